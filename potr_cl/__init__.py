@@ -1,0 +1,9 @@
+"""potr_cl: post-training compression of 3D Gaussian Splatting scenes with OpenCL."""
+
+from potr_cl.cameras import Camera
+from potr_cl.errors import DataError, DeviceError, PotrError, UsageError
+from potr_cl.scene import Scene
+
+__version__ = "0.1.0"
+
+__all__ = ["Camera", "DataError", "DeviceError", "PotrError", "Scene", "UsageError", "__version__"]

@@ -1,0 +1,92 @@
+"""Camera: a pinhole view of a scene, and the split into training and test views."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+from pathlib import Path
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.errors import DataError, UsageError
+
+Split = str  # "train" or "test"
+
+
+@dataclass(frozen=True, eq=False)
+class Camera:
+    """A pinhole camera, axes as in OpenCV and COLMAP (x right, y down, z forward).
+
+    A world point μ has view coordinates ``t = rotation @ μ + translation`` and the pixel position
+    ``(fx · t_x / t_z + cx, fy · t_y / t_z + cy)``; the centre of pixel (i, j) is at (i + 0.5, j + 0.5).
+
+    Attributes:
+        name: of the view; by convention its image's name without folder and extension.
+        width, height: of the image in pixels.
+        fx, fy: focal lengths in pixels.
+        cx, cy: principal point in pixels.
+        rotation: (3, 3) float64, world to camera.
+        translation: (3,) float64, world to camera, world units.
+        split: "train" (the encoder may look at it) or "test" (for judging only).
+        image_path: the photograph, if the camera file names one.
+    """
+
+    name: str
+    width: int
+    height: int
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+    rotation: NDArray[np.float64]
+    translation: NDArray[np.float64]
+    split: Split = "train"
+    image_path: Path | None = None
+
+    def __post_init__(self) -> None:
+        where = f"camera '{self.name}'"
+        if self.width < 1 or self.height < 1:
+            raise DataError(f"{where}: image size {self.width} x {self.height} is not positive")
+        intrinsics = (self.fx, self.fy, self.cx, self.cy)
+        if not np.isfinite(intrinsics).all() or self.fx <= 0 or self.fy <= 0:
+            raise DataError(f"{where}: intrinsics (fx, fy, cx, cy) = {intrinsics} are not a pinhole camera's")
+        if self.rotation.shape != (3, 3) or self.translation.shape != (3,):
+            raise DataError(f"{where}: the pose is not a 3 x 3 rotation and a translation of 3")
+        if not (np.isfinite(self.rotation).all() and np.isfinite(self.translation).all()):
+            raise DataError(f"{where}: the pose holds a non-finite value")
+        # Files round to 6 or 7 digits; anything worse is a scale or a shear, which a pinhole pose cannot hold.
+        if np.abs(self.rotation @ self.rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(self.rotation) < 0:
+            raise DataError(f"{where}: the pose's 3 x 3 part is not a rotation")
+        if self.split not in ("train", "test"):
+            raise DataError(f"{where}: split '{self.split}' is neither 'train' nor 'test'")
+
+    @property
+    def centre(self) -> NDArray[np.float64]:
+        """(3,) position of the eye in world units."""
+        return -self.rotation.T @ self.translation
+
+
+def train_views(cameras: Sequence[Camera]) -> list[Camera]:
+    """The views that the encoder may look at.
+
+    Raises:
+        UsageError: there is none.
+    """
+    views = [c for c in cameras if c.split == "train"]
+    if not views:
+        raise UsageError("none of the cameras is a training view: encoding looks at training views only")
+    return views
+
+
+def test_views(cameras: Sequence[Camera]) -> list[Camera]:
+    """The views kept for judging; may be empty."""
+    return [c for c in cameras if c.split == "test"]
+
+
+test_views.__test__ = False  # type: ignore[attr-defined]  # pytest would collect it by its name
+
+
+def camera_centres(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    """(S, 3) positions of the eyes in world units."""
+    return np.array([c.centre for c in cameras], dtype=np.float64).reshape(-1, 3)

@@ -1,0 +1,23 @@
+"""The exceptions that potr_cl raises on purpose: each message is one line that says what, where and how to mend it."""
+
+from __future__ import annotations
+
+
+class PotrError(Exception):
+    """Base of every error raised on purpose; the command line prints it as one line and exits with ``exit_code``."""
+
+    exit_code = 1
+
+
+class DataError(PotrError):
+    """A file's content is not what it should be (damaged, truncated, of another kind)."""
+
+
+class UsageError(PotrError):
+    """The call itself cannot be carried out: a wrong option, a path that does not exist, a missing extra."""
+
+    exit_code = 2
+
+
+class DeviceError(PotrError):
+    """An OpenCL device is missing, failed to build a program, or ran out of memory."""

@@ -1,0 +1,138 @@
+"""Scene: the arrays of a trained 3D Gaussian Splatting model, their units and their validation."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.errors import DataError
+
+FloatArray = NDArray[np.float32]
+
+#: Number of SH coefficients a colour channel for each degree.
+SH_COEFFICIENTS = (1, 4, 9, 16)
+
+
+@dataclass(frozen=True)
+class CleanReport:
+    """What :meth:`Scene.cleaned` had to mend.
+
+    Attributes:
+        non_finite: splats dropped because one of their values was NaN or infinite.
+        zero_quaternions: splats whose quaternion had length zero and became the identity.
+    """
+
+    non_finite: int
+    zero_quaternions: int
+
+
+@dataclass(frozen=True)
+class Scene:
+    """A trained scene, in the parametrisation that 3DGS files hold (Kerbl et al. 2023).
+
+    All arrays are float32, N splats long, and may have any strides (the decoder returns ``sh`` with each
+    coefficient contiguous in memory; nothing may assume otherwise of it).
+
+    Attributes:
+        means: (N, 3) centres in world units.
+        log_scales: (N, 3) natural logarithm of the standard deviations along the splat's own axes.
+        quaternions: (N, 4) rotation as w, x, y, z; not necessarily of unit length.
+        opacity_logits: (N,) logit of the opacity.
+        sh: (N, M, 3) spherical-harmonics coefficients, M = 1, 4, 9 or 16; [:, 0] is the DC term; the last axis is R, G, B.
+
+    Raises:
+        DataError: shapes do not belong together.
+    """
+
+    means: FloatArray
+    log_scales: FloatArray
+    quaternions: FloatArray
+    opacity_logits: FloatArray
+    sh: FloatArray
+
+    def __post_init__(self) -> None:
+        n = len(self.means)
+        wanted = {
+            "means": (n, 3),
+            "log_scales": (n, 3),
+            "quaternions": (n, 4),
+            "opacity_logits": (n,),
+        }
+        for name, shape in wanted.items():
+            array = getattr(self, name)
+            if array.shape != shape:
+                raise DataError(f"scene: {name} has shape {array.shape}, expected {shape}")
+        if self.sh.ndim != 3 or self.sh.shape[0] != n or self.sh.shape[2] != 3:
+            raise DataError(f"scene: sh has shape {self.sh.shape}, expected ({n}, M, 3)")
+        if self.sh.shape[1] not in SH_COEFFICIENTS:
+            raise DataError(f"scene: {self.sh.shape[1]} SH coefficients a channel, expected one of {SH_COEFFICIENTS}")
+        for name in (*wanted, "sh"):
+            if getattr(self, name).dtype != np.float32:
+                raise DataError(f"scene: {name} is {getattr(self, name).dtype}, expected float32")
+
+    def __len__(self) -> int:
+        return len(self.means)
+
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return SH_COEFFICIENTS.index(self.sh.shape[1])
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all arrays."""
+        return sum(a.nbytes for a in (self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh))
+
+    @property
+    def scales(self) -> FloatArray:
+        """(N, 3) standard deviations in world units."""
+        return np.exp(self.log_scales)
+
+    @property
+    def opacities(self) -> FloatArray:
+        """(N,) opacities in (0, 1)."""
+        logits = self.opacity_logits
+        # exp of a non-positive number only: a logit of -100 must not overflow.
+        e = np.exp(-np.abs(logits))
+        return np.where(logits >= 0, 1 / (1 + e), e / (1 + e)).astype(np.float32)
+
+    def subset(self, index: NDArray[np.generic]) -> Scene:
+        """The splats that ``index`` (integers or a boolean mask) selects, in its order."""
+        return Scene(
+            self.means[index],
+            self.log_scales[index],
+            self.quaternions[index],
+            self.opacity_logits[index],
+            self.sh[index],
+        )
+
+    def cleaned(self) -> tuple[Scene, CleanReport]:
+        """Drop splats with non-finite values, turn zero quaternions into the identity.
+
+        Returns:
+            The clean scene (``self`` if nothing had to be mended) and what was mended.
+
+        Raises:
+            DataError: no splat is left.
+        """
+        finite = np.isfinite(self.means).all(axis=1)
+        finite &= np.isfinite(self.log_scales).all(axis=1)
+        finite &= np.isfinite(self.quaternions).all(axis=1)
+        finite &= np.isfinite(self.opacity_logits)
+        for m in range(self.sh.shape[1]):  # one coefficient at a time: no temporary as large as the SH
+            finite &= np.isfinite(self.sh[:, m]).all(axis=1)
+        dropped = len(self) - int(np.count_nonzero(finite))
+        scene = self.subset(finite) if dropped else self
+        if len(scene) == 0:
+            raise DataError("the scene holds no splat with finite values: nothing to do")
+        # A length whose square underflows cannot be normalised either.
+        norm2 = np.einsum("ij,ij->i", scene.quaternions, scene.quaternions, dtype=np.float64)
+        zero = norm2 < 1e-30
+        zeros = int(np.count_nonzero(zero))
+        if zeros:
+            quaternions = scene.quaternions.copy()
+            quaternions[zero] = (1, 0, 0, 0)
+            scene = Scene(scene.means, scene.log_scales, quaternions, scene.opacity_logits, scene.sh)
+        return scene, CleanReport(dropped, zeros)
