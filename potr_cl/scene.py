@@ -40,7 +40,8 @@ class Scene:
         log_scales: (N, 3) natural logarithm of the standard deviations along the splat's own axes.
         quaternions: (N, 4) rotation as w, x, y, z; not necessarily of unit length.
         opacity_logits: (N,) logit of the opacity.
-        sh: (N, M, 3) spherical-harmonics coefficients, M = 1, 4, 9 or 16; [:, 0] is the DC term; the last axis is R, G, B.
+        sh: (N, M, 3) spherical-harmonics coefficients, M = 1, 4, 9 or 16; [:, 0] is the DC term; the last
+            axis is R, G, B.
 
     Raises:
         DataError: shapes do not belong together.
