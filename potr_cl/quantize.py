@@ -1,0 +1,211 @@
+"""Quantiser: scale factors, the hyper-parameters that one quality q sets, and the integers of every attribute.
+
+The integers are those of the *activated* values (paper section "Codec", eq. for quantisation and dequantisation):
+standard deviations, opacities after the sigmoid, unit quaternions without their real part, SH coefficients in YCoCg.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, fields, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.errors import DataError, UsageError
+
+Integers = NDArray[np.signedinteger]
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+
+#: Added to a quantised opacity before the division: the paper's shift of the reconstruction off the bin's centre.
+OPACITY_SHIFT = 0.25
+#: A standard deviation that rounds to 0 comes back as this part of a step: its logarithm must stay finite.
+ZERO_SCALE = 0.25
+#: Integers beyond this are not exact in float64; no sane scene comes near.
+_LARGEST = 2.0**53
+
+
+@dataclass(frozen=True)
+class HyperParameters:
+    """What one quality q sets (paper table "Hyperparameters as functions of q"); each can be replaced on its own.
+
+    Attributes:
+        beta: allowed distance of a centre to its leaf's centre, as a part of the distance to the nearest camera.
+        gamma: the least such distance, world units.
+        sf_sh, sf_opacity, sf_rotation, sf_scale: scale factors; a quantiser step is 1 / SF.
+    """
+
+    beta: float
+    gamma: float
+    sf_sh: float
+    sf_opacity: float
+    sf_rotation: float
+    sf_scale: float
+
+    @staticmethod
+    def from_quality(q: float, **replaced: float | None) -> HyperParameters:
+        """The paper's values for quality q in [0, 1]; keywords that are not None replace single ones.
+
+        Raises:
+            UsageError: q or a replaced value is out of range.
+        """
+        if not 0 <= q <= 1:
+            raise UsageError(f"the quality q is {q:g}, it must lie between 0 and 1")
+        values = HyperParameters(
+            beta=1.4e-4 * q,
+            gamma=5.0 * 10 ** (-3 - 5 * q),
+            sf_sh=1 + 100 * q,
+            sf_opacity=1 + 200 * q,
+            sf_rotation=1 + 400 * q,
+            sf_scale=1 + 4000 * q,
+        )
+        values = replace(values, **{k: float(v) for k, v in replaced.items() if v is not None})
+        for field in fields(values):
+            value = getattr(values, field.name)
+            low, high = (0.0, 1e30) if field.name == "beta" else (1e-30, 1e30)
+            if field.name.startswith("sf_"):
+                low, high = 1e-3, 1e9
+            if not low <= value <= high:
+                raise UsageError(f"{field.name} is {value:g}, it must lie between {low:g} and {high:g}")
+        return values
+
+
+def _to_steps(values: F64, scale_factor: float, what: str) -> Integers:
+    """⌊½ + x · SF⌋ in the smallest of the signed integer types that holds it."""
+    steps = np.floor(0.5 + values * scale_factor)
+    largest = float(np.abs(steps).max(initial=0))
+    if not largest < _LARGEST:
+        raise DataError(
+            f"a {what} of {largest / scale_factor:.3g} is too large to quantise: remove that splat or lower SF"
+        )
+    for dtype in (np.int16, np.int32):
+        if largest <= np.iinfo(dtype).max:
+            return steps.astype(dtype)
+    return steps.astype(np.int64)
+
+
+# ------------------------------------------------------------------------------------------------ scales
+
+
+def quantize_scales(log_scales: F64, sf_scale: float) -> Integers:
+    """Natural logarithms of standard deviations to steps of 1 / SF of the standard deviations themselves."""
+    with np.errstate(over="ignore"):
+        return _to_steps(np.exp(log_scales), sf_scale, "standard deviation")
+
+
+def dequantize_scales(steps: NDArray[np.integer], sf_scale: float) -> F32:
+    """Steps to natural logarithms of standard deviations."""
+    scales = np.maximum(steps.astype(np.float32), np.float32(ZERO_SCALE)) / np.float32(sf_scale)
+    logarithms: F32 = np.log(scales, dtype=np.float32)
+    return logarithms
+
+
+# ------------------------------------------------------------------------------------------------ opacity
+
+
+def quantize_opacities(logits: F64, sf_opacity: float) -> Integers:
+    """Logits to steps of 1 / SF of the opacity."""
+    return _to_steps(1 / (1 + np.exp(-np.clip(logits, -500, 500))), sf_opacity, "opacity")
+
+
+def dequantize_opacities(steps: NDArray[np.integer], sf_opacity: float) -> F32:
+    """Steps to logits of (steps + 0.25) / SF, kept a float32 rounding away from an opacity of 1."""
+    opacity = (steps.astype(np.float32) + np.float32(OPACITY_SHIFT)) / np.float32(sf_opacity)
+    opacity = np.minimum(opacity, np.float32(1 - 2.0**-24))
+    logits: F32 = np.log(opacity / (1 - opacity), dtype=np.float32)
+    return logits
+
+
+# ------------------------------------------------------------------------------------------------ rotation
+
+
+def _octahedral_rotations() -> tuple[F64, NDArray[np.intp]]:
+    """The 24 rotations g that map the axes onto each other: conjugate quaternions (24, 4), and axis permutations.
+
+    With R' = R G the covariance R S² Rᵀ stays the same if S' holds the scales in the order ``permutation``.
+    """
+    quaternions = [np.eye(4)[i] for i in range(4)]
+    quaternions += [np.array([1, a, b, c]) / 2 for a in (1, -1) for b in (1, -1) for c in (1, -1)]
+    for i in range(4):
+        for j in range(i + 1, 4):
+            for sign in (1, -1):
+                g = np.zeros(4)
+                g[i], g[j] = np.sqrt(0.5), sign * np.sqrt(0.5)
+                quaternions.append(g)
+    table = np.array(quaternions)
+    permutations = []
+    for w, x, y, z in table:
+        matrix = np.array(
+            [
+                [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+                [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+                [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+            ]
+        )
+        permutations.append(np.abs(matrix).argmax(axis=0))
+    return table, np.array(permutations)
+
+
+_GROUP, _PERMUTATIONS = _octahedral_rotations()
+
+
+def canonical_rotations(quaternions: F32, log_scales: F32) -> tuple[F64, F32]:
+    """The equivalent form of each splat whose unit quaternion has the largest real part.
+
+    A Gaussian has 24 equivalent pairs of rotation and order of scales, and two signs of each quaternion. The one with
+    the largest real part (at least 0.85) has the smallest imaginary parts to code, and loses least when the dropped
+    real part is computed from them.
+
+    Args:
+        quaternions: (N, 4) w, x, y, z of any non-zero length.
+        log_scales: (N, 3).
+
+    Returns:
+        (N, 3) float64 imaginary parts of unit quaternions with a real part >= 0, and the log scales in matching order.
+    """
+    q = quaternions.astype(np.float64)
+    q /= np.linalg.norm(q, axis=1, keepdims=True)
+    # Rounded, so that ties between equivalent forms fall the same way on every processor.
+    real = np.round(q @ (_GROUP * (1, -1, -1, -1)).T, 9)
+    best = np.abs(real).argmax(axis=1)
+    gw, gx, gy, gz = _GROUP[best].T
+    w, x, y, z = q.T
+    product = np.stack(
+        [
+            w * gx + x * gw + y * gz - z * gy,
+            w * gy - x * gz + y * gw + z * gx,
+            w * gz + x * gy - y * gx + z * gw,
+        ],
+        axis=1,
+    )
+    product[np.take_along_axis(real, best[:, None], axis=1)[:, 0] < 0] *= -1
+    return product, np.take_along_axis(log_scales, _PERMUTATIONS[best], axis=1)
+
+
+def quantize_rotations(imaginary: F64, sf_rotation: float) -> Integers:
+    """One imaginary part of unit quaternions to steps of 1 / SF."""
+    return _to_steps(imaginary, sf_rotation, "quaternion component")
+
+
+def dequantize_rotations(steps: list[NDArray[np.integer]], sf_rotation: float, out: F32) -> None:
+    """Steps of x, y, z to unit quaternions w, x, y, z in ``out`` (N, 4); w ≥ 0 is computed from the rest."""
+    rest = np.ones(len(out), np.float32)
+    for axis, step in enumerate(steps, start=1):
+        part = step.astype(np.float32) / np.float32(sf_rotation)
+        out[:, axis] = part
+        rest -= part * part
+    out[:, 0] = np.sqrt(np.maximum(rest, 0))
+
+
+# ------------------------------------------------------------------------------------------------ colour
+
+
+def to_ycocg(rgb: F64) -> tuple[F64, F64, F64]:
+    """(N, 3) R, G, B to Y = R/4 + G/2 + B/4, Co = R/2 − B/2, Cg = −R/4 + G/2 − B/4."""
+    r, g, b = rgb[:, 0], rgb[:, 1], rgb[:, 2]
+    return r / 4 + g / 2 + b / 4, (r - b) / 2, g / 2 - (r + b) / 4
+
+
+def quantize_sh(values: F64, sf_sh: float) -> Integers:
+    """One channel of one SH coefficient (YCoCg) to steps of 1 / SF."""
+    return _to_steps(values, sf_sh, "SH coefficient")
