@@ -1,1 +1,77 @@
 """One module a file format, each with load(path) and, where we write it, save(path, …)."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+from potr_cl.cameras import Camera
+from potr_cl.errors import DataError, UsageError
+from potr_cl.formats import cameras_json, colmap, ply, transforms
+from potr_cl.formats.view_files import read_json
+from potr_cl.scene import Scene
+
+
+def load_scene(path: Path) -> Scene:
+    """Read a trained scene; the extension tells the format.
+
+    Args:
+        path: of a .ply file.
+
+    Raises:
+        UsageError: the file cannot be opened, or its extension is unknown.
+        DataError: its content is damaged.
+    """
+    path = Path(path)
+    if path.suffix.lower() != ".ply":
+        raise UsageError(f"'{path}': unknown kind of scene, expected a .ply file")
+    return ply.load(path)
+
+
+def load_cameras(path: Path) -> list[Camera]:
+    """Read the views of a scene; the content tells the format.
+
+    Args:
+        path: of a cameras.json, a transforms.json (Blender or nerfstudio), a file of a COLMAP model, or of a folder
+            that holds such files or a COLMAP model in ``sparse/0`` or ``sparse``.
+
+    Returns:
+        The views with their split into training and test views; at least one.
+
+    Raises:
+        UsageError: there is nothing at ``path``, or it is of no known kind, or needs an extra.
+        DataError: its content is damaged.
+    """
+    path = Path(path)
+    if path.is_dir():
+        return _from_folder(path)
+    if path.suffix.lower() in (".bin", ".txt") and colmap.is_model(path.parent):
+        return colmap.load(path.parent)
+    if path.suffix.lower() == ".json":
+        content = read_json(path)
+        if isinstance(content, list):
+            return cameras_json.parse(content, path)
+        if isinstance(content, dict) and "frames" in content:
+            return transforms.parse([(content, path)])
+        raise DataError(f"'{path}' is neither a cameras.json (a list) nor a transforms.json (with 'frames')")
+    if not path.exists():
+        raise UsageError(f"there is no file or folder '{path}'")
+    raise UsageError(f"'{path}': unknown kind of cameras, {_EXPECTED}")
+
+
+def _from_folder(folder: Path) -> list[Camera]:
+    if colmap.is_model(folder):
+        return colmap.load(folder)
+    # cameras.json first: it lists just the views that a scene was trained with, as they were.
+    if (folder / "cameras.json").exists():
+        return cameras_json.load(folder / "cameras.json")
+    if (folder / "transforms_train.json").exists():
+        return transforms.load_folder(folder)
+    if (folder / "transforms.json").exists():
+        return transforms.load(folder / "transforms.json")
+    for model in (folder / "sparse" / "0", folder / "sparse"):
+        if colmap.is_model(model):
+            return colmap.load(model)
+    raise UsageError(f"the folder '{folder}' holds no cameras, {_EXPECTED}")
+
+
+_EXPECTED = "expected a cameras.json, a transforms.json, or a COLMAP model (cameras and images as .bin or .txt)"

@@ -1,0 +1,201 @@
+"""Views from a COLMAP sparse model: ``cameras`` and ``images``, as .bin or .txt files.
+
+The model is read by pycolmap, which is an extra. It trusts its input: at the end of a truncated file it goes on with
+what happens to be in memory, without an error, or takes memory until none is left. So it is handed copies whose
+structure has been checked here, and without the points: those make up nearly all of a model, and no view needs them.
+"""
+
+from __future__ import annotations
+
+import os
+import struct
+import tempfile
+from pathlib import Path
+from types import ModuleType
+
+import numpy as np
+
+from potr_cl.cameras import Camera
+from potr_cl.errors import DataError, UsageError
+from potr_cl.formats.view_files import camera_of, every_eighth, image_name, read_bytes, view_names
+
+#: COLMAP's pinhole models: their number in binary files and how many parameters they have.
+_PINHOLES = {"SIMPLE_PINHOLE": (0, 3), "PINHOLE": (1, 4)}
+
+_CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters as float64
+_IMAGE = struct.Struct("<I7dI")  # id, rotation, translation, camera; then the name, a zero, the 2-D points
+_COUNT = struct.Struct("<Q")
+_POINT_BYTES = 24
+_MAX_SIDE = 1 << 16
+
+
+def is_model(folder: Path) -> bool:
+    """Whether a folder holds a sparse model."""
+    return any((folder / f"cameras{ending}").exists() for ending in (".bin", ".txt"))
+
+
+def load(folder: Path) -> list[Camera]:
+    """Read the views of a sparse model.
+
+    Each 8th image by name is a test view, as in the field's benchmarks. Photographs are looked for in a folder
+    ``images`` beside the model or up to two folders above it.
+
+    Args:
+        folder: holds cameras.bin and images.bin, or the same as .txt.
+
+    Returns:
+        The views, ordered by the names of their images.
+
+    Raises:
+        UsageError: pycolmap is not installed, or a file cannot be opened.
+        DataError: the model is damaged, or a camera is not a pinhole.
+    """
+    pycolmap = _pycolmap()
+    ending = ".bin" if (folder / "cameras.bin").exists() else ".txt"
+    cameras, images = folder / f"cameras{ending}", folder / f"images{ending}"
+    check, strip, no_points = (
+        (_check_binary_cameras, _without_points_binary, _COUNT.pack(0))
+        if ending == ".bin"
+        else (_check_text_cameras, _without_points_text, b"")
+    )
+    content = {
+        cameras.name: check(read_bytes(cameras), cameras),
+        images.name: strip(read_bytes(images), images),
+        f"points3D{ending}": no_points,
+    }
+    with tempfile.TemporaryDirectory(prefix="potr-cl-") as copy:
+        for name, data in content.items():
+            Path(copy, name).write_bytes(data)
+        try:
+            model = pycolmap.Reconstruction(copy)
+        except Exception as error:  # the library raises what its parts happen to raise
+            reason = " ".join(str(error).split())[:200]
+            raise DataError(f"'{folder}' is a damaged COLMAP model: {reason}") from error
+
+    views = sorted(model.images.values(), key=lambda image: image.name)
+    if not views:
+        raise DataError(f"'{images}' holds no view")
+    files = [image_name(image.name, f"'{images}': the name of image {image.image_id}") for image in views]
+    names = view_names(files, images)
+    photographs = _photographs(folder)
+    result = []
+    for image, name, file, split in zip(views, names, files, every_eighth(files), strict=True):
+        camera = model.cameras[image.camera_id]
+        if max(camera.width, camera.height) > _MAX_SIDE:
+            raise DataError(f"'{cameras}': camera {camera.camera_id} is {camera.width} x {camera.height} pixels large")
+        focal, (cx, cy) = camera.params[:-2], camera.params[-2:]
+        pose = np.asarray(image.cam_from_world().matrix(), dtype=np.float64)
+        photograph = photographs / file if photographs else None
+        result.append(
+            camera_of(
+                images,
+                name=name,
+                width=int(camera.width),
+                height=int(camera.height),
+                fx=float(focal[0]),
+                fy=float(focal[-1]),
+                cx=float(cx),
+                cy=float(cy),
+                rotation=pose[:, :3],
+                translation=pose[:, 3],
+                split=split,
+                image_path=photograph if photograph and os.path.isfile(photograph) else None,
+            )
+        )
+    return result
+
+
+def _pycolmap() -> ModuleType:
+    try:
+        import pycolmap
+    except ImportError as error:
+        raise UsageError('reading COLMAP models needs pycolmap: pip install "potr-cl[colmap]"') from error
+    return pycolmap  # type: ignore[no-any-return]
+
+
+def _photographs(folder: Path) -> Path | None:
+    """The folder that the names of the images are relative to, if it is where it usually is."""
+    absolute = Path(os.path.abspath(folder))
+    candidates = (parent / "images" for parent in (absolute, *absolute.parents[:2]))
+    return next((candidate for candidate in candidates if candidate.is_dir()), None)
+
+
+def _distorted(path: Path, camera: str, model: str) -> DataError:
+    return DataError(
+        f"'{path}': camera {camera} has the model {model}, only {' and '.join(_PINHOLES)} are supported: "
+        "undistort the images with 'colmap image_undistorter' and use the model that it writes"
+    )
+
+
+def _model_name(model: int) -> str:
+    try:
+        return str(_pycolmap().CameraModelId(model).name)
+    except ValueError:
+        return f"number {model}"
+
+
+def _truncated(path: Path) -> DataError:
+    return DataError(f"'{path}' is truncated, or is no file of a COLMAP model")
+
+
+def _check_binary_cameras(data: bytes, path: Path) -> bytes:
+    parameters = dict(_PINHOLES.values())
+    try:
+        (count,) = _COUNT.unpack_from(data)
+        offset = _COUNT.size
+        for _ in range(count):
+            identifier, model, _, _ = _CAMERA.unpack_from(data, offset)
+            if model not in parameters:
+                raise _distorted(path, str(identifier), _model_name(model))
+            offset += _CAMERA.size + 8 * parameters[model]
+    except struct.error as error:
+        raise _truncated(path) from error
+    if offset != len(data):
+        raise _truncated(path)
+    return data
+
+
+def _without_points_binary(data: bytes, path: Path) -> bytes:
+    kept = [data[: _COUNT.size]]
+    try:
+        (count,) = _COUNT.unpack_from(data)
+        offset = _COUNT.size
+        for _ in range(count):
+            name_end = data.index(b"\0", offset + _IMAGE.size)
+            (points,) = _COUNT.unpack_from(data, name_end + 1)
+            kept += [data[offset : name_end + 1], _COUNT.pack(0)]
+            offset = name_end + 1 + _COUNT.size + points * _POINT_BYTES
+    except (struct.error, ValueError) as error:
+        raise _truncated(path) from error
+    if offset != len(data):
+        raise _truncated(path)
+    return b"".join(kept)
+
+
+def _check_text_cameras(data: bytes, path: Path) -> bytes:
+    for line in data.splitlines():
+        fields = line.decode("utf-8", "replace").split()
+        if not fields or fields[0].startswith("#"):
+            continue
+        if len(fields) < 4:
+            raise _truncated(path)
+        if fields[1] not in _PINHOLES:
+            raise _distorted(path, fields[0][:40], fields[1][:40])
+        if len(fields) != 4 + _PINHOLES[fields[1]][1]:
+            raise _truncated(path)
+    return data
+
+
+def _without_points_text(data: bytes, path: Path) -> bytes:
+    """Each image has two lines, the second one, its 2-D points, may be empty."""
+    kept = []
+    lines = iter(data.splitlines())
+    for line in lines:
+        fields = line.split(maxsplit=9)
+        if not fields or fields[0].startswith(b"#"):
+            continue
+        if len(fields) < 10:
+            raise _truncated(path)
+        kept.append(line + b"\n\n")
+        next(lines, None)
+    return b"".join(kept)
