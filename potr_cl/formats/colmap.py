@@ -17,7 +17,7 @@ import numpy as np
 
 from potr_cl.cameras import Camera
 from potr_cl.errors import DataError, UsageError
-from potr_cl.formats.view_files import camera_of, every_eighth, image_name, read_bytes, view_names
+from potr_cl.formats.view_files import camera_of, every_eighth, excerpt, image_name, read_bytes, view_names
 
 #: COLMAP's pinhole models: their number in binary files and how many parameters they have.
 _PINHOLES = {"SIMPLE_PINHOLE": (0, 3), "PINHOLE": (1, 4)}
@@ -68,11 +68,13 @@ def load(folder: Path) -> list[Camera]:
             Path(copy, name).write_bytes(data)
         try:
             model = pycolmap.Reconstruction(copy)
+            views = sorted(model.images.values(), key=lambda image: image.name)
+        except UnicodeDecodeError as error:
+            raise DataError(f"'{images}': the name of an image is not UTF-8: rename it") from error
         except Exception as error:  # the library raises what its parts happen to raise
             reason = " ".join(str(error).split())[:200]
             raise DataError(f"'{folder}' is a damaged COLMAP model: {reason}") from error
 
-    views = sorted(model.images.values(), key=lambda image: image.name)
     if not views:
         raise DataError(f"'{images}' holds no view")
     files = [image_name(image.name, f"'{images}': the name of image {image.image_id}") for image in views]
@@ -122,16 +124,14 @@ def _photographs(folder: Path) -> Path | None:
 
 def _distorted(path: Path, camera: str, model: str) -> DataError:
     return DataError(
-        f"'{path}': camera {camera} has the model {model}, only {' and '.join(_PINHOLES)} are supported: "
+        f"'{path}': camera {camera} has the model {excerpt(model)}, only {' and '.join(_PINHOLES)} are supported: "
         "undistort the images with 'colmap image_undistorter' and use the model that it writes"
     )
 
 
-def _model_name(model: int) -> str:
-    try:
-        return str(_pycolmap().CameraModelId(model).name)
-    except ValueError:
-        return f"number {model}"
+def _model_name(number: int) -> str:
+    name = str(_pycolmap().CameraModelId(number).name)
+    return f"number {number}" if name == "???" else name
 
 
 def _truncated(path: Path) -> DataError:
@@ -180,7 +180,7 @@ def _check_text_cameras(data: bytes, path: Path) -> bytes:
         if len(fields) < 4:
             raise _truncated(path)
         if fields[1] not in _PINHOLES:
-            raise _distorted(path, fields[0][:40], fields[1][:40])
+            raise _distorted(path, excerpt(fields[0]), fields[1])
         if len(fields) != 4 + _PINHOLES[fields[1]][1]:
             raise _truncated(path)
     return data

@@ -114,7 +114,8 @@ def stem(file: str) -> str:
 def camera_of(path: Path, **fields: Any) -> Camera:
     """A camera; if its values belong to none, the message names the file that they come from."""
     try:
-        return Camera(**fields)
+        with np.errstate(all="ignore"):  # a damaged pose may overflow while it is checked
+            return Camera(**fields)
     except DataError as error:
         raise DataError(f"'{path}', {error}") from error
 
