@@ -1,0 +1,50 @@
+"""Scenes that several tests use."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from potr_cl import Camera, Scene
+from potr_cl.formats import load_cameras, load_scene
+
+DATA = Path(__file__).parent / "data"
+SCENES = Path(__file__).parents[2] / "shared" / "scenes"
+
+
+@pytest.fixture(scope="session")
+def data() -> Path:
+    """The folder of the small excerpts."""
+    return DATA
+
+
+@pytest.fixture(scope="session")
+def lego_excerpt() -> Scene:
+    """1500 splats of a real scene, SH degree 3."""
+    return load_scene(DATA / "lego_excerpt.ply")
+
+
+@pytest.fixture(scope="session")
+def lego_excerpt_cameras() -> list[Camera]:
+    """9 training and 3 test views that see the excerpt."""
+    return load_cameras(DATA / "lego_cameras.json")
+
+
+@pytest.fixture(scope="session")
+def lego() -> Path:
+    """The folder of the whole scene lego: point_cloud.ply, cameras.json, transforms_*.json, images."""
+    return _whole_scene("lego")
+
+
+@pytest.fixture(scope="session")
+def plush() -> Path:
+    """The folder of the whole scene plush: point_cloud.ply, cameras.json, sparse/0, images."""
+    return _whole_scene("plush")
+
+
+def _whole_scene(name: str) -> Path:
+    folder = SCENES / name
+    if not (folder / "point_cloud.ply").exists():
+        pytest.skip(f"the scene {name} is not in {SCENES}")
+    return folder
