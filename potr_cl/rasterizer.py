@@ -1,0 +1,421 @@
+"""The rasterizer: projection, tile lists, depth order and compositing of one view after the other.
+
+The stages run in this order and leave their results in device buffers of a :class:`View`, so that whoever needs a view
+more than once keeps the view and repeats only the last stage:
+
+1. ``project``: each splat's ellipse and colour on screen (cl/project.cl);
+2. ``count_tiles``, ``scan_tiles``, ``fill_tiles``: which splats touch which 16 x 16 tile (cl/tile_lists_*.cl);
+3. ``sort_tiles``: each tile's list front to back (cl/sort_*.cl);
+4. ``composite``: the picture (cl/composite_*.cl).
+
+Semantics: the original 3DGS rasterizer (Kerbl et al. 2023); where renderers differ, :class:`RasterRules` says how.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from potr_cl.cameras import Camera
+from potr_cl.device import Device
+from potr_cl.errors import DeviceError, UsageError
+from potr_cl.scene import FloatArray, Scene
+
+TILE = 16
+
+#: Splats are padded to a multiple of this, the size of a work-group.
+_SPLAT_GROUP = 256
+
+#: Standard deviations above this many world units are taken as this: nothing can be seen to differ, nothing overflows.
+_LARGEST_SCALE = 1e12
+
+_CAMERA = np.dtype(
+    [
+        ("rotation", np.float32, 9),
+        ("eye_high", np.float32, 3),
+        ("eye_low", np.float32, 3),
+        ("focal", np.float32, 2),
+        ("principal", np.float32, 2),
+        ("limit", np.float32, 2),
+        ("size", np.int32, 2),
+        ("tiles", np.int32, 2),
+    ]
+)
+
+
+@dataclass(frozen=True)
+class RasterRules:
+    """The rules in which rasterizers differ.
+
+    Attributes:
+        near: splats whose view-space depth is at or below this, in world units, are not drawn.
+        alpha_cap: largest alpha of a splat in a pixel.
+        square_extent: draw a splat only in the tiles that the square of half side ceil(3 sigma_max) around its centre
+            touches, as the original does; without, wherever its alpha reaches 1/255.
+        stop_included: a pixel ends before a splat that would bring its transmittance to 1e-4 exactly; without, only
+            below.
+    """
+
+    near: float = 0.2
+    alpha_cap: float = 0.99
+    square_extent: bool = True
+    stop_included: bool = False
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.near) and self.near > 0):
+            raise UsageError(f"the near plane must be a positive distance, not {self.near}")
+        if not 1 / 255 <= self.alpha_cap < 1:
+            raise UsageError(f"the alpha cap must lie in [1/255, 1), not {self.alpha_cap}")
+
+    @property
+    def stop(self) -> float:
+        """A pixel ends before its transmittance would fall below this float32."""
+        stop = np.float32(1e-4)
+        return float(np.nextafter(stop, np.float32(1)) if self.stop_included else stop)
+
+
+#: The original 3DGS rasterizer.
+INRIA = RasterRules()
+#: gsplat's rasterizer, with the original's near plane instead of its own default of 0.01.
+GSPLAT = RasterRules(alpha_cap=0.999, square_extent=False, stop_included=True)
+
+
+def _camera_struct(camera: Camera) -> NDArray[Any]:
+    """The camera as the kernels take it (``View`` in cl/splat.clh)."""
+    struct = np.zeros((), _CAMERA)
+    struct["rotation"] = camera.rotation.ravel()
+    struct["eye_high"] = camera.centre
+    struct["eye_low"] = camera.centre - struct["eye_high"]
+    struct["focal"] = camera.fx, camera.fy
+    struct["principal"] = camera.cx, camera.cy
+    struct["limit"] = 1.3 * camera.width / (2 * camera.fx), 1.3 * camera.height / (2 * camera.fy)
+    struct["size"] = camera.width, camera.height
+    struct["tiles"] = _tiles(camera)
+    return struct
+
+
+def _tiles(camera: Camera) -> tuple[int, int]:
+    """Columns and rows of tiles that cover the image."""
+    return -(-camera.width // TILE), -(-camera.height // TILE)
+
+
+class View:
+    """One camera's projection, tile lists and depth order, in device buffers.
+
+    Attributes:
+        camera: whose view it is.
+        columns, rows: tiles across and down.
+        shapes: (N, 8) float32, a splat's ellipse, see cl/splat.clh; radius 0 for a splat that is not drawn.
+        colours: (N, 4) float32; R, G, B of the splats that are drawn, the rest unset.
+        offsets: (columns * rows + 1,) uint32, where each tile's run of ``entries`` begins.
+        entries: uint32 splat numbers, front to back within a tile.
+        capacity: entries that ``entries`` can hold.
+        entry_count: entries there are; set once the device is known to have found them all.
+    """
+
+    def __init__(self, device: Device, camera: Camera, splats: int, capacity: int) -> None:
+        self._device = device
+        self.camera = camera
+        self.columns, self.rows = _tiles(camera)
+        self.shapes = device.allocate(32 * splats, "the projected splats")
+        self.colours = device.allocate(16 * splats, "the projected splats' colours")
+        self.offsets = device.allocate(4 * (self.tiles + 1), "the tile offsets")
+        self.entries = device.allocate(4 * capacity, "the tile lists")
+        self.capacity = capacity
+        self.entry_count = 0
+
+    @property
+    def tiles(self) -> int:
+        """Number of tiles."""
+        return self.columns * self.rows
+
+    def grow(self, capacity: int) -> None:
+        """Make room for more entries; those there are get lost."""
+        self._device.free(self.entries)
+        self.entries = self._device.allocate(4 * capacity, "the tile lists")
+        self.capacity = capacity
+
+    def free(self) -> None:
+        """Give the buffers back."""
+        for buffer in (self.shapes, self.colours, self.offsets, self.entries):
+            self._device.free(buffer)
+
+
+class Rasterizer:
+    """Renders one scene on one device, with the scene and all scratch memory kept there.
+
+    Args:
+        device: to render on.
+        scene: to render; copied to the device, later changes of its arrays are not seen.
+        rules: of the rasterizer to follow.
+        background: R, G, B behind everything.
+
+    Raises:
+        DeviceError: the scene does not fit, or the kernels cannot be built.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        scene: Scene,
+        rules: RasterRules = INRIA,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        if len(scene) > 0xFFFFFF00:
+            raise DeviceError(f"{len(scene)} splats are more than the kernels can number")
+        self.device = device
+        self.rules = rules
+        self.background = background
+        self.splats = len(scene)
+        self._stride = max(-(-len(scene) // _SPLAT_GROUP), 1) * _SPLAT_GROUP
+        self._upload(scene)
+        self._build(scene.sh.shape[1])
+        self._counts = device.upload(np.zeros(1, np.uint32), "the tile counts")
+        self._total = device.allocate(4, "the entry count")
+        self._keys: list[cl.Buffer] = []
+        self._key_capacity = 0
+        self._image = device.allocate(1, "the image")
+        self._transmittance = device.allocate(1, "the transmittance")
+        self._scratch: View | None = None
+
+    def _upload(self, scene: Scene) -> None:
+        """Activate the parameters and copy them, structure of arrays, padded to the stride."""
+
+        def upload(columns: NDArray[Any], fill: float, what: str) -> cl.Buffer:
+            padded = np.full((columns.shape[1], self._stride), fill, np.float32)
+            padded[:, : self.splats] = columns.T
+            return self.device.upload(padded, what)
+
+        quaternions = scene.quaternions.astype(np.float64)
+        length = np.linalg.norm(quaternions, axis=1, keepdims=True)
+        quaternions = np.where(length > 0, quaternions / np.where(length > 0, length, 1), (1.0, 0.0, 0.0, 0.0))
+        scales = np.minimum(np.exp(np.minimum(scene.log_scales.astype(np.float64), 100)), _LARGEST_SCALE)
+        log2_opacities = -np.logaddexp(0, -scene.opacity_logits.astype(np.float64)) / np.log(2)
+        self._parameters = [
+            upload(scene.means, 0, "the centres"),
+            upload(scales, 0, "the scales"),
+            upload(quaternions, 0, "the rotations"),
+            upload(log2_opacities[:, None], -np.inf, "the opacities"),
+            upload(scene.sh.reshape(self.splats, -1), 0, "the SH coefficients"),
+        ]
+
+    def _build(self, sh_count: int) -> None:
+        device, rules = self.device, self.rules
+        self._lanes = 1 if device.family == "gpu" else device.vector_width
+        row_lanes = max(self._lanes, 4)
+        self._project = device.kernel(
+            "project.cl",
+            "project",
+            LANES=self._lanes,
+            SH_COUNT=sh_count,
+            NEAR=float(rules.near),
+            SQUARE_EXTENT=int(rules.square_extent),
+        )
+        lists = f"tile_lists_{device.family}.cl"
+        self._count = device.kernel(lists, "count_tiles")
+        self._scan = device.kernel(lists, "scan_tiles")
+        self._fill = device.kernel(lists, "fill_tiles")
+        limits = {"ALPHA_CAP": float(rules.alpha_cap), "STOP": rules.stop}
+        if device.family == "gpu":
+            # 16 KB of keys: half of what every GPU has, so that two tiles are sorted at a time.
+            self._sort = device.kernel("sort_gpu.cl", "sort_tiles", SORT_CAPACITY=2048)
+            self._composite = device.kernel(
+                "composite_gpu.cl", "composite", NATIVE_EXP2=int(device.native_exp2), **limits
+            )
+        else:
+            self._sort = device.kernel("sort_cpu.cl", "sort_tiles")
+            self._composite = device.kernel("composite_cpu.cl", "composite", LANES=row_lanes, **limits)
+
+    def _reserve(self, view: View) -> None:
+        """Scratch memory for this view's size and capacity."""
+        device = self.device
+        if self._counts.size < 4 * view.tiles:
+            device.free(self._counts)
+            self._counts = device.upload(np.zeros(view.tiles, np.uint32), "the tile counts")
+        if self._key_capacity < view.capacity:
+            for keys in self._keys:
+                device.free(keys)
+            self._keys = []
+            self._key_capacity = 0
+            for _ in range(1 if device.family == "gpu" else 2):
+                self._keys.append(device.allocate(8 * view.capacity, "the tile lists' sort keys"))
+            self._key_capacity = view.capacity
+        pixels = view.camera.width * view.camera.height
+        if self._transmittance.size < 4 * pixels:
+            device.free(self._image)
+            device.free(self._transmittance)
+            self._image = device.allocate(12 * pixels, "the image")
+            self._transmittance = device.allocate(4 * pixels, "the transmittance")
+
+    def _enqueue_lists(self, view: View, struct: NDArray[Any]) -> None:
+        """Enqueue tile lists and depth order of a projected view."""
+        device = self.device
+        splats, capacity = np.uint32(self._stride), np.uint32(view.capacity)
+        group = (_SPLAT_GROUP,) if device.family == "gpu" else None
+        self._count.set_args(view.shapes, splats, struct, self._counts)
+        device.launch(self._count, (self._stride,), group)
+        self._scan.set_args(self._counts, view.offsets, np.uint32(view.tiles), self._total)
+        scanners = _SPLAT_GROUP if device.family == "gpu" else 1
+        device.launch(self._scan, (scanners,), (scanners,))
+        self._fill.set_args(view.shapes, splats, struct, self._counts, self._keys[0], capacity)
+        device.launch(self._fill, (self._stride,), group)
+        self._sort.set_args(*self._keys, view.offsets, view.entries, self._counts, capacity)
+        if device.family == "gpu":
+            device.launch(self._sort, (view.tiles * 256,), (256,))
+        else:
+            device.launch(self._sort, (view.tiles,), (1,))
+
+    def _enqueue_project(self, view: View, struct: NDArray[Any]) -> None:
+        self._project.set_args(*self._parameters, np.uint32(self._stride), struct, view.shapes, view.colours)
+        self.device.launch(self._project, (self._stride // self._lanes,))
+
+    def _enqueue_composite(self, view: View, struct: NDArray[Any]) -> None:
+        self._composite.set_args(
+            view.shapes,
+            view.colours,
+            view.offsets,
+            view.entries,
+            np.uint32(view.capacity),
+            struct,
+            *(np.float32(channel) for channel in self.background),
+            self._image,
+            self._transmittance,
+        )
+        if self.device.family == "gpu":
+            self.device.launch(self._composite, (view.columns * TILE, view.rows * TILE), (TILE, TILE))
+        else:
+            # One tile a work-group: PoCL keeps the private memory of a whole work-group on its stack.
+            self.device.launch(self._composite, (view.tiles,), (1,))
+
+    def _settle(self, view: View) -> bool:
+        """Wait for the entry count; make room and say False if the lists did not fit."""
+        count = int(self.device.download(self._total, (1,), np.uint32)[0])
+        if count == 0xFFFFFFFF:
+            raise DeviceError(
+                f"view '{view.camera.name}' needs more than 2^32 tile entries: too many huge splats for this image size"
+            )
+        view.entry_count = count
+        if count <= view.capacity:
+            return True
+        view.grow(count + count // 4)
+        return False
+
+    def _first_capacity(self) -> int:
+        """Room for entries before anything is known of a view."""
+        return max(4 * self.splats, 1 << 16)
+
+    def prepare(self, camera: Camera) -> View:
+        """Projection, tile lists and depth order of a view, to keep for as many :meth:`composite` as wanted.
+
+        Returns:
+            The view, with buffers of its own, its list no longer than needed; :meth:`View.free` it.
+
+        Raises:
+            DeviceError: it does not fit the device.
+        """
+        view = View(self.device, camera, self._stride, self._first_capacity())
+        struct = _camera_struct(camera)
+        self._reserve(view)
+        self._enqueue_project(view, struct)
+        self._enqueue_lists(view, struct)
+        while not self._settle(view):
+            self._reserve(view)
+            self._enqueue_lists(view, struct)
+        exact = self.device.allocate(4 * view.entry_count, "the tile lists")
+        if view.entry_count:
+            cl.enqueue_copy(self.device.queue, exact, view.entries, byte_count=4 * view.entry_count)
+        self.device.free(view.entries)
+        view.entries, view.capacity = exact, view.entry_count
+        return view
+
+    def composite(self, view: View) -> tuple[FloatArray, FloatArray]:
+        """The picture of a prepared view: as :meth:`render`."""
+        self._reserve(view)
+        self._enqueue_composite(view, _camera_struct(view.camera))
+        return self._pictures(view.camera)
+
+    def render(self, camera: Camera) -> tuple[FloatArray, FloatArray]:
+        """Render one view.
+
+        Returns:
+            image: (H, W, 3) float32, linear in the scene's colours, not clamped above.
+            transmittance: (H, W) float32, the share of the background that shows through.
+
+        Raises:
+            DeviceError: the view does not fit the device, or the device failed.
+        """
+        self.render_device(camera)
+        return self._pictures(camera)
+
+    def render_device(self, camera: Camera) -> tuple[cl.Buffer, cl.Buffer]:
+        """Render one view and leave it on the device, finished.
+
+        Returns:
+            Buffers that begin with the image and the transmittance, as :meth:`render` describes them; the next call
+            overwrites them.
+        """
+        view = self._scratch_view(camera)
+        struct = _camera_struct(camera)
+        self._reserve(view)
+        self._enqueue_project(view, struct)
+        self._enqueue_lists(view, struct)
+        self._enqueue_composite(view, struct)
+        # Lists that did not fit are cut short, so the kernels above were safe; their result is thrown away.
+        while not self._settle(view):
+            self._reserve(view)
+            self._enqueue_lists(view, struct)
+            self._enqueue_composite(view, struct)
+        return self._image, self._transmittance
+
+    def _pictures(self, camera: Camera) -> tuple[FloatArray, FloatArray]:
+        shape = (camera.height, camera.width)
+        return (
+            self.device.download(self._image, (*shape, 3), np.float32),
+            self.device.download(self._transmittance, shape, np.float32),
+        )
+
+    def _scratch_view(self, camera: Camera) -> View:
+        """The view that :meth:`render` uses again and again; its lists keep the room that earlier views needed."""
+        old = self._scratch
+        if old is not None and (old.columns, old.rows) == _tiles(camera):
+            old.camera = camera
+            return old
+        capacity = self._first_capacity()
+        if old is not None:
+            capacity = max(capacity, old.capacity)
+            old.free()
+            self._scratch = None
+        self._scratch = View(self.device, camera, self._stride, capacity)
+        return self._scratch
+
+    def free(self) -> None:
+        """Give all device memory back; the rasterizer is of no use afterwards."""
+        if self._scratch is not None:
+            self._scratch.free()
+        for buffer in (*self._parameters, *self._keys, self._counts, self._total, self._image, self._transmittance):
+            self.device.free(buffer)
+
+
+def render(
+    scene: Scene,
+    camera: Camera,
+    device: Device | None = None,
+    rules: RasterRules = INRIA,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> tuple[FloatArray, FloatArray]:
+    """Render one view of a scene; for many views keep a :class:`Rasterizer`.
+
+    Args:
+        device: to render on; the best one there is by default.
+
+    Returns, Raises: as :meth:`Rasterizer.render`.
+    """
+    rasterizer = Rasterizer(device or Device(), scene, rules, background)
+    try:
+        return rasterizer.render(camera)
+    finally:
+        rasterizer.free()
