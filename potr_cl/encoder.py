@@ -22,6 +22,8 @@ Progress = Callable[[str, float], None]
 
 #: Splats worked on at a time where a stage needs large temporaries.
 _BLOCK = 1 << 16
+#: Splats whose distances to every camera are taken at a time: a few arrays of them fit a second-level cache.
+_NEAR_BLOCK = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -145,13 +147,15 @@ def _tolerance(
         return parameters.gamma
     eyes = camera_centres(train_views(cameras))
     nearest = np.empty(len(means))
-    for start in range(0, len(means), _BLOCK):
-        block = means[start : start + _BLOCK].astype(np.float64)
-        least = np.full(len(block), np.inf)
+    for start in range(0, len(means), _NEAR_BLOCK):
+        x, y, z = means[start : start + _NEAR_BLOCK].T.astype(np.float64)
+        least = nearest[start : start + _NEAR_BLOCK]
+        least[:] = np.inf
         for eye in eyes:
-            offset = block - eye
-            np.minimum(least, np.einsum("ij,ij->i", offset, offset), out=least)
-        nearest[start : start + _BLOCK] = least
+            squared = np.square(x - eye[0])
+            squared += np.square(y - eye[1])
+            squared += np.square(z - eye[2])
+            np.minimum(least, squared, out=least)
     return np.maximum(parameters.gamma, parameters.beta * np.sqrt(nearest))
 
 

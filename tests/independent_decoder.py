@@ -1,0 +1,473 @@
+"""An independent decoder of .potr files, written from docs/format.md alone.
+
+It is kept to prove that the page suffices to write a decoder; the package never uses it. It is plain and slow on
+purpose: one loop for each sentence of the page, and Python integers, which cannot overflow.
+"""
+
+import json
+import math
+import struct
+import zlib
+from dataclasses import dataclass, field
+from typing import Any, NamedTuple
+
+import numpy as np
+import zstandard
+
+MAGIC = bytes.fromhex("504F54520D0A1A0A")
+ZSTANDARD_MAGIC = bytes.fromhex("28B52FFD")
+FIXED_HEADER = 120
+ENTRY_SIZE = 24
+
+METADATA = 0
+OCCUPANCY = 1
+SEVERAL = 2
+MULTIPLICITY = 3
+TAIL_LENGTH = 4
+TAIL = 5
+SCALE = 16
+ROTATION = 17
+OPACITY = 18
+SH = 19
+
+BYTE_STREAMS = (METADATA, OCCUPANCY, SEVERAL, TAIL_LENGTH, TAIL)
+ONE_INTEGER_A_SPLAT = (SCALE, ROTATION, OPACITY, SH)
+
+STORED = 0
+ZSTANDARD = 1
+ZLIB = 2
+LARGEST_EXPANSION = {STORED: 1, ZSTANDARD: 2**15, ZLIB: 1032}
+
+
+class Header(NamedTuple):
+    """The numbers of the fixed part of the header that decoding needs."""
+
+    size: int
+    splats: int
+    coefficients: int
+    deepest: int
+    sections: int
+    origin: tuple[float, float, float]
+    edge: float
+    scale_factors: dict[int, float]
+
+
+class Section(NamedTuple):
+    """One section after undoing its coder."""
+
+    planes: int
+    raw: bytes
+
+
+@dataclass
+class Cell:
+    """A cell of the octree; `splats` counts only in leaves."""
+
+    level: int
+    i: int
+    j: int
+    k: int
+    crowded: bool = False
+    splats: int = 1
+    children: list["Cell"] = field(default_factory=list)
+
+    def child(self, x: int, y: int, z: int) -> "Cell":
+        """Make the child with the given coordinate bits."""
+        return Cell(self.level + 1, 2 * self.i + x, 2 * self.j + y, 2 * self.k + z)
+
+
+Sections = dict[tuple[int, int], Section]
+
+
+def decode(data: bytes) -> dict[str, Any]:
+    """Decode a file; the arrays are float64 and in the format's order of splats.
+
+    Keys: means (N, 3), scales (N, 3) linear, quaternions (N, 4) as w x y z, opacities (N,), sh (N, M, 3) as RGB,
+    and metadata, a dict. Raises ValueError for a file that breaks the format.
+    """
+    header = read_header(data)
+    sections = read_sections(data, header)
+    return {
+        "means": decode_means(sections, header),
+        "scales": decode_scales(sections, header),
+        "quaternions": decode_quaternions(sections, header),
+        "opacities": decode_opacities(sections, header),
+        "sh": decode_sh(sections, header),
+        "metadata": decode_metadata(sections),
+    }
+
+
+# Container
+
+
+def read_header(data: bytes) -> Header:
+    """Read and check the header, except for the section table."""
+    check(data[:8] == MAGIC, "not a .potr file: wrong magic")
+    check(len(data) >= FIXED_HEADER + 4, "the file is shorter than the smallest header")
+    version, flags, header_size, file_size, splats = struct.unpack_from("<HHIQQ", data, 8)
+    degree, deepest, section_count = struct.unpack_from("<BBH", data, 32)
+    origin = struct.unpack_from("<3d", data, 40)
+    (edge,) = struct.unpack_from("<d", data, 64)
+    scale_factors = struct.unpack_from("<4d", data, 72)
+
+    check(version == 1, f"version {version} is not supported, only 1")
+    check(file_size == len(data), f"the file has {len(data)} bytes, but its header says {file_size}")
+    check(header_size == 124 + ENTRY_SIZE * section_count, "the header's size does not fit the number of sections")
+    check(header_size <= len(data), "the file ends within the header")
+    (checksum,) = struct.unpack_from("<I", data, header_size - 4)
+    check(zlib.crc32(data[: header_size - 4]) == checksum, "the header's checksum is wrong")
+
+    check(flags == 0, f"unknown flags {flags}")
+    check(data[36:40] == bytes(4), "bytes 36 to 39 are not zero")
+    check(data[104:120] == bytes(16), "the reserved bytes 104 to 119 are not zero")
+    check(splats >= 1, "the file holds no splats")
+    check(degree <= 3, f"SH degree {degree} is above 3")
+    check(deepest <= 52, f"deepest octree level {deepest} is above 52")
+    check(all(math.isfinite(value) for value in origin), "the origin of the root cube is not finite")
+    check(math.isfinite(edge) and edge >= 0, "the edge of the root cube is negative or not finite")
+    for factor in scale_factors:
+        check(0.001 <= factor <= 1e9, f"scale factor {factor} is not within 0.001 to 10^9")
+
+    return Header(
+        size=header_size,
+        splats=splats,
+        coefficients=(degree + 1) ** 2,
+        deepest=deepest,
+        sections=section_count,
+        origin=origin,
+        edge=edge,
+        scale_factors=dict(zip((SCALE, ROTATION, OPACITY, SH), scale_factors, strict=True)),
+    )
+
+
+def read_sections(data: bytes, header: Header) -> Sections:
+    """Check the section table and undo the coders."""
+    number_of_indices = {
+        METADATA: 1,
+        OCCUPANCY: 1,
+        SEVERAL: 1,
+        MULTIPLICITY: 1,
+        TAIL_LENGTH: 1,
+        TAIL: 1,
+        SCALE: 3,
+        ROTATION: 3,
+        OPACITY: 1,
+        SH: 3 * header.coefficients,
+    }
+    sections: Sections = {}
+    start = header.size
+    for number in range(header.sections):
+        entry = struct.unpack_from("<BBBBIQQ", data, FIXED_HEADER + ENTRY_SIZE * number)
+        prop, index, coder, planes, checksum, raw_size, stored_size = entry
+        name = f"section (property {prop}, index {index})"
+
+        check(prop in number_of_indices, f"{name}: unknown property")
+        check(index < number_of_indices[prop], f"{name}: unknown index")
+        check((prop, index) not in sections, f"{name} stands twice")
+        check(coder in LARGEST_EXPANSION, f"{name}: unknown coder {coder}")
+        check(1 <= planes <= 8, f"{name}: {planes} planes")
+        if prop in BYTE_STREAMS:
+            check(planes == 1, f"{name}: {planes} planes instead of 1")
+        if prop in ONE_INTEGER_A_SPLAT:
+            check(raw_size == header.splats * planes, f"{name}: raw size {raw_size} is not splats times planes")
+        if prop == METADATA:
+            check(raw_size <= 65536, f"{name}: more than 65536 bytes of metadata")
+        check(stored_size <= len(data) - start, f"{name} reaches beyond the end of the file")
+        check(raw_size <= LARGEST_EXPANSION[coder] * stored_size, f"{name}: impossible raw size {raw_size}")
+
+        stored = data[start : start + stored_size]
+        start += stored_size
+        check(zlib.crc32(stored) == checksum, f"{name}: wrong checksum")
+        sections[prop, index] = Section(planes, undo_coder(coder, stored, raw_size, name))
+
+    check(start == len(data), "the sections do not fill the file")
+    # It also bounds the number of splats by the size of the file, before anything is made for each splat.
+    check((OPACITY, 0) in sections, "the opacity section is absent")
+    return sections
+
+
+def undo_coder(coder: int, stored: bytes, raw_size: int, name: str) -> bytes:
+    """Return the raw bytes of a section."""
+    if coder == STORED:
+        raw = stored
+    elif coder == ZSTANDARD:
+        raw = undo_zstandard(stored, raw_size, name)
+    else:
+        raw = undo_zlib(stored, raw_size, name)
+    check(len(raw) == raw_size, f"{name} yields {len(raw)} bytes instead of {raw_size}")
+    return raw
+
+
+def undo_zstandard(stored: bytes, raw_size: int, name: str) -> bytes:
+    """Decompress one Zstandard frame that names its content size."""
+    # A skippable frame is not one that holds content, but the library takes it for an empty one.
+    check(stored[:4] == ZSTANDARD_MAGIC, f"{name} is not a Zstandard frame")
+    try:
+        check(zstandard.frame_content_size(stored) == raw_size, f"{name}: the Zstandard frame names another size")
+        # The page sets no limit to the window, so the library's smaller default must not.
+        decompressor = zstandard.ZstdDecompressor(max_window_size=2**31).decompressobj()
+        raw = decompressor.decompress(stored)
+    except zstandard.ZstdError as error:
+        raise ValueError(f"{name}: broken Zstandard frame: {error}") from error
+    check(decompressor.eof, f"{name}: the Zstandard frame is cut off")
+    check(not decompressor.unused_data, f"{name}: bytes after the Zstandard frame")
+    return raw
+
+
+def undo_zlib(stored: bytes, raw_size: int, name: str) -> bytes:
+    """Decompress one zlib stream."""
+    decompressor = zlib.decompressobj()
+    try:
+        # One byte more than allowed shows a stream that is too long; the library reads a limit of 0 as none.
+        raw = decompressor.decompress(stored, raw_size + 1)
+    except zlib.error as error:
+        raise ValueError(f"{name}: broken zlib stream: {error}") from error
+    check(decompressor.eof, f"{name}: the zlib stream does not end with its raw size")
+    check(not decompressor.unused_data, f"{name}: bytes after the zlib stream")
+    return raw
+
+
+def decode_metadata(sections: Sections) -> dict[str, Any]:
+    """Parse the metadata."""
+    raw = raw_bytes(sections, METADATA)
+    if not raw:
+        return {}
+    try:
+        metadata = json.loads(raw.decode("utf-8"))
+    except (ValueError, RecursionError) as error:
+        raise ValueError(f"the metadata is not JSON in UTF-8: {error}") from error
+    if not isinstance(metadata, dict):
+        raise ValueError("the metadata is not a JSON object")
+    return metadata
+
+
+# Integers
+
+
+def raw_bytes(sections: Sections, prop: int) -> bytes:
+    """Return the raw bytes of a property with a single index, empty if it is absent."""
+    if (prop, 0) not in sections:
+        return b""
+    return sections[prop, 0].raw
+
+
+def unsigned_integers(section: Section) -> list[int]:
+    """Put the integers together from their byte planes."""
+    count, remainder = divmod(len(section.raw), section.planes)
+    check(remainder == 0, "a section is not a whole number of integers")
+    values = []
+    for n in range(count):
+        value = 0
+        for plane in range(section.planes):
+            value += section.raw[plane * count + n] << (8 * plane)
+        values.append(value)
+    return values
+
+
+def unsigned_stream(sections: Sections, prop: int, index: int, splats: int) -> list[int]:
+    """Return one unsigned integer a splat."""
+    if (prop, index) not in sections:
+        return [0] * splats
+    return unsigned_integers(sections[prop, index])
+
+
+def signed_stream(sections: Sections, prop: int, index: int, splats: int) -> list[int]:
+    """Return one signed integer a splat."""
+    values = []
+    for u in unsigned_stream(sections, prop, index, splats):
+        if u % 2 == 0:
+            values.append(u // 2)
+        else:
+            values.append(-(u + 1) // 2)
+    return values
+
+
+def get_bit(data: bytes, position: int) -> int:
+    """Return one bit of a byte stream."""
+    return (data[position // 8] >> (position % 8)) & 1
+
+
+def bytes_for_bits(bits: int) -> int:
+    """Return the number of whole bytes that hold so many bits."""
+    return (bits + 7) // 8
+
+
+def check_padding(data: bytes, bits: int, name: str) -> None:
+    """Check that the bits of the last byte after so many bits are zero."""
+    for position in range(bits, 8 * len(data)):
+        check(get_bit(data, position) == 0, f"{name}: a padding bit is not zero")
+
+
+# Positions
+
+
+def decode_means(sections: Sections, header: Header) -> np.ndarray:
+    """Return the centres of all splats."""
+    root = read_tree(sections, header)
+    leaves: list[Cell] = []
+    collect_leaves(root, leaves)
+    total = sum(leaf.splats for leaf in leaves)
+    check(total == header.splats, f"the tree holds {total} splats instead of {header.splats}")
+    follow_tails(sections, header, [leaf for leaf in leaves if not leaf.crowded])
+
+    means = []
+    for leaf in leaves:
+        for _ in range(leaf.splats):
+            means.append(centre(leaf, header))
+    return np.array(means, dtype=np.float64).reshape(header.splats, 3)
+
+
+def read_tree(sections: Sections, header: Header) -> Cell:
+    """Read the octree level by level and return its root."""
+    occupancy = raw_bytes(sections, OCCUPANCY)
+    several = raw_bytes(sections, SEVERAL)
+    multiplicity: list[int] = []
+    if (MULTIPLICITY, 0) in sections:
+        multiplicity = unsigned_integers(sections[MULTIPLICITY, 0])
+
+    root = Cell(0, 0, 0, 0, crowded=len(occupancy) > 0 or len(multiplicity) > 0)
+    cells = [root]
+    occupancy_read = 0
+    several_read = 0
+    for _ in range(header.deepest):
+        next_cells = []
+        for cell in cells:
+            if not cell.crowded:
+                continue
+            check(occupancy_read < len(occupancy), "occupancy is shorter than the tree asks for")
+            byte = occupancy[occupancy_read]
+            occupancy_read += 1
+            check(byte != 0, "an occupancy byte is zero")
+            for number in range(8):
+                if (byte >> number) & 1:
+                    cell.children.append(cell.child(number & 1, (number >> 1) & 1, (number >> 2) & 1))
+            next_cells.extend(cell.children)
+        for cell in next_cells:
+            check(several_read < 8 * len(several), "several is shorter than the tree asks for")
+            cell.crowded = get_bit(several, several_read) == 1
+            several_read += 1
+        cells = next_cells
+
+    multiplicity_read = 0
+    for cell in cells:
+        if cell.crowded:
+            check(multiplicity_read < len(multiplicity), "multiplicity is shorter than the tree asks for")
+            cell.splats = multiplicity[multiplicity_read]
+            multiplicity_read += 1
+            check(cell.splats >= 2, "a multiplicity is below 2")
+
+    check(occupancy_read == len(occupancy), "occupancy is longer than the tree asks for")
+    check(bytes_for_bits(several_read) == len(several), "several is longer than the tree asks for")
+    check_padding(several, several_read, "several")
+    check(multiplicity_read == len(multiplicity), "multiplicity is longer than the tree asks for")
+    return root
+
+
+def collect_leaves(cell: Cell, leaves: list[Cell]) -> None:
+    """Append the leaves of a cell in depth-first order, which is the order of splats."""
+    if not cell.children:
+        leaves.append(cell)
+    for child in cell.children:
+        collect_leaves(child, leaves)
+
+
+def follow_tails(sections: Sections, header: Header, lone: list[Cell]) -> None:
+    """Move each lone splat's leaf down to the cell where its tail ends."""
+    lengths = raw_bytes(sections, TAIL_LENGTH)
+    tail = raw_bytes(sections, TAIL)
+    check(len(lengths) == len(lone), f"tail length has {len(lengths)} bytes for {len(lone)} lone splats")
+    for leaf, length in zip(lone, lengths, strict=True):
+        check(leaf.level + length <= header.deepest, "a tail goes below the deepest level")
+
+    order = sorted(range(len(lone)), key=lambda n: -lengths[n])
+    longest = max(lengths, default=0)
+    start = 0
+    for step in range(1, longest + 1):
+        moving = [lone[n] for n in order if lengths[n] >= step]
+        plane_size = bytes_for_bits(len(moving))
+        planes = []
+        for _ in range(3):
+            plane = tail[start : start + plane_size]
+            start += plane_size
+            check(len(plane) == plane_size, "tail is shorter than the tree asks for")
+            check_padding(plane, len(moving), "tail")
+            planes.append(plane)
+        for position, leaf in enumerate(moving):
+            leaf.level += 1
+            leaf.i = 2 * leaf.i + get_bit(planes[0], position)
+            leaf.j = 2 * leaf.j + get_bit(planes[1], position)
+            leaf.k = 2 * leaf.k + get_bit(planes[2], position)
+    check(start == len(tail), "tail is longer than the tree asks for")
+
+
+def centre(cell: Cell, header: Header) -> tuple[float, float, float]:
+    """Return the centre of a cell in world units."""
+    edge = header.edge * 2.0**-cell.level
+    x, y, z = header.origin
+    return x + (cell.i + 0.5) * edge, y + (cell.j + 0.5) * edge, z + (cell.k + 0.5) * edge
+
+
+# Attributes
+
+
+def decode_scales(sections: Sections, header: Header) -> np.ndarray:
+    """Return the standard deviations along the splats' own axes."""
+    factor = header.scale_factors[SCALE]
+    scales = np.zeros((header.splats, 3), dtype=np.float64)
+    for axis in range(3):
+        for n, value in enumerate(unsigned_stream(sections, SCALE, axis, header.splats)):
+            scales[n, axis] = max(value, 0.25) / factor
+    return scales
+
+
+def decode_quaternions(sections: Sections, header: Header) -> np.ndarray:
+    """Return the rotations as w x y z."""
+    factor = header.scale_factors[ROTATION]
+    streams = [signed_stream(sections, ROTATION, axis, header.splats) for axis in range(3)]
+    quaternions = np.zeros((header.splats, 4), dtype=np.float64)
+    for n in range(header.splats):
+        x, y, z = (stream[n] / factor for stream in streams)
+        w = math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
+        quaternions[n] = (w, x, y, z)
+    return quaternions
+
+
+def decode_opacities(sections: Sections, header: Header) -> np.ndarray:
+    """Return the opacities."""
+    factor = header.scale_factors[OPACITY]
+    opacities = np.zeros(header.splats, dtype=np.float64)
+    for n, value in enumerate(unsigned_stream(sections, OPACITY, 0, header.splats)):
+        opacities[n] = min(1.0, (value + 0.25) / factor)
+    return opacities
+
+
+def decode_sh(sections: Sections, header: Header) -> np.ndarray:
+    """Return the spherical harmonics coefficients as RGB."""
+    factor = header.scale_factors[SH]
+    sh = np.zeros((header.splats, header.coefficients, 3), dtype=np.float64)
+    for coefficient in range(header.coefficients):
+        streams = [signed_stream(sections, SH, 3 * coefficient + channel, header.splats) for channel in range(3)]
+        if coefficient == 0:
+            streams = [running_sums(stream) for stream in streams]
+        for n in range(header.splats):
+            luma, orange, green = (stream[n] for stream in streams)
+            sh[n, coefficient, 0] = (luma + orange - green) / factor
+            sh[n, coefficient, 1] = (luma + green) / factor
+            sh[n, coefficient, 2] = (luma - orange - green) / factor
+    return sh
+
+
+def running_sums(differences: list[int]) -> list[int]:
+    """Undo the differences: each value is the sum of all up to and including it."""
+    total = 0
+    sums = []
+    for difference in differences:
+        total += difference
+        sums.append(total)
+    return sums
+
+
+def check(condition: bool, message: str) -> None:
+    """Raise ValueError with the message unless the condition holds."""
+    if not condition:
+        raise ValueError(message)

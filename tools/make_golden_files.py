@@ -1,0 +1,58 @@
+"""Make the golden files of the format's current version: python -m tools.make_golden_files
+
+Writes tests/data/golden_v1_NAME.potr and, with the independent decoder of the tests, the values that they must yield
+for ever. Refuses to touch a golden file that exists: those are never made again.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+
+from potr_cl.bitstream import VERSION, EntropyCoder
+from potr_cl.encoder import EncodeOptions, encode
+from potr_cl.scene import Scene
+from tests.independent_decoder import decode
+from tests.scenes import random_scene, ring_of_cameras
+
+DATA = Path(__file__).parent.parent / "tests" / "data"
+
+
+def _with_means(scene: Scene, means: np.ndarray) -> Scene:
+    return Scene(means.astype(np.float32), scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh)
+
+
+def main() -> None:
+    rng = np.random.default_rng(1)
+    cameras = ring_of_cameras(8)
+    deep = np.vstack([rng.normal(size=(39, 3)) * 1e-6, [[1e6, 1e6, 1e6]]])
+    coincident = random_scene(60, 2, seed=3).subset(np.r_[np.arange(60), np.arange(20), [5, 5]])
+    still = random_scene(50, 3, seed=8)
+    still.sh[:, 4:] = 0
+    scenes = {
+        "degree3_cameras": encode(random_scene(200, 3, seed=1), cameras),
+        "degree1_npz": encode(random_scene(80, 1, seed=2), None, EncodeOptions(q=0.8, entropy=EntropyCoder("npz"))),
+        "degree2_coincident": encode(coincident, None, EncodeOptions(q=0.2)),
+        "degree0_one_splat": encode(random_scene(1, 0, seed=4), None),
+        "degree0_deep": encode(_with_means(random_scene(40, 0, seed=5), deep), None, EncodeOptions(q=1.0)),
+        "degree0_all_coincident": encode(_with_means(random_scene(30, 0, seed=6), np.full((30, 3), 0.7)), cameras),
+        "degree3_zero_bands": encode(still, cameras, EncodeOptions(q=0.0)),
+        "degree0_wide_integers": encode(
+            random_scene(30, 0, seed=9, extent=1e3), None, EncodeOptions(sf_scale=1e8, sf_sh=1e6)
+        ),
+    }
+    for name, encoded in scenes.items():
+        path = DATA / f"golden_v{VERSION}_{name}.potr"
+        if path.exists():
+            print(f"{path.name} exists: kept")
+            continue
+        data = b"".join(encoded.pieces)
+        values = {k: v for k, v in decode(data).items() if isinstance(v, np.ndarray)}
+        path.write_bytes(data)
+        np.savez_compressed(path.with_suffix(".npz"), **values)  # type: ignore[arg-type]
+        print(f"{path.name}: {len(data)} bytes")
+
+
+if __name__ == "__main__":
+    main()
