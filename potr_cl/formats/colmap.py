@@ -86,7 +86,10 @@ def load(folder: Path) -> list[Camera]:
         if max(camera.width, camera.height) > _MAX_SIDE:
             raise DataError(f"'{cameras}': camera {camera.camera_id} is {camera.width} x {camera.height} pixels large")
         focal, (cx, cy) = camera.params[:-2], camera.params[-2:]
-        pose = np.asarray(image.cam_from_world().matrix(), dtype=np.float64)
+        pose = image.cam_from_world()
+        if not abs(np.linalg.norm(pose.rotation.quat) - 1) < 1e-3:  # zero would silently mean no rotation
+            raise DataError(f"'{images}', view '{name}': its rotation is not a unit quaternion")
+        matrix = np.asarray(pose.matrix(), dtype=np.float64)
         photograph = photographs / file if photographs else None
         result.append(
             camera_of(
@@ -98,8 +101,8 @@ def load(folder: Path) -> list[Camera]:
                 fy=float(focal[-1]),
                 cx=float(cx),
                 cy=float(cy),
-                rotation=pose[:, :3],
-                translation=pose[:, 3],
+                rotation=matrix[:, :3],
+                translation=matrix[:, 3],
                 split=split,
                 image_path=photograph if photograph and os.path.isfile(photograph) else None,
             )

@@ -149,7 +149,11 @@ def excerpt(value: Any) -> str:
     """A value that may be of any size and kind, short enough for a message."""
     if value is None:
         return "missing"
-    if isinstance(value, (list, dict)):
-        return f"a {'list' if isinstance(value, list) else 'object'} of {len(value)}"
-    text = repr(value) if isinstance(value, (str, float, bool)) else type(value).__name__
+    if isinstance(value, list):
+        return f"a list of {len(value)}"
+    if isinstance(value, dict):
+        return f"an object of {len(value)} keys"
+    if isinstance(value, int) and value.bit_length() > 64:
+        return "a number of more than 64 bits"
+    text = repr(value)
     return text if len(text) <= 40 else text[:37] + "..."
