@@ -42,11 +42,17 @@ def load_cameras(path: Path) -> list[Camera]:
         DataError: its content is damaged.
     """
     path = Path(path)
-    if path.is_dir():
-        return _from_folder(path)
-    if path.suffix.lower() in (".bin", ".txt") and colmap.is_model(path.parent):
+    try:
+        return _from_folder(path) if path.is_dir() else _from_file(path)
+    except OSError as error:
+        raise UsageError(f"cannot read '{error.filename or path}': {error.strerror or error}") from error
+
+
+def _from_file(path: Path) -> list[Camera]:
+    kind = path.suffix.lower()
+    if kind in (".bin", ".txt") and colmap.is_model(path.parent):
         return colmap.load(path.parent)
-    if path.suffix.lower() == ".json":
+    if kind == ".json":
         content = read_json(path)
         if isinstance(content, list):
             return cameras_json.parse(content, path)
