@@ -208,8 +208,7 @@ def choose_device(spec: str | None = None) -> DeviceInfo:
     devices = sorted(list_devices(), key=_preference)
     if not devices:
         raise DeviceError(
-            "no OpenCL device found: install your GPU's OpenCL driver, or a CPU runtime by "
-            "`pip install pyopencl[pocl]`"
+            "no OpenCL device found: install your GPU's OpenCL driver, or a CPU runtime by `pip install pyopencl[pocl]`"
         )
     spec = spec or os.environ.get(DEVICE_VARIABLE)
     if not spec:
@@ -454,6 +453,40 @@ class Device:
                 if not np.array_equal(mark, back):
                     raise DeviceError(f"device {self.info} fails the self-check: a large buffer loses its content")
         self.free(big)
+
+
+class Scratch:
+    """A buffer that grows when asked to, and loses its content then.
+
+    Attributes:
+        buffer: the memory. nbytes: its size; 0 before the first :meth:`reserve` and after one that failed.
+    """
+
+    def __init__(self, device: Device, what: str) -> None:
+        self._device = device
+        self._what = what
+        self.buffer: cl.Buffer = None
+        self.nbytes = 0
+
+    def reserve(self, nbytes: int) -> bool:
+        """Have at least ``nbytes``; whether the memory is new.
+
+        Raises:
+            DeviceError: the device has no room.
+        """
+        if self.buffer is not None and self.nbytes >= nbytes:
+            return False
+        self.free()
+        self.buffer = self._device.allocate(nbytes, self._what)
+        self.nbytes = nbytes
+        return True
+
+    def free(self) -> None:
+        """Give the memory back."""
+        if self.buffer is not None:
+            self._device.free(self.buffer)
+            self.buffer = None
+        self.nbytes = 0
 
 
 def _aborts_on_wide_vectors(info: DeviceInfo) -> bool:

@@ -21,13 +21,14 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.cameras import Camera
-from potr_cl.device import Device
+from potr_cl.device import Device, Scratch
 from potr_cl.errors import DeviceError, UsageError
 from potr_cl.scene import FloatArray, Scene
 
 TILE = 16
 
-#: Splats are padded to a multiple of this, the size of a work-group.
+#: Splats are padded to a multiple of this and handled in groups of it. CPUs are told the group too: left to itself,
+#: PoCL makes one of thousands and overflows its stack with their private memory.
 _SPLAT_GROUP = 256
 
 #: Standard deviations above this many world units are taken as this: nothing can be seen to differ, nothing overflows.
@@ -112,8 +113,6 @@ class View:
         shapes: (N, 8) float32, a splat's ellipse, see cl/splat.clh; radius 0 for a splat that is not drawn.
         colours: (N, 4) float32; R, G, B of the splats that are drawn, the rest unset.
         offsets: (columns * rows + 1,) uint32, where each tile's run of ``entries`` begins.
-        entries: uint32 splat numbers, front to back within a tile.
-        capacity: entries that ``entries`` can hold.
         entry_count: entries there are; set once the device is known to have found them all.
     """
 
@@ -124,8 +123,8 @@ class View:
         self.shapes = device.allocate(32 * splats, "the projected splats")
         self.colours = device.allocate(16 * splats, "the projected splats' colours")
         self.offsets = device.allocate(4 * (self.tiles + 1), "the tile offsets")
-        self.entries = device.allocate(4 * capacity, "the tile lists")
-        self.capacity = capacity
+        self._lists = Scratch(device, "the tile lists")
+        self._lists.reserve(4 * capacity)
         self.entry_count = 0
 
     @property
@@ -133,16 +132,34 @@ class View:
         """Number of tiles."""
         return self.columns * self.rows
 
+    @property
+    def entries(self) -> cl.Buffer:
+        """(capacity,) uint32 splat numbers, tile by tile, front to back within a tile."""
+        return self._lists.buffer
+
+    @property
+    def capacity(self) -> int:
+        """Entries that there is room for."""
+        return self._lists.nbytes // 4
+
     def grow(self, capacity: int) -> None:
         """Make room for more entries; those there are get lost."""
-        self._device.free(self.entries)
-        self.entries = self._device.allocate(4 * capacity, "the tile lists")
-        self.capacity = capacity
+        self._lists.reserve(4 * capacity)
+
+    def trim(self) -> None:
+        """Give back the room that the entries do not need."""
+        trimmed = Scratch(self._device, "the tile lists")
+        trimmed.reserve(4 * self.entry_count)
+        if self.entry_count:
+            cl.enqueue_copy(self._device.queue, trimmed.buffer, self.entries, byte_count=4 * self.entry_count)
+        self._lists.free()
+        self._lists = trimmed
 
     def free(self) -> None:
         """Give the buffers back."""
-        for buffer in (self.shapes, self.colours, self.offsets, self.entries):
+        for buffer in (self.shapes, self.colours, self.offsets):
             self._device.free(buffer)
+        self._lists.free()
 
 
 class Rasterizer:
@@ -174,12 +191,12 @@ class Rasterizer:
         self._stride = max(-(-len(scene) // _SPLAT_GROUP), 1) * _SPLAT_GROUP
         self._upload(scene)
         self._build(scene.sh.shape[1])
-        self._counts = device.upload(np.zeros(1, np.uint32), "the tile counts")
         self._total = device.allocate(4, "the entry count")
-        self._keys: list[cl.Buffer] = []
-        self._key_capacity = 0
-        self._image = device.allocate(1, "the image")
-        self._transmittance = device.allocate(1, "the transmittance")
+        self._counts = Scratch(device, "the tile counts")
+        # Merging needs a second set of keys, the bitonic network sorts in place.
+        self._keys = [Scratch(device, "the tile lists' sort keys") for _ in range(1 if device.family == "gpu" else 2)]
+        self._image = Scratch(device, "the image")
+        self._transmittance = Scratch(device, "the transmittance")
         self._scratch: View | None = None
 
     def _upload(self, scene: Scene) -> None:
@@ -232,38 +249,29 @@ class Rasterizer:
 
     def _reserve(self, view: View) -> None:
         """Scratch memory for this view's size and capacity."""
-        device = self.device
-        if self._counts.size < 4 * view.tiles:
-            device.free(self._counts)
-            self._counts = device.upload(np.zeros(view.tiles, np.uint32), "the tile counts")
-        if self._key_capacity < view.capacity:
-            for keys in self._keys:
-                device.free(keys)
-            self._keys = []
-            self._key_capacity = 0
-            for _ in range(1 if device.family == "gpu" else 2):
-                self._keys.append(device.allocate(8 * view.capacity, "the tile lists' sort keys"))
-            self._key_capacity = view.capacity
+        if self._counts.reserve(4 * view.tiles):  # zero at first; each view leaves them so
+            cl.enqueue_fill_buffer(self.device.queue, self._counts.buffer, np.uint32(0), 0, 4 * view.tiles)
+        for keys in self._keys:
+            keys.reserve(8 * view.capacity)
         pixels = view.camera.width * view.camera.height
-        if self._transmittance.size < 4 * pixels:
-            device.free(self._image)
-            device.free(self._transmittance)
-            self._image = device.allocate(12 * pixels, "the image")
-            self._transmittance = device.allocate(4 * pixels, "the transmittance")
+        self._image.reserve(12 * pixels)
+        self._transmittance.reserve(4 * pixels)
 
     def _enqueue_lists(self, view: View, struct: NDArray[Any]) -> None:
         """Enqueue tile lists and depth order of a projected view."""
         device = self.device
         splats, capacity = np.uint32(self._stride), np.uint32(view.capacity)
-        group = (_SPLAT_GROUP,) if device.family == "gpu" else None
-        self._count.set_args(view.shapes, splats, struct, self._counts)
+        group = (_SPLAT_GROUP,)
+        self._count.set_args(view.shapes, splats, struct, self._counts.buffer)
         device.launch(self._count, (self._stride,), group)
-        self._scan.set_args(self._counts, view.offsets, np.uint32(view.tiles), self._total)
+        self._scan.set_args(self._counts.buffer, view.offsets, np.uint32(view.tiles), self._total)
         scanners = _SPLAT_GROUP if device.family == "gpu" else 1
         device.launch(self._scan, (scanners,), (scanners,))
-        self._fill.set_args(view.shapes, splats, struct, self._counts, self._keys[0], capacity)
+        self._fill.set_args(view.shapes, splats, struct, self._counts.buffer, self._keys[0].buffer, capacity)
         device.launch(self._fill, (self._stride,), group)
-        self._sort.set_args(*self._keys, view.offsets, view.entries, self._counts, capacity)
+        self._sort.set_args(
+            *(keys.buffer for keys in self._keys), view.offsets, view.entries, self._counts.buffer, capacity
+        )
         if device.family == "gpu":
             device.launch(self._sort, (view.tiles * 256,), (256,))
         else:
@@ -271,7 +279,7 @@ class Rasterizer:
 
     def _enqueue_project(self, view: View, struct: NDArray[Any]) -> None:
         self._project.set_args(*self._parameters, np.uint32(self._stride), struct, view.shapes, view.colours)
-        self.device.launch(self._project, (self._stride // self._lanes,))
+        self.device.launch(self._project, (self._stride // self._lanes,), (_SPLAT_GROUP // self._lanes,))
 
     def _enqueue_composite(self, view: View, struct: NDArray[Any]) -> None:
         self._composite.set_args(
@@ -282,8 +290,8 @@ class Rasterizer:
             np.uint32(view.capacity),
             struct,
             *(np.float32(channel) for channel in self.background),
-            self._image,
-            self._transmittance,
+            self._image.buffer,
+            self._transmittance.buffer,
         )
         if self.device.family == "gpu":
             self.device.launch(self._composite, (view.columns * TILE, view.rows * TILE), (TILE, TILE))
@@ -325,11 +333,7 @@ class Rasterizer:
         while not self._settle(view):
             self._reserve(view)
             self._enqueue_lists(view, struct)
-        exact = self.device.allocate(4 * view.entry_count, "the tile lists")
-        if view.entry_count:
-            cl.enqueue_copy(self.device.queue, exact, view.entries, byte_count=4 * view.entry_count)
-        self.device.free(view.entries)
-        view.entries, view.capacity = exact, view.entry_count
+        view.trim()
         return view
 
     def composite(self, view: View) -> tuple[FloatArray, FloatArray]:
@@ -369,13 +373,13 @@ class Rasterizer:
             self._reserve(view)
             self._enqueue_lists(view, struct)
             self._enqueue_composite(view, struct)
-        return self._image, self._transmittance
+        return self._image.buffer, self._transmittance.buffer
 
     def _pictures(self, camera: Camera) -> tuple[FloatArray, FloatArray]:
         shape = (camera.height, camera.width)
         return (
-            self.device.download(self._image, (*shape, 3), np.float32),
-            self.device.download(self._transmittance, shape, np.float32),
+            self.device.download(self._image.buffer, (*shape, 3), np.float32),
+            self.device.download(self._transmittance.buffer, shape, np.float32),
         )
 
     def _scratch_view(self, camera: Camera) -> View:
@@ -396,8 +400,10 @@ class Rasterizer:
         """Give all device memory back; the rasterizer is of no use afterwards."""
         if self._scratch is not None:
             self._scratch.free()
-        for buffer in (*self._parameters, *self._keys, self._counts, self._total, self._image, self._transmittance):
+        for buffer in (*self._parameters, self._total):
             self.device.free(buffer)
+        for scratch in (self._counts, *self._keys, self._image, self._transmittance):
+            scratch.free()
 
 
 def render(

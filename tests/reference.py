@@ -196,6 +196,46 @@ def composite(
     return Composite(image, transmittance, margin, pairs)
 
 
+@dataclass
+class Pixel:
+    """One pixel of a scene of any size, see :class:`Composite`.
+
+    Attributes:
+        colour: (3,). transmittance, margin: as there.
+        gap: smallest difference in depth, relatively, between two splats that follow each other in the pixel: below
+            float32's resolution their order, and with it the colour, is anyone's.
+    """
+
+    colour: Array
+    transmittance: float
+    margin: float
+    gap: float
+
+
+def composite_pixel(projected: Projected, column: int, row: int, rules: RasterRules) -> Pixel:
+    """One pixel over black, for scenes too large for :func:`composite`; rules without the square extent only."""
+    assert not rules.square_extent
+    a, b, c = projected.covariance[:, 0, 0], projected.covariance[:, 0, 1], projected.covariance[:, 1, 1]
+    dx = column + 0.5 - projected.centre[:, 0]
+    dy = row + 0.5 - projected.centre[:, 1]
+    raw = projected.opacity * np.exp(-0.5 * (c * dx * dx - 2 * b * dx * dy + a * dy * dy) / (a * c - b * b))
+    colour, transmittance, margin, gap, depth = np.zeros(3), 1.0, np.inf, np.inf, 0.0
+    for k in np.flatnonzero(raw >= 0.99 / 255):
+        margin = min(margin, abs(raw[k] * 255 - 1))
+        if raw[k] < 1 / 255:
+            continue
+        alpha = min(raw[k], rules.alpha_cap)
+        following = transmittance * (1 - alpha)
+        margin = min(margin, abs(following * 1e4 - 1))
+        if following <= 1e-4 if rules.stop_included else following < 1e-4:
+            break
+        gap = min(gap, abs(projected.depth[k] / depth - 1) if depth else np.inf)
+        depth = projected.depth[k]
+        colour += transmittance * alpha * projected.colour[k]
+        transmittance = following
+    return Pixel(colour, transmittance, margin, gap)
+
+
 def render(
     scene: Scene,
     camera: Camera,
