@@ -14,6 +14,7 @@ Semantics: the original 3DGS rasterizer (Kerbl et al. 2023); where renderers dif
 from __future__ import annotations
 
 from dataclasses import dataclass
+from functools import lru_cache
 from typing import Any
 
 import numpy as np
@@ -85,6 +86,7 @@ INRIA = RasterRules()
 GSPLAT = RasterRules(alpha_cap=0.999, square_extent=False, stop_included=True)
 
 
+@lru_cache(maxsize=4096)
 def _camera_struct(camera: Camera) -> NDArray[Any]:
     """The camera as the kernels take it (``View`` in cl/splat.clh)."""
     struct = np.zeros((), _CAMERA)
@@ -198,6 +200,7 @@ class Rasterizer:
         self._image = Scratch(device, "the image")
         self._transmittance = Scratch(device, "the transmittance")
         self._scratch: View | None = None
+        self._bound: View | None = None
 
     def _upload(self, scene: Scene) -> None:
         """Activate the parameters and copy them, structure of arrays, padded to the stride."""
@@ -232,6 +235,8 @@ class Rasterizer:
             NEAR=float(rules.near),
             SQUARE_EXTENT=int(rules.square_extent),
         )
+        # Work-items that share a tile. On a CPU one: PoCL would keep the private memory of more of them on its stack.
+        self._tile_group = 256 if device.family == "gpu" else 1
         lists = f"tile_lists_{device.family}.cl"
         self._count = device.kernel(lists, "count_tiles")
         self._scan = device.kernel(lists, "scan_tiles")
@@ -247,56 +252,63 @@ class Rasterizer:
             self._sort = device.kernel("sort_cpu.cl", "sort_tiles")
             self._composite = device.kernel("composite_cpu.cl", "composite", LANES=row_lanes, **limits)
 
-    def _reserve(self, view: View) -> None:
-        """Scratch memory for this view's size and capacity."""
-        if self._counts.reserve(4 * view.tiles):  # zero at first; each view leaves them so
-            cl.enqueue_fill_buffer(self.device.queue, self._counts.buffer, np.uint32(0), 0, 4 * view.tiles)
-        for keys in self._keys:
-            keys.reserve(8 * view.capacity)
-        pixels = view.camera.width * view.camera.height
-        self._image.reserve(12 * pixels)
-        self._transmittance.reserve(4 * pixels)
-
-    def _enqueue_lists(self, view: View, struct: NDArray[Any]) -> None:
-        """Enqueue tile lists and depth order of a projected view."""
+    def _bind(self, view: View) -> None:
+        """Scratch memory for a view, and all kernel arguments but the camera; does nothing for the view bound last."""
         device = self.device
-        splats, capacity = np.uint32(self._stride), np.uint32(view.capacity)
-        group = (_SPLAT_GROUP,)
-        self._count.set_args(view.shapes, splats, struct, self._counts.buffer)
-        device.launch(self._count, (self._stride,), group)
-        self._scan.set_args(self._counts.buffer, view.offsets, np.uint32(view.tiles), self._total)
-        scanners = _SPLAT_GROUP if device.family == "gpu" else 1
-        device.launch(self._scan, (scanners,), (scanners,))
-        self._fill.set_args(view.shapes, splats, struct, self._counts.buffer, self._keys[0].buffer, capacity)
-        device.launch(self._fill, (self._stride,), group)
-        self._sort.set_args(
-            *(keys.buffer for keys in self._keys), view.offsets, view.entries, self._counts.buffer, capacity
-        )
-        if device.family == "gpu":
-            device.launch(self._sort, (view.tiles * 256,), (256,))
-        else:
-            device.launch(self._sort, (view.tiles,), (1,))
-
-    def _enqueue_project(self, view: View, struct: NDArray[Any]) -> None:
-        self._project.set_args(*self._parameters, np.uint32(self._stride), struct, view.shapes, view.colours)
-        self.device.launch(self._project, (self._stride // self._lanes,), (_SPLAT_GROUP // self._lanes,))
-
-    def _enqueue_composite(self, view: View, struct: NDArray[Any]) -> None:
+        if self._counts.reserve(4 * view.tiles):  # zero at first; each view leaves them so
+            cl.enqueue_fill_buffer(device.queue, self._counts.buffer, np.uint32(0), 0, 4 * view.tiles)
+            self._bound = None
+        pixels = view.camera.width * view.camera.height
+        for scratch, size in (
+            *((keys, 8 * view.capacity) for keys in self._keys),
+            (self._image, 12 * pixels),
+            (self._transmittance, 4 * pixels),
+        ):
+            if scratch.reserve(size):
+                self._bound = None
+        if self._bound is view:
+            return
+        stride, capacity = np.uint32(self._stride), np.uint32(view.capacity)
+        keys = [scratch.buffer for scratch in self._keys]
+        counts, camera = self._counts.buffer, _camera_struct(view.camera)
+        self._project.set_args(*self._parameters, stride, camera, view.shapes, view.colours)
+        self._count.set_args(view.shapes, stride, camera, counts)
+        self._scan.set_args(counts, view.offsets, np.uint32(view.tiles), self._total)
+        self._fill.set_args(view.shapes, stride, camera, counts, keys[0], capacity)
+        self._sort.set_args(*keys, view.offsets, view.entries, counts, capacity)
         self._composite.set_args(
             view.shapes,
             view.colours,
             view.offsets,
             view.entries,
-            np.uint32(view.capacity),
-            struct,
+            capacity,
+            camera,
             *(np.float32(channel) for channel in self.background),
             self._image.buffer,
             self._transmittance.buffer,
         )
+        self._bound = view
+
+    def _enqueue_project(self, view: View) -> None:
+        self._project.set_arg(6, _camera_struct(view.camera))
+        self.device.launch(self._project, (self._stride // self._lanes,), (_SPLAT_GROUP // self._lanes,))
+
+    def _enqueue_lists(self, view: View) -> None:
+        """Enqueue tile lists and depth order of a projected view."""
+        camera = _camera_struct(view.camera)
+        launch = self.device.launch
+        self._count.set_arg(2, camera)
+        launch(self._count, (self._stride,), (_SPLAT_GROUP,))
+        launch(self._scan, (self._tile_group,), (self._tile_group,))
+        self._fill.set_arg(2, camera)
+        launch(self._fill, (self._stride,), (_SPLAT_GROUP,))
+        launch(self._sort, (view.tiles * self._tile_group,), (self._tile_group,))
+
+    def _enqueue_composite(self, view: View) -> None:
+        self._composite.set_arg(5, _camera_struct(view.camera))
         if self.device.family == "gpu":
             self.device.launch(self._composite, (view.columns * TILE, view.rows * TILE), (TILE, TILE))
         else:
-            # One tile a work-group: PoCL keeps the private memory of a whole work-group on its stack.
             self.device.launch(self._composite, (view.tiles,), (1,))
 
     def _settle(self, view: View) -> bool:
@@ -309,6 +321,7 @@ class Rasterizer:
         view.entry_count = count
         if count <= view.capacity:
             return True
+        self._bound = None
         view.grow(count + count // 4)
         return False
 
@@ -326,20 +339,20 @@ class Rasterizer:
             DeviceError: it does not fit the device.
         """
         view = View(self.device, camera, self._stride, self._first_capacity())
-        struct = _camera_struct(camera)
-        self._reserve(view)
-        self._enqueue_project(view, struct)
-        self._enqueue_lists(view, struct)
+        self._bind(view)
+        self._enqueue_project(view)
+        self._enqueue_lists(view)
         while not self._settle(view):
-            self._reserve(view)
-            self._enqueue_lists(view, struct)
+            self._bind(view)
+            self._enqueue_lists(view)
         view.trim()
+        self._bound = None
         return view
 
     def composite(self, view: View) -> tuple[FloatArray, FloatArray]:
         """The picture of a prepared view: as :meth:`render`."""
-        self._reserve(view)
-        self._enqueue_composite(view, _camera_struct(view.camera))
+        self._bind(view)
+        self._enqueue_composite(view)
         return self._pictures(view.camera)
 
     def render(self, camera: Camera) -> tuple[FloatArray, FloatArray]:
@@ -363,16 +376,15 @@ class Rasterizer:
             overwrites them.
         """
         view = self._scratch_view(camera)
-        struct = _camera_struct(camera)
-        self._reserve(view)
-        self._enqueue_project(view, struct)
-        self._enqueue_lists(view, struct)
-        self._enqueue_composite(view, struct)
+        self._bind(view)
+        self._enqueue_project(view)
+        self._enqueue_lists(view)
+        self._enqueue_composite(view)
         # Lists that did not fit are cut short, so the kernels above were safe; their result is thrown away.
         while not self._settle(view):
-            self._reserve(view)
-            self._enqueue_lists(view, struct)
-            self._enqueue_composite(view, struct)
+            self._bind(view)
+            self._enqueue_lists(view)
+            self._enqueue_composite(view)
         return self._image.buffer, self._transmittance.buffer
 
     def _pictures(self, camera: Camera) -> tuple[FloatArray, FloatArray]:
