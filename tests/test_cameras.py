@@ -404,7 +404,10 @@ def test_damaged_text_models(text_model_lines: Callable[[str], Path]) -> None:
     for line in ("", "# nothing\n", "2 PINHOLE 990 742 800 800 495 371\n", "1 PINHOLE x y 800 800 495 371\n"):
         refused(text_model_lines(line), "is a damaged COLMAP model: ")
     refused(text_model_lines("1 PINHOLE 990 742 nan 800 495 371\n"), "intrinsics|damaged")
-    refused(text_model_lines("1 PINHOLE 990 99999999 800 800 495 371\n"), "camera 1 is 990 x 99999999 pixels large")
+    refused(
+        text_model_lines("1 PINHOLE 990 99999999 800 800 495 371\n"),
+        "the height of its camera is 99999999, not a number of pixels",
+    )
 
 
 def test_every_truncation_of_a_binary_model(model: Path) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 from pathlib import Path
 
 from potr_cl.cameras import Camera
+from potr_cl.decoder import decode
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats import cameras_json, colmap, ply, transforms
 from potr_cl.formats.view_files import read_json
@@ -15,16 +16,19 @@ def load_scene(path: Path) -> Scene:
     """Read a trained scene; the extension tells the format.
 
     Args:
-        path: of a .ply file.
+        path: of a .ply file, or of a .potr file, which is decoded.
 
     Raises:
         UsageError: the file cannot be opened, or its extension is unknown.
         DataError: its content is damaged.
     """
     path = Path(path)
-    if path.suffix.lower() != ".ply":
-        raise UsageError(f"'{path}': unknown kind of scene, expected a .ply file")
-    return ply.load(path)
+    suffix = path.suffix.lower()
+    if suffix == ".ply":
+        return ply.load(path)
+    if suffix == ".potr":
+        return decode(path)
+    raise UsageError(f"'{path}': unknown kind of scene, expected a .ply or .potr file")
 
 
 def load_cameras(path: Path) -> list[Camera]:

@@ -7,17 +7,19 @@ structure has been checked here, and without the points: those make up nearly al
 
 from __future__ import annotations
 
+import math
 import os
 import struct
 import tempfile
 from pathlib import Path
 from types import ModuleType
+from typing import Any
 
 import numpy as np
 
 from potr_cl.cameras import Camera
 from potr_cl.errors import DataError, UsageError
-from potr_cl.formats.view_files import camera_of, every_eighth, excerpt, image_name, read_bytes, view_names
+from potr_cl.formats.view_files import camera_of, every_eighth, excerpt, image_name, image_side, read_bytes, view_names
 
 #: COLMAP's pinhole models: their number in binary files and how many parameters they have.
 _PINHOLES = {"SIMPLE_PINHOLE": (0, 3), "PINHOLE": (1, 4)}
@@ -26,7 +28,6 @@ _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameter
 _IMAGE = struct.Struct("<I7dI")  # id, rotation, translation, camera; then the name, a zero, the 2-D points
 _COUNT = struct.Struct("<Q")
 _POINT_BYTES = 24
-_MAX_SIDE = 1 << 16
 
 
 def is_model(folder: Path) -> bool:
@@ -50,64 +51,67 @@ def load(folder: Path) -> list[Camera]:
         UsageError: pycolmap is not installed, or a file cannot be opened.
         DataError: the model is damaged, or a camera is not a pinhole.
     """
-    pycolmap = _pycolmap()
     ending = ".bin" if (folder / "cameras.bin").exists() else ".txt"
-    cameras, images = folder / f"cameras{ending}", folder / f"images{ending}"
-    check, strip, no_points = (
-        (_check_binary_cameras, _without_points_binary, _COUNT.pack(0))
-        if ending == ".bin"
-        else (_check_text_cameras, _without_points_text, b"")
+    cameras, images = _read_checked(folder, ending)
+    path = folder / f"images{ending}"
+    if not images:
+        raise DataError(f"'{path}' holds no view")
+    files = [image_name(image.name, f"'{path}': the name of image {image.image_id}") for image in images]
+    photographs = _photographs(folder)
+    return [
+        _camera(path, image, cameras[image.camera_id], name, split, photographs / file if photographs else None)
+        for image, name, file, split in zip(images, view_names(files, path), files, every_eighth(files), strict=True)
+    ]
+
+
+def _camera(path: Path, image: Any, lens: Any, name: str, split: str, photograph: Path | None) -> Camera:
+    pose = image.cam_from_world()
+    if not abs(math.hypot(*pose.rotation.quat) - 1) < 1e-3:  # zero would silently mean no rotation
+        raise DataError(f"'{path}', view '{name}': its rotation is not a unit quaternion")
+    world_to_camera = np.asarray(pose.matrix(), dtype=np.float64)
+    return camera_of(
+        path,
+        name=name,
+        width=image_side(lens.width, f"'{path}', view '{name}': the width of its camera"),
+        height=image_side(lens.height, f"'{path}', view '{name}': the height of its camera"),
+        fx=float(lens.params[0]),
+        fy=float(lens.params[-3]),  # the only focal length of a SIMPLE_PINHOLE
+        cx=float(lens.params[-2]),
+        cy=float(lens.params[-1]),
+        rotation=world_to_camera[:, :3],
+        translation=world_to_camera[:, 3],
+        split=split,
+        image_path=photograph if photograph and os.path.isfile(photograph) else None,
     )
-    content = {
-        cameras.name: check(read_bytes(cameras), cameras),
-        images.name: strip(read_bytes(images), images),
-        f"points3D{ending}": no_points,
-    }
+
+
+def _read_checked(folder: Path, ending: str) -> tuple[Any, list[Any]]:
+    """The cameras of a model by number, and its images by name, as pycolmap's objects."""
+    pycolmap = _pycolmap()
+    cameras, images = folder / f"cameras{ending}", folder / f"images{ending}"
+    if ending == ".bin":
+        content = {
+            cameras.name: _check_binary_cameras(read_bytes(cameras), cameras),
+            images.name: _without_points_binary(read_bytes(images), images),
+            "points3D.bin": _COUNT.pack(0),
+        }
+    else:
+        content = {
+            cameras.name: _check_text_cameras(read_bytes(cameras), cameras),
+            images.name: _without_points_text(read_bytes(images), images),
+            "points3D.txt": b"",
+        }
     with tempfile.TemporaryDirectory(prefix="potr-cl-") as copy:
         for name, data in content.items():
             Path(copy, name).write_bytes(data)
         try:
             model = pycolmap.Reconstruction(copy)
-            views = sorted(model.images.values(), key=lambda image: image.name)
+            return model.cameras, sorted(model.images.values(), key=lambda image: image.name)
         except UnicodeDecodeError as error:
             raise DataError(f"'{images}': the name of an image is not UTF-8: rename it") from error
         except Exception as error:  # the library raises what its parts happen to raise
             reason = " ".join(str(error).split())[:200]
             raise DataError(f"'{folder}' is a damaged COLMAP model: {reason}") from error
-
-    if not views:
-        raise DataError(f"'{images}' holds no view")
-    files = [image_name(image.name, f"'{images}': the name of image {image.image_id}") for image in views]
-    names = view_names(files, images)
-    photographs = _photographs(folder)
-    result = []
-    for image, name, file, split in zip(views, names, files, every_eighth(files), strict=True):
-        camera = model.cameras[image.camera_id]
-        if max(camera.width, camera.height) > _MAX_SIDE:
-            raise DataError(f"'{cameras}': camera {camera.camera_id} is {camera.width} x {camera.height} pixels large")
-        focal, (cx, cy) = camera.params[:-2], camera.params[-2:]
-        pose = image.cam_from_world()
-        if not abs(np.linalg.norm(pose.rotation.quat) - 1) < 1e-3:  # zero would silently mean no rotation
-            raise DataError(f"'{images}', view '{name}': its rotation is not a unit quaternion")
-        matrix = np.asarray(pose.matrix(), dtype=np.float64)
-        photograph = photographs / file if photographs else None
-        result.append(
-            camera_of(
-                images,
-                name=name,
-                width=int(camera.width),
-                height=int(camera.height),
-                fx=float(focal[0]),
-                fy=float(focal[-1]),
-                cx=float(cx),
-                cy=float(cy),
-                rotation=matrix[:, :3],
-                translation=matrix[:, 3],
-                split=split,
-                image_path=photograph if photograph and os.path.isfile(photograph) else None,
-            )
-        )
-    return result
 
 
 def _pycolmap() -> ModuleType:
