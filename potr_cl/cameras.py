@@ -56,7 +56,9 @@ class Camera:
         if not (np.isfinite(self.rotation).all() and np.isfinite(self.translation).all()):
             raise DataError(f"{where}: the pose holds a non-finite value")
         # Files round to 6 or 7 digits; anything worse is a scale or a shear, which a pinhole pose cannot hold.
-        if np.abs(self.rotation @ self.rotation.T - np.eye(3)).max() > 1e-3 or np.linalg.det(self.rotation) < 0:
+        with np.errstate(over="ignore", invalid="ignore"):
+            skew = np.abs(self.rotation @ self.rotation.T - np.eye(3)).max()
+        if not skew <= 1e-3 or np.linalg.det(self.rotation) < 0:
             raise DataError(f"{where}: the pose's 3 x 3 part is not a rotation")
         if self.split not in ("train", "test"):
             raise DataError(f"{where}: split '{self.split}' is neither 'train' nor 'test'")

@@ -11,6 +11,9 @@ from potr_cl.errors import DataError
 
 FloatArray = NDArray[np.float32]
 
+#: Splats looked at at a time where values are checked.
+_BLOCK = 1 << 14
+
 #: Number of SH coefficients a colour channel for each degree.
 SH_COEFFICIENTS = (1, 4, 9, 16)
 
@@ -118,12 +121,14 @@ class Scene:
         Raises:
             DataError: no splat is left.
         """
-        finite = np.isfinite(self.means).all(axis=1)
-        finite &= np.isfinite(self.log_scales).all(axis=1)
-        finite &= np.isfinite(self.quaternions).all(axis=1)
-        finite &= np.isfinite(self.opacity_logits)
-        for m in range(self.sh.shape[1]):  # one coefficient at a time: no temporary as large as the SH
-            finite &= np.isfinite(self.sh[:, m]).all(axis=1)
+        finite = np.ones(len(self), bool)
+        # Block by block: the temporaries stay in the cache, and a block without fault is done at the first look.
+        for start in range(0, len(self), _BLOCK):
+            rows = slice(start, start + _BLOCK)
+            for array in (self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh):
+                ok = np.isfinite(array[rows])
+                if not ok.all():
+                    finite[rows] &= ok.reshape(len(ok), -1).all(axis=1)
         dropped = len(self) - int(np.count_nonzero(finite))
         scene = self.subset(finite) if dropped else self
         if len(scene) == 0:
