@@ -1,0 +1,65 @@
+"""The OpenCL devices there are and what matters about them, as numbers and as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from potr_cl.device import Device, DeviceInfo, choose_device, list_devices
+from potr_cl.errors import DeviceError
+
+
+def device_report(check: bool) -> list[dict[str, Any]]:
+    """One entry a device, in the order of their indices.
+
+    Args:
+        check: run each device's self-check; the entry's "check" is then "passed" or says what failed.
+
+    Raises:
+        DeviceError: there is no device at all, or the environment variable names one that there is not.
+    """
+    chosen = choose_device()
+    return [_entry(info, info.index == chosen.index, check) for info in list_devices()]
+
+
+def _entry(info: DeviceInfo, chosen: bool, check: bool) -> dict[str, Any]:
+    entry = {
+        "index": info.index,
+        "chosen": chosen,
+        "name": info.name,
+        "platform": info.platform,
+        "version": info.version,
+        "kind": info.kind,
+        "integrated": info.integrated,
+        "memory_bytes": info.memory,
+        "largest_buffer_bytes": info.largest_buffer,
+        "local_memory_bytes": info.local_memory,
+        "compute_units": info.compute_units,
+        "vector_width": info.vector_width,
+        "kernels": info.family,
+    }
+    if check:
+        try:
+            Device(info).self_check()
+            entry["check"] = "passed"
+        except DeviceError as error:
+            entry["check"] = str(error)
+    return entry
+
+
+def format_devices(report: Sequence[dict[str, Any]]) -> str:
+    """The report as lines for people; ``*`` marks the device that is taken without ``--device``."""
+    lines = [
+        f"{'':<2}{'index':<7}{'kind':<6}{'kernels':<9}{'memory':>9}{'buffer':>9}{'local':>8}{'units':>7}{'vector':>8}"
+        "  name (platform)"
+    ]
+    for entry in report:
+        lines.append(
+            f"{'*' if entry['chosen'] else '':<2}{entry['index']:<7}{entry['kind']:<6}{entry['kernels']:<9}"
+            f"{entry['memory_bytes'] / 1e9:>6.1f} GB{entry['largest_buffer_bytes'] / 1e9:>6.1f} GB"
+            f"{entry['local_memory_bytes'] / 1024:>5.0f} KB{entry['compute_units']:>7}{entry['vector_width']:>8}"
+            f"  {entry['name']} ({entry['platform']})"
+        )
+        if "check" in entry:
+            lines.append(f"  self-check: {entry['check']}")
+    return "\n".join(lines)
