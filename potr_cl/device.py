@@ -8,6 +8,7 @@ import logging
 import os
 import re
 import tempfile
+import warnings
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -311,7 +312,8 @@ class Device:
         key = (source, macros)
         if key not in self._programs:
             options = ["-cl-std=CL1.2", *(f"-D{name}={value}" for name, value in macros)]
-            with self.errors(f"failed to build {source}"):
+            with self.errors(f"failed to build {source}"), warnings.catch_warnings():
+                warnings.simplefilter("ignore", cl.CompilerWarning)  # some drivers chat without being asked
                 self._programs[key] = cl.Program(self.context, kernel_source(source)).build(options)
         return self._programs[key]
 

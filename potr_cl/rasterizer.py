@@ -32,6 +32,9 @@ TILE = 16
 #: PoCL makes one of thousands and overflows its stack with their private memory.
 _SPLAT_GROUP = 256
 
+#: A tile's counter on the device with room to the next, enough for both kernel families.
+_COUNTER_BYTES = 32
+
 #: Standard deviations above this many world units are taken as this: nothing can be seen to differ, nothing overflows.
 _LARGEST_SCALE = 1e12
 
@@ -255,8 +258,8 @@ class Rasterizer:
     def _bind(self, view: View) -> None:
         """Scratch memory for a view, and all kernel arguments but the camera; does nothing for the view bound last."""
         device = self.device
-        if self._counts.reserve(4 * view.tiles):  # zero at first; each view leaves them so
-            cl.enqueue_fill_buffer(device.queue, self._counts.buffer, np.uint32(0), 0, 4 * view.tiles)
+        if self._counts.reserve(_COUNTER_BYTES * view.tiles):  # zero at first; each view leaves them so
+            cl.enqueue_fill_buffer(device.queue, self._counts.buffer, np.uint32(0), 0, self._counts.nbytes)
             self._bound = None
         pixels = view.camera.width * view.camera.height
         for scratch, size in (
@@ -306,10 +309,7 @@ class Rasterizer:
 
     def _enqueue_composite(self, view: View) -> None:
         self._composite.set_arg(5, _camera_struct(view.camera))
-        if self.device.family == "gpu":
-            self.device.launch(self._composite, (view.columns * TILE, view.rows * TILE), (TILE, TILE))
-        else:
-            self.device.launch(self._composite, (view.tiles,), (1,))
+        self.device.launch(self._composite, (view.tiles * self._tile_group,), (self._tile_group,))
 
     def _settle(self, view: View) -> bool:
         """Wait for the entry count; make room and say False if the lists did not fit."""

@@ -1,4 +1,5 @@
-/* Compositing for GPUs: one work-group a tile, one pixel a work-item, splats fetched into local memory in batches.
+/* Compositing for GPUs: one work-group a tile, one pixel a work-item (32 in a row make a block of 8 x 4
+   pixels), splats fetched into local memory in batches.
 
    Macros: ALPHA_CAP, STOP (a pixel ends before its transmittance would fall below it), NATIVE_EXP2. */
 
@@ -7,6 +8,22 @@
 #include "splat.clh"
 
 #define BATCH (TILE * TILE)
+/* Splats whose exponents are computed before the first is composited: independent work to hide latency behind. */
+#define AHEAD 8
+
+/* One splat of the next batch into registers, long before it is needed; past the end one that touches nothing. */
+#define FETCH                                              \
+    if (next < end) {                                      \
+        uint splat = entries[next];                        \
+        s0 = shapes[2 * splat];                            \
+        s1 = shapes[2 * splat + 1];                        \
+        colour = colours[splat];                           \
+    } else {                                               \
+        s0 = (float4)(0.0f);                               \
+        s1 = (float4)(0.0f, -1e30f, 0.0f, 0.0f);           \
+        colour = (float4)(0.0f);                           \
+    }                                                      \
+    next += BATCH;
 
 #if NATIVE_EXP2
 #define EXP2 native_exp2
@@ -14,7 +31,7 @@
 #define EXP2 exp2_polynomial
 #endif
 
-kernel __attribute__((reqd_work_group_size(TILE, TILE, 1)))
+kernel __attribute__((reqd_work_group_size(BATCH, 1, 1)))
 void composite(
     global const float4 *shapes,
     global const float4 *colours,
@@ -32,48 +49,59 @@ void composite(
     local float near_blue[BATCH];
     local int alive_count[2];
 
-    const int lid = get_local_id(1) * TILE + get_local_id(0);
-    const int tile = get_group_id(1) * view.columns + get_group_id(0);
-    const int column = get_global_id(0), row = get_global_id(1);
+    const int lid = get_local_id(0);
+    const int tile = get_group_id(0);
+    const int column = tile % view.columns * TILE + (lid & 7) + (lid >> 2 & 8);
+    const int row = tile / view.columns * TILE + (lid >> 3 & 3) + (lid >> 6 << 2);
     const int inside = column < view.width && row < view.height;
     const float x = column + 0.5f, y = row + 0.5f;
     const uint end = min(offsets[tile + 1], capacity);
+    const uint begin = min(offsets[tile], capacity);
+    uint next = begin + lid;
 
     float t = 1.0f, r = 0.0f, g = 0.0f, b = 0.0f;
     int alive = inside;
     int parity = 0;
     int tile_alive = 1;
-    for (uint batch = min(offsets[tile], capacity); batch < end && tile_alive; batch += BATCH) {
+    float4 s0, s1, colour;
+    FETCH
+    for (uint batch = begin; batch < end && tile_alive; batch += BATCH) {
         const int size = min((uint)BATCH, end - batch);
         barrier(CLK_LOCAL_MEM_FENCE);
-        if (lid < size) {
-            uint splat = entries[batch + lid];
-            float4 s1 = shapes[2 * splat + 1];
-            float4 colour = colours[splat];
-            near_s0[lid] = shapes[2 * splat];
-            near_s1[lid] = (float4)(s1.x, s1.y, colour.x, colour.y);
-            near_blue[lid] = colour.z;
-        }
+        near_s0[lid] = s0;
+        near_s1[lid] = (float4)(s1.x, s1.y, colour.x, colour.y);
+        near_blue[lid] = colour.z;
         if (lid == 0)
             alive_count[parity] = 0;
         barrier(CLK_LOCAL_MEM_FENCE);
-        for (int k = 0; k < size && alive; ++k) {
-            float4 s0 = near_s0[k], s1 = near_s1[k];
-            float dy = y - s0.y;
-            float u = mad(s0.z, x - s0.x, s0.w * dy);
-            float v = s1.x * dy;
-            float power = mad(-u, u, mad(-v, v, s1.y));
-            if (power >= LOG2_ALPHA_MIN) {
-                float alpha = fmin(EXP2(power), ALPHA_CAP);
-                float after = mad(-alpha, t, t);
-                if (after < STOP) {
-                    alive = 0;
-                } else {
-                    float weight = alpha * t;
-                    r = mad(weight, s1.z, r);
-                    g = mad(weight, s1.w, g);
-                    b = mad(weight, near_blue[k], b);
-                    t = after;
+        FETCH
+        for (int k = 0; k < size && alive; k += AHEAD) {
+            float powers[AHEAD];
+            float most = LOG2_ALPHA_MIN - 1.0f;
+            for (int j = 0; j < AHEAD; ++j) {
+                float4 n0 = near_s0[k + j];
+                float2 n1 = near_s1[k + j].xy;
+                float dy = y - n0.y;
+                float u = mad(n0.z, x - n0.x, n0.w * dy);
+                float v = n1.x * dy;
+                powers[j] = mad(-u, u, mad(-v, v, n1.y));
+                most = fmax(most, powers[j]);
+            }
+            if (most < LOG2_ALPHA_MIN)
+                continue;
+            for (int j = 0; j < AHEAD; ++j) {
+                if (alive && powers[j] >= LOG2_ALPHA_MIN) {
+                    float alpha = fmin(EXP2(powers[j]), ALPHA_CAP);
+                    float after = mad(-alpha, t, t);
+                    if (after < STOP) {
+                        alive = 0;
+                    } else {
+                        float weight = alpha * t;
+                        r = mad(weight, near_s1[k + j].z, r);
+                        g = mad(weight, near_s1[k + j].w, g);
+                        b = mad(weight, near_blue[k + j], b);
+                        t = after;
+                    }
                 }
             }
         }

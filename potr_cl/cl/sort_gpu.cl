@@ -5,6 +5,7 @@
    SORT_CAPACITY keys stay in local memory; in longer ones, steps that reach further than that run in global memory. */
 
 #define GROUP 256
+#define COUNTER_STRIDE 8 /* as in tile_lists_gpu.cl */
 
 #define ORDER(memory, low, high)                        \
     {                                                   \
@@ -15,20 +16,25 @@
         }                                               \
     }
 
-/* The i-th pair of a step over distance `half`; mirrored or straight. */
-inline uint pair_low(uint i, uint half_size)
+/* Lower index of the i-th pair of a step over distance `reach`, a power of two (no division: they are slow). */
+inline uint pair_low(uint i, uint reach)
 {
-    return (i / half_size) * 2 * half_size + i % half_size;
+    return 2 * i - (i & (reach - 1));
 }
 
-/* Steps of distance half_size, half_size / 2, … 1 on keys in local memory; the first mirrored if asked. */
-inline void merge_local(local ulong *keys, uint n, uint half_size, int mirrored, uint lid)
+inline uint pair_high(uint low, uint reach, int mirrored)
 {
-    for (; half_size > 0; half_size /= 2) {
+    return mirrored ? low ^ (2 * reach - 1) : low + reach;
+}
+
+/* Steps of distance reach, reach / 2, … 1 on keys in local memory; the first mirrored if asked. */
+inline void merge_local(local ulong *keys, uint n, uint reach, int mirrored, uint lid)
+{
+    for (; reach > 0; reach /= 2) {
         barrier(CLK_LOCAL_MEM_FENCE);
         for (uint i = lid; i < SORT_CAPACITY / 2 && i < n; i += GROUP) {
-            uint low = pair_low(i, half_size);
-            uint high = mirrored ? low + 2 * half_size - 1 - 2 * (low % half_size) : low + half_size;
+            uint low = pair_low(i, reach);
+            uint high = pair_high(low, reach, mirrored);
             if (high < n)
                 ORDER(keys, low, high)
         }
@@ -47,15 +53,15 @@ void sort_tiles(
     const uint n = min(offsets[tile + 1], capacity) - begin;
     global ulong *keys = all_keys + begin;
     if (lid == 0)
-        counts[tile] = 0; /* ready for the next view */
+        counts[tile * COUNTER_STRIDE] = 0; /* ready for the next view */
 
     /* Pieces that fit local memory, sorted one by one. */
     for (uint piece = 0; piece < n; piece += SORT_CAPACITY) {
         uint m = min(n - piece, (uint)SORT_CAPACITY);
         for (uint i = lid; i < m; i += GROUP)
             near[i] = keys[piece + i];
-        for (uint half_size = 1; half_size < m; half_size *= 2)
-            merge_local(near, m, half_size, 1, lid);
+        for (uint reach = 1; reach < m; reach *= 2)
+            merge_local(near, m, reach, 1, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
         if (n <= SORT_CAPACITY) {
             for (uint i = lid; i < m; i += GROUP)
@@ -71,12 +77,12 @@ void sort_tiles(
 
     for (uint size = SORT_CAPACITY; size < n; size *= 2) {
         int mirrored = 1;
-        for (uint half_size = size; half_size >= SORT_CAPACITY; half_size /= 2) {
+        for (uint reach = size; reach >= SORT_CAPACITY; reach /= 2) {
             for (uint i = lid;; i += GROUP) {
-                uint low = pair_low(i, half_size);
+                uint low = pair_low(i, reach);
                 if (low >= n)
                     break;
-                uint high = mirrored ? low + 2 * half_size - 1 - 2 * (low % half_size) : low + half_size;
+                uint high = pair_high(low, reach, mirrored);
                 if (high < n)
                     ORDER(keys, low, high)
             }

@@ -3,6 +3,7 @@
 #include "splat.clh"
 
 #define GROUP 1
+#define COUNTER_STRIDE 1
 
 kernel void count_tiles(global const float4 *shapes, uint splats, View view, volatile global uint *counts)
 {

@@ -10,6 +10,8 @@
 #include "splat.clh"
 
 #define GROUP 256
+/* Every tile's counter has 32 bytes to itself: the memory system does one atomic at a time in so many. */
+#define COUNTER_STRIDE 8
 
 /* first[s] = number of rows of the splats before s; first[GROUP] = all of them. */
 inline void string_rows(global const float4 *shapes, uint splats, View view, local int *first, local int *low)
@@ -63,7 +65,7 @@ void count_tiles(global const float4 *shapes, uint splats, View view, volatile g
         int2 columns = ellipse_tile_columns(
             shapes[2 * splat], shapes[2 * splat + 1], tile_row, view.columns, view.width, view.height);
         for (int column = columns.x; column < columns.y; ++column)
-            atomic_inc(&counts[tile_row * view.columns + column]);
+            atomic_inc(&counts[(tile_row * view.columns + column) * COUNTER_STRIDE]);
     }
 }
 
@@ -82,7 +84,7 @@ void fill_tiles(
             ellipse_tile_columns(shapes[2 * splat], s1, tile_row, view.columns, view.width, view.height);
         ulong key = depth_key(s1.z, splat);
         for (int column = columns.x; column < columns.y; ++column) {
-            uint slot = atomic_inc(&cursors[tile_row * view.columns + column]);
+            uint slot = atomic_inc(&cursors[(tile_row * view.columns + column) * COUNTER_STRIDE]);
             if (slot < capacity)
                 keys[slot] = key;
         }
