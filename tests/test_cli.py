@@ -12,9 +12,14 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from potr_cl import cli
-from potr_cl.formats import ply
+from potr_cl.device import DEVICE_VARIABLE, Device, list_devices
+from potr_cl.errors import DeviceError
+from potr_cl.formats import load_cameras, load_scene, ply
+from potr_cl.images import to_8_bits
+from potr_cl.rasterizer import GSPLAT, Rasterizer
 from tests.scenes import random_scene, ring_of_cameras
 
 
@@ -254,3 +259,214 @@ def test_module_runs():
     command = [sys.executable, "-m", "potr_cl", "--version"]
     result = subprocess.run(command, capture_output=True, text=True, check=True)
     assert result.stdout.startswith("potr-cl ")
+
+
+# ------------------------------------------------------------------------------------------ render
+
+
+@pytest.fixture
+def cameras_path(tmp_path):
+    return cameras_json(tmp_path / "cameras.json")
+
+
+def run(capsys, *arguments) -> str:
+    """Standard output of a command that succeeds."""
+    code = cli.main([str(a) for a in arguments])
+    captured = capsys.readouterr()
+    assert code == 0, captured.err
+    return captured.out
+
+
+def test_render_writes_what_the_rasterizer_sees(tmp_path, potr_path, cameras_path, capsys):
+    out = tmp_path / "new" / "folder"
+    options = ["--background", "1,0.5,0", "--rules", "gsplat"]
+    text = run(capsys, "render", potr_path, "--cameras", cameras_path, "-o", out, *options)
+    assert "8 images" in text
+    rasterizer = Rasterizer(Device(), load_scene(potr_path), GSPLAT, (1, 0.5, 0))
+    cameras = load_cameras(cameras_path)
+    assert sorted(file.name for file in out.iterdir()) == sorted(f"{c.name}.png" for c in cameras)
+    for camera in cameras:
+        with Image.open(out / f"{camera.name}.png") as image:
+            assert np.array_equal(np.asarray(image), to_8_bits(rasterizer.render(camera)[0]))
+
+
+@pytest.mark.parametrize(
+    ("options", "views"),
+    [
+        (["--split", "test"], [0, 4]),
+        (["--split", "train"], [1, 2, 3, 5, 6, 7]),
+        (["--split", "all"], range(8)),
+        (["--views", "view_3", "5", "view_5"], [3, 5]),
+    ],
+)
+def test_render_chosen_views(tmp_path, scene_path, cameras_path, capsys, options, views):
+    run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", tmp_path / "out", *options)
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == [f"view_{k}.png" for k in views]
+
+
+def test_a_view_named_like_a_number_is_that_view(tmp_path, scene_path, cameras_path, capsys):
+    views = json.loads(cameras_path.read_text())
+    views[7]["img_name"] = "0"
+    cameras_path.write_text(json.dumps(views))
+    run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", tmp_path / "out", "--views", "0", "1")
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["0.png", "view_1.png"]
+
+
+def test_pictures_stay_in_their_folder(tmp_path, scene_path, cameras_path, capsys):
+    """Names of views come from files that others wrote."""
+    views = json.loads(cameras_path.read_text())[:3]
+    for view, name in zip(views, ("../../x.png", "/x.png", "a/x.png"), strict=True):
+        view["img_name"] = name
+    cameras_path.write_text(json.dumps(views))
+    out = tmp_path / "out"
+    before = set(tmp_path.iterdir())
+    run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", out)
+    assert set(tmp_path.iterdir()) == before | {out}
+    assert sorted(file.name for file in out.iterdir()) == [".._.._x.png", "_x.png", "a_x.png"]
+    views[0]["img_name"] = "a_x.png"
+    views[1]["img_name"] = "b/x.png"
+    cameras_path.write_text(json.dumps(views))
+    fails(capsys, ["render", scene_path, "--cameras", cameras_path, "-o", out], 1, "two views", "cameras.json")
+
+
+def test_render_bad_calls(tmp_path, scene_path, cameras_path, capsys):
+    out = tmp_path / "out"
+    render = ["render", scene_path, "--cameras", cameras_path, "-o", out]
+    fails(capsys, ["render", tmp_path / "none.ply", *render[2:]], 2, "none.ply")
+    fails(capsys, ["render", cameras_path, *render[2:]], 2, "cameras.json", "unknown kind of scene")
+    fails(capsys, [*render[:3], tmp_path / "none.json", *render[4:]], 2, "none.json")
+    fails(capsys, [*render, "--views", "view_9"], 2, "'view_9'", "0 ('view_0') to 7 ('view_7')")
+    fails(capsys, [*render, "--views", "8"], 2, "'8'")
+    fails(capsys, [*render, "--background", "beige-ish"], 2, "'beige-ish' is no colour")
+    fails(capsys, [*render, "--device", "no such thing"], 1, "'no such thing'", list_devices()[0].name)
+    (tmp_path / "file").write_bytes(b"")
+    fails(capsys, [*render[:5], tmp_path / "file"], 2, "cannot make the folder")
+    (tmp_path / "folder" / "view_0.png").mkdir(parents=True)
+    fails(capsys, [*render[:5], tmp_path / "folder"], 2, "view_0.png")
+    views = [view for view in json.loads(cameras_path.read_text()) if view["split"] == "train"]
+    cameras_path.write_text(json.dumps(views))
+    fails(capsys, [*render, "--split", "test"], 2, "--split all")
+
+
+def test_device_by_environment(tmp_path, scene_path, cameras_path, capsys, monkeypatch):
+    render = ["render", scene_path, "--cameras", cameras_path, "--views", "0", "-o", tmp_path / "out"]
+    monkeypatch.setenv(DEVICE_VARIABLE, "no such thing")
+    fails(capsys, render, 1, "'no such thing'")
+    assert list_devices()[0].name in run(capsys, *render, "--device", "0")
+
+
+# ------------------------------------------------------------------------------------------ compare
+
+
+def test_compare_from_cameras(tmp_path, scene_path, potr_path, cameras_path, capsys):
+    both = [scene_path, potr_path, "--cameras", cameras_path]
+    report = json.loads(run(capsys, "compare", *both, "--json"))
+    assert [view["name"] for view in report["views"]] == ["view_0", "view_4"]  # the test views
+    assert report["a"]["bytes"] == scene_path.stat().st_size
+    assert report["b"]["bytes"] == potr_path.stat().st_size
+    assert report["size_ratio"] == report["a"]["bytes"] / report["b"]["bytes"]
+    assert report["rules"] == "inria"
+    psnrs = [view["b_against_a"]["psnr"] for view in report["views"]]
+    assert report["mean"]["b_against_a"]["psnr"] == pytest.approx(np.mean(psnrs))
+    assert min(psnrs) > 30
+    text = run(capsys, "compare", *both)
+    assert f"{np.mean(psnrs):.2f}" in text
+    assert "LPIPS" in text  # its column, or that it is left out
+    assert len(json.loads(run(capsys, "compare", *both, "--json", "--split", "all"))["views"]) == 8
+    assert json.loads(run(capsys, "compare", *both, "--json", "--views", "2"))["worst_view"] == "view_2"
+
+
+def test_compare_with_itself_is_valid_json(scene_path, cameras_path, capsys):
+    report = json.loads(run(capsys, "compare", scene_path, scene_path, "--cameras", cameras_path, "--json"))
+    assert report["mean"]["b_against_a"] == {"psnr": None, "ssim": 1}
+    assert "identical" in run(capsys, "compare", scene_path, scene_path, "--cameras", cameras_path)
+
+
+def test_compare_without_cameras(scene_path, potr_path, capsys):
+    assert cli.main(["compare", str(scene_path), str(potr_path)]) == 0
+    captured = capsys.readouterr()
+    assert "times smaller" in captured.out
+    assert "--cameras" in captured.err
+    report = json.loads(run(capsys, "compare", scene_path, potr_path, "--json"))
+    assert (report["a"]["splats"], report["b"]["splats"]) == (200, 200)
+    for option in (["--truth", "x"], ["--views", "0"], ["--split", "all"], ["-o", "x.png"]):
+        fails(capsys, ["compare", scene_path, potr_path, *option], 2, "--cameras")
+
+
+def test_compare_picture(tmp_path, scene_path, potr_path, cameras_path, capsys):
+    picture = tmp_path / "worst.png"
+    text = run(capsys, "compare", scene_path, potr_path, "--cameras", cameras_path, "-o", picture)
+    factor = int(text.split("difference times ")[1].split()[0])
+    worst = text.split("worst view: ")[1].split(",")[0]
+    with Image.open(picture) as image:
+        assert image.size == (3 * 64, 64)
+        assert image.text["Description"] == (
+            f"view {worst}: A, B and their difference times {factor}; A is scene.ply, B is scene.potr"
+        )
+
+
+def test_compare_with_photographs(tmp_path, scene_path, potr_path, cameras_path, capsys):
+    """The uncompressed scene's own pictures as photographs: 8 bits are all that A loses."""
+    photos = tmp_path / "photos"
+    run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", photos, "--background", "white")
+    both = ["compare", scene_path, potr_path, "--cameras", cameras_path, "--background", "white"]
+    mean = json.loads(run(capsys, *both, "--truth", photos, "--json"))["mean"]
+    assert mean["a_against_photograph"]["psnr"] > 55
+    assert mean["b_against_photograph"]["psnr"] == pytest.approx(mean["b_against_a"]["psnr"], abs=0.5)
+    assert "loss by photo" in run(capsys, *both, "--truth", photos)
+
+    picture = tmp_path / "worst.png"
+    with_truth = [*both, "--truth", photos, "-o", picture]
+    fails(capsys, [*both, "--truth", tmp_path / "nowhere"], 2, "nowhere")
+    whole = (photos / "view_4.png").read_bytes()
+    (photos / "view_4.png").write_bytes(whole[: len(whole) // 2])
+    fails(capsys, with_truth, 1, "view_4.png", "damaged")
+    Image.new("RGB", (32, 64)).save(photos / "view_4.png")
+    fails(capsys, with_truth, 2, "32 x 64", "64 x 64")
+    (photos / "view_4.png").unlink()
+    fails(capsys, with_truth, 2, "no photograph of view 'view_4'")
+    assert not picture.exists()
+
+
+def test_compare_bad_calls(tmp_path, scene_path, potr_path, cameras_path, capsys, monkeypatch):
+    call = ["compare", scene_path, potr_path, "--cameras", cameras_path]
+    fails(capsys, ["compare", scene_path, tmp_path / "none.potr"], 2, "none.potr")
+    fails(capsys, ["compare", scene_path, potr_path, "--cameras", tmp_path / "none.json"], 2, "none.json")
+    fails(capsys, [*call, "-o", tmp_path], 2, "it is a directory")
+    fails(capsys, [*call, "--device", "77"], 1, "'77'")
+    fails(capsys, [*call, "--views", "nobody"], 2, "'nobody'")
+    potr_path.write_bytes(potr_path.read_bytes()[:-20])
+    fails(capsys, [*call, "-o", tmp_path / "worst.png"], 1, str(potr_path))
+    monkeypatch.setitem(sys.modules, "skimage.metrics", None)
+    fails(capsys, [*call[:2], scene_path, *call[3:]], 2, "pip install")
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cameras.json", "scene.ply", "scene.potr"]
+
+
+# ------------------------------------------------------------------------------------------ devices
+
+
+def test_devices(capsys):
+    report = json.loads(run(capsys, "devices", "--json"))
+    assert [entry["index"] for entry in report] == list(range(len(list_devices())))
+    assert [entry["name"] for entry in report if entry["chosen"]] == [Device().info.name]
+    lines = run(capsys, "devices").splitlines()
+    assert len(lines) == 1 + len(report)
+    assert [line.startswith("*") for line in lines[1:]] == [entry["chosen"] for entry in report]
+
+
+def test_devices_check(capsys, monkeypatch):
+    assert {entry["check"] for entry in json.loads(run(capsys, "devices", "--check", "--json"))} == {"passed"}
+
+    def broken(self):
+        raise DeviceError("1 + 1 is 3")
+
+    monkeypatch.setattr(Device, "self_check", broken)
+    assert cli.main(["devices", "--check"]) == 1
+    captured = capsys.readouterr()
+    assert "self-check: 1 + 1 is 3" in captured.out
+    assert captured.err.startswith("potr-cl: ")
+
+
+def test_no_device(capsys, monkeypatch):
+    monkeypatch.setattr("potr_cl.device.list_devices", list)
+    fails(capsys, ["devices"], 1, "no OpenCL device found")
