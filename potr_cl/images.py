@@ -95,4 +95,4 @@ def write_png(file: BinaryIO, pixels: NDArray[np.uint8], description: str = "") 
     text = PngImagePlugin.PngInfo()
     if description:
         text.add_text("Description", description)
-    Image.fromarray(pixels).save(file, format="PNG", pnginfo=text, optimize=True)
+    Image.fromarray(pixels).save(file, format="PNG", pnginfo=text)
