@@ -157,8 +157,10 @@ def _describe(index: int, platform: cl.Platform, handle: cl.Device) -> DeviceInf
         kind = "gpu"
     elif handle.type & cl.device_type.CPU:
         kind = "cpu"
-    family: Family = "cpu" if kind == "cpu" else "gpu"
     native = int(handle.native_vector_width_float)
+    # A CPU runtime that asks for scalars packs work-items into vectors itself, as GPUs do (Mesa's llvmpipe, which also
+    # ends every loop after 65,535 rounds: too few for one work-item a tile).
+    family: Family = "cpu" if kind == "cpu" and native > 1 else "gpu"
     return DeviceInfo(
         index=index,
         name=handle.name.strip(),

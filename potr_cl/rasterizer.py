@@ -198,8 +198,7 @@ class Rasterizer:
         self._build(scene.sh.shape[1])
         self._total = device.allocate(4, "the entry count")
         self._counts = Scratch(device, "the tile counts")
-        # Merging needs a second set of keys, the bitonic network sorts in place.
-        self._keys = [Scratch(device, "the tile lists' sort keys") for _ in range(1 if device.family == "gpu" else 2)]
+        self._keys = Scratch(device, "the tile lists' sort keys")
         self._image = Scratch(device, "the image")
         self._transmittance = Scratch(device, "the transmittance")
         self._scratch: View | None = None
@@ -259,11 +258,13 @@ class Rasterizer:
         """Scratch memory for a view, and all kernel arguments but the camera; does nothing for the view bound last."""
         device = self.device
         if self._counts.reserve(_COUNTER_BYTES * view.tiles):  # zero at first; each view leaves them so
-            cl.enqueue_fill_buffer(device.queue, self._counts.buffer, np.uint32(0), 0, self._counts.nbytes)
+            zeros = np.zeros(self._counts.nbytes // 4, np.uint32)
+            cl.enqueue_copy(device.queue, self._counts.buffer, zeros, is_blocking=True)
             self._bound = None
         pixels = view.camera.width * view.camera.height
         for scratch, size in (
-            *((keys, 8 * view.capacity) for keys in self._keys),
+            # The bitonic network sorts in place, merging needs room for as many keys again.
+            (self._keys, (8 if device.family == "gpu" else 16) * view.capacity),
             (self._image, 12 * pixels),
             (self._transmittance, 4 * pixels),
         ):
@@ -272,13 +273,12 @@ class Rasterizer:
         if self._bound is view:
             return
         stride, capacity = np.uint32(self._stride), np.uint32(view.capacity)
-        keys = [scratch.buffer for scratch in self._keys]
-        counts, camera = self._counts.buffer, _camera_struct(view.camera)
+        keys, counts, camera = self._keys.buffer, self._counts.buffer, _camera_struct(view.camera)
         self._project.set_args(*self._parameters, stride, camera, view.shapes, view.colours)
         self._count.set_args(view.shapes, stride, camera, counts)
         self._scan.set_args(counts, view.offsets, np.uint32(view.tiles), self._total)
-        self._fill.set_args(view.shapes, stride, camera, counts, keys[0], capacity)
-        self._sort.set_args(*keys, view.offsets, view.entries, counts, capacity)
+        self._fill.set_args(view.shapes, stride, camera, counts, keys, capacity)
+        self._sort.set_args(keys, view.offsets, view.entries, counts, capacity)
         self._composite.set_args(
             view.shapes,
             view.colours,
@@ -414,7 +414,7 @@ class Rasterizer:
             self._scratch.free()
         for buffer in (*self._parameters, self._total):
             self.device.free(buffer)
-        for scratch in (self._counts, *self._keys, self._image, self._transmittance):
+        for scratch in (self._counts, self._keys, self._image, self._transmittance):
             scratch.free()
 
 

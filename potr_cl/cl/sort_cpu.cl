@@ -2,21 +2,16 @@
 
 #define RUN 16
 
+/* all_keys holds the keys and behind them, from capacity on, as much room to merge into. */
 kernel void sort_tiles(
-    global ulong *all_keys,
-    global ulong *all_spare,
-    global const uint *offsets,
-    global uint *entries,
-    global uint *counts,
-    uint capacity)
+    global ulong *all_keys, global const uint *offsets, global uint *entries, global uint *counts, uint capacity)
 {
     const uint tile = get_global_id(0);
     const uint begin = min(offsets[tile], capacity);
     const uint n = min(offsets[tile + 1], capacity) - begin;
-    global ulong *keys = all_keys + begin;
-    global ulong *spare = all_spare + begin;
     counts[tile] = 0; /* ready for the next view */
 
+    global ulong *keys = all_keys + begin;
     for (uint run = 0; run < n; run += RUN) {
         uint end = min(run + RUN, n);
         for (uint i = run + 1; i < end; ++i) {
@@ -27,26 +22,26 @@ kernel void sort_tiles(
             keys[j] = key;
         }
     }
+    size_t from = 0, to = capacity;
     for (uint size = RUN; size < n; size *= 2) {
         for (uint low = 0; low < n; low += 2 * size) {
             uint middle = min(low + size, n), high = min(low + 2 * size, n);
             uint i = low, j = middle, k = low;
             while (i < middle && j < high) {
-                ulong left = keys[i], right = keys[j];
+                ulong left = keys[from + i], right = keys[from + j];
                 int first = left < right;
-                spare[k++] = first ? left : right;
+                keys[to + k++] = first ? left : right;
                 i += first;
                 j += !first;
             }
             while (i < middle)
-                spare[k++] = keys[i++];
+                keys[to + k++] = keys[from + i++];
             while (j < high)
-                spare[k++] = keys[j++];
+                keys[to + k++] = keys[from + j++];
         }
-        global ulong *swap = keys;
-        keys = spare;
-        spare = swap;
+        from = to;
+        to = capacity - to;
     }
     for (uint i = 0; i < n; ++i)
-        entries[begin + i] = (uint)keys[i];
+        entries[begin + i] = (uint)keys[from + i];
 }

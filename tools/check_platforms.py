@@ -1,0 +1,184 @@
+"""The rasterizer on every OpenCL runtime of this machine: python -m tools.check_platforms [--scenes FOLDER]
+
+Each device and kernel family runs in a process of its own, so that a runtime that crashes is one row of the table. What
+is checked: the device's self-check; small random scenes of every SH degree and both rules against the float64
+definition; the same bytes twice; and, where FOLDER holds scenes with reference renders, PSNR against them.
+
+Oclgrind, where installed, simulates small scenes under its race, bounds and initialisation checks. pip's PoCL, Debian's
+PoCL (pocl-opencl-icd), Intel's (intel-opencl-rt) and Mesa's rusticl (mesa-opencl-icd) are found if they are there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from potr_cl.device import Device, DeviceInfo, list_devices
+from potr_cl.formats import load_cameras, load_scene
+from potr_cl.rasterizer import GSPLAT, INRIA, Rasterizer
+from tests import reference
+from tests.raster_scenes import camera, random_splats, splats, tilted_camera
+
+#: As in the tests: pixels that come no nearer, relatively, to 1/255 and 1e-4 cannot flip.
+CLEAR = 1e-4
+TOLERANCE = 2e-5
+
+
+def check_definition(device: Device, sizes: tuple[int, ...] = (30, 400)) -> dict[str, Any]:
+    """Largest error clear of thresholds, and the pixels that flipped, over random scenes."""
+    worst, flips, pixels, same = 0.0, 0, 0, True
+    for degree in range(4):
+        for rules in (INRIA, GSPLAT):
+            for size in sizes:
+                scene, view = random_splats(size, degree, seed=degree), tilted_camera(degree, 83, 61)
+                rasterizer = Rasterizer(device, scene, rules)
+                image, transmittance = rasterizer.render(view)
+                same &= image.tobytes() == rasterizer.render(view)[0].tobytes()
+                rasterizer.free()
+                wanted = reference.render(scene, view, rules)
+                error = np.abs(image - wanted.image).max(axis=2)
+                error = np.maximum(error, np.abs(transmittance - wanted.transmittance))
+                worst = max(worst, float(error[wanted.margin > CLEAR].max()))
+                flips += int((error > TOLERANCE).sum())
+                pixels += error.size
+    return {"error": worst, "flips": flips, "pixels": pixels, "same_bytes": same}
+
+
+def check_scene(device: Device, folder: Path) -> dict[str, float]:
+    """Lowest PSNR against the reference renders, largest difference, and seconds a frame."""
+    rasterizer = Rasterizer(device, load_scene(folder / "point_cloud.ply"), GSPLAT)
+    cameras = {c.name: c for c in load_cameras(folder / "cameras.json")}
+    psnr, largest, times = np.inf, 0.0, []
+    for path in sorted((folder / "reference").glob("*.npz")):
+        image, _ = rasterizer.render(cameras[path.stem])
+        with np.load(path) as theirs:
+            error = image - theirs["rgb"]
+        psnr = min(psnr, float(-10 * np.log10(np.mean(np.square(error)))))
+        largest = max(largest, float(np.abs(error).max()))
+        for _ in range(5):
+            started = time.perf_counter()
+            rasterizer.render_device(cameras[path.stem])
+            times.append(time.perf_counter() - started)
+    rasterizer.free()
+    return {"psnr": psnr, "largest": largest, "seconds": min(times)}
+
+
+def check_device(index: int, family: str, scenes: Path | None) -> dict[str, Any]:
+    """Everything about one device and family."""
+    device = Device(list_devices()[index], family=family)  # type: ignore[arg-type]
+    device.self_check()
+    result = {"vector_width": device.vector_width, **check_definition(device)}
+    for name in ("lego", "plush"):
+        if scenes and (scenes / name / "reference").exists():
+            result[name] = check_scene(device, scenes / name)
+    return result
+
+
+def simulate() -> None:
+    """Inside Oclgrind: every kernel, both families, every vector width, on scenes as small as it is slow.
+
+    Nothing is freed: Oclgrind mistakes a new buffer in an old one's place for memory that no one has written.
+    """
+    info = next(d for d in list_devices() if "oclgrind" in d.platform.lower())
+    kept: list[Rasterizer] = []
+    for family, width in (("gpu", 1), ("cpu", 4), ("cpu", 8), ("cpu", 16)):
+        device = Device(dataclasses.replace(info, vector_width=width), family=family)  # type: ignore[arg-type]
+        device.free = lambda buffer: None  # type: ignore[method-assign]
+        for rules in (INRIA, GSPLAT):
+            for size in (60, 400):
+                scene, view = random_splats(size, 3, seed=1), tilted_camera(1, 40, 24)
+                kept.append(Rasterizer(device, scene, rules))
+                image, _ = kept[-1].render(view)
+                wanted = reference.render(scene, view, rules)
+                error = np.abs(image - wanted.image)[wanted.margin > CLEAR].max()
+                assert error <= TOLERANCE, f"{family}: {error}"
+        centres = np.random.default_rng(0).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (5000, 3))
+        kept.append(Rasterizer(device, splats(centres, sigma=1e-3, logit=1)))
+        kept[-1].render(camera(16, 16))  # a list longer than local memory
+
+
+def run_oclgrind() -> str:
+    """One line: what Oclgrind found."""
+    with tempfile.TemporaryDirectory() as folder:
+        log = Path(folder) / "log"
+        # Its optimiser breaks stores of vectors; programs from pyopencl's cache lose their sources.
+        command = [
+            "oclgrind",
+            "--build-options",
+            "-cl-opt-disable",
+            "--data-races",
+            "--uninitialized",
+            "--log",
+            str(log),
+        ]
+        environment = os.environ | {"PYOPENCL_NO_CACHE": "1"}
+        run = subprocess.run(
+            [*command, sys.executable, "-m", "tools.check_platforms", "--simulate"],
+            env=environment, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        found = log.read_text().strip() if log.exists() else ""
+    if run.returncode:
+        return f"the run failed: {run.stderr.strip().splitlines()[-1]}"
+    return found.splitlines()[0] if found else "no race, no access out of bounds, no uninitialised read"
+
+
+def row(info: DeviceInfo, family: str, scenes: Path | None) -> str:
+    """One line of the table."""
+    command = [sys.executable, "-m", "tools.check_platforms", "--device", str(info.index), "--family", family]
+    run = subprocess.run(
+        [*command, *(["--scenes", str(scenes)] if scenes else [])], capture_output=True, text=True, check=False
+    )
+    head = f"| {info.name} | {info.platform}, {info.version} | {family}"
+    if run.returncode:
+        message = run.stderr.strip().splitlines()[-1] if run.stderr.strip() else f"exit code {run.returncode}"
+        return f"{head} | failed: {message} | | | | |"
+    r = json.loads(run.stdout.splitlines()[-1])
+    real = [
+        f"{r[n]['psnr']:.1f} dB, {r[n]['largest']:.1e}, {1e3 * r[n]['seconds']:.1f} ms" if n in r else ""
+        for n in ("lego", "plush")
+    ]
+    return (
+        f"{head} | {r['vector_width'] if family == 'cpu' else ''} | {r['error']:.1e} | "
+        f"{r['flips']} of {r['pixels']:,} | {'yes' if r['same_bytes'] else 'NO'} | {real[0]} | {real[1]} |"
+    )
+
+
+def main() -> None:
+    """Command line."""
+    os.environ.setdefault("RUSTICL_ENABLE", "llvmpipe")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=Path, help="folder with lego and plush")
+    parser.add_argument("--device", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--family", help=argparse.SUPPRESS)
+    parser.add_argument("--simulate", action="store_true", help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.simulate:
+        simulate()
+        return
+    if arguments.device is not None:
+        print(json.dumps(check_device(arguments.device, arguments.family, arguments.scenes)))
+        return
+    print(
+        "| device | runtime | family | vector | largest error | flipped pixels | same bytes twice | lego | plush |\n"
+        "|---|---|---|---|---|---|---|---|---|"
+    )
+    for info in list_devices():
+        for family in ("gpu", "cpu") if info.family == "cpu" else ("gpu",):
+            print(row(info, family, arguments.scenes), flush=True)
+    if shutil.which("oclgrind"):
+        print(f"\nOclgrind: {run_oclgrind()}")
+
+
+if __name__ == "__main__":
+    main()
