@@ -1,0 +1,163 @@
+"""The pruning controller: which splats go in which iteration (paper section "Iterative pruning"). Pure numpy.
+
+It knows removal effects and importances as numbers only; :mod:`potr_cl.removal` measures them.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from typing import Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.errors import UsageError
+
+F64 = NDArray[np.float64]
+Indices = NDArray[np.int64]
+
+
+class RemovalEffects(Protocol):
+    """What the controller asks of whoever measures the effects."""
+
+    def measure(self) -> tuple[F64, F64]:
+        """ΔMSE_k and I_k of all N splats (of removed ones: anything)."""
+
+    def remove(self, splats: Indices) -> None:
+        """Take splats out for good."""
+
+
+@dataclass(frozen=True)
+class PruningOptions:
+    """How to prune.
+
+    Attributes:
+        delta_mse_max: ΔMSE_MAX: splats whose removal costs less are candidates. Ignored where ``count`` is given.
+        iterations: rounds in which effects are measured anew.
+        a: the mapping function's curvature: how much a negative ΔMSE is preferred to a small one.
+        count: if given, the number of splats to keep, exactly.
+
+    Raises:
+        UsageError: a value is out of range.
+    """
+
+    delta_mse_max: float
+    iterations: int = 48
+    a: float = 10.0
+    count: int | None = None
+
+    def __post_init__(self) -> None:
+        if not self.delta_mse_max >= 0:
+            raise UsageError(f"ΔMSE_MAX is {self.delta_mse_max:g}, it must be 0 or more")
+        if self.iterations < 1:
+            raise UsageError(f"{self.iterations} pruning iterations: at least 1 is needed")
+        if not 0 < self.a < np.inf:
+            raise UsageError(f"the mapping's a is {self.a:g}, it must be positive")
+        if self.count is not None and self.count < 1:
+            raise UsageError(f"{self.count} splats to keep: at least 1 is needed")
+
+
+@dataclass(frozen=True)
+class Pruned:
+    """What a pruning run did.
+
+    Attributes:
+        order: (N,) all splats: first the removed ones as they went, then the kept ones by ascending ΔMSE.
+        kept: number of splats at the end of ``order`` that were kept.
+        iteration_of: (N,) int32, the iteration (from 0) in which each splat went; -1 for the kept ones.
+        iterations: rounds that were run: fewer than asked for when nothing was left to decide.
+    """
+
+    order: Indices
+    kept: int
+    iteration_of: NDArray[np.int32]
+    iterations: int
+
+    @property
+    def survivors(self) -> Indices:
+        """Indices of the kept splats, ascending."""
+        return np.sort(self.order[len(self.order) - self.kept :])
+
+
+def mapping(x: F64, a: float) -> F64:
+    """m(x) = x for x >= 0, (sqrt(1 - 2 a x) - 1) / a for x < 0 (paper, "The mapping function")."""
+    return np.where(x >= 0, x, (np.sqrt(1 - 2 * a * np.minimum(x, 0)) - 1) / a)
+
+
+def choose(delta_mse: F64, importance: F64, alive: Indices, remaining: int, options: PruningOptions) -> Indices:
+    """The splats to remove in one iteration, in the order of removal.
+
+    Splats that no view sees go at once whatever the budget: their removal changes nothing, and keeping them in the
+    lists costs time.
+
+    Args:
+        delta_mse, importance: (N,) of all splats.
+        alive: indices of the splats that are left, ascending.
+        remaining: iterations left, this one included.
+    """
+    effect, weight = delta_mse[alive], importance[alive]
+    surplus = len(alive)
+    if options.count is not None:
+        surplus = max(len(alive) - options.count, 0)
+        ascending = np.argsort(effect, kind="stable")[:surplus]
+        candidates = np.sort(ascending)
+        limit = float(effect[ascending[-1]]) if surplus else 0.0
+    else:
+        candidates = np.flatnonzero(effect < options.delta_mse_max)
+        limit = options.delta_mse_max
+    if len(candidates) == 0:
+        return alive[:0]
+    with np.errstate(divide="ignore", over="ignore"):
+        score = mapping(effect[candidates] / limit, options.a) if limit > 0 else effect[candidates]
+    candidates = candidates[np.argsort(score, kind="stable")]
+    if remaining <= 1:
+        return alive[candidates]
+    spent = np.cumsum(weight[candidates])
+    budget = weight[candidates].sum() / remaining
+    # Up to and including the splat with which the budget is reached.
+    chosen = candidates[: int(np.searchsorted(spent, budget)) + 1]
+    unseen = candidates[(weight[candidates] == 0) & (effect[candidates] == 0)]
+    gone: Indices = alive[np.concatenate([unseen, chosen[~np.isin(chosen, unseen)]])]
+    return gone
+
+
+def prune(
+    effects: RemovalEffects,
+    splats: int,
+    options: PruningOptions,
+    progress: Callable[[int, int], None] | None = None,
+    after_iteration: Callable[[int, Indices], None] | None = None,
+) -> Pruned:
+    """Run the schedule.
+
+    Args:
+        effects: measures and removes.
+        splats: N.
+        options: thresholds and iterations.
+        progress: called with the iterations done and the number of splats left.
+        after_iteration: called with the iteration and the splats that it removed.
+    """
+    alive = np.arange(splats, dtype=np.int64)
+    iteration_of = np.full(splats, -1, np.int32)
+    removed: list[Indices] = []
+    done = 0
+    delta_mse = np.zeros(splats)
+    for iteration in range(options.iterations):
+        delta_mse, importance = effects.measure()
+        gone = choose(delta_mse, importance, alive, options.iterations - iteration, options)
+        if len(gone) >= len(alive) and options.count is None:
+            gone = gone[: len(alive) - 1]  # an empty scene is no scene
+        done = iteration + 1
+        if len(gone) == 0:
+            break  # no candidate is left, and measuring again would find the same
+        iteration_of[gone] = iteration
+        removed.append(gone)
+        alive = alive[iteration_of[alive] < 0]
+        effects.remove(gone)
+        if progress is not None:
+            progress(done, len(alive))
+        if after_iteration is not None:
+            after_iteration(iteration, gone)
+    kept = alive[np.argsort(delta_mse[alive], kind="stable")]
+    return Pruned(np.concatenate([*removed, kept]), len(kept), iteration_of, done)

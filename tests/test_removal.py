@@ -1,0 +1,231 @@
+"""Removal effects against brute force in float64: render with and without each splat."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.cameras import Camera
+from potr_cl.device import Device
+from potr_cl.errors import UsageError
+from potr_cl.pruning import PruningOptions, prune
+from potr_cl.rasterizer import INRIA, Rasterizer
+from potr_cl.removal import RemovalSweep
+from potr_cl.scene import Scene
+from tests import reference
+from tests.scenes import random_scene, ring_of_cameras
+
+
+@pytest.fixture(scope="module", params=["cpu", "gpu"])
+def device(request):
+    device = Device(family=request.param)
+    yield device
+    assert device.allocated == 0, "a sweep did not give all its memory back"
+
+
+def visible_scene(splats: int, degree: int = 0, seed: int = 0) -> Scene:
+    """Few layers, splats of several pixels: no pixel ends early, so that brute force measures the same thing."""
+    scene = random_scene(splats, degree, seed)
+    rng = np.random.default_rng(seed + 100)
+    return dataclasses.replace(
+        scene,
+        log_scales=rng.normal(-2, 0.5, size=(splats, 3)).astype(np.float32),
+        opacity_logits=rng.normal(-1, 1.5, size=splats).astype(np.float32),
+    )
+
+
+def without(scene: Scene, gone) -> Scene:
+    return scene.subset(np.setdiff1d(np.arange(len(scene)), gone))
+
+
+def renders(scene: Scene, cameras: list[Camera], background=(0.0, 0.0, 0.0)):
+    return [reference.render(scene, c, INRIA, background).image for c in cameras]
+
+
+def mean_squared(images, targets) -> float:
+    return float(np.mean([np.mean((a - b) ** 2) for a, b in zip(images, targets, strict=True)]))
+
+
+def brute_force(scene, cameras, targets, splats, gone=(), background=(0.0, 0.0, 0.0)):
+    """ΔMSE of removing each of ``splats`` from what is left after ``gone``."""
+    now = mean_squared(renders(without(scene, gone), cameras, background), targets)
+    return np.array(
+        [mean_squared(renders(without(scene, [*gone, k]), cameras, background), targets) - now for k in splats]
+    )
+
+
+def close(predicted, true):
+    """Relative to the effect, above a floor: thresholds at 1/255 flip, float32 ends."""
+    floor = 1e-4 * np.abs(true).max() * 1e-3
+    error = np.abs(predicted - true) / (np.abs(true) + floor)
+    assert np.median(error) <= 1e-4
+    assert np.quantile(error, 0.95) <= 1e-2
+
+
+def sweep(device, scene, cameras, tolerance=0.0, background=(0.0, 0.0, 0.0)):
+    rasterizer = Rasterizer(device, scene, background=background)
+    return rasterizer, RemovalSweep(rasterizer, cameras, tolerance)
+
+
+def finish(rasterizer, removal):
+    removal.free()
+    rasterizer.free()
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 0.3, 0.0)])
+def test_single_removals(device, background):
+    scene = visible_scene(60, 1)
+    cameras = ring_of_cameras(3, size=48)
+    rasterizer, removal = sweep(device, scene, cameras, background=background)
+    effect, importance = removal.measure()
+    finish(rasterizer, removal)
+    targets = renders(scene, cameras, background)
+    close(effect, brute_force(scene, cameras, targets, range(60), background=background))
+    assert (effect >= 0).all()  # nothing is better than the target itself
+    transmittances = [reference.render(scene, c, INRIA).transmittance for c in cameras]
+    assert importance.sum() == pytest.approx(np.mean([1 - t.mean() for t in transmittances]), rel=1e-5)
+
+
+def test_single_removals_when_others_are_gone(device):
+    # Black twins in front of white splats; once they are gone, the picture is too bright.
+    scene = visible_scene(25, seed=3).subset(np.tile(np.arange(25), 2))
+    scene.sh[:, 0] = np.where(np.arange(50) < 25, -2, 2)[:, None]
+    scene.opacity_logits[:25] = 3
+    cameras = ring_of_cameras(2, size=48)
+    gone = np.arange(0, 25, 2)
+    left = np.setdiff1d(np.arange(50), gone)
+    rasterizer, removal = sweep(device, scene, cameras)
+    removal.measure()
+    removal.remove(gone)
+    effect, _ = removal.measure()
+    finish(rasterizer, removal)
+    targets = renders(scene, cameras)
+    true = brute_force(scene, cameras, targets, left, list(gone))
+    assert (true < 0).any()  # some removals improve the match
+    close(effect[left], true)
+
+
+def test_alpha_at_the_cap_behind_hundreds_of_layers(device):
+    """No digits are lost where the paper's formula divides by 1 - alpha and subtracts what the layers in front add."""
+    layers, opaque = 320, 300
+    logits = np.full(layers, -4.6, np.float32)  # alpha 0.01; a twentieth of the light is left at the opaque one
+    logits[opaque] = 12  # alpha 0.99
+    means = np.zeros((layers, 3), np.float32)
+    means[:, 0] = np.linspace(-2, 2, layers)
+    quaternions = np.zeros((layers, 4), np.float32)
+    quaternions[:, 0] = 1
+    dc = np.random.default_rng(0).normal(size=(layers, 1, 3)).astype(np.float32)
+    scene = Scene(means, np.full((layers, 3), 0.5, np.float32), quaternions, logits, dc)
+    eye = np.array([-8.0, 0, 0])
+    rotation = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    cameras = [Camera("along", 16, 16, 60, 60, 8, 8, rotation, -rotation @ eye)]
+    rasterizer, removal = sweep(device, scene, cameras)
+    effect, _ = removal.measure()
+    finish(rasterizer, removal)
+    splats = [0, 150, 299, opaque, 301, 310, 319]
+    true = brute_force(scene, cameras, renders(scene, cameras), splats)
+    assert np.abs(effect[splats] / true - 1).max() < 1e-3
+
+
+def test_same_bits_every_time(device, lego_excerpt, lego_excerpt_cameras):
+    results = []
+    for _ in range(3):
+        rasterizer, removal = sweep(device, lego_excerpt, lego_excerpt_cameras[:3])
+        removal.measure()
+        removal.remove(np.arange(0, 1500, 7))
+        results.append(np.concatenate(removal.measure()).tobytes())
+        finish(rasterizer, removal)
+    assert len(set(results)) == 1
+
+
+def test_sums_kept_over_removals_are_those_of_a_new_sweep(device, lego_excerpt, lego_excerpt_cameras):
+    """Exact totals: tiles that were skipped because nothing changed add up to what sweeping all of them gives."""
+    cameras = lego_excerpt_cameras[:2]
+    few = np.arange(0, 20)
+    rasterizer, removal = sweep(device, lego_excerpt, cameras)
+    removal.measure()
+    removal.remove(few)
+    skipping = removal.measure()
+    removal.sweep_everything()
+    everything = removal.measure()
+    finish(rasterizer, removal)
+    left = np.setdiff1d(np.arange(1500), few)
+    for a, b in zip(skipping, everything, strict=True):
+        assert np.array_equal(a[left], b[left])
+
+
+def test_a_view_that_sees_nothing_changes_only_the_mean(device):
+    scene = visible_scene(30)
+    cameras = ring_of_cameras(1, size=48)
+    away = dataclasses.replace(cameras[0], name="away", translation=np.array([0, 0, -50.0]))
+    rasterizer, removal = sweep(device, scene, cameras)
+    one = removal.measure()
+    finish(rasterizer, removal)
+    rasterizer, removal = sweep(device, scene, [*cameras, away])
+    two = removal.measure()
+    finish(rasterizer, removal)
+    for a, b in zip(one, two, strict=True):
+        assert np.allclose(a, 2 * b, rtol=1e-6, atol=1e-14)
+
+
+def test_views_of_different_sizes_count_the_same(device):
+    scene = visible_scene(30)
+    large = ring_of_cameras(2, size=96)[0]
+    small = ring_of_cameras(2, size=48)[1]
+    separate = []
+    for camera in (large, small):
+        rasterizer, removal = sweep(device, scene, [camera])
+        separate.append(removal.measure())
+        finish(rasterizer, removal)
+    rasterizer, removal = sweep(device, scene, [large, small])
+    together = removal.measure()
+    finish(rasterizer, removal)
+    for i in range(2):
+        assert np.allclose(together[i], (separate[0][i] + separate[1][i]) / 2, rtol=1e-5, atol=1e-13)
+
+
+def test_identical_splats_share_their_effect(device):
+    scene = visible_scene(1).subset(np.zeros(40, np.int64))
+    cameras = ring_of_cameras(2, size=48)
+    rasterizer, removal = sweep(device, scene, cameras)
+    effect, importance = removal.measure()
+    finish(rasterizer, removal)
+    assert np.isfinite(effect).all()
+    # Nearer by number: the first is in front of all others.
+    assert (np.diff(importance) <= 1e-12).all()
+
+
+def test_pruning_to_one_splat(device):
+    scene = visible_scene(40)
+    cameras = ring_of_cameras(2, size=48)
+    rasterizer, removal = sweep(device, scene, cameras)
+    pruned = prune(removal, 40, PruningOptions(np.inf, 5))
+    finish(rasterizer, removal)
+    assert pruned.kept == 1
+
+
+def test_pruning_keeps_the_picture_better_than_importance(device, lego_excerpt, lego_excerpt_cameras):
+    cameras = [c for c in lego_excerpt_cameras if c.split == "train"][:4]
+    rasterizer, removal = sweep(device, lego_excerpt, cameras)
+    _, importance = removal.measure()
+    pruned = prune(removal, 1500, PruningOptions(0, 12, count=750))
+    removal.free()
+    by_importance = np.sort(np.argsort(importance)[-750:])
+
+    def error(kept):
+        other = Rasterizer(device, lego_excerpt.subset(kept))
+        total = sum(np.mean((other.render(c)[0] - rasterizer.render(c)[0]) ** 2) for c in cameras)
+        other.free()
+        return total
+
+    assert error(pruned.survivors) < 0.5 * error(by_importance)
+    rasterizer.free()
+
+
+def test_no_view_is_an_error(device):
+    rasterizer = Rasterizer(device, visible_scene(3))
+    with pytest.raises(UsageError, match="at least one view"):
+        RemovalSweep(rasterizer, [])
+    rasterizer.free()
