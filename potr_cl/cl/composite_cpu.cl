@@ -7,31 +7,9 @@
 
 #include "lanes.clh"
 #include "splat.clh"
+#include "splat_block.clh"
 
 #define VECTORS (TILE / LANES)
-#define BLOCK 16
-
-/* Half-open range of pixel rows, within a tile whose first pixel is `origin`, that the ellipse touches between the
-   tile's left and right edge: its vertical extent within that strip. */
-inline int2 ellipse_pixel_rows(float4 s0, float4 s1, int2 origin)
-{
-    float level = ellipse_level(s1);
-    float a = s0.z, b = s0.w, c = s1.x;
-    float g = b * b + c * c;
-    float reach_x = sqrt(level * g) / (a * c) + PIXEL_SLACK + RELATIVE_SLACK * fabs(s0.x);
-    float d0 = fmax(origin.x + 0.5f - s0.x, -reach_x);
-    float d1 = fmin(origin.x + (TILE - 0.5f) - s0.x, reach_x);
-    float peak = -b / a * (sqrt(level) / c);
-    float bottom_x = fmin(fmax(peak, d0), d1);
-    float top_x = fmin(fmax(-peak, d0), d1);
-    float ac = a * c;
-    float bottom = (sqrt(fmax(g * level - ac * ac * bottom_x * bottom_x, 0.0f)) - a * b * bottom_x) / g;
-    float top = (-sqrt(fmax(g * level - ac * ac * top_x * top_x, 0.0f)) - a * b * top_x) / g;
-    float slack = PIXEL_SLACK + RELATIVE_SLACK * (fabs(s0.y) + fmax(fabs(bottom), fabs(top)));
-    float first = ceil(s0.y + top - slack - 0.5f) - origin.y;
-    float last = floor(s0.y + bottom + slack - 0.5f) - origin.y;
-    return (int2)((int)fmin(fmax(first, 0.0f), (float)TILE), (int)fmin(fmax(last + 1.0f, 0.0f), (float)TILE));
-}
 
 kernel void composite(
     global const float4 *shapes,
@@ -59,37 +37,35 @@ kernel void composite(
     }
 
     int first_alive = 0, end_alive = pixel_rows;
-    for (uint block = min(offsets[tile], capacity); block < end && first_alive < end_alive; block += BLOCK) {
-        const uint block_end = min(block + BLOCK, end);
-        for (uint e = block; e < block_end; ++e) {
-            uint splat = entries[e];
-            float4 s0 = shapes[2 * splat], s1 = shapes[2 * splat + 1];
-            float4 colour = colours[splat];
-            int2 rows = ellipse_pixel_rows(s0, s1, origin);
-            rows.x = max(rows.x, first_alive);
-            rows.y = min(rows.y, end_alive);
+    SplatBlock block;
+    for (uint begin = min(offsets[tile], capacity); begin < end && first_alive < end_alive; begin += BLOCK) {
+        fetch_block(&block, shapes, colours, entries, begin, end, origin);
+        for (int k = 0; k < BLOCK; ++k) {
+            const int first_row = max(block.first_row[k], first_alive);
+            const int end_row = min(block.end_row[k], end_alive);
+            const float x = block.x[k], a = block.a[k];
             vfloat au[VECTORS];
             for (int v = 0; v < VECTORS; ++v)
-                au[v] = s0.z * ((LANE_NUMBERS + (origin.x + v * LANES + 0.5f)) - s0.x);
-            for (int row = rows.x; row < rows.y; ++row) {
-                float dy = origin.y + row + 0.5f - s0.y;
-                float bu = s0.w * dy;
-                float cv = s1.x * dy;
-                float level = mad(-cv, cv, s1.y);
+                au[v] = a * ((LANE_NUMBERS + (origin.x + v * LANES + 0.5f)) - x);
+            for (int row = first_row; row < end_row; ++row) {
+                const float dy = origin.y + row + 0.5f - block.y[k];
+                const float bu = block.b[k] * dy;
+                const float cv = block.c[k] * dy;
+                const float level = mad(-cv, cv, block.log2_opacity[k]);
                 for (int v = 0; v < VECTORS; ++v) {
-                    int i = row * VECTORS + v;
-                    vfloat u = au[v] + bu;
-                    vfloat power = mad(-u, u, (vfloat)(level));
+                    const int i = row * VECTORS + v;
+                    const vfloat u = au[v] + bu;
+                    const vfloat power = mad(-u, u, (vfloat)(level));
                     vfloat alpha = fmin(exp2_polynomial(power), ALPHA_CAP);
                     alpha = power >= LOG2_ALPHA_MIN ? alpha : (vfloat)(0.0f);
-                    vfloat before = t[i];
-                    vfloat after = mad(-alpha, before, before);
-                    vint goes_on = after >= STOP;
-                    vfloat weight = goes_on ? alpha * before : (vfloat)(0.0f);
+                    const vfloat before = t[i];
+                    const vfloat after = mad(-alpha, before, before);
+                    const vint goes_on = after >= STOP;
+                    const vfloat weight = goes_on ? alpha * before : (vfloat)(0.0f);
                     t[i] = goes_on ? after : -fabs(before);
-                    r[i] = mad(weight, (vfloat)(colour.x), r[i]);
-                    g[i] = mad(weight, (vfloat)(colour.y), g[i]);
-                    b[i] = mad(weight, (vfloat)(colour.z), b[i]);
+                    r[i] = mad(weight, (vfloat)(block.red[k]), r[i]);
+                    g[i] = mad(weight, (vfloat)(block.green[k]), g[i]);
+                    b[i] = mad(weight, (vfloat)(block.blue[k]), b[i]);
                 }
             }
         }
