@@ -90,7 +90,7 @@ GSPLAT = RasterRules(alpha_cap=0.999, square_extent=False, stop_included=True)
 
 
 @lru_cache(maxsize=4096)
-def _camera_struct(camera: Camera) -> NDArray[Any]:
+def camera_struct(camera: Camera) -> NDArray[Any]:
     """The camera as the kernels take it (``View`` in cl/splat.clh)."""
     struct = np.zeros((), _CAMERA)
     struct["rotation"] = camera.rotation.ravel()
@@ -160,10 +160,17 @@ class View:
         self._lists.free()
         self._lists = trimmed
 
+    def free_geometry(self) -> None:
+        """Give shapes and colours back, for those who keep the lists and project again (:meth:`Rasterizer.project`)."""
+        for buffer in (self.shapes, self.colours):
+            if buffer is not None:
+                self._device.free(buffer)
+        self.shapes = self.colours = None
+
     def free(self) -> None:
         """Give the buffers back."""
-        for buffer in (self.shapes, self.colours, self.offsets):
-            self._device.free(buffer)
+        self.free_geometry()
+        self._device.free(self.offsets)
         self._lists.free()
 
 
@@ -175,6 +182,10 @@ class Rasterizer:
         scene: to render; copied to the device, later changes of its arrays are not seen.
         rules: of the rasterizer to follow.
         background: R, G, B behind everything.
+
+    Attributes:
+        device, rules, background: as given.
+        splats: N. stride: N padded; buffers of a value a splat hold so many.
 
     Raises:
         DeviceError: the scene does not fit, or the kernels cannot be built.
@@ -193,7 +204,7 @@ class Rasterizer:
         self.rules = rules
         self.background = background
         self.splats = len(scene)
-        self._stride = max(-(-len(scene) // _SPLAT_GROUP), 1) * _SPLAT_GROUP
+        self.stride = max(-(-len(scene) // _SPLAT_GROUP), 1) * _SPLAT_GROUP
         self._upload(scene)
         self._build(scene.sh.shape[1])
         self._total = device.allocate(4, "the entry count")
@@ -208,7 +219,7 @@ class Rasterizer:
         """Activate the parameters and copy them, structure of arrays, padded to the stride."""
 
         def upload(columns: NDArray[Any], fill: float, what: str) -> cl.Buffer:
-            padded = np.full((columns.shape[1], self._stride), fill, np.float32)
+            padded = np.full((columns.shape[1], self.stride), fill, np.float32)
             padded[:, : self.splats] = columns.T
             return self.device.upload(padded, what)
 
@@ -272,8 +283,8 @@ class Rasterizer:
                 self._bound = None
         if self._bound is view:
             return
-        stride, capacity = np.uint32(self._stride), np.uint32(view.capacity)
-        keys, counts, camera = self._keys.buffer, self._counts.buffer, _camera_struct(view.camera)
+        stride, capacity = np.uint32(self.stride), np.uint32(view.capacity)
+        keys, counts, camera = self._keys.buffer, self._counts.buffer, camera_struct(view.camera)
         self._project.set_args(*self._parameters, stride, camera, view.shapes, view.colours)
         self._count.set_args(view.shapes, stride, camera, counts)
         self._scan.set_args(counts, view.offsets, np.uint32(view.tiles), self._total)
@@ -293,22 +304,28 @@ class Rasterizer:
         self._bound = view
 
     def _enqueue_project(self, view: View) -> None:
-        self._project.set_arg(6, _camera_struct(view.camera))
-        self.device.launch(self._project, (self._stride // self._lanes,), (_SPLAT_GROUP // self._lanes,))
+        self._project.set_arg(6, camera_struct(view.camera))
+        self.device.launch(self._project, (self.stride // self._lanes,), (_SPLAT_GROUP // self._lanes,))
+
+    def project(self, camera: Camera, shapes: cl.Buffer, colours: cl.Buffer) -> None:
+        """Enqueue a view's projection alone, into buffers like :class:`View`'s."""
+        self._project.set_args(*self._parameters, np.uint32(self.stride), camera_struct(camera), shapes, colours)
+        self._bound = None
+        self.device.launch(self._project, (self.stride // self._lanes,), (_SPLAT_GROUP // self._lanes,))
 
     def _enqueue_lists(self, view: View) -> None:
         """Enqueue tile lists and depth order of a projected view."""
-        camera = _camera_struct(view.camera)
+        camera = camera_struct(view.camera)
         launch = self.device.launch
         self._count.set_arg(2, camera)
-        launch(self._count, (self._stride,), (_SPLAT_GROUP,))
+        launch(self._count, (self.stride,), (_SPLAT_GROUP,))
         launch(self._scan, (self._tile_group,), (self._tile_group,))
         self._fill.set_arg(2, camera)
-        launch(self._fill, (self._stride,), (_SPLAT_GROUP,))
+        launch(self._fill, (self.stride,), (_SPLAT_GROUP,))
         launch(self._sort, (view.tiles * self._tile_group,), (self._tile_group,))
 
     def _enqueue_composite(self, view: View) -> None:
-        self._composite.set_arg(5, _camera_struct(view.camera))
+        self._composite.set_arg(5, camera_struct(view.camera))
         self.device.launch(self._composite, (view.tiles * self._tile_group,), (self._tile_group,))
 
     def _settle(self, view: View) -> bool:
@@ -338,7 +355,7 @@ class Rasterizer:
         Raises:
             DeviceError: it does not fit the device.
         """
-        view = View(self.device, camera, self._stride, self._first_capacity())
+        view = View(self.device, camera, self.stride, self._first_capacity())
         self._bind(view)
         self._enqueue_project(view)
         self._enqueue_lists(view)
@@ -405,7 +422,7 @@ class Rasterizer:
             capacity = max(capacity, old.capacity)
             old.free()
             self._scratch = None
-        self._scratch = View(self.device, camera, self._stride, capacity)
+        self._scratch = View(self.device, camera, self.stride, capacity)
         return self._scratch
 
     def free(self) -> None:

@@ -4,6 +4,8 @@ splat's removal").
 A view's projection, tile lists and depth order are made once: pruning never changes them, it only takes entries out.
 Each measurement is one sweep over the tiles of every view (cl/removal_*.cl), whose sums go to exact integer totals a
 splat; a tile in which little has changed since its last sweep keeps its sums.
+
+What does not fit the memory budget is made again when it is needed: first the projections, then whole views.
 """
 
 from __future__ import annotations
@@ -16,25 +18,59 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.cameras import Camera
+from potr_cl.device import Device
 from potr_cl.errors import UsageError
-from potr_cl.rasterizer import Rasterizer, View, _camera_struct
+from potr_cl.rasterizer import TILE, Rasterizer, View, camera_struct
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+#: Part of the device's memory that the views may take unless the caller sets a budget: on CPUs it is everybody's.
+_SHARE = 0.5
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """What a measurement may skip.
+
+    Attributes:
+        tolerance: a tile is swept again once the importance removed from it, as a part of its area, exceeds this.
+            0: whenever anything was removed from it; negative: always.
+        turns: a view is swept in every so many-th measurement only (all of them in the first).
+        memory: bytes of device memory that the views may take; None: half of the device's.
+
+    Raises:
+        UsageError: a value is out of range.
+    """
+
+    tolerance: float = 0.01
+    turns: int = 1
+    memory: int | None = None
+
+    def __post_init__(self) -> None:
+        if not self.tolerance < np.inf:
+            raise UsageError(f"the tile tolerance is {self.tolerance:g}, it must be a number")
+        if self.turns < 1:
+            raise UsageError(f"views cannot be swept every {self.turns} measurements: at least 1 is needed")
+        if self.memory is not None and self.memory < 0:
+            raise UsageError(f"a memory budget of {self.memory} bytes is less than nothing")
+
 
 @dataclass
 class _Swept:
-    """A view and what the sweeps keep of it."""
+    """A view and what is kept of it from sweep to sweep."""
 
     view: View
-    struct: NDArray[np.void]
     begins: cl.Buffer
     lengths: cl.Buffer
     sums: cl.Buffer
     target: cl.Buffer
-    weight: float
     stale: NDArray[np.float32]
+
+    def free(self, device: Device) -> None:
+        self.view.free()
+        for buffer in (self.begins, self.lengths, self.sums, self.target):
+            device.free(buffer)
 
 
 class RemovalSweep:
@@ -43,9 +79,12 @@ class RemovalSweep:
     Args:
         rasterizer: holds the uncompressed scene, its rules and its background.
         cameras: the views that count.
-        tolerance: a tile is swept again once the importance removed from it, as a part of its area, exceeds this; 0:
-            whenever anything was removed from it.
+        options: what may be skipped.
         progress: called with the views prepared and their number.
+
+    Attributes:
+        sweeps: work done so far, as a multiple of sweeping every tile of every view once.
+        kept_views: views whose lists fit the memory budget; the others are made again for every measurement.
 
     Raises:
         UsageError: no camera.
@@ -56,16 +95,53 @@ class RemovalSweep:
         self,
         rasterizer: Rasterizer,
         cameras: Sequence[Camera],
-        tolerance: float = 0.0,
+        options: SweepOptions | None = None,
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
         if not cameras:
             raise UsageError("removal effects need at least one view")
         self._rasterizer = rasterizer
         self._device = device = rasterizer.device
-        self._tolerance = tolerance
-        self._first = True
-        rules = rasterizer.rules
+        self._options = options or SweepOptions()
+        self._measured = 0
+        self.sweeps = 0.0
+        self._build()
+
+        self.splats = rasterizer.splats
+        self._alive = np.ones(rasterizer.stride, np.uint8)
+        self._alive_buffer = device.upload(self._alive, "the splats that are left")
+        # Views of different sizes count the same: each is scaled to the size of the largest.
+        self._views = len(cameras)
+        self._pixels = max(c.width * c.height for c in cameras)
+        # Fixed point: an effect of 16 a pixel and channel in every tile of every view still fits 62 bits.
+        area = max((c.width + TILE - 1) * (c.height + TILE - 1) for c in cameras)
+        self._scale = 2.0 ** np.floor(60 - np.log2(12.0 * area * self._views))
+        self._bound = 48.0 * TILE * TILE
+        self._totals = self._zero_totals()
+
+        memory = self._options.memory
+        self._budget = device.info.memory * _SHARE if memory is None else memory
+        self._swept: list[_Swept] = []
+        self._transient: list[Camera] = []
+        self._shared: tuple[cl.Buffer, cl.Buffer] | None = None
+        self._tile_count = 0
+        most = 1
+        for done, camera in enumerate(cameras, start=1):
+            swept = self._prepare(camera)
+            most = max(most, swept.view.tiles)
+            self._tile_count += swept.view.tiles
+            self._keep(swept)
+            if progress is not None:
+                progress(done, len(cameras))
+        self._tiles = device.allocate(4 * most, "the tiles to sweep")
+        self._stale = device.allocate(4 * most, "the tiles' staleness")
+
+    @property
+    def kept_views(self) -> int:
+        return len(self._swept)
+
+    def _build(self) -> None:
+        device, rules = self._device, self._rasterizer.rules
         limits: dict[str, float | int] = {"ALPHA_CAP": float(rules.alpha_cap), "STOP": rules.stop}
         if device.family == "gpu":
             limits["NATIVE_EXP2"] = int(device.native_exp2)
@@ -76,22 +152,8 @@ class RemovalSweep:
         self._stale_kernel = device.kernel(source, "staleness", **limits)
         self._group = 64 if device.family == "gpu" else 1
 
-        self.splats = rasterizer.splats
-        self._alive = np.ones(rasterizer._stride, np.uint8)
-        self._alive_buffer = device.upload(self._alive, "the splats that are left")
-        self._totals = device.upload(np.zeros((rasterizer._stride, 4), np.uint32), "the removal effects")
-        # Views of different sizes count the same: each is scaled to the size of the largest.
-        self._pixels = max(c.width * c.height for c in cameras)
-        self._scale = 2.0 ** np.floor(60 - np.log2(12.0 * self._pixels * len(cameras)))
-        self._bound = 2.0**60 / self._scale / len(cameras)
-        self._swept: list[_Swept] = []
-        for done, camera in enumerate(cameras, start=1):
-            self._swept.append(self._prepare(camera))
-            if progress is not None:
-                progress(done, len(cameras))
-        most = max(s.view.tiles for s in self._swept)
-        self._tiles = device.allocate(4 * most, "the tiles to sweep")
-        self._stale = device.allocate(4 * most, "the tiles' staleness")
+    def _zero_totals(self) -> cl.Buffer:
+        return self._device.upload(np.zeros((self._rasterizer.stride, 4), np.uint32), "the removal effects")
 
     def _prepare(self, camera: Camera) -> _Swept:
         device = self._device
@@ -99,14 +161,62 @@ class RemovalSweep:
         offsets = device.download(view.offsets, (view.tiles + 1,), np.uint32)
         return _Swept(
             view=view,
-            struct=_camera_struct(camera),
             begins=device.upload(offsets[:-1], "the tile lists"),
             lengths=device.upload(np.diff(offsets), "the tile lists"),
             sums=device.upload(np.zeros((view.entry_count, 2), np.float32), "the tiles' removal effects"),
             target=device.allocate(12 * camera.width * camera.height, "the target image"),
-            weight=self._pixels / (camera.width * camera.height),
             stale=np.full(view.tiles, np.inf, np.float32),
         )
+
+    def _keep(self, swept: _Swept) -> None:
+        """Keep a prepared view as far as the budget allows."""
+        view = swept.view
+        geometry = 48 * self._rasterizer.stride
+        lists = 12 * view.entry_count + 12 * view.tiles + 12 * view.camera.width * view.camera.height
+        # The first view stands for the others: geometry is kept for all of them or for none.
+        if not self._swept and not self._transient and self._views * (lists + geometry) > self._budget:
+            self._shared = (
+                self._device.allocate(32 * self._rasterizer.stride, "the projected splats"),
+                self._device.allocate(16 * self._rasterizer.stride, "the projected splats' colours"),
+            )
+        self._budget -= lists + (0 if self._shared else geometry)
+        if self._budget < 0:
+            self._budget = 0
+            self._transient.append(view.camera)
+            swept.free(self._device)
+            return
+        if self._shared:
+            view.free_geometry()
+        self._swept.append(swept)
+
+    def _sweep(self, swept: _Swept, tiles: NDArray[np.uint32], first: bool, totals: cl.Buffer) -> None:
+        device, view = self._device, swept.view
+        shapes, colours = view.shapes, view.colours
+        if shapes is None:
+            assert self._shared is not None
+            shapes, colours = self._shared
+            self._rasterizer.project(view.camera, shapes, colours)
+        weight = self._pixels / (view.camera.width * view.camera.height)
+        cl.enqueue_copy(device.queue, self._tiles, tiles, is_blocking=True)
+        self._kernel.set_args(
+            shapes,
+            colours,
+            self._alive_buffer,
+            self._tiles,
+            swept.begins,
+            swept.lengths,
+            view.entries,
+            camera_struct(view.camera),
+            *(np.float32(channel) for channel in self._rasterizer.background),
+            np.int32(first),
+            np.float32(self._scale * weight),
+            np.float32(self._bound / weight),
+            swept.target,
+            swept.sums,
+            totals,
+        )
+        device.launch(self._kernel, (len(tiles) * self._group,), (self._group,))
+        self.sweeps += len(tiles) / self._tile_count
 
     def measure(self) -> tuple[F64, F64]:
         """ΔMSE_k and I_k of all N splats, float64; of removed splats they mean nothing.
@@ -114,35 +224,42 @@ class RemovalSweep:
         ΔMSE is the change of the mean squared error over all views, pixels and channels against the uncompressed
         scene's renders if that splat alone went; I the mean over views and pixels of T α.
         """
-        device, background = self._device, self._rasterizer.background
-        for swept in self._swept:
-            tiles = np.flatnonzero(swept.stale > self._tolerance).astype(np.uint32)
-            if len(tiles) == 0:
+        first = self._measured == 0
+        for number, swept in enumerate(self._swept):
+            if (self._measured + number) % self._options.turns and not first:
                 continue
-            cl.enqueue_copy(device.queue, self._tiles, tiles, is_blocking=False)
-            self._kernel.set_args(
-                swept.view.shapes,
-                swept.view.colours,
-                self._alive_buffer,
-                self._tiles,
-                swept.begins,
-                swept.lengths,
-                swept.view.entries,
-                swept.struct,
-                *(np.float32(channel) for channel in background),
-                np.int32(self._first),
-                np.float32(self._scale * swept.weight),
-                np.float32(self._bound / swept.weight),
-                swept.target,
-                swept.sums,
-                self._totals,
-            )
-            device.launch(self._kernel, (len(tiles) * self._group,), (self._group,))
-            swept.stale[tiles] = 0
-        self._first = False
-        words = device.download(self._totals, (self.splats, 2), np.int64)
-        values = words / (self._scale * self._pixels * len(self._swept))
+            tiles = np.flatnonzero(swept.stale > self._options.tolerance).astype(np.uint32)
+            if len(tiles):
+                self._sweep(swept, tiles, first, self._totals)
+                swept.stale[tiles] = 0 if self._options.tolerance >= 0 else np.inf
+        words = self._device.download(self._totals, (self.splats, 2), np.int64)
+        if self._transient:
+            words += self._measure_transient()
+        self._measured += 1
+        values = words / (self._scale * self._pixels * self._views)
         return values[:, 0] / 3, values[:, 1]
+
+    def _measure_transient(self) -> NDArray[np.int64]:
+        """The views that nothing is kept of: lists, target and sums anew."""
+        device = self._device
+        totals, unused = self._zero_totals(), self._zero_totals()
+        everything = np.ones_like(self._alive)
+        for camera in self._transient:
+            swept = self._prepare(camera)
+            tiles = np.arange(swept.view.tiles, dtype=np.uint32)
+            if self._measured:
+                cl.enqueue_copy(device.queue, self._alive_buffer, everything, is_blocking=True)
+                self._sweep(swept, tiles, True, unused)
+                cl.enqueue_copy(device.queue, self._alive_buffer, self._alive, is_blocking=True)
+                device.free(swept.sums)
+                swept.sums = device.upload(np.zeros((swept.view.entry_count, 2), np.float32), "the removal effects")
+            self._sweep(swept, tiles, self._measured == 0, totals)
+            device.queue.finish()
+            swept.free(device)
+        words = device.download(totals, (self.splats, 2), np.int64)
+        device.free(totals)
+        device.free(unused)
+        return words
 
     def remove(self, splats: Indices) -> None:
         """Take splats out of all lists; note how much each tile loses."""
@@ -166,9 +283,7 @@ class RemovalSweep:
     def free(self) -> None:
         """Give all device memory back."""
         for swept in self._swept:
-            swept.view.free()
-            for buffer in (swept.begins, swept.lengths, swept.sums, swept.target):
-                self._device.free(buffer)
-        for buffer in (self._alive_buffer, self._totals, self._tiles, self._stale):
-            self._device.free(buffer)
+            swept.free(self._device)
         self._swept = []
+        for buffer in (self._alive_buffer, self._totals, self._tiles, self._stale, *(self._shared or ())):
+            self._device.free(buffer)

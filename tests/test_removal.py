@@ -12,7 +12,7 @@ from potr_cl.device import Device
 from potr_cl.errors import UsageError
 from potr_cl.pruning import PruningOptions, prune
 from potr_cl.rasterizer import INRIA, Rasterizer
-from potr_cl.removal import RemovalSweep
+from potr_cl.removal import RemovalSweep, SweepOptions
 from potr_cl.scene import Scene
 from tests import reference
 from tests.scenes import random_scene, ring_of_cameras
@@ -66,7 +66,7 @@ def close(predicted, true):
 
 def sweep(device, scene, cameras, tolerance=0.0, background=(0.0, 0.0, 0.0)):
     rasterizer = Rasterizer(device, scene, background=background)
-    return rasterizer, RemovalSweep(rasterizer, cameras, tolerance)
+    return rasterizer, RemovalSweep(rasterizer, cameras, SweepOptions(tolerance))
 
 
 def finish(rasterizer, removal):
@@ -154,6 +154,52 @@ def test_sums_kept_over_removals_are_those_of_a_new_sweep(device, lego_excerpt, 
     left = np.setdiff1d(np.arange(1500), few)
     for a, b in zip(skipping, everything, strict=True):
         assert np.array_equal(a[left], b[left])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
+def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, lego_excerpt, lego_excerpt_cameras, share):
+    cameras = lego_excerpt_cameras[:4]
+    results = []
+    for memory in (None, int(share * 4 * 48 * 1536)):
+        rasterizer = Rasterizer(device, lego_excerpt)
+        removal = RemovalSweep(rasterizer, cameras, SweepOptions(0, memory=memory))
+        kept = removal.kept_views
+        removal.measure()
+        for start in (0, 5):
+            removal.remove(np.arange(start, 1500, 10))
+            effects = removal.measure()
+        results.append(np.stack(effects)[:, np.arange(1, 1500, 10)])
+        finish(rasterizer, removal)
+    assert kept == 0 if share == 0 else kept <= 4
+    assert np.array_equal(*results)
+
+
+def test_views_in_turns(device, lego_excerpt, lego_excerpt_cameras):
+    rasterizer = Rasterizer(device, lego_excerpt)
+    removal = RemovalSweep(rasterizer, lego_excerpt_cameras[:4], SweepOptions(-1, turns=2))
+    for _ in range(3):
+        removal.measure()
+    assert removal.sweeps == pytest.approx(1 + 0.5 + 0.5)
+    finish(rasterizer, removal)
+
+
+def test_tolerance_saves_sweeps(device, lego_excerpt, lego_excerpt_cameras):
+    sweeps = []
+    for tolerance in (-1, 0, 0.05):
+        rasterizer, removal = sweep(device, lego_excerpt, lego_excerpt_cameras[:2], tolerance)
+        for start in range(4):
+            removal.measure()
+            removal.remove(np.arange(start, 1500, 100))
+        sweeps.append(removal.sweeps)
+        finish(rasterizer, removal)
+    assert sweeps[0] == pytest.approx(4)
+    assert sweeps[0] > sweeps[1] > sweeps[2] >= 1
+
+
+@pytest.mark.parametrize("bad", [{"tolerance": np.nan}, {"tolerance": np.inf}, {"turns": 0}, {"memory": -1}])
+def test_options_out_of_range(bad):
+    with pytest.raises(UsageError):
+        SweepOptions(**bad)
 
 
 def test_a_view_that_sees_nothing_changes_only_the_mean(device):

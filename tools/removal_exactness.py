@@ -68,7 +68,8 @@ class BruteForce:
         place = np.array([column, row])
         low = np.floor((self.p.centre[near] - 0.5 - self.square[near, None]) / TILE)
         high = np.floor((self.p.centre[near] - 0.5 + self.square[near, None] + TILE - 1) / TILE)
-        return ((low <= place) & (place < high)).all(axis=1)
+        inside: NDArray[np.bool_] = ((low <= place) & (place < high)).all(axis=1)
+        return inside
 
     def goes_on(self, alpha: F64) -> NDArray[np.bool_]:
         """(K, pixels) where a pixel has not ended."""
