@@ -143,8 +143,8 @@ class Compactor:
         """The scene with new SH coefficients; everything else is shared with ``scene``.
 
         Splats in no view keep their DC term and lose the rest; a scene of degree 0 is returned as it is. A channel of a
-        splat whose solution is not finite, is worse than its starting point, or holds an AC coefficient above four times
-        max(1, norm of the channel's coefficients) keeps its original coefficients.
+        splat whose solution is not finite, is worse than its starting point, or holds an AC coefficient above four
+        times max(1, norm of the channel's coefficients) keeps its original coefficients.
 
         Args:
             camera_centres: (S, 3) positions of the views that ``weights`` counts.
