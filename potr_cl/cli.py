@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import dataclasses
 import json
 import logging
 import sys
@@ -12,6 +13,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
+import numpy as np
 from tqdm import tqdm
 
 from potr_cl import __version__
@@ -31,15 +33,17 @@ from potr_cl.compare import (
 from potr_cl.decoder import PotrFile, decode
 from potr_cl.device import DEVICE_VARIABLE, Device
 from potr_cl.device_report import device_report, format_devices
-from potr_cl.encoder import EncodeOptions, encode
+from potr_cl.encoder import EncodeOptions, encode, prune_scene
 from potr_cl.errors import DataError, DeviceError, PotrError, UsageError
 from potr_cl.formats import load_cameras, load_scene, ply
 from potr_cl.images import parse_colour, to_8_bits, write_png
 from potr_cl.metrics import Lpips
 from potr_cl.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.removal import SweepOptions
 from potr_cl.report import file_report, format_report
 
 _RULES = {"inria": INRIA, "gsplat": GSPLAT}
+_CAMERAS_HELP = "cameras.json, transforms.json, or a COLMAP model's folder"
 
 
 class _Progress:
@@ -72,9 +76,56 @@ class _Progress:
             self._bar = None
 
 
+def _count(args: argparse.Namespace, splats: int) -> int | None:
+    """The number of splats that ``--keep`` or ``--count`` ask for."""
+    if args.keep is None:
+        count: int | None = args.count
+        return count
+    if not 0 < args.keep <= 1:
+        raise UsageError(f"--keep is {args.keep:g}, it must be above 0 and at most 1")
+    return max(round(args.keep * splats), 1)
+
+
+def _sweep_options(args: argparse.Namespace) -> SweepOptions:
+    return SweepOptions(args.tolerance, memory=None if args.memory is None else int(args.memory * 2**30))
+
+
+def _prune(args: argparse.Namespace) -> None:
+    if args.order is not None and args.order.resolve() == args.output.resolve():
+        raise UsageError("--order and --output name the same file")
+    options = EncodeOptions(
+        q=args.quality,
+        delta_mse_max=args.delta_mse_max,
+        iterations=args.iterations,
+        sweep=_sweep_options(args),
+        background=parse_colour(args.background),
+    )
+    _ = options.parameters  # a wrong option is told before a gigabyte is read
+    cameras = load_cameras(args.cameras)
+    scene = load_scene(args.scene)
+    options = dataclasses.replace(options, count=_count(args, len(scene)))
+    device = Device(args.device)
+    with contextlib.ExitStack() as stack:
+        order = stack.enter_context(replacing(args.order)) if args.order is not None else None
+        progress = stack.enter_context(contextlib.closing(_Progress()))
+        pruned = prune_scene(scene, cameras, options, progress, device)
+        ply.save(args.output, scene.subset(pruned.survivors))
+        if order is not None:
+            np.save(order, pruned.order)
+    print(
+        f"{args.output}: kept {pruned.kept} of {len(scene)} splats "
+        f"({100 * pruned.kept / len(scene):.1f} %) in {pruned.iterations} iterations on {device.info}"
+    )
+
+
 def _encode(args: argparse.Namespace) -> None:
     options = EncodeOptions(
         q=args.quality,
+        delta_mse_max=args.delta_mse_max,
+        prune=not args.no_prune,
+        iterations=args.iterations,
+        sweep=_sweep_options(args),
+        background=parse_colour(args.background),
         beta=args.beta,
         gamma=args.gamma,
         sf_sh=args.sf_sh,
@@ -87,17 +138,24 @@ def _encode(args: argparse.Namespace) -> None:
     )
     _ = options.parameters  # a wrong option is told before a gigabyte is read
     cameras = load_cameras(args.cameras) if args.cameras is not None else None
+    if cameras is None and (args.keep is not None or args.count is not None):
+        raise UsageError("--keep and --count need --cameras, the views that show which splats matter")
     scene = load_scene(args.scene)
+    options = dataclasses.replace(options, count=_count(args, len(scene)))
+    device = Device(args.device) if options.prune and cameras is not None else None
     with replacing(args.output) as file, contextlib.closing(_Progress()) as progress:
-        encoded = encode(scene, cameras, options, progress)
+        encoded = encode(scene, cameras, options, progress, device)
         for piece in encoded.pieces:
             file.write(piece)
-    if not (args.no_prune and args.no_compact):
-        print("all splats and all their colours were kept: this version neither prunes nor compacts", file=sys.stderr)
+    if options.prune and cameras is None:
+        print("every splat was kept: give --cameras to have those removed that no view misses", file=sys.stderr)
+    if not args.no_compact:
+        print("the colours were kept as they are: this version does not compact them", file=sys.stderr)
     before = options.source_bytes or scene.nbytes
+    kept = len(encoded.order)
     print(
-        f"{args.output}: {len(scene)} splats, {encoded.nbytes} bytes, "
-        f"{encoded.nbytes / len(scene):.2f} bytes a splat, {before / encoded.nbytes:.1f} times smaller"
+        f"{args.output}: {kept} of {len(scene)} splats, {encoded.nbytes} bytes, "
+        f"{encoded.nbytes / kept:.2f} bytes a splat, {before / encoded.nbytes:.1f} times smaller"
     )
 
 
@@ -215,19 +273,47 @@ def _devices(args: argparse.Namespace) -> None:
         raise DeviceError(f"{len(failed)} of {len(report)} devices failed the self-check: {', '.join(failed)}")
 
 
+def _add_pruning_options(p: argparse.ArgumentParser) -> None:
+    """What every command that prunes understands."""
+    group = p.add_argument_group("pruning")
+    how_many = group.add_mutually_exclusive_group()
+    how_many.add_argument("--keep", type=float, metavar="FRACTION", help="of the splats, exactly, instead of -q's")
+    how_many.add_argument("--count", type=int, metavar="N", help="splats to keep, exactly, instead of -q's")
+    how_many.add_argument(
+        "--delta-mse-max", type=float, metavar="X", help="remove a splat if the mean squared error grows by less"
+    )
+    group.add_argument("--iterations", type=int, default=48, metavar="N", help="default 48")
+    group.add_argument(
+        "--tolerance",
+        type=float,
+        default=SweepOptions.tolerance,
+        metavar="X",
+        help="part of a tile that must have been removed before it is looked at again; 0: any; default "
+        f"{SweepOptions.tolerance:g}",
+    )
+    group.add_argument(
+        "--memory", type=float, metavar="GB", help="GiB of device memory to keep views in; default: half of it"
+    )
+    _add_device_options(group)
+
+
 def _add_rendering_options(p: argparse.ArgumentParser) -> None:
     """What every command that renders understands."""
-    p.add_argument(
-        "--background",
-        default="black",
-        metavar="COLOUR",
-        help="R,G,B from 0 to 1, a name, or #rrggbb; default black",
-    )
+    _add_device_options(p)
     p.add_argument(
         "--rules",
         choices=tuple(_RULES),
         default="inria",
         help="whose rasterizer to follow; default inria, the original",
+    )
+
+
+def _add_device_options(p: argparse._ActionsContainer) -> None:
+    p.add_argument(
+        "--background",
+        default="black",
+        metavar="COLOUR",
+        help="R,G,B from 0 to 1, a name, or #rrggbb; default black",
     )
     p.add_argument(
         "--device",
@@ -260,9 +346,11 @@ def _parser() -> argparse.ArgumentParser:
         "--cameras",
         type=Path,
         metavar="PATH",
-        help="cameras.json, transforms.json, or a COLMAP model's folder: lets far splats be placed more coarsely",
+        help="cameras.json, transforms.json, or a COLMAP model's folder: with them, splats that no view misses are "
+        "removed, and far ones placed more coarsely",
     )
     p.add_argument("--no-prune", action="store_true", help="keep every splat")
+    _add_pruning_options(p)
     p.add_argument("--no-compact", action="store_true", help="keep the colours' coefficients as they are")
     p.add_argument(
         "--entropy", choices=("zstd", "npz"), default="zstd", help="npz: deflate, as NumPy's compressed files use"
@@ -283,6 +371,20 @@ def _parser() -> argparse.ArgumentParser:
         single.add_argument(f"--sf-{name}", type=float, metavar="SF", help=f"steps a unit for {what}")
     p.set_defaults(run=_encode)
 
+    p = commands.add_parser("prune", help="remove the splats that no view misses; nothing else changes")
+    p.add_argument("scene", type=Path, metavar="SCENE", help=".ply or .potr")
+    p.add_argument("--cameras", type=Path, required=True, metavar="PATH", help=_CAMERAS_HELP)
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.ply")
+    p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (fewest splats) to 1; default 0.5")
+    p.add_argument(
+        "--order",
+        type=Path,
+        metavar="FILE.npy",
+        help="also write the order of removal: the scene's splat numbers, first removed first, kept ones last",
+    )
+    _add_pruning_options(p)
+    p.set_defaults(run=_prune)
+
     p = commands.add_parser("decode", help="a .potr file to a .ply that every viewer opens")
     p.add_argument("file", type=Path, metavar="IN.potr")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.ply")
@@ -293,10 +395,9 @@ def _parser() -> argparse.ArgumentParser:
     p.add_argument("--json", action="store_true", help="for programs")
     p.set_defaults(run=_info)
 
-    cameras_help = "cameras.json, transforms.json, or a COLMAP model's folder"
     p = commands.add_parser("render", help="pictures (.png) of a scene from its cameras")
     p.add_argument("scene", type=Path, metavar="SCENE", help=".ply or .potr")
-    p.add_argument("--cameras", type=Path, required=True, metavar="PATH", help=cameras_help)
+    p.add_argument("--cameras", type=Path, required=True, metavar="PATH", help=_CAMERAS_HELP)
     p.add_argument("-o", "--output", type=Path, required=True, metavar="DIR", help="one file a view, named after it")
     _add_view_options(p, "all")
     _add_rendering_options(p)
@@ -310,7 +411,7 @@ def _parser() -> argparse.ArgumentParser:
     )
     p.add_argument("a", type=Path, metavar="A", help="the uncompressed scene, .ply or .potr")
     p.add_argument("b", type=Path, metavar="B", help="the one to judge, .ply or .potr")
-    p.add_argument("--cameras", type=Path, metavar="PATH", help=f"{cameras_help}; without, only sizes are compared")
+    p.add_argument("--cameras", type=Path, metavar="PATH", help=f"{_CAMERAS_HELP}; without, only sizes are compared")
     p.add_argument(
         "--truth", type=Path, metavar="DIR", help="photographs, named after the views: judge A and B by them"
     )

@@ -15,6 +15,10 @@ from numpy.typing import NDArray
 from potr_cl import bitstream, octree, quantize
 from potr_cl.bitstream import EntropyCoder, Header, Property, Section
 from potr_cl.cameras import Camera, camera_centres, train_views
+from potr_cl.device import Device
+from potr_cl.pruning import Pruned, PruningOptions, prune
+from potr_cl.rasterizer import Rasterizer
+from potr_cl.removal import RemovalSweep, SweepOptions
 from potr_cl.scene import Scene
 
 #: Called with the stage's name and the part of it that is done, 0 to 1.
@@ -32,20 +36,31 @@ class EncodeOptions:
 
     Attributes:
         q: quality, 0 to 1; sets every hyper-parameter that is not given on its own.
-        beta, gamma, sf_sh, sf_opacity, sf_rotation, sf_scale: replace single hyper-parameters
+        delta_mse_max, beta, gamma, sf_sh, sf_opacity, sf_rotation, sf_scale: replace single hyper-parameters
             (:class:`potr_cl.quantize.HyperParameters`).
+        prune: remove splats; needs cameras, without them nothing is removed.
+        iterations: of the pruning schedule.
+        count: number of splats to keep, instead of ΔMSE_MAX.
+        sweep: what measuring removal effects may skip.
+        background: R, G, B behind the scene in the views that pruning looks at.
         entropy: the entropy stage.
         threads: for the entropy stage; the bytes do not depend on it. 0: one a processor.
         source_bytes: size of the file that the scene came from, for the metadata; None if it came from none.
     """
 
     q: float = 0.5
+    delta_mse_max: float | None = None
     beta: float | None = None
     gamma: float | None = None
     sf_sh: float | None = None
     sf_opacity: float | None = None
     sf_rotation: float | None = None
     sf_scale: float | None = None
+    prune: bool = True
+    iterations: int = 48
+    count: int | None = None
+    sweep: SweepOptions = field(default_factory=SweepOptions)
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     entropy: EntropyCoder = field(default_factory=EntropyCoder)
     threads: int = 0
     source_bytes: int | None = None
@@ -53,7 +68,7 @@ class EncodeOptions:
     @property
     def parameters(self) -> quantize.HyperParameters:
         """The hyper-parameters that result."""
-        names = ("beta", "gamma", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale")
+        names = ("delta_mse_max", "beta", "gamma", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale")
         return quantize.HyperParameters.from_quality(self.q, **{name: getattr(self, name) for name in names})
 
 
@@ -65,12 +80,14 @@ class Encoded:
         pieces: the file's bytes, to be written one after another.
         nbytes: their number.
         order: (N,) index in the source scene of each splat of the file.
+        pruned: what pruning did; None if it was left out.
         seconds: wall time by stage.
     """
 
     pieces: list[bytes]
     nbytes: int
     order: NDArray[np.int64]
+    pruned: Pruned | None
     seconds: dict[str, float]
 
 
@@ -79,14 +96,17 @@ def encode(
     cameras: Sequence[Camera] | None = None,
     options: EncodeOptions | None = None,
     progress: Progress | None = None,
+    device: Device | None = None,
 ) -> Encoded:
     """Encode a scene.
 
     Args:
         scene: clean (:meth:`potr_cl.scene.Scene.cleaned`), at least one splat.
-        cameras: with them centres may be coarser far from every training view; without them γ alone decides.
+        cameras: the training views among them decide which splats may go, and how coarse centres may be; without
+            cameras every splat is kept and γ alone decides.
         options: defaults to quality 0.5.
         progress: told how far each stage is.
+        device: to prune on; the best one there is by default.
 
     Raises:
         UsageError: options out of range, or cameras without a training view.
@@ -96,6 +116,14 @@ def encode(
     parameters = options.parameters
     report = progress or (lambda stage, done: None)
     seconds: dict[str, float] = {}
+    source = scene
+
+    pruned: Pruned | None = None
+    if options.prune and cameras is not None:
+        started = time.perf_counter()
+        pruned = prune_scene(scene, cameras, options, report, device)
+        scene = scene.subset(pruned.survivors)
+        seconds["prune"] = time.perf_counter() - started
 
     report("octree", 0.0)
     started = time.perf_counter()
@@ -106,7 +134,7 @@ def encode(
 
     started = time.perf_counter()
     jobs = [*_octree_jobs(tree), *_attribute_jobs(scene, order, parameters)]
-    jobs.append(lambda: [(Property.METADATA, 0, _metadata(scene, cameras, options), 1)])
+    jobs.append(lambda: [(Property.METADATA, 0, _metadata(source, cameras, options, pruned), 1)])
     coded: list[tuple[Section, bytes]] = []
 
     def run(job: _Job) -> list[tuple[Section, bytes]]:
@@ -136,7 +164,51 @@ def encode(
         coded,
     )
     seconds["quantise and code"] = time.perf_counter() - started
-    return Encoded(pieces, sum(map(len, pieces)), order, seconds)
+    if pruned is not None:
+        order = pruned.survivors[order]
+    return Encoded(pieces, sum(map(len, pieces)), order, pruned, seconds)
+
+
+def prune_scene(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    options: EncodeOptions,
+    progress: Progress | None = None,
+    device: Device | None = None,
+) -> Pruned:
+    """Decide which splats may go.
+
+    Args:
+        scene: uncompressed; its renders are the target.
+        cameras: only the training views among them are looked at.
+        options: ``parameters.delta_mse_max``, ``iterations``, ``count``, ``sweep`` and ``background`` count here.
+        progress: told how far the stages "prepare views" and "prune" are.
+        device: the best one there is by default.
+
+    Raises:
+        UsageError: options out of range, or no training view.
+        DeviceError: the scene does not fit the device.
+    """
+    report = progress or (lambda stage, done: None)
+    schedule = PruningOptions(options.parameters.delta_mse_max, options.iterations, count=options.count)
+    views = train_views(cameras)
+    rasterizer = Rasterizer(device or Device(), scene, background=options.background)
+    try:
+        report("prepare views", 0.0)
+        removal = RemovalSweep(
+            rasterizer, views, options.sweep, lambda done, count: report("prepare views", done / count)
+        )
+        try:
+            report("prune", 0.0)
+            pruned = prune(
+                removal, len(scene), schedule, lambda done, left: report("prune", min(done / options.iterations, 0.99))
+            )
+            report("prune", 1.0)
+            return pruned
+        finally:
+            removal.free()
+    finally:
+        rasterizer.free()
 
 
 def _tolerance(
@@ -159,11 +231,12 @@ def _tolerance(
     return np.maximum(parameters.gamma, parameters.beta * np.sqrt(nearest))
 
 
-def _metadata(scene: Scene, cameras: Sequence[Camera] | None, options: EncodeOptions) -> bytes:
+def _metadata(scene: Scene, cameras: Sequence[Camera] | None, options: EncodeOptions, pruned: Pruned | None) -> bytes:
     facts = {
         "q": options.q,
         "beta": options.parameters.beta if cameras is not None else None,
         "gamma": options.parameters.gamma,
+        "delta_mse_max": options.parameters.delta_mse_max if pruned is not None and options.count is None else None,
         "source_splats": len(scene),
         "source_bytes": options.source_bytes,
     }

@@ -30,11 +30,13 @@ class HyperParameters:
     """What one quality q sets (paper table "Hyperparameters as functions of q"); each can be replaced on its own.
 
     Attributes:
+        delta_mse_max: ΔMSE_MAX: a splat may go if its removal changes the mean squared error by less.
         beta: allowed distance of a centre to its leaf's centre, as a part of the distance to the nearest camera.
         gamma: the least such distance, world units.
         sf_sh, sf_opacity, sf_rotation, sf_scale: scale factors; a quantiser step is 1 / SF.
     """
 
+    delta_mse_max: float
     beta: float
     gamma: float
     sf_sh: float
@@ -52,6 +54,7 @@ class HyperParameters:
         if not 0 <= q <= 1:
             raise UsageError(f"the quality q is {q:g}, it must lie between 0 and 1")
         values = HyperParameters(
+            delta_mse_max=10 ** (-8.8 - 2 * q),
             beta=1.4e-4 * q,
             gamma=5.0 * 10 ** (-3 - 5 * q),
             sf_sh=1 + 100 * q,
@@ -62,7 +65,7 @@ class HyperParameters:
         values = replace(values, **{k: float(v) for k, v in replaced.items() if v is not None})
         for field in fields(values):
             value = getattr(values, field.name)
-            low, high = (0.0, 1e30) if field.name == "beta" else (1e-30, 1e30)
+            low, high = (1e-30, 1e30) if field.name == "gamma" else (0.0, 1e30)
             if field.name.startswith("sf_"):
                 low, high = 1e-3, 1e9
             if not low <= value <= high:

@@ -63,6 +63,7 @@ def file_report(file: PotrFile) -> dict[str, Any]:
         },
         "gamma": metadata.get("gamma"),
         "beta": metadata.get("beta"),
+        "delta_mse_max": metadata.get("delta_mse_max"),
         "coders": sorted({s.coder.name.lower() for s in header.sections}),
         "bytes": len(file.data),
         "bytes_a_splat": len(file.data) / header.splats,

@@ -121,6 +121,78 @@ def test_both_entropy_stages(tmp_path, scene_path, capsys):
     capsys.readouterr()
 
 
+def test_prune(tmp_path, scene_path, capsys):
+    cameras = cameras_json(tmp_path / "cameras.json")
+    out, order = tmp_path / "pruned.ply", tmp_path / "order.npy"
+    arguments = ["prune", scene_path, "--cameras", cameras, "-o", out, "--iterations", "4"]
+    assert cli.main([str(a) for a in [*arguments, "--count", "50", "--order", order]]) == 0
+    assert "kept 50 of 200 splats" in capsys.readouterr().out
+    scene, pruned = ply.load(scene_path), ply.load(out)
+    removal_order = np.load(order)
+    assert sorted(removal_order) == list(range(200))
+    assert np.array_equal(pruned.means, scene.means[np.sort(removal_order[150:])])
+    assert cli.main([str(a) for a in [*arguments, "--keep", "0.5"]]) == 0
+    assert len(ply.load(out)) == 100
+    for limit, kept in (("0", 200), ("1e9", 1)):
+        assert cli.main([str(a) for a in [*arguments, "--delta-mse-max", limit]]) == 0
+        assert len(ply.load(out)) <= kept
+    capsys.readouterr()
+
+
+def test_encode_prunes(tmp_path, scene_path, capsys):
+    cameras = cameras_json(tmp_path / "cameras.json")
+    potr = tmp_path / "a.potr"
+    arguments = ["encode", scene_path, "-o", potr, "--cameras", cameras, "--iterations", "3", "--memory", "0.00001"]
+    assert cli.main([str(a) for a in [*arguments, "--count", "60"]]) == 0
+    assert "60 of 200 splats" in capsys.readouterr().out
+    assert cli.main(["info", str(potr), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["splats"], report["source_splats"]) == (60, 200)
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--keep", "0"], "--keep"),
+        (["--keep", "1.5"], "--keep"),
+        (["--count", "0"], "at least 1"),
+        (["--iterations", "0"], "iterations"),
+        (["--delta-mse-max", "-1"], "delta_mse_max"),
+        (["--tolerance", "nan"], "tolerance"),
+        (["--memory", "-2"], "memory"),
+        (["--background", "octarine"], "octarine"),
+    ],
+)
+def test_wrong_pruning_options(tmp_path, scene_path, capsys, options, word):
+    cameras = cameras_json(tmp_path / "cameras.json")
+    for command in ("prune", "encode"):
+        out = tmp_path / "out"
+        fails(capsys, [command, scene_path, "--cameras", cameras, "-o", out, *options], 2, word)
+        assert not out.exists()
+
+
+def test_interrupted_pruning_leaves_nothing(tmp_path, scene_path, capsys, monkeypatch):
+    def interrupted(*_args, **_kwargs):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr("potr_cl.encoder.prune", interrupted)
+    cameras = cameras_json(tmp_path / "cameras.json")
+    before = sorted(tmp_path.iterdir())
+    for command in ("prune", "encode"):
+        fails(capsys, [command, scene_path, "--cameras", cameras, "-o", tmp_path / "out"], 130, "interrupted")
+        assert sorted(tmp_path.iterdir()) == before
+
+
+def test_counts_need_cameras(tmp_path, scene_path, capsys):
+    fails(capsys, ["encode", scene_path, "-o", tmp_path / "a.potr", "--keep", "0.5"], 2, "--cameras")
+
+
+def test_order_and_output_must_differ(tmp_path, scene_path, capsys):
+    cameras = cameras_json(tmp_path / "cameras.json")
+    arguments = ["prune", scene_path, "--cameras", cameras, "-o", tmp_path / "x", "--order", tmp_path / "x"]
+    fails(capsys, arguments, 2, "same file")
+
+
 def test_no_such_input(tmp_path, capsys):
     for command in ("encode", "decode"):
         fails(capsys, [command, tmp_path / "none.potr", "-o", tmp_path / "out"], 2, "none.potr")

@@ -22,6 +22,7 @@ from tests.independent_decoder import decode as decode_independently
 from tests.scenes import random_scene, ring_of_cameras
 
 FAST = EntropyCoder("zstd", 1)
+KEEP = EncodeOptions(prune=False)
 DATA = Path(__file__).parent / "data"
 
 
@@ -74,7 +75,7 @@ def test_within_steps(degree, entropy, q):
 def test_within_the_criterion_of_the_cameras():
     scene = random_scene(2000, 0, extent=20)
     cameras = ring_of_cameras(12)
-    options = EncodeOptions(entropy=FAST)
+    options = EncodeOptions(entropy=FAST, prune=False)
     eyes = camera_centres(train_views(cameras))
     nearest = np.linalg.norm(scene.means[:, None].astype(np.float64) - eyes, axis=2).min(axis=1)
     p = options.parameters
@@ -88,7 +89,7 @@ def test_within_the_criterion_of_the_cameras():
 def test_test_views_do_not_matter():
     scene = random_scene(300, 0, extent=20)
     cameras = ring_of_cameras(12)
-    assert joined(encode(scene, cameras)) == joined(encode(scene, train_views(cameras)))
+    assert joined(encode(scene, cameras, KEEP)) == joined(encode(scene, train_views(cameras), KEEP))
 
 
 def test_no_training_view_is_an_error():
@@ -207,7 +208,7 @@ def test_independent_decoder_agrees(degree):
     scene = random_scene(300, degree)
     scene = scene.subset(np.r_[np.arange(300), [0, 0, 7]])
     for cameras in (None, ring_of_cameras(8)):
-        data = joined(encode(scene, cameras))
+        data = joined(encode(scene, cameras, KEEP))
         agree(decode(data), decode_independently(data))
 
 

@@ -33,6 +33,7 @@ def test_paper_values():
     assert (p.sf_sh, p.sf_opacity, p.sf_rotation, p.sf_scale) == (51, 101, 201, 2001)
     assert p.beta == pytest.approx(7e-5)
     assert p.gamma == pytest.approx(5e-3 * 10**-2.5)
+    assert p.delta_mse_max == pytest.approx(10**-9.8)
     low = HyperParameters.from_quality(0)
     assert (low.beta, low.gamma, low.sf_sh) == (0, 5e-3, 1)
 
