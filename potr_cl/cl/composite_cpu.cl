@@ -51,21 +51,21 @@ kernel void composite(
                 const float dy = origin.y + row + 0.5f - block.y[k];
                 const float bu = block.b[k] * dy;
                 const float cv = block.c[k] * dy;
-                const float level = mad(-cv, cv, block.log2_opacity[k]);
+                const float level = MAD(-cv, cv, block.log2_opacity[k]);
                 for (int v = 0; v < VECTORS; ++v) {
                     const int i = row * VECTORS + v;
                     const vfloat u = au[v] + bu;
-                    const vfloat power = mad(-u, u, (vfloat)(level));
-                    vfloat alpha = fmin(exp2_polynomial(power), ALPHA_CAP);
+                    const vfloat power = MAD(-u, u, (vfloat)(level));
+                    vfloat alpha = min(exp2_polynomial(power), ALPHA_CAP);
                     alpha = power >= LOG2_ALPHA_MIN ? alpha : (vfloat)(0.0f);
                     const vfloat before = t[i];
-                    const vfloat after = mad(-alpha, before, before);
+                    const vfloat after = MAD(-alpha, before, before);
                     const vint goes_on = after >= STOP;
                     const vfloat weight = goes_on ? alpha * before : (vfloat)(0.0f);
                     t[i] = goes_on ? after : -fabs(before);
-                    r[i] = mad(weight, (vfloat)(block.red[k]), r[i]);
-                    g[i] = mad(weight, (vfloat)(block.green[k]), g[i]);
-                    b[i] = mad(weight, (vfloat)(block.blue[k]), b[i]);
+                    r[i] = MAD(weight, (vfloat)(block.red[k]), r[i]);
+                    g[i] = MAD(weight, (vfloat)(block.green[k]), g[i]);
+                    b[i] = MAD(weight, (vfloat)(block.blue[k]), b[i]);
                 }
             }
         }
@@ -90,9 +90,9 @@ kernel void composite(
             int i = row * VECTORS + v;
             vfloat through = fabs(t[i]);
             VSTORE(through, v, rest);
-            VSTORE(mad(through, (vfloat)(red), r[i]), v, reds);
-            VSTORE(mad(through, (vfloat)(green), g[i]), v, greens);
-            VSTORE(mad(through, (vfloat)(blue), b[i]), v, blues);
+            VSTORE(MAD(through, (vfloat)(red), r[i]), v, reds);
+            VSTORE(MAD(through, (vfloat)(green), g[i]), v, greens);
+            VSTORE(MAD(through, (vfloat)(blue), b[i]), v, blues);
         }
         size_t pixel = (size_t)(origin.y + row) * view.width + origin.x;
         for (int column = 0; column < pixel_columns; ++column, ++pixel) {

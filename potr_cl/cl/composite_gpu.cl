@@ -82,24 +82,24 @@ void composite(
                 float4 n0 = near_s0[k + j];
                 float2 n1 = near_s1[k + j].xy;
                 float dy = y - n0.y;
-                float u = mad(n0.z, x - n0.x, n0.w * dy);
+                float u = MAD(n0.z, x - n0.x, n0.w * dy);
                 float v = n1.x * dy;
-                powers[j] = mad(-u, u, mad(-v, v, n1.y));
+                powers[j] = MAD(-u, u, MAD(-v, v, n1.y));
                 most = fmax(most, powers[j]);
             }
             if (most < LOG2_ALPHA_MIN)
                 continue;
             for (int j = 0; j < AHEAD; ++j) {
                 if (alive && powers[j] >= LOG2_ALPHA_MIN) {
-                    float alpha = fmin(EXP2(powers[j]), ALPHA_CAP);
-                    float after = mad(-alpha, t, t);
+                    float alpha = min(EXP2(powers[j]), ALPHA_CAP);
+                    float after = MAD(-alpha, t, t);
                     if (after < STOP) {
                         alive = 0;
                     } else {
                         float weight = alpha * t;
-                        r = mad(weight, near_s1[k + j].z, r);
-                        g = mad(weight, near_s1[k + j].w, g);
-                        b = mad(weight, near_blue[k + j], b);
+                        r = MAD(weight, near_s1[k + j].z, r);
+                        g = MAD(weight, near_s1[k + j].w, g);
+                        b = MAD(weight, near_blue[k + j], b);
                         t = after;
                     }
                 }
@@ -113,9 +113,9 @@ void composite(
     }
     if (inside) {
         size_t pixel = (size_t)row * view.width + column;
-        image[3 * pixel] = mad(t, red, r);
-        image[3 * pixel + 1] = mad(t, green, g);
-        image[3 * pixel + 2] = mad(t, blue, b);
+        image[3 * pixel] = MAD(t, red, r);
+        image[3 * pixel + 1] = MAD(t, green, g);
+        image[3 * pixel + 2] = MAD(t, blue, b);
         transmittance[pixel] = t;
     }
 }
