@@ -1,0 +1,234 @@
+"""Device discovery and choice on this machine and on invented ones, program cache, memory accounting, errors."""
+
+from __future__ import annotations
+
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from potr_cl import device as device_module
+from potr_cl.device import Device, DeviceInfo, Scratch, choose_device, kernel_source, list_devices
+from potr_cl.errors import DeviceError
+
+
+@pytest.fixture(scope="module")
+def device() -> Device:
+    return Device()
+
+
+def invented(
+    index: int, name: str, kind: str, platform: str = "Some", version: str = "1", integrated: bool = False
+) -> DeviceInfo:
+    return DeviceInfo(
+        index, name, platform, version, kind, integrated, 1 << 30, 1 << 28, 1 << 15, 8, 8, 256, "gpu", None  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch) -> list[DeviceInfo]:
+    """A machine with one of everything, worst first."""
+    pocl = "Portable Computing Language"
+    devices = [
+        invented(0, "Oclgrind Simulator", "cpu", "Oclgrind"),
+        invented(1, "llvmpipe", "cpu", "rusticl"),
+        invented(2, "pthread-old", "cpu", pocl, "OpenCL 3.0 PoCL 3.0-rc2  Linux"),
+        invented(3, "pthread-new", "cpu", pocl, "OpenCL 3.0 PoCL 3.1+debian  Linux"),
+        invented(4, "AMD EPYC", "cpu", "Intel(R) OpenCL"),
+        invented(5, "Iris", "gpu", "Intel(R) OpenCL Graphics", integrated=True),
+        invented(6, "RTX", "gpu", "NVIDIA CUDA"),
+        invented(7, "RTX", "gpu", "NVIDIA CUDA"),
+    ]
+    monkeypatch.setattr(device_module, "_devices", devices)
+    monkeypatch.delenv("POTR_CL_DEVICE", raising=False)
+    return devices
+
+
+def test_preference(machine: list[DeviceInfo]) -> None:
+    """Discrete GPU, integrated GPU, then CPU runtimes by speed; the first of equals."""
+    order = []
+    while machine:
+        order.append(choose_device().index)
+        machine.remove(choose_device())
+        device_module._devices = machine
+    assert order == [6, 7, 5, 4, 3, 2, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("spec", "index"),
+    [("7", 7), ("cpu", 4), ("gpu", 6), ("CPU", 4), ("iris", 5), ("pthread-old", 2), ("portable", 3), ("nvidia", 6)],
+)
+def test_specification(machine: list[DeviceInfo], spec: str, index: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert choose_device(spec).index == index
+    monkeypatch.setenv("POTR_CL_DEVICE", spec)
+    assert choose_device().index == index
+    assert choose_device("1").index == 1  # what is asked for goes before the environment
+
+
+@pytest.mark.parametrize("spec", ["8", "-1", "voodoo"])
+def test_specification_that_fits_nothing(machine: list[DeviceInfo], spec: str) -> None:
+    with pytest.raises(DeviceError, match=r"there are 0: Oclgrind Simulator, 1: llvmpipe"):
+        choose_device(spec)
+
+
+def test_no_device_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_module, "_devices", [])
+    with pytest.raises(DeviceError, match="pip install"):
+        choose_device()
+
+
+def test_this_machine() -> None:
+    devices = list_devices()
+    assert devices
+    assert [d.index for d in devices] == list(range(len(devices)))
+    for info in devices:
+        assert info.memory > 0
+        assert 0 < info.largest_buffer <= info.memory
+        assert info.vector_width in (1, 4, 8, 16)
+
+
+def list_names(vendors: Path, **environment: str) -> list[str]:
+    """The devices that a fresh process finds with this folder of ICDs."""
+    run = subprocess.run(
+        [sys.executable, "-c", "from potr_cl.device import *\nfor d in list_devices(): print(d.platform)"],
+        env=os.environ | {"OCL_ICD_VENDORS": str(vendors)} | environment,
+        cwd=Path(__file__).parents[1],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return run.stdout.splitlines()
+
+
+def test_broken_drivers_are_survived(tmp_path: Path) -> None:
+    """ICDs whose library is missing, is no library, or is no OpenCL driver; and one that is empty."""
+    (tmp_path / "missing.icd").write_text("/nowhere/libOpenCL-nothing.so\n")
+    (tmp_path / "empty.icd").write_text("")
+    (tmp_path / "text.icd").write_text(f"{tmp_path / 'text.so'}\n")
+    (tmp_path / "text.so").write_text("no library")
+    (tmp_path / "other.icd").write_text("libm.so.6\n")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert list_names(tmp_path) == list_names(empty)
+
+
+def test_registering_a_runtime_keeps_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    library = tmp_path / "lib" / "libintelocl.so"
+    library.parent.mkdir()
+    library.touch()
+    vendors = tmp_path / "vendors"
+    vendors.mkdir()
+    (vendors / "other.icd").write_text("libother.so\n")
+
+    class Installed:
+        name = "libintelocl.so"
+
+        def locate(self) -> Path:
+            return library
+
+    monkeypatch.setattr(device_module.importlib.metadata, "files", lambda package: [Installed()])
+    monkeypatch.setattr(device_module.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))
+    device_module._register_intel_runtime()
+    made = Path(os.environ["OCL_ICD_VENDORS"])
+    assert made.parent == tmp_path
+    assert {p.name: p.read_text() for p in made.iterdir()} == {
+        "other.icd": "libother.so\n",
+        "potr_cl_intel_cpu.icd": f"{library}\n",
+    }
+    device_module._register_intel_runtime()  # what is there already is left alone
+    assert os.environ["OCL_ICD_VENDORS"] == str(made)
+
+    library.unlink()
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))
+    device_module._register_intel_runtime()
+    assert os.environ["OCL_ICD_VENDORS"] == str(vendors)
+
+
+def test_self_check_passes(device: Device) -> None:
+    before = device.allocated
+    device.self_check()
+    assert device.allocated == before
+
+
+def test_programs_are_built_once(device: Device) -> None:
+    assert device.program("probe.cl", LANES=1) is device.program("probe.cl", LANES=1)
+    assert device.program("probe.cl", LANES=1) is not device.program("probe.cl", LANES=4)
+
+
+def test_headers_are_included_once() -> None:
+    source = kernel_source("project.cl")
+    assert "#include" not in source
+    assert source.count("typedef struct {") == 1
+
+
+def test_failing_build_names_the_device(device: Device) -> None:
+    with pytest.raises(DeviceError, match=r"failed to build probe.cl .*--device") as error:
+        device.program("probe.cl", LANES="nonsense")
+    assert device.info.name in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+def test_memory_is_accounted_for(device: Device) -> None:
+    before = device.allocated
+    buffer = device.allocate(1000, "a test")
+    assert device.allocated == before + 1000
+    device.free(buffer)
+    assert device.allocated == before
+
+
+@pytest.mark.parametrize("excess", ["buffer", "memory"])
+def test_allocation_beyond_the_device_is_refused(device: Device, excess: str) -> None:
+    nbytes = device.info.largest_buffer + 1 if excess == "buffer" else device.info.memory + 1
+    before = device.allocated
+    with pytest.raises(DeviceError, match=r"cannot hold the splats of a test: .* MB .*--device"):
+        device.allocate(nbytes, "the splats of a test")
+    assert device.allocated == before
+
+
+def test_driver_errors_become_device_errors(device: Device) -> None:
+    with pytest.raises(DeviceError, match="ran out of memory"), device.errors("failed"):
+        raise cl.MemoryError("clEnqueueNDRangeKernel failed: MEM_OBJECT_ALLOCATION_FAILURE")
+    with pytest.raises(DeviceError, match="failed to think"), device.errors("failed to think"):
+        raise cl.LogicError("clSomething failed: INVALID_VALUE\nmore")
+
+
+def test_upload_and_download(device: Device) -> None:
+    array = np.arange(24, dtype=np.float32).reshape(2, 3, 4)
+    buffer = device.upload(array.transpose(2, 0, 1), "a test")  # any strides
+    assert np.array_equal(device.download(buffer, (4, 2, 3), np.float32), array.transpose(2, 0, 1))
+    device.free(buffer)
+    nothing = device.upload(np.empty(0, np.float32), "nothing")
+    assert device.download(nothing, (0,), np.float32).size == 0
+    device.free(nothing)
+
+
+def test_scratch_grows_and_survives_failure(device: Device) -> None:
+    before = device.allocated
+    scratch = Scratch(device, "a test")
+    assert scratch.reserve(100)
+    first = scratch.buffer
+    assert not scratch.reserve(50)
+    assert scratch.buffer is first
+    with pytest.raises(DeviceError):
+        scratch.reserve(device.info.memory * 2)
+    assert scratch.nbytes == 0
+    assert scratch.reserve(10)
+    scratch.free()
+    scratch.free()
+    assert device.allocated == before
+
+
+def test_stage_times_need_profiling(device: Device) -> None:
+    profiled = Device(device.info, profiling=True)
+    profiled.stage_times()
+    profiled.self_check()
+    times = profiled.stage_times()
+    assert times["probe_integers"] > 0
+    assert profiled.stage_times() == {}
+    device.self_check()
+    assert device.stage_times() == {}
