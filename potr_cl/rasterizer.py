@@ -38,6 +38,9 @@ _COUNTER_BYTES = 32
 #: Standard deviations above this many world units are taken as this: nothing can be seen to differ, nothing overflows.
 _LARGEST_SCALE = 1e12
 
+#: Where the SH coefficients stand among the kernel's parameters.
+_SH = 4
+
 _CAMERA = np.dtype(
     [
         ("rotation", np.float32, 9),
@@ -115,7 +118,7 @@ class View:
     Attributes:
         camera: whose view it is.
         columns, rows: tiles across and down.
-        shapes: (N, 8) float32, a splat's ellipse, see cl/splat.clh; radius 0 for a splat that is not drawn.
+        shapes: (N, 8) float32, a splat's ellipse, see cl/splat.clh.
         colours: (N, 4) float32; R, G, B of the splats that are drawn, the rest unset.
         offsets: (columns * rows + 1,) uint32, where each tile's run of ``entries`` begins.
         entry_count: entries there are; set once the device is known to have found them all.
@@ -207,6 +210,7 @@ class Rasterizer:
         self.stride = max(-(-len(scene) // _SPLAT_GROUP), 1) * _SPLAT_GROUP
         self._upload(scene)
         self._build(scene.sh.shape[1])
+        self._bounds = device.allocate(8 * self.stride, "the projected splats' bounds")
         self._total = device.allocate(4, "the entry count")
         self._counts = Scratch(device, "the tile counts")
         self._keys = Scratch(device, "the tile lists' sort keys")
@@ -218,11 +222,7 @@ class Rasterizer:
     def _upload(self, scene: Scene) -> None:
         """Activate the parameters and copy them, structure of arrays, padded to the stride."""
 
-        def upload(columns: NDArray[Any], fill: float, what: str) -> cl.Buffer:
-            padded = np.full((columns.shape[1], self.stride), fill, np.float32)
-            padded[:, : self.splats] = columns.T
-            return self.device.upload(padded, what)
-
+        upload = self._upload_columns
         quaternions = scene.quaternions.astype(np.float64)
         length = np.linalg.norm(quaternions, axis=1, keepdims=True)
         quaternions = np.where(length > 0, quaternions / np.where(length > 0, length, 1), (1.0, 0.0, 0.0, 0.0))
@@ -235,6 +235,11 @@ class Rasterizer:
             upload(log2_opacities[:, None], -np.inf, "the opacities"),
             upload(scene.sh.reshape(self.splats, -1), 0, "the SH coefficients"),
         ]
+
+    def _upload_columns(self, columns: NDArray[Any], fill: float, what: str) -> cl.Buffer:
+        padded = np.full((columns.shape[1], self.stride), fill, np.float32)
+        padded[:, : self.splats] = columns.T
+        return self.device.upload(padded, what)
 
     def _build(self, sh_count: int) -> None:
         device, rules = self.device, self.rules
@@ -285,10 +290,10 @@ class Rasterizer:
             return
         stride, capacity = np.uint32(self.stride), np.uint32(view.capacity)
         keys, counts, camera = self._keys.buffer, self._counts.buffer, camera_struct(view.camera)
-        self._project.set_args(*self._parameters, stride, camera, view.shapes, view.colours)
-        self._count.set_args(view.shapes, stride, camera, counts)
+        self._project.set_args(*self._parameters, stride, camera, view.shapes, view.colours, self._bounds)
+        self._count.set_args(self._bounds, view.shapes, stride, camera, counts)
         self._scan.set_args(counts, view.offsets, np.uint32(view.tiles), self._total)
-        self._fill.set_args(view.shapes, stride, camera, counts, keys, capacity)
+        self._fill.set_args(self._bounds, view.shapes, stride, camera, counts, keys, capacity)
         self._sort.set_args(keys, view.offsets, view.entries, counts, capacity)
         self._composite.set_args(
             view.shapes,
@@ -307,9 +312,25 @@ class Rasterizer:
         self._project.set_arg(6, camera_struct(view.camera))
         self.device.launch(self._project, (self.stride // self._lanes,), (_SPLAT_GROUP // self._lanes,))
 
-    def project(self, camera: Camera, shapes: cl.Buffer, colours: cl.Buffer) -> None:
-        """Enqueue a view's projection alone, into buffers like :class:`View`'s."""
-        self._project.set_args(*self._parameters, np.uint32(self.stride), camera_struct(camera), shapes, colours)
+    def replace_sh(self, sh: FloatArray) -> cl.Buffer:
+        """Give the scene other SH coefficients, (N, M, 3) float32 of the same degree.
+
+        Views that were prepared before keep their colours until they are projected again.
+
+        Returns:
+            The buffer of the former coefficients, which is the caller's to free.
+        """
+        former = self._parameters[_SH]
+        self._parameters[_SH] = self._upload_columns(sh.reshape(self.splats, -1), 0, "the SH coefficients")
+        self._bound = None
+        return former
+
+    def project(self, camera: Camera, shapes: cl.Buffer, colours: cl.Buffer, sh: cl.Buffer | None = None) -> None:
+        """Enqueue a view's projection alone, into buffers like :class:`View`'s; with other SH if ``sh`` is given."""
+        parameters = [*self._parameters[:_SH], self._parameters[_SH] if sh is None else sh]
+        self._project.set_args(
+            *parameters, np.uint32(self.stride), camera_struct(camera), shapes, colours, self._bounds
+        )
         self._bound = None
         self.device.launch(self._project, (self.stride // self._lanes,), (_SPLAT_GROUP // self._lanes,))
 
@@ -317,10 +338,10 @@ class Rasterizer:
         """Enqueue tile lists and depth order of a projected view."""
         camera = camera_struct(view.camera)
         launch = self.device.launch
-        self._count.set_arg(2, camera)
+        self._count.set_arg(3, camera)
         launch(self._count, (self.stride,), (_SPLAT_GROUP,))
         launch(self._scan, (self._tile_group,), (self._tile_group,))
-        self._fill.set_arg(2, camera)
+        self._fill.set_arg(3, camera)
         launch(self._fill, (self.stride,), (_SPLAT_GROUP,))
         launch(self._sort, (view.tiles * self._tile_group,), (self._tile_group,))
 
@@ -429,7 +450,7 @@ class Rasterizer:
         """Give all device memory back; the rasterizer is of no use afterwards."""
         if self._scratch is not None:
             self._scratch.free()
-        for buffer in (*self._parameters, self._total):
+        for buffer in (*self._parameters, self._bounds, self._total):
             self.device.free(buffer)
         for scratch in (self._counts, self._keys, self._image, self._transmittance):
             scratch.free()

@@ -14,6 +14,24 @@
 /* Projected axes are clamped to this many pixels: far more than any image has, and its fourth power is finite. */
 #define AXIS_LIMIT 1e8f
 
+/* Half-open range of tiles along one axis of `size` pixels, in whole numbers: those with a pixel centre within reach of
+   the position and, with the square extent, that touch the square around it. The original numbers pixel centres from 0,
+   half a pixel less than here. */
+inline void tile_range(vfloat position, vfloat reach, vfloat radius, int size, vfloat *first, vfloat *end)
+{
+    const float tiles = (size + TILE - 1) / TILE;
+    vfloat first_pixel = ceil(position - reach - 0.5f);
+    vfloat last_pixel = floor(position + reach - 0.5f);
+    vint none = first_pixel > last_pixel || last_pixel < 0.0f || first_pixel >= (float)size;
+    *first = floor(fmin(fmax(first_pixel, 0.0f), (float)size) / TILE);
+    *end = floor(fmin(fmax(last_pixel, 0.0f), (float)(size - 1)) / TILE) + 1.0f;
+#if SQUARE_EXTENT
+    *first = fmax(*first, floor(fmin(fmax(position - 0.5f - radius, 0.0f), (float)size) / TILE));
+    *end = fmin(*end, floor(fmin(fmax(position - 0.5f + radius + (TILE - 1), 0.0f), tiles * TILE) / TILE));
+#endif
+    *end = none ? *first : *end;
+}
+
 kernel void project(
     global const float *means,
     global const float *scales,
@@ -23,7 +41,8 @@ kernel void project(
     uint stride_,
     View view,
     global float4 *shapes,
-    global float4 *colours)
+    global float4 *colours,
+    global ushort4 *bounds)
 {
     const size_t index = get_global_id(0);
     const size_t stride = stride_;
@@ -85,19 +104,19 @@ kernel void project(
     vfloat c = EXPONENT_SCALE / sqrt(syy);
     drawn = drawn && (fabs(x) + fabs(y) + a + fabs(b) + c < 1e30f);
 
+    vfloat radius = 0.0f;
 #if SQUARE_EXTENT
     vfloat half_trace = 0.5f * (sxx + syy);
     vfloat half_gap = 0.5f * (sxx - syy);
-    vfloat radius = ceil(3.0f * sqrt(half_trace + sqrt(fmax(half_gap * half_gap + sxy * sxy, 0.1f))));
-#else
-    vfloat radius = 1e9f;
+    radius = ceil(3.0f * sqrt(half_trace + sqrt(fmax(half_gap * half_gap + sxy * sxy, 0.1f))));
 #endif
     vfloat level = fmax(lo - LOG2_ALPHA_MIN, 0.0f) + LEVEL_SLACK;
-    vfloat reach_x = sqrt(level * sxx) / EXPONENT_SCALE + 1.0f + RELATIVE_SLACK * fabs(x);
-    vfloat reach_y = sqrt(level * syy) / EXPONENT_SCALE + 1.0f + RELATIVE_SLACK * fabs(y);
-    drawn = drawn && (x + reach_x > 0.0f) && (x - reach_x < (float)view.width);
-    drawn = drawn && (y + reach_y > 0.0f) && (y - reach_y < (float)view.height);
-    radius = drawn ? radius : (vfloat)(0.0f);
+    vfloat reach_x = sqrt(level * sxx) / EXPONENT_SCALE + PIXEL_SLACK + RELATIVE_SLACK * fabs(x);
+    vfloat reach_y = sqrt(level * syy) / EXPONENT_SCALE + PIXEL_SLACK + RELATIVE_SLACK * fabs(y);
+    vfloat first_column, end_column, first_row, end_row;
+    tile_range(x, reach_x, radius, view.width, &first_column, &end_column);
+    tile_range(y, reach_y, radius, view.height, &first_row, &end_row);
+    drawn = drawn && (first_column < end_column) && (first_row < end_row);
 
     vfloat rgb[3] = {(vfloat)(0.0f), (vfloat)(0.0f), (vfloat)(0.0f)};
     if (VANY(drawn)) {
@@ -107,19 +126,28 @@ kernel void project(
 
 #if LANES == 1
     shapes[2 * index] = (float4)(x, y, a, b);
-    shapes[2 * index + 1] = (float4)(c, lo, tz, radius);
+    shapes[2 * index + 1] = (float4)(c, lo, tz, 0.0f);
+    ushort4 tiles = (ushort4)(0);
+    if (drawn)
+        tiles = (ushort4)((ushort)first_column, (ushort)end_column, (ushort)first_row, (ushort)end_row);
+    bounds[index] = tiles;
     if (drawn)
         colours[index] = (float4)(rgb[0], rgb[1], rgb[2], 0.0f);
 #else
-    float columns[11][LANES];
-    vfloat values[11] = {x, y, a, b, c, lo, tz, radius, rgb[0], rgb[1], rgb[2]};
-    for (int k = 0; k < 11; ++k)
+    vfloat zero = 0.0f;
+    float columns[14][LANES];
+    vfloat values[14] = {
+        x, y, a, b, c, lo, tz, rgb[0], rgb[1], rgb[2],
+        drawn ? first_column : zero, drawn ? end_column : zero, drawn ? first_row : zero, drawn ? end_row : zero};
+    for (int k = 0; k < 14; ++k)
         VSTORE(values[k], 0, columns[k]);
     for (int lane = 0; lane < LANES; ++lane) {
         size_t splat = index * LANES + lane;
         shapes[2 * splat] = (float4)(columns[0][lane], columns[1][lane], columns[2][lane], columns[3][lane]);
-        shapes[2 * splat + 1] = (float4)(columns[4][lane], columns[5][lane], columns[6][lane], columns[7][lane]);
-        colours[splat] = (float4)(columns[8][lane], columns[9][lane], columns[10][lane], 0.0f);
+        shapes[2 * splat + 1] = (float4)(columns[4][lane], columns[5][lane], columns[6][lane], 0.0f);
+        colours[splat] = (float4)(columns[7][lane], columns[8][lane], columns[9][lane], 0.0f);
+        bounds[splat] = (ushort4)(
+            (ushort)columns[10][lane], (ushort)columns[11][lane], (ushort)columns[12][lane], (ushort)columns[13][lane]);
     }
 #endif
 }

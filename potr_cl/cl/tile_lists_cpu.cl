@@ -5,33 +5,34 @@
 #define GROUP 1
 #define COUNTER_STRIDE 1
 
-kernel void count_tiles(global const float4 *shapes, uint splats, View view, volatile global uint *counts)
+kernel void count_tiles(
+    global const ushort4 *bounds, global const float4 *shapes, uint splats, View view, volatile global uint *counts)
 {
     const uint splat = get_global_id(0);
-    float4 s1 = shapes[2 * splat + 1];
-    if (s1.w == 0.0f)
-        return;
-    float4 s0 = shapes[2 * splat];
-    int2 rows = ellipse_tile_rows(s0, s1, view.rows);
-    for (int row = rows.x; row < rows.y; ++row) {
-        int2 columns = ellipse_tile_columns(s0, s1, row, view.columns, view.width, view.height);
+    const int4 around = convert_int4(bounds[splat]);
+    for (int row = around.z; row < around.w; ++row) {
+        int2 columns = splat_tile_columns(shapes, splat, around, row, view.width, view.height);
         for (int column = columns.x; column < columns.y; ++column)
             atomic_inc(&counts[row * view.columns + column]);
     }
 }
 
 kernel void fill_tiles(
-    global const float4 *shapes, uint splats, View view, volatile global uint *cursors, global ulong *keys, uint capacity)
+    global const ushort4 *bounds,
+    global const float4 *shapes,
+    uint splats,
+    View view,
+    volatile global uint *cursors,
+    global ulong *keys,
+    uint capacity)
 {
     const uint splat = get_global_id(0);
-    float4 s1 = shapes[2 * splat + 1];
-    if (s1.w == 0.0f)
+    const int4 around = convert_int4(bounds[splat]);
+    if (around.z == around.w)
         return;
-    float4 s0 = shapes[2 * splat];
-    ulong key = depth_key(s1.z, splat);
-    int2 rows = ellipse_tile_rows(s0, s1, view.rows);
-    for (int row = rows.x; row < rows.y; ++row) {
-        int2 columns = ellipse_tile_columns(s0, s1, row, view.columns, view.width, view.height);
+    const ulong key = depth_key(shapes[2 * splat + 1].z, splat);
+    for (int row = around.z; row < around.w; ++row) {
+        int2 columns = splat_tile_columns(shapes, splat, around, row, view.width, view.height);
         for (int column = columns.x; column < columns.y; ++column) {
             uint slot = atomic_inc(&cursors[row * view.columns + column]);
             if (slot < capacity)

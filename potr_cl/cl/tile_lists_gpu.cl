@@ -14,18 +14,13 @@
 #define COUNTER_STRIDE 8
 
 /* first[s] = number of rows of the splats before s; first[GROUP] = all of them. */
-inline void string_rows(global const float4 *shapes, uint splats, View view, local int *first, local int *low)
+inline void string_rows(global const ushort4 *bounds, uint splats, local int *first, local ushort4 *around)
 {
     const int lid = get_local_id(0);
     const uint splat = get_global_id(0);
-    int2 rows = (int2)(0, 0);
-    if (splat < splats) {
-        float4 s1 = shapes[2 * splat + 1];
-        if (s1.w > 0.0f)
-            rows = ellipse_tile_rows(shapes[2 * splat], s1, view.rows);
-    }
-    low[lid] = rows.x;
-    first[lid + 1] = max(rows.y - rows.x, 0);
+    const ushort4 tiles = splat < splats ? bounds[splat] : (ushort4)(0);
+    around[lid] = tiles;
+    first[lid + 1] = tiles.w - tiles.z;
     if (lid == 0)
         first[0] = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
@@ -54,16 +49,18 @@ inline int row_owner(local const int *first, int row)
 }
 
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void count_tiles(global const float4 *shapes, uint splats, View view, volatile global uint *counts)
+void count_tiles(
+    global const ushort4 *bounds, global const float4 *shapes, uint splats, View view, volatile global uint *counts)
 {
-    local int first[GROUP + 1], low[GROUP];
-    string_rows(shapes, splats, view, first, low);
+    local int first[GROUP + 1];
+    local ushort4 around[GROUP];
+    string_rows(bounds, splats, first, around);
     for (int row = get_local_id(0); row < first[GROUP]; row += GROUP) {
         int owner = row_owner(first, row);
         uint splat = get_group_id(0) * GROUP + owner;
-        int tile_row = low[owner] + row - first[owner];
-        int2 columns = ellipse_tile_columns(
-            shapes[2 * splat], shapes[2 * splat + 1], tile_row, view.columns, view.width, view.height);
+        int4 tiles = convert_int4(around[owner]);
+        int tile_row = tiles.z + row - first[owner];
+        int2 columns = splat_tile_columns(shapes, splat, tiles, tile_row, view.width, view.height);
         for (int column = columns.x; column < columns.y; ++column)
             atomic_inc(&counts[(tile_row * view.columns + column) * COUNTER_STRIDE]);
     }
@@ -71,18 +68,24 @@ void count_tiles(global const float4 *shapes, uint splats, View view, volatile g
 
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void fill_tiles(
-    global const float4 *shapes, uint splats, View view, volatile global uint *cursors, global ulong *keys, uint capacity)
+    global const ushort4 *bounds,
+    global const float4 *shapes,
+    uint splats,
+    View view,
+    volatile global uint *cursors,
+    global ulong *keys,
+    uint capacity)
 {
-    local int first[GROUP + 1], low[GROUP];
-    string_rows(shapes, splats, view, first, low);
+    local int first[GROUP + 1];
+    local ushort4 around[GROUP];
+    string_rows(bounds, splats, first, around);
     for (int row = get_local_id(0); row < first[GROUP]; row += GROUP) {
         int owner = row_owner(first, row);
         uint splat = get_group_id(0) * GROUP + owner;
-        int tile_row = low[owner] + row - first[owner];
-        float4 s1 = shapes[2 * splat + 1];
-        int2 columns =
-            ellipse_tile_columns(shapes[2 * splat], s1, tile_row, view.columns, view.width, view.height);
-        ulong key = depth_key(s1.z, splat);
+        int4 tiles = convert_int4(around[owner]);
+        int tile_row = tiles.z + row - first[owner];
+        int2 columns = splat_tile_columns(shapes, splat, tiles, tile_row, view.width, view.height);
+        ulong key = depth_key(shapes[2 * splat + 1].z, splat);
         for (int column = columns.x; column < columns.y; ++column) {
             uint slot = atomic_inc(&cursors[(tile_row * view.columns + column) * COUNTER_STRIDE]);
             if (slot < capacity)
