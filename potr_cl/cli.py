@@ -33,11 +33,12 @@ from potr_cl.compare import (
 from potr_cl.decoder import PotrFile, decode
 from potr_cl.device import DEVICE_VARIABLE, Device
 from potr_cl.device_report import device_report, format_devices
-from potr_cl.encoder import EncodeOptions, encode, prune_scene
+from potr_cl.encoder import EncodeOptions, encode, reduce_scene
 from potr_cl.errors import DataError, DeviceError, PotrError, UsageError
 from potr_cl.formats import load_cameras, load_scene, ply
 from potr_cl.images import parse_colour, to_8_bits, write_png
 from potr_cl.metrics import Lpips
+from potr_cl.quantize import ac_sparsity
 from potr_cl.rasterizer import GSPLAT, INRIA, Rasterizer
 from potr_cl.removal import SweepOptions
 from potr_cl.report import file_report, format_report
@@ -79,15 +80,18 @@ class _Progress:
 def _count(args: argparse.Namespace, splats: int) -> int | None:
     """The number of splats that ``--keep`` or ``--count`` ask for."""
     if args.keep is None:
-        count: int | None = args.count
-        return count
+        return None if args.count is None else int(args.count)
     if not 0 < args.keep <= 1:
         raise UsageError(f"--keep is {args.keep:g}, it must be above 0 and at most 1")
-    return max(round(args.keep * splats), 1)
+    return max(round(float(args.keep) * splats), 1)
 
 
 def _sweep_options(args: argparse.Namespace) -> SweepOptions:
-    return SweepOptions(args.tolerance, memory=None if args.memory is None else int(args.memory * 2**30))
+    return SweepOptions(args.tolerance, memory=_bytes(args.memory))
+
+
+def _bytes(gigabytes: float | None) -> int | None:
+    return None if gigabytes is None else int(gigabytes * 2**30)
 
 
 def _prune(args: argparse.Namespace) -> None:
@@ -97,6 +101,7 @@ def _prune(args: argparse.Namespace) -> None:
         q=args.quality,
         delta_mse_max=args.delta_mse_max,
         iterations=args.iterations,
+        compact=False,
         sweep=_sweep_options(args),
         background=parse_colour(args.background),
     )
@@ -108,8 +113,9 @@ def _prune(args: argparse.Namespace) -> None:
     with contextlib.ExitStack() as stack:
         order = stack.enter_context(replacing(args.order)) if args.order is not None else None
         progress = stack.enter_context(contextlib.closing(_Progress()))
-        pruned = prune_scene(scene, cameras, options, progress, device)
-        ply.save(args.output, scene.subset(pruned.survivors))
+        kept, pruned = reduce_scene(scene, cameras, options, progress, device)
+        assert pruned is not None
+        ply.save(args.output, kept)
         if order is not None:
             np.save(order, pruned.order)
     print(
@@ -118,12 +124,39 @@ def _prune(args: argparse.Namespace) -> None:
     )
 
 
+def _compact(args: argparse.Namespace) -> None:
+    options = EncodeOptions(
+        q=args.quality,
+        lam=args.lam,
+        alpha=args.alpha,
+        sf_sh=args.sf_sh,
+        prune=False,
+        sweep=SweepOptions(memory=_bytes(args.memory)),
+        background=parse_colour(args.background),
+    )
+    _ = options.parameters
+    cameras = load_cameras(args.cameras)
+    scene = load_scene(args.scene)
+    device = Device(args.device)
+    with contextlib.closing(_Progress()) as progress:
+        compacted, _ = reduce_scene(scene, cameras, options, progress, device)
+    ply.save(args.output, compacted)
+    before, after = (100 * ac_sparsity(s.sh, options.parameters.sf_sh) for s in (scene, compacted))
+    print(
+        f"{args.output}: {len(scene)} splats, {after:.1f} % of the AC coefficients quantise to 0, {before:.1f} % before"
+    )
+
+
 def _encode(args: argparse.Namespace) -> None:
     options = EncodeOptions(
         q=args.quality,
         delta_mse_max=args.delta_mse_max,
+        lam=args.lam,
+        alpha=args.alpha,
         prune=not args.no_prune,
         iterations=args.iterations,
+        compact=not args.no_compact,
+        compact_at=args.compact_at,
         sweep=_sweep_options(args),
         background=parse_colour(args.background),
         beta=args.beta,
@@ -142,15 +175,13 @@ def _encode(args: argparse.Namespace) -> None:
         raise UsageError("--keep and --count need --cameras, the views that show which splats matter")
     scene = load_scene(args.scene)
     options = dataclasses.replace(options, count=_count(args, len(scene)))
-    device = Device(args.device) if options.prune and cameras is not None else None
+    device = Device(args.device) if (options.prune or options.compact) and cameras is not None else None
     with replacing(args.output) as file, contextlib.closing(_Progress()) as progress:
         encoded = encode(scene, cameras, options, progress, device)
         for piece in encoded.pieces:
             file.write(piece)
-    if options.prune and cameras is None:
-        print("every splat was kept: give --cameras to have those removed that no view misses", file=sys.stderr)
-    if not args.no_compact:
-        print("the colours were kept as they are: this version does not compact them", file=sys.stderr)
+    if (options.prune or options.compact) and cameras is None:
+        print("every splat and colour was kept: give --cameras to remove what no view misses", file=sys.stderr)
     before = options.source_bytes or scene.nbytes
     kept = len(encoded.order)
     print(
@@ -291,10 +322,21 @@ def _add_pruning_options(p: argparse.ArgumentParser) -> None:
         help="part of a tile that must have been removed before it is looked at again; 0: any; default "
         f"{SweepOptions.tolerance:g}",
     )
-    group.add_argument(
+    _add_memory_option(group)
+    _add_device_options(group)
+
+
+def _add_memory_option(p: argparse._ActionsContainer) -> None:
+    p.add_argument(
         "--memory", type=float, metavar="GB", help="GiB of device memory to keep views in; default: half of it"
     )
-    _add_device_options(group)
+
+
+def _add_compaction_options(p: argparse._ActionsContainer) -> None:
+    p.add_argument("--lambda", dest="lam", type=float, metavar="X", help="how strongly AC coefficients are pulled to 0")
+    p.add_argument(
+        "--alpha", type=float, metavar="X", help="cosine above which two coefficients count as one; 1: never"
+    )
 
 
 def _add_rendering_options(p: argparse.ArgumentParser) -> None:
@@ -353,6 +395,13 @@ def _parser() -> argparse.ArgumentParser:
     _add_pruning_options(p)
     p.add_argument("--no-compact", action="store_true", help="keep the colours' coefficients as they are")
     p.add_argument(
+        "--compact-at",
+        type=float,
+        default=EncodeOptions.compact_at,
+        metavar="PART",
+        help=f"of the pruning iterations after which colours are compacted; default {EncodeOptions.compact_at:g}",
+    )
+    p.add_argument(
         "--entropy", choices=("zstd", "npz"), default="zstd", help="npz: deflate, as NumPy's compressed files use"
     )
     p.add_argument("--zstd-level", type=int, default=19, metavar="L", help="1 (fast) to 22 (small); default 19")
@@ -369,6 +418,7 @@ def _parser() -> argparse.ArgumentParser:
         ("scale", "standard deviations"),
     ):
         single.add_argument(f"--sf-{name}", type=float, metavar="SF", help=f"steps a unit for {what}")
+    _add_compaction_options(single)
     p.set_defaults(run=_encode)
 
     p = commands.add_parser("prune", help="remove the splats that no view misses; nothing else changes")
@@ -384,6 +434,17 @@ def _parser() -> argparse.ArgumentParser:
     )
     _add_pruning_options(p)
     p.set_defaults(run=_prune)
+
+    p = commands.add_parser("compact", help="make the colours' coefficients sparse; nothing else changes")
+    p.add_argument("scene", type=Path, metavar="SCENE", help=".ply or .potr")
+    p.add_argument("--cameras", type=Path, required=True, metavar="PATH", help=_CAMERAS_HELP)
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.ply")
+    p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (sparsest) to 1; default 0.5")
+    _add_compaction_options(p)
+    p.add_argument("--sf-sh", type=float, metavar="SF", help="steps a unit of the quantiser to expect")
+    _add_memory_option(p)
+    _add_device_options(p)
+    p.set_defaults(run=_compact)
 
     p = commands.add_parser("decode", help="a .potr file to a .ply that every viewer opens")
     p.add_argument("file", type=Path, metavar="IN.potr")

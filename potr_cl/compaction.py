@@ -7,6 +7,7 @@ coefficients but the constant (DC) one are pulled towards zero. Kernels: cl/ridg
 
 from __future__ import annotations
 
+from collections.abc import Iterable
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -23,8 +24,8 @@ Weighting = Literal["importance", "visibility"]
 Precision = Literal["plain", "scaled", "refined", "orthogonal", "fp64"]
 
 #: Weights are in pixels of an image of this many: lambda then means the same whatever size the views are rendered at.
-#: With 400 x 400 the sparsity of our scenes follows the paper's curve.
-REFERENCE_PIXELS = 160_000
+#: Half a megapixel is about the size of the images on which the paper's figures for lambda were measured.
+REFERENCE_PIXELS = 500_000
 
 #: The largest weight and lambda whose squares and sums stay finite in single precision.
 _LARGEST_WEIGHT = 1e12
@@ -49,8 +50,8 @@ class ViewWeights:
     Attributes:
         offsets: (N + 1,) int64; splat k's entries are ``offsets[k]:offsets[k + 1]``.
         views: (K,) int32 index of the view, any order within a splat, none twice.
-        weights: (K,) float32 sum of transmittance times alpha of the splat over the view's pixels, times
-            ``REFERENCE_PIXELS`` over their number; in pixels, from 0 up.
+        weights: (K,) float32 mean of transmittance times alpha of the splat over the view's pixels, times
+            :data:`REFERENCE_PIXELS`; from 0 up.
 
     Raises:
         UsageError: the arrays do not belong together.
@@ -71,6 +72,32 @@ class ViewWeights:
             )
         if len(self.weights) and not (self.weights.min() >= 0 and self.weights.max() <= _LARGEST_WEIGHT):
             raise UsageError(f"view weights: a weight is negative, above {_LARGEST_WEIGHT:g} or not a number")
+
+    @staticmethod
+    def from_importances(
+        splats: int, importances: Iterable[tuple[int, NDArray[np.integer[Any]], NDArray[np.floating[Any]]]]
+    ) -> ViewWeights:
+        """Gather what :meth:`potr_cl.removal.RemovalSweep.view_importances` gives.
+
+        Args:
+            splats: N.
+            importances: per view its number, the splats that it sees, and I_k(s) of each, the mean over the view's
+                pixels.
+        """
+        per_view = [(view, seen.astype(np.uint32), values.astype(np.float32)) for view, seen, values in importances]
+        offsets = np.zeros(splats + 1, np.int64)
+        for _, seen, _ in per_view:
+            offsets[1:] += np.bincount(seen, minlength=splats)
+        np.cumsum(offsets, out=offsets)
+        views = np.empty(offsets[-1], np.int32)
+        weights = np.empty(offsets[-1], np.float32)
+        free = offsets[:-1].copy()
+        for view, seen, values in per_view:
+            places = free[seen]
+            views[places] = view
+            weights[places] = values * np.float32(REFERENCE_PIXELS)
+            free[seen] += 1
+        return ViewWeights(offsets, views, weights)
 
 
 @dataclass(frozen=True)

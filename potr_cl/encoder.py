@@ -15,7 +15,9 @@ from numpy.typing import NDArray
 from potr_cl import bitstream, octree, quantize
 from potr_cl.bitstream import EntropyCoder, Header, Property, Section
 from potr_cl.cameras import Camera, camera_centres, train_views
+from potr_cl.compaction import REFERENCE_PIXELS, CompactionOptions, Compactor, ViewWeights
 from potr_cl.device import Device
+from potr_cl.errors import UsageError
 from potr_cl.pruning import Pruned, PruningOptions, prune
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.removal import RemovalSweep, SweepOptions
@@ -36,10 +38,12 @@ class EncodeOptions:
 
     Attributes:
         q: quality, 0 to 1; sets every hyper-parameter that is not given on its own.
-        delta_mse_max, beta, gamma, sf_sh, sf_opacity, sf_rotation, sf_scale: replace single hyper-parameters
-            (:class:`potr_cl.quantize.HyperParameters`).
+        lam, alpha, delta_mse_max, beta, gamma, sf_sh, sf_opacity, sf_rotation, sf_scale: replace single
+            hyper-parameters (:class:`potr_cl.quantize.HyperParameters`).
         prune: remove splats; needs cameras, without them nothing is removed.
         iterations: of the pruning schedule.
+        compact: make the SH coefficients sparse; needs cameras, as pruning does.
+        compact_at: the part of the pruning iterations after which that is done: later ones see its effect.
         count: number of splats to keep, instead of ΔMSE_MAX.
         sweep: what measuring removal effects may skip.
         background: R, G, B behind the scene in the views that pruning looks at.
@@ -49,6 +53,8 @@ class EncodeOptions:
     """
 
     q: float = 0.5
+    lam: float | None = None
+    alpha: float | None = None
     delta_mse_max: float | None = None
     beta: float | None = None
     gamma: float | None = None
@@ -58,6 +64,8 @@ class EncodeOptions:
     sf_scale: float | None = None
     prune: bool = True
     iterations: int = 48
+    compact: bool = True
+    compact_at: float = 0.5
     count: int | None = None
     sweep: SweepOptions = field(default_factory=SweepOptions)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -68,7 +76,7 @@ class EncodeOptions:
     @property
     def parameters(self) -> quantize.HyperParameters:
         """The hyper-parameters that result."""
-        names = ("delta_mse_max", "beta", "gamma", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale")
+        names = ("lam", "alpha", "delta_mse_max", "beta", "gamma", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale")
         return quantize.HyperParameters.from_quality(self.q, **{name: getattr(self, name) for name in names})
 
 
@@ -119,11 +127,10 @@ def encode(
     source = scene
 
     pruned: Pruned | None = None
-    if options.prune and cameras is not None:
+    if cameras is not None and (options.prune or (options.compact and scene.sh_degree > 0)):
         started = time.perf_counter()
-        pruned = prune_scene(scene, cameras, options, report, device)
-        scene = scene.subset(pruned.survivors)
-        seconds["prune"] = time.perf_counter() - started
+        scene, pruned = reduce_scene(scene, cameras, options, report, device)
+        seconds["prune and compact"] = time.perf_counter() - started
 
     report("octree", 0.0)
     started = time.perf_counter()
@@ -169,46 +176,105 @@ def encode(
     return Encoded(pieces, sum(map(len, pieces)), order, pruned, seconds)
 
 
-def prune_scene(
+def reduce_scene(
     scene: Scene,
     cameras: Sequence[Camera],
     options: EncodeOptions,
     progress: Progress | None = None,
     device: Device | None = None,
-) -> Pruned:
-    """Decide which splats may go.
+) -> tuple[Scene, Pruned | None]:
+    """Remove splats and make the colours of the others sparse, as far as the options say.
 
     Args:
         scene: uncompressed; its renders are the target.
         cameras: only the training views among them are looked at.
-        options: ``parameters.delta_mse_max``, ``iterations``, ``count``, ``sweep`` and ``background`` count here.
-        progress: told how far the stages "prepare views" and "prune" are.
+        options: the hyper-parameters of pruning and compaction count here.
+        progress: told how far the stages are.
         device: the best one there is by default.
+
+    Returns:
+        The splats that are left, in their order, and what pruning did (None if it was left out).
 
     Raises:
         UsageError: options out of range, or no training view.
         DeviceError: the scene does not fit the device.
     """
     report = progress or (lambda stage, done: None)
-    schedule = PruningOptions(options.parameters.delta_mse_max, options.iterations, count=options.count)
+    parameters = options.parameters
+    schedule = PruningOptions(parameters.delta_mse_max, options.iterations, count=options.count)
+    if not 0 <= options.compact_at <= 1:
+        raise UsageError(f"compact_at is {options.compact_at:g}, it must lie between 0 and 1")
     views = train_views(cameras)
-    rasterizer = Rasterizer(device or Device(), scene, background=options.background)
+    device = device or Device()
+    rasterizer = Rasterizer(device, scene, background=options.background)
+    removal: RemovalSweep | None = None
+    sh = scene.sh
+    compacted = not options.compact or scene.sh_degree == 0
+
+    def compact(splats: NDArray[np.int64]) -> None:
+        nonlocal sh, compacted
+        assert removal is not None
+        weights = _view_weights(removal, views, splats)
+        how = CompactionOptions(lam=parameters.lam, alpha=parameters.alpha, sf_sh=parameters.sf_sh)
+        eyes = camera_centres(views)
+        sh = sh.copy()
+        sh[splats] = Compactor(device).compact(scene.subset(splats), eyes, weights, how).sh
+        compacted = True
+
+    def after_iteration(iteration: int, gone: NDArray[np.int64]) -> None:
+        left[gone] = False
+        if not compacted and iteration + 1 >= options.compact_at * options.iterations:
+            compact(np.flatnonzero(left))
+            assert removal is not None
+            removal.replace_sh(sh)
+
     try:
         report("prepare views", 0.0)
         removal = RemovalSweep(
             rasterizer, views, options.sweep, lambda done, count: report("prepare views", done / count)
         )
-        try:
+        pruned: Pruned | None = None
+        survivors = np.arange(len(scene))
+        left = np.ones(len(scene), bool)
+        if options.prune:
             report("prune", 0.0)
             pruned = prune(
-                removal, len(scene), schedule, lambda done, left: report("prune", min(done / options.iterations, 0.99))
+                removal,
+                len(scene),
+                schedule,
+                lambda done, kept: report("prune", min(done / options.iterations, 0.99)),
+                after_iteration,
             )
             report("prune", 1.0)
-            return pruned
-        finally:
-            removal.free()
+            survivors = pruned.survivors
+        if not compacted:
+            report("compact", 0.0)
+            if pruned is None:
+                removal.measure()
+            compact(survivors)
+            report("compact", 1.0)
+        kept = scene.subset(survivors)
+        return Scene(kept.means, kept.log_scales, kept.quaternions, kept.opacity_logits, sh[survivors]), pruned
     finally:
+        if removal is not None:
+            removal.free()
         rasterizer.free()
+
+
+def _view_weights(removal: RemovalSweep, views: Sequence[Camera], splats: NDArray[np.int64]) -> ViewWeights:
+    """The importances of some splats to each view, by splat."""
+    number = np.full(removal.splats, -1, np.int64)
+    number[splats] = np.arange(len(splats))
+    rows, columns, values = [], [], []
+    for view, seen, importance in removal.view_importances():
+        mine = number[seen] >= 0
+        rows.append(number[seen[mine]].astype(np.int32))
+        columns.append(np.full(int(mine.sum()), view, np.int32))
+        values.append((importance[mine] * REFERENCE_PIXELS).astype(np.float32))
+    row = np.concatenate(rows)
+    by_splat = np.argsort(row, kind="stable")
+    offsets = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(splats)))])
+    return ViewWeights(offsets.astype(np.int64), np.concatenate(columns)[by_splat], np.concatenate(values)[by_splat])
 
 
 def _tolerance(
@@ -237,6 +303,8 @@ def _metadata(scene: Scene, cameras: Sequence[Camera] | None, options: EncodeOpt
         "beta": options.parameters.beta if cameras is not None else None,
         "gamma": options.parameters.gamma,
         "delta_mse_max": options.parameters.delta_mse_max if pruned is not None and options.count is None else None,
+        "lambda": options.parameters.lam if cameras is not None and options.compact else None,
+        "alpha": options.parameters.alpha if cameras is not None and options.compact else None,
         "source_splats": len(scene),
         "source_bytes": options.source_bytes,
     }

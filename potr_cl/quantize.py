@@ -6,6 +6,7 @@ standard deviations, opacities after the sigmoid, unit quaternions without their
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass, fields, replace
 
 import numpy as np
@@ -30,12 +31,16 @@ class HyperParameters:
     """What one quality q sets (paper table "Hyperparameters as functions of q"); each can be replaced on its own.
 
     Attributes:
+        lam: λ, how strongly SH compaction pulls AC coefficients to zero, pixels squared.
+        alpha: two SH columns whose cosine exceeds it count as parallel.
         delta_mse_max: ΔMSE_MAX: a splat may go if its removal changes the mean squared error by less.
         beta: allowed distance of a centre to its leaf's centre, as a part of the distance to the nearest camera.
         gamma: the least such distance, world units.
         sf_sh, sf_opacity, sf_rotation, sf_scale: scale factors; a quantiser step is 1 / SF.
     """
 
+    lam: float
+    alpha: float
     delta_mse_max: float
     beta: float
     gamma: float
@@ -54,6 +59,8 @@ class HyperParameters:
         if not 0 <= q <= 1:
             raise UsageError(f"the quality q is {q:g}, it must lie between 0 and 1")
         values = HyperParameters(
+            lam=10**-q,
+            alpha=1 / (1 + math.exp(-3 * q)),
             delta_mse_max=10 ** (-8.8 - 2 * q),
             beta=1.4e-4 * q,
             gamma=5.0 * 10 ** (-3 - 5 * q),
@@ -66,6 +73,8 @@ class HyperParameters:
         for field in fields(values):
             value = getattr(values, field.name)
             low, high = (1e-30, 1e30) if field.name == "gamma" else (0.0, 1e30)
+            if field.name == "alpha":
+                low, high = 1e-30, 1.0
             if field.name.startswith("sf_"):
                 low, high = 1e-3, 1e9
             if not low <= value <= high:
@@ -212,3 +221,19 @@ def to_ycocg(rgb: F64) -> tuple[F64, F64, F64]:
 def quantize_sh(values: F64, sf_sh: float) -> Integers:
     """One channel of one SH coefficient (YCoCg) to steps of 1 / SF."""
     return _to_steps(values, sf_sh, "SH coefficient")
+
+
+def ac_sparsity(sh: F32, sf_sh: float) -> float:
+    """The part of the AC coefficients, in YCoCg, that are quantised to 0; 1 if there are none.
+
+    Args:
+        sh: (N, M, 3) R, G, B.
+        sf_sh: scale factor.
+    """
+    coefficients = range(1, sh.shape[1])
+    zeros = [
+        np.count_nonzero(quantize_sh(channel, sf_sh) == 0)
+        for m in coefficients
+        for channel in to_ycocg(sh[:, m].astype(np.float64))
+    ]
+    return sum(zeros) / (3 * len(sh) * len(coefficients)) if zeros else 1.0

@@ -10,7 +10,7 @@ What does not fit the memory budget is made again when it is needed: first the p
 
 from __future__ import annotations
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,7 @@ from potr_cl.cameras import Camera
 from potr_cl.device import Device
 from potr_cl.errors import UsageError
 from potr_cl.rasterizer import TILE, Rasterizer, View, camera_struct
+from potr_cl.scene import FloatArray
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -104,6 +105,7 @@ class RemovalSweep:
         self._device = device = rasterizer.device
         self._options = options or SweepOptions()
         self._measured = 0
+        self._original_sh: cl.Buffer | None = None
         self.sweeps = 0.0
         self._build()
 
@@ -111,6 +113,7 @@ class RemovalSweep:
         self._alive = np.ones(rasterizer.stride, np.uint8)
         self._alive_buffer = device.upload(self._alive, "the splats that are left")
         # Views of different sizes count the same: each is scaled to the size of the largest.
+        self._cameras = list(cameras)
         self._views = len(cameras)
         self._pixels = max(c.width * c.height for c in cameras)
         # Fixed point: an effect of 16 a pixel and channel in every tile of every view still fits 62 bits.
@@ -121,24 +124,23 @@ class RemovalSweep:
 
         memory = self._options.memory
         self._budget = device.info.memory * _SHARE if memory is None else memory
-        self._swept: list[_Swept] = []
-        self._transient: list[Camera] = []
+        self._kept: dict[int, _Swept] = {}  # by the number of the view
         self._shared: tuple[cl.Buffer, cl.Buffer] | None = None
         self._tile_count = 0
         most = 1
-        for done, camera in enumerate(cameras, start=1):
+        for number, camera in enumerate(cameras):
             swept = self._prepare(camera)
             most = max(most, swept.view.tiles)
             self._tile_count += swept.view.tiles
-            self._keep(swept)
+            self._keep(number, swept)
             if progress is not None:
-                progress(done, len(cameras))
+                progress(number + 1, len(cameras))
         self._tiles = device.allocate(4 * most, "the tiles to sweep")
         self._stale = device.allocate(4 * most, "the tiles' staleness")
 
     @property
     def kept_views(self) -> int:
-        return len(self._swept)
+        return len(self._kept)
 
     def _build(self) -> None:
         device, rules = self._device, self._rasterizer.rules
@@ -168,13 +170,13 @@ class RemovalSweep:
             stale=np.full(view.tiles, np.inf, np.float32),
         )
 
-    def _keep(self, swept: _Swept) -> None:
+    def _keep(self, number: int, swept: _Swept) -> None:
         """Keep a prepared view as far as the budget allows."""
         view = swept.view
         geometry = 48 * self._rasterizer.stride
         lists = 12 * view.entry_count + 12 * view.tiles + 12 * view.camera.width * view.camera.height
         # The first view stands for the others: geometry is kept for all of them or for none.
-        if not self._swept and not self._transient and self._views * (lists + geometry) > self._budget:
+        if number == 0 and self._views * (lists + geometry) > self._budget:
             self._shared = (
                 self._device.allocate(32 * self._rasterizer.stride, "the projected splats"),
                 self._device.allocate(16 * self._rasterizer.stride, "the projected splats' colours"),
@@ -182,12 +184,11 @@ class RemovalSweep:
         self._budget -= lists + (0 if self._shared else geometry)
         if self._budget < 0:
             self._budget = 0
-            self._transient.append(view.camera)
             swept.free(self._device)
             return
         if self._shared:
             view.free_geometry()
-        self._swept.append(swept)
+        self._kept[number] = swept
 
     def _sweep(self, swept: _Swept, tiles: NDArray[np.uint32], first: bool, totals: cl.Buffer) -> None:
         device, view = self._device, swept.view
@@ -225,7 +226,7 @@ class RemovalSweep:
         scene's renders if that splat alone went; I the mean over views and pixels of T α.
         """
         first = self._measured == 0
-        for number, swept in enumerate(self._swept):
+        for number, swept in self._kept.items():
             if (self._measured + number) % self._options.turns and not first:
                 continue
             tiles = np.flatnonzero(swept.stale > self._options.tolerance).astype(np.uint32)
@@ -233,7 +234,7 @@ class RemovalSweep:
                 self._sweep(swept, tiles, first, self._totals)
                 swept.stale[tiles] = 0 if self._options.tolerance >= 0 else np.inf
         words = self._device.download(self._totals, (self.splats, 2), np.int64)
-        if self._transient:
+        if len(self._kept) < self._views:
             words += self._measure_transient()
         self._measured += 1
         values = words / (self._scale * self._pixels * self._views)
@@ -244,12 +245,19 @@ class RemovalSweep:
         device = self._device
         totals, unused = self._zero_totals(), self._zero_totals()
         everything = np.ones_like(self._alive)
-        for camera in self._transient:
+        for number, camera in enumerate(self._cameras):
+            if number in self._kept:
+                continue
             swept = self._prepare(camera)
             tiles = np.arange(swept.view.tiles, dtype=np.uint32)
             if self._measured:
+                view = swept.view
                 cl.enqueue_copy(device.queue, self._alive_buffer, everything, is_blocking=True)
+                if self._original_sh is not None:
+                    self._rasterizer.project(camera, view.shapes, view.colours, self._original_sh)
                 self._sweep(swept, tiles, True, unused)
+                if self._original_sh is not None:
+                    self._rasterizer.project(camera, view.shapes, view.colours)
                 cl.enqueue_copy(device.queue, self._alive_buffer, self._alive, is_blocking=True)
                 device.free(swept.sums)
                 swept.sums = device.upload(np.zeros((swept.view.entry_count, 2), np.float32), "the removal effects")
@@ -266,7 +274,7 @@ class RemovalSweep:
         device = self._device
         self._alive[splats] = 2  # just gone
         cl.enqueue_copy(device.queue, self._alive_buffer, self._alive, is_blocking=True)
-        for swept in self._swept:
+        for swept in self._kept.values():
             self._stale_kernel.set_args(
                 self._alive_buffer, swept.begins, swept.lengths, swept.view.entries, swept.sums, self._stale
             )
@@ -275,15 +283,57 @@ class RemovalSweep:
         self._alive[splats] = 0
         cl.enqueue_copy(device.queue, self._alive_buffer, self._alive, is_blocking=True)
 
+    def replace_sh(self, sh: FloatArray) -> None:
+        """Go on with other colours: (N, M, 3) float32 of the same degree. The targets stay as they are."""
+        former = self._rasterizer.replace_sh(sh)
+        if self._original_sh is None:
+            self._original_sh = former
+        else:
+            self._device.free(former)
+        for swept in self._kept.values():
+            if swept.view.shapes is not None:
+                self._rasterizer.project(swept.view.camera, swept.view.shapes, swept.view.colours)
+        self.sweep_everything()
+
+    def view_importances(self) -> Iterator[tuple[int, Indices, F64]]:
+        """I_k(s) of the splats that are left, view by view, of tiles as they were last swept.
+
+        Yields:
+            The number of the view among the cameras, the splats that it sees, ascending, and the mean of T α of each
+            over the view's pixels.
+
+        Raises:
+            UsageError: nothing has been measured yet.
+        """
+        if not self._measured:
+            raise UsageError("importances are known after a measurement")
+        for number, camera in enumerate(self._cameras):
+            kept = self._kept.get(number)
+            swept = kept or self._prepare(camera)
+            if kept is None:
+                unused = self._zero_totals()
+                self._sweep(swept, np.arange(swept.view.tiles, dtype=np.uint32), True, unused)
+            view = swept.view
+            entries = self._device.download(view.entries, (view.entry_count,), np.uint32)
+            sums = self._device.download(swept.sums, (view.entry_count, 2), np.float32)
+            if kept is None:
+                self._device.free(unused)
+                swept.free(self._device)
+            total = np.bincount(entries, weights=sums[:, 1], minlength=self.splats)[: self.splats]
+            splats = np.flatnonzero((total > 0) & (self._alive[: self.splats] == 1))
+            yield number, splats, total[splats] / (camera.width * camera.height)
+
     def sweep_everything(self) -> None:
         """Have the next measurement sweep every tile, whatever has changed."""
-        for swept in self._swept:
+        for swept in self._kept.values():
             swept.stale[:] = np.inf
 
     def free(self) -> None:
         """Give all device memory back."""
-        for swept in self._swept:
+        for swept in self._kept.values():
             swept.free(self._device)
-        self._swept = []
+        self._kept = {}
         for buffer in (self._alive_buffer, self._totals, self._tiles, self._stale, *(self._shared or ())):
             self._device.free(buffer)
+        if self._original_sh is not None:
+            self._device.free(self._original_sh)

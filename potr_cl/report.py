@@ -64,6 +64,8 @@ def file_report(file: PotrFile) -> dict[str, Any]:
         "gamma": metadata.get("gamma"),
         "beta": metadata.get("beta"),
         "delta_mse_max": metadata.get("delta_mse_max"),
+        "lambda": metadata.get("lambda"),
+        "alpha": metadata.get("alpha"),
         "coders": sorted({s.coder.name.lower() for s in header.sections}),
         "bytes": len(file.data),
         "bytes_a_splat": len(file.data) / header.splats,

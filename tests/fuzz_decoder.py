@@ -29,7 +29,7 @@ SECONDS_A_FILE = 20  # a file of this size decodes in milliseconds: whatever rea
 def seeds() -> list[bytes]:
     coincident = random_scene(120, 1, seed=2).subset(np.r_[np.arange(120), np.arange(40), [3, 3]])
     encoded = [
-        encode(random_scene(150, 3, seed=1), ring_of_cameras(6), EncodeOptions(prune=False)),
+        encode(random_scene(150, 3, seed=1), ring_of_cameras(6), EncodeOptions(prune=False, compact=False)),
         encode(coincident, None, EncodeOptions(q=0.3, entropy=EntropyCoder("npz"))),
         encode(random_scene(400, 0, seed=3), None, EncodeOptions(q=1.0, entropy=EntropyCoder("zstd", 1))),
         encode(random_scene(1, 0, seed=4)),

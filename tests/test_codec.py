@@ -22,7 +22,7 @@ from tests.independent_decoder import decode as decode_independently
 from tests.scenes import random_scene, ring_of_cameras
 
 FAST = EntropyCoder("zstd", 1)
-KEEP = EncodeOptions(prune=False)
+KEEP = EncodeOptions(prune=False, compact=False)
 DATA = Path(__file__).parent / "data"
 
 
@@ -75,7 +75,7 @@ def test_within_steps(degree, entropy, q):
 def test_within_the_criterion_of_the_cameras():
     scene = random_scene(2000, 0, extent=20)
     cameras = ring_of_cameras(12)
-    options = EncodeOptions(entropy=FAST, prune=False)
+    options = EncodeOptions(entropy=FAST, prune=False, compact=False)
     eyes = camera_centres(train_views(cameras))
     nearest = np.linalg.norm(scene.means[:, None].astype(np.float64) - eyes, axis=2).min(axis=1)
     p = options.parameters

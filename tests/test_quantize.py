@@ -33,6 +33,8 @@ def test_paper_values():
     assert (p.sf_sh, p.sf_opacity, p.sf_rotation, p.sf_scale) == (51, 101, 201, 2001)
     assert p.beta == pytest.approx(7e-5)
     assert p.gamma == pytest.approx(5e-3 * 10**-2.5)
+    assert p.lam == pytest.approx(10**-0.5)
+    assert p.alpha == pytest.approx(0.8175745)
     assert p.delta_mse_max == pytest.approx(10**-9.8)
     low = HyperParameters.from_quality(0)
     assert (low.beta, low.gamma, low.sf_sh) == (0, 5e-3, 1)
@@ -119,3 +121,13 @@ def test_absurd_values_are_errors():
         quantize.quantize_sh(np.array([1e30]), 51)
     with pytest.raises(DataError, match="too large"):
         quantize.quantize_scales(np.array([1000.0]), 2001)
+
+
+def test_ac_sparsity():
+    sh = np.zeros((4, 4, 3), np.float32)
+    assert quantize.ac_sparsity(sh, 51) == 1
+    sh[0, 1] = 1  # a grey: Y only
+    assert quantize.ac_sparsity(sh, 51) == 35 / 36
+    sh[:, 0] = 5  # DC does not count
+    assert quantize.ac_sparsity(sh, 51) == 35 / 36
+    assert quantize.ac_sparsity(sh[:, :1], 51) == 1

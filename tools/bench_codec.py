@@ -114,7 +114,7 @@ def _child_encode(scene_path: str, cameras: str, level: str) -> dict[str, Any]:
     scene = load_scene(Path(scene_path))
     before = _resident()
     started = time.perf_counter()
-    encoded = encode(scene, views, EncodeOptions(entropy=EntropyCoder("zstd", int(level)), prune=False))
+    encoded = encode(scene, views, EncodeOptions(entropy=EntropyCoder("zstd", int(level)), prune=False, compact=False))
     seconds = time.perf_counter() - started
     return {
         "seconds": seconds,
@@ -139,7 +139,7 @@ def bench_decode(splats: int, folder: Path) -> None:
     scene = large_scene(load_scene(scene_path), splats)
     views = load_cameras(cameras) if cameras else None
     path = folder / "scene.potr"
-    encoded = encode(scene, views, EncodeOptions(entropy=EntropyCoder("zstd", 9), prune=False))
+    encoded = encode(scene, views, EncodeOptions(entropy=EntropyCoder("zstd", 9), prune=False, compact=False))
     path.write_bytes(b"".join(encoded.pieces))
     del scene
     result = _child("decode", path)
@@ -218,7 +218,7 @@ def bench_sizes(_: int, __: Path) -> None:
             ("zstd 22", EntropyCoder("zstd", 22)),
             ("npz", EntropyCoder("npz")),
         ):
-            encoded = encode(scene, cameras, EncodeOptions(entropy=coder, prune=False))
+            encoded = encode(scene, cameras, EncodeOptions(entropy=coder, prune=False, compact=False))
             columns[label] = file_report(PotrFile.from_bytes(b"".join(encoded.pieces)))
         first = columns["zstd 9"]
         print("| | serialised | " + " | ".join(columns) + " |\n|---|---|" + "---|" * len(columns))
