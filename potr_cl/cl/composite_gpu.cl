@@ -89,20 +89,18 @@ void composite(
             }
             if (most < LOG2_ALPHA_MIN)
                 continue;
+            /* Without branches from here on: a pixel that this splat misses or that has ended adds nothing. */
+            float alphas[AHEAD];
+            for (int j = 0; j < AHEAD; ++j)
+                alphas[j] = powers[j] >= LOG2_ALPHA_MIN ? min(EXP2(powers[j]), ALPHA_CAP) : 0.0f;
             for (int j = 0; j < AHEAD; ++j) {
-                if (alive && powers[j] >= LOG2_ALPHA_MIN) {
-                    float alpha = min(EXP2(powers[j]), ALPHA_CAP);
-                    float after = MAD(-alpha, t, t);
-                    if (after < STOP) {
-                        alive = 0;
-                    } else {
-                        float weight = alpha * t;
-                        r = MAD(weight, near_s1[k + j].z, r);
-                        g = MAD(weight, near_s1[k + j].w, g);
-                        b = MAD(weight, near_blue[k + j], b);
-                        t = after;
-                    }
-                }
+                float after = MAD(-alphas[j], t, t);
+                alive = alive && after >= STOP;
+                float weight = alive ? alphas[j] * t : 0.0f;
+                r = MAD(weight, near_s1[k + j].z, r);
+                g = MAD(weight, near_s1[k + j].w, g);
+                b = MAD(weight, near_blue[k + j], b);
+                t = alive ? after : t;
             }
         }
         if (alive)
