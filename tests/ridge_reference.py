@@ -24,7 +24,7 @@ def weighted_basis(mean: Array, centres: Array, weights: Array, degree: int) -> 
 def usable_columns(basis: Array, alpha: float) -> Mask:
     """(M,) columns that are not zero and whose |cosine| to every column used before them is at most ``alpha``."""
     norms = np.linalg.norm(basis, axis=0)
-    usable = norms > 0
+    usable: Mask = norms > 0
     if alpha < 1:
         for i in range(1, basis.shape[1]):
             for j in np.flatnonzero(usable[:i]):
