@@ -276,6 +276,7 @@ class Device:
         self.family: Family = family or self.info.family
         self.allocated = 0
         self.timings: list[tuple[str, cl.Event]] = []
+        self._unfinished: list[list[cl.Buffer]] = []
         self._profiling = profiling
         self._programs: dict[tuple[str, tuple[tuple[str, str], ...]], cl.Program] = {}
         with self.errors("cannot be opened"):
@@ -344,10 +345,30 @@ class Device:
         with self.errors(f"cannot hold {what}"):
             buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, nbytes)
         self.allocated += nbytes
+        if self._unfinished:
+            self._unfinished[-1].append(buffer)
         return buffer
+
+    @contextmanager
+    def all_or_nothing(self) -> Iterator[None]:
+        """Free what was allocated inside if an error leaves it: for objects that own several buffers."""
+        self._unfinished.append([])
+        try:
+            yield
+        except BaseException:
+            for buffer in list(self._unfinished[-1]):
+                self.free(buffer)
+            raise
+        finally:
+            finished = self._unfinished.pop()
+            if self._unfinished:
+                self._unfinished[-1].extend(finished)
 
     def free(self, buffer: cl.Buffer) -> None:
         """Give back what :meth:`allocate` gave."""
+        for buffers in self._unfinished:
+            if buffer in buffers:
+                buffers.remove(buffer)
         self.allocated -= buffer.size
         buffer.release()
 

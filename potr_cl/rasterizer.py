@@ -35,6 +35,9 @@ _SPLAT_GROUP = 256
 #: A tile's counter on the device with room to the next, enough for both kernel families.
 _COUNTER_BYTES = 32
 
+#: Tiles along a side of the image: the kernels number them in 16 bits.
+_MOST_TILES = 0xFFFF
+
 #: Standard deviations above this many world units are taken as this: nothing can be seen to differ, nothing overflows.
 _LARGEST_SCALE = 1e12
 
@@ -128,11 +131,17 @@ class View:
         self._device = device
         self.camera = camera
         self.columns, self.rows = _tiles(camera)
-        self.shapes = device.allocate(32 * splats, "the projected splats")
-        self.colours = device.allocate(16 * splats, "the projected splats' colours")
-        self.offsets = device.allocate(4 * (self.tiles + 1), "the tile offsets")
-        self._lists = Scratch(device, "the tile lists")
-        self._lists.reserve(4 * capacity)
+        if max(self.columns, self.rows) > _MOST_TILES:
+            raise UsageError(
+                f"view '{camera.name}': {camera.width} x {camera.height} pixels are more than {_MOST_TILES * TILE} "
+                "on a side; render a smaller image"
+            )
+        with device.all_or_nothing():
+            self.shapes = device.allocate(32 * splats, "the projected splats")
+            self.colours = device.allocate(16 * splats, "the projected splats' colours")
+            self.offsets = device.allocate(4 * (self.tiles + 1), "the tile offsets")
+            self._lists = Scratch(device, "the tile lists")
+            self._lists.reserve(4 * capacity)
         self.entry_count = 0
 
     @property
@@ -208,10 +217,11 @@ class Rasterizer:
         self.background = background
         self.splats = len(scene)
         self.stride = max(-(-len(scene) // _SPLAT_GROUP), 1) * _SPLAT_GROUP
-        self._upload(scene)
-        self._build(scene.sh.shape[1])
-        self._bounds = device.allocate(8 * self.stride, "the projected splats' bounds")
-        self._total = device.allocate(4, "the entry count")
+        with device.all_or_nothing():
+            self._upload(scene)
+            self._build(scene.sh.shape[1])
+            self._bounds = device.allocate(8 * self.stride, "the projected splats' bounds")
+            self._total = device.allocate(4, "the entry count")
         self._counts = Scratch(device, "the tile counts")
         self._keys = Scratch(device, "the tile lists' sort keys")
         self._image = Scratch(device, "the image")
@@ -377,14 +387,19 @@ class Rasterizer:
             DeviceError: it does not fit the device.
         """
         view = View(self.device, camera, self.stride, self._first_capacity())
-        self._bind(view)
-        self._enqueue_project(view)
-        self._enqueue_lists(view)
-        while not self._settle(view):
+        try:
             self._bind(view)
+            self._enqueue_project(view)
             self._enqueue_lists(view)
-        view.trim()
-        self._bound = None
+            while not self._settle(view):
+                self._bind(view)
+                self._enqueue_lists(view)
+            view.trim()
+        except BaseException:
+            view.free()
+            raise
+        finally:
+            self._bound = None
         return view
 
     def composite(self, view: View) -> tuple[FloatArray, FloatArray]:

@@ -363,6 +363,37 @@ def test_lists_larger_than_the_device_give_an_error(device: Device) -> None:
     rasterizer.free()
 
 
+def test_what_does_not_fit_leaves_nothing_behind(device: Device) -> None:
+    """Wherever in making a rasterizer or a view the memory runs out."""
+    scene, view = random_splats(3000, 3, seed=1), tilted_camera(1, 100, 100)
+    before = device.allocated
+    rasterizer = Rasterizer(device, scene)
+    with_scene = device.allocated
+    rasterizer.prepare(view).free()
+    most = device.allocated
+    rasterizer.free()
+    assert device.allocated == before
+    for share in (0.1, 0.5, 0.9, 1.1):
+        room = int(share * (with_scene - before)) if share < 1 else (with_scene + most) // 2 - before
+        held = device.info.memory - device.allocated - room
+        device.allocated += held
+        try:
+            with pytest.raises(DeviceError, match="cannot hold"):
+                rasterizer = Rasterizer(device, scene)
+                try:
+                    rasterizer.prepare(view)
+                finally:
+                    rasterizer.free()
+        finally:
+            device.allocated -= held
+        assert device.allocated == before
+
+
+def test_image_with_too_many_tiles_is_refused(device: Device) -> None:
+    with pytest.raises(UsageError, match="1048577 x 1"):
+        render(splats([0, 0, 2]), camera(1 << 20 | 1, 1), device)
+
+
 @pytest.mark.parametrize("rules", [{"near": 0.0}, {"near": float("nan")}, {"alpha_cap": 1.0}, {"alpha_cap": 0.0}])
 def test_impossible_rules_are_refused(rules: dict[str, float]) -> None:
     with pytest.raises(UsageError):

@@ -18,6 +18,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+import pyopencl as cl
 
 from potr_cl.cameras import Camera, train_views
 from potr_cl.device import Device
@@ -50,6 +51,36 @@ def stage_times(scene: Scene, cameras: list[Camera], spec: str | None, family: s
     return {name: seconds / len(cameras) for name, seconds in sums.items()}
 
 
+def copy_bandwidth(device: Device) -> float:
+    """Bytes a second of a copy within the device's memory, read and written bytes both counted."""
+    size = min(device.info.largest_buffer, device.info.memory // 4, 1 << 30)
+    source, target = device.allocate(size, "the copy"), device.allocate(size, "the copy")
+    best = np.inf
+    for _ in range(5):
+        device.queue.finish()
+        started = time.perf_counter()
+        cl.enqueue_copy(device.queue, target, source, byte_count=size)
+        device.queue.finish()
+        best = min(best, time.perf_counter() - started)
+    device.free(source)
+    device.free(target)
+    return 2 * size / best
+
+
+def least_bytes(scene: Scene, camera: Camera, entries: float) -> dict[str, float]:
+    """What each kernel must at least move through memory: every input read once, every output written once."""
+    splats = len(scene)
+    tiles = -(-camera.width // 16) * -(-camera.height // 16)
+    return {
+        "project": splats * (44 + 12 * scene.sh.shape[1] + 56),
+        "count_tiles": splats * 8 + tiles * 4,
+        "scan_tiles": tiles * 12,
+        "fill_tiles": splats * 12 + entries * 8,
+        "sort_tiles": entries * 12,
+        "composite": splats * 48 + entries * 4 + camera.width * camera.height * 16,
+    }
+
+
 def bench_scene(folder: Path, spec: str | None, family: str | None, passes: int, limit: int | None) -> dict[str, Any]:
     """Frames a second, time a stage and list lengths of one scene."""
     scene = load_scene(folder / "point_cloud.ply")
@@ -76,6 +107,8 @@ def bench_scene(folder: Path, spec: str | None, family: str | None, passes: int,
         "entries": entries,
         "longest_list": longest,
         "stage_seconds": stage_times(scene, cameras, spec, family),
+        "least_bytes": least_bytes(scene, cameras[0], entries),
+        "bandwidth": copy_bandwidth(device),
     }
 
 
@@ -92,14 +125,17 @@ def print_scenes(results: list[dict[str, Any]]) -> None:
             + (f"{theirs:.0f} | {r['frames_per_second'] / theirs:.2f} |" if theirs else "| |")
         )
     stages = list(results[0]["stage_seconds"])
-    print("\nMicroseconds a frame on the device, by kernel:\n")
+    print(
+        f"\nMicroseconds a frame on the device, by kernel; in brackets the least that its bytes take at "
+        f"{1e-9 * results[0]['bandwidth']:.0f} GB/s, what a copy reaches:\n"
+    )
     print("| scene | " + " | ".join(stages) + " | all kernels | frame |")
     print("|---" * (len(stages) + 3) + "|")
     for r in results:
         seconds = r["stage_seconds"]
         print(
             f"| {r['scene']} | "
-            + " | ".join(f"{1e6 * seconds[s]:.0f}" for s in stages)
+            + " | ".join(f"{1e6 * seconds[s]:.0f} ({1e6 * r['least_bytes'][s] / r['bandwidth']:.1f})" for s in stages)
             + f" | {1e6 * sum(seconds.values()):.0f} | {1e6 / r['frames_per_second']:.0f} |"
         )
 

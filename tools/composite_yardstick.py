@@ -127,6 +127,7 @@ def main() -> None:
                 f"{pairs * OPERATIONS / kernel / ceiling:.0%} | {1e-9 * pairs / loop:.2f} | {loop / kernel:.2f} |",
                 flush=True,
             )
+        print(f"\n{pairs / len(cameras):,.0f} pairs a view")
 
 
 if __name__ == "__main__":
