@@ -296,7 +296,7 @@ class RemovalSweep:
         self.sweep_everything()
 
     def view_importances(self) -> Iterator[tuple[int, Indices, F64]]:
-        """I_k(s) of the splats that are left, view by view, of tiles as they were last swept.
+        """I_k(s) of the splats that are left, view by view.
 
         Yields:
             The number of the view among the cameras, the splats that it sees, ascending, and the mean of T α of each
@@ -310,9 +310,13 @@ class RemovalSweep:
         for number, camera in enumerate(self._cameras):
             kept = self._kept.get(number)
             swept = kept or self._prepare(camera)
+            changed = np.flatnonzero(swept.stale > 0).astype(np.uint32)
             if kept is None:
                 unused = self._zero_totals()
-                self._sweep(swept, np.arange(swept.view.tiles, dtype=np.uint32), True, unused)
+                self._sweep(swept, changed, True, unused)
+            elif len(changed):
+                self._sweep(swept, changed, False, self._totals)
+                swept.stale[changed] = 0 if self._options.tolerance >= 0 else np.inf
             view = swept.view
             entries = self._device.download(view.entries, (view.entry_count,), np.uint32)
             sums = self._device.download(swept.sums, (view.entry_count, 2), np.float32)
