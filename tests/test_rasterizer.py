@@ -363,6 +363,14 @@ def test_lists_larger_than_the_device_give_an_error(device: Device) -> None:
     rasterizer.free()
 
 
+def make_and_prepare(device: Device, scene: Scene, view: Camera) -> None:
+    rasterizer = Rasterizer(device, scene)
+    try:
+        rasterizer.prepare(view)
+    finally:
+        rasterizer.free()
+
+
 def test_what_does_not_fit_leaves_nothing_behind(device: Device) -> None:
     """Wherever in making a rasterizer or a view the memory runs out."""
     scene, view = random_splats(3000, 3, seed=1), tilted_camera(1, 100, 100)
@@ -379,11 +387,7 @@ def test_what_does_not_fit_leaves_nothing_behind(device: Device) -> None:
         device.allocated += held
         try:
             with pytest.raises(DeviceError, match="cannot hold"):
-                rasterizer = Rasterizer(device, scene)
-                try:
-                    rasterizer.prepare(view)
-                finally:
-                    rasterizer.free()
+                make_and_prepare(device, scene, view)
         finally:
             device.allocated -= held
         assert device.allocated == before
