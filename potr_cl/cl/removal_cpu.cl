@@ -16,30 +16,10 @@
 
 #include "lanes.clh"
 #include "splat.clh"
+#include "splat_block.clh"
 #include "removal.clh"
 
 #define VECTORS (TILE / LANES)
-#define BLOCK 16
-
-inline int2 touched_rows(float4 s0, float4 s1, int2 origin)
-{
-    float level = ellipse_level(s1);
-    float a = s0.z, b = s0.w, c = s1.x;
-    float g = b * b + c * c;
-    float reach_x = sqrt(level * g) / (a * c) + PIXEL_SLACK + RELATIVE_SLACK * fabs(s0.x);
-    float d0 = fmax(origin.x + 0.5f - s0.x, -reach_x);
-    float d1 = fmin(origin.x + (TILE - 0.5f) - s0.x, reach_x);
-    float peak = -b / a * (sqrt(level) / c);
-    float bottom_x = fmin(fmax(peak, d0), d1);
-    float top_x = fmin(fmax(-peak, d0), d1);
-    float ac = a * c;
-    float bottom = (sqrt(fmax(g * level - ac * ac * bottom_x * bottom_x, 0.0f)) - a * b * bottom_x) / g;
-    float top = (-sqrt(fmax(g * level - ac * ac * top_x * top_x, 0.0f)) - a * b * top_x) / g;
-    float slack = PIXEL_SLACK + RELATIVE_SLACK * (fabs(s0.y) + fmax(fabs(bottom), fabs(top)));
-    float first = ceil(s0.y + top - slack - 0.5f) - origin.y;
-    float last = floor(s0.y + bottom + slack - 0.5f) - origin.y;
-    return (int2)((int)fmin(fmax(first, 0.0f), (float)TILE), (int)fmin(fmax(last + 1.0f, 0.0f), (float)TILE));
-}
 
 /* Work-item i handles tile tiles[i]. */
 kernel void removal(
@@ -64,6 +44,7 @@ kernel void removal(
     const int tile = tiles[get_global_id(0)];
     const int2 origin = (int2)(tile % view.columns, tile / view.columns) * TILE;
     const int pixel_rows = min(TILE, view.height - origin.y);
+    const int pixel_columns = min(TILE, view.width - origin.x);
     const uint begin = begins[tile];
     const uint end = begin + lengths[tile];
 
@@ -77,45 +58,49 @@ kernel void removal(
     }
 
     int first_alive = 0, end_alive = pixel_rows;
-    uint read = begin, kept = begin, swept = begin;
-    while (read < end && first_alive < end_alive) {
-        const uint block_end = min(read + BLOCK, end);
-        for (; read < block_end; ++read) {
-            uint splat = entries[read];
-            if (!alive[splat])
-                continue;
-            entries[kept] = splat;
-            sums[kept] = sums[read];
-            float4 s0 = shapes[2 * splat], s1 = shapes[2 * splat + 1];
-            float4 colour = colours[splat];
-            int2 rows = touched_rows(s0, s1, origin);
-            rows.x = max(rows.x, first_alive);
-            rows.y = min(rows.y, end_alive);
-            vint number = (vint)((int)(kept - begin));
-            ++kept;
+    uint kept = begin, swept = begin;
+    SplatBlock block;
+    for (uint read = begin; read < end; read += BLOCK) {
+        const uint block_begin = kept;
+        for (uint e = read; e < min(read + BLOCK, end); ++e) {
+            const uint splat = entries[e];
+            if (alive[splat]) {
+                entries[kept] = splat;
+                sums[kept++] = sums[e];
+            }
+        }
+        if (first_alive >= end_alive || kept == block_begin)
+            continue;
+        swept = kept;
+        fetch_block(&block, shapes, colours, entries, block_begin, kept, origin);
+        for (int k = 0; k < BLOCK; ++k) {
+            const int first_row = max(block.first_row[k], first_alive);
+            const int end_row = min(block.end_row[k], end_alive);
+            const vint number = (vint)((int)(block_begin - begin) + k);
+            const float x = block.x[k], a = block.a[k];
             vfloat au[VECTORS];
             for (int v = 0; v < VECTORS; ++v)
-                au[v] = s0.z * ((LANE_NUMBERS + (origin.x + v * LANES + 0.5f)) - s0.x);
-            for (int row = rows.x; row < rows.y; ++row) {
-                float dy = origin.y + row + 0.5f - s0.y;
-                float bu = s0.w * dy;
-                float cv = s1.x * dy;
-                float level = mad(-cv, cv, s1.y);
+                au[v] = a * ((LANE_NUMBERS + (origin.x + v * LANES + 0.5f)) - x);
+            for (int row = first_row; row < end_row; ++row) {
+                const float dy = origin.y + row + 0.5f - block.y[k];
+                const float bu = block.b[k] * dy;
+                const float cv = block.c[k] * dy;
+                const float level = MAD(-cv, cv, block.log2_opacity[k]);
                 for (int v = 0; v < VECTORS; ++v) {
-                    int i = row * VECTORS + v;
-                    vfloat u = au[v] + bu;
-                    vfloat power = mad(-u, u, (vfloat)(level));
-                    vfloat alpha = fmin(exp2_polynomial(power), ALPHA_CAP);
+                    const int i = row * VECTORS + v;
+                    const vfloat u = au[v] + bu;
+                    const vfloat power = MAD(-u, u, (vfloat)(level));
+                    vfloat alpha = min(exp2_polynomial(power), ALPHA_CAP);
                     alpha = power >= LOG2_ALPHA_MIN ? alpha : (vfloat)(0.0f);
-                    vfloat before = t[i];
-                    vfloat after = mad(-alpha, before, before);
-                    vint goes_on = after >= STOP;
-                    vfloat weight = goes_on ? alpha * before : (vfloat)(0.0f);
+                    const vfloat before = t[i];
+                    const vfloat after = MAD(-alpha, before, before);
+                    const vint goes_on = after >= STOP;
+                    const vfloat weight = goes_on ? alpha * before : (vfloat)(0.0f);
                     t[i] = goes_on ? after : -fabs(before);
                     last[i] = goes_on ? number : last[i];
-                    r[i] = mad(weight, (vfloat)(colour.x), r[i]);
-                    g[i] = mad(weight, (vfloat)(colour.y), g[i]);
-                    b[i] = mad(weight, (vfloat)(colour.z), b[i]);
+                    r[i] = MAD(weight, (vfloat)(block.red[k]), r[i]);
+                    g[i] = MAD(weight, (vfloat)(block.green[k]), g[i]);
+                    b[i] = MAD(weight, (vfloat)(block.blue[k]), b[i]);
                 }
             }
         }
@@ -132,14 +117,6 @@ kernel void removal(
         first_alive = first;
         end_alive = final + 1;
     }
-    swept = kept;
-    for (; read < end; ++read) {
-        uint splat = entries[read];
-        if (alive[splat]) {
-            sums[kept] = sums[read];
-            entries[kept++] = splat;
-        }
-    }
     lengths[tile] = kept - begin;
     /* What lies behind the last pixel's end has no effect any more; nor have the slots that the dead left. */
     for (uint e = swept; e < end; ++e) {
@@ -150,81 +127,81 @@ kernel void removal(
 
     /* From here on r, g, b are twice the difference of the colour to the target, and br, bg, bb the colour behind. */
     vfloat br[TILE * VECTORS], bg[TILE * VECTORS], bb[TILE * VECTORS];
-    const int pixel_columns = min(TILE, view.width - origin.x);
     for (int row = 0; row < pixel_rows; ++row) {
-        float colours_here[3][TILE];
+        float differences[3][TILE];
         for (int v = 0; v < VECTORS; ++v) {
-            int i = row * VECTORS + v;
+            const int i = row * VECTORS + v;
             t[i] = fabs(t[i]);
-            r[i] = mad(t[i], (vfloat)(red), r[i]);
-            g[i] = mad(t[i], (vfloat)(green), g[i]);
-            b[i] = mad(t[i], (vfloat)(blue), b[i]);
-            VSTORE(r[i], v, colours_here[0]);
-            VSTORE(g[i], v, colours_here[1]);
-            VSTORE(b[i], v, colours_here[2]);
-        }
-        size_t pixel = 3 * ((size_t)(origin.y + row) * view.width + origin.x);
-        for (int column = 0; column < pixel_columns; ++column)
-            for (int channel = 0; channel < 3; ++channel) {
-                if (first_time)
-                    target[pixel + 3 * column + channel] = colours_here[channel][column];
-                colours_here[channel][column] -= target[pixel + 3 * column + channel];
-            }
-        for (int v = 0; v < VECTORS; ++v) {
-            int i = row * VECTORS + v;
-            r[i] = 2.0f * VLOAD(v, colours_here[0]);
-            g[i] = 2.0f * VLOAD(v, colours_here[1]);
-            b[i] = 2.0f * VLOAD(v, colours_here[2]);
+            VSTORE(MAD(t[i], (vfloat)(red), r[i]), v, differences[0]);
+            VSTORE(MAD(t[i], (vfloat)(green), g[i]), v, differences[1]);
+            VSTORE(MAD(t[i], (vfloat)(blue), b[i]), v, differences[2]);
             br[i] = (vfloat)(red);
             bg[i] = (vfloat)(green);
             bb[i] = (vfloat)(blue);
         }
+        const size_t pixel = 3 * ((size_t)(origin.y + row) * view.width + origin.x);
+        for (int column = 0; column < pixel_columns; ++column)
+            for (int channel = 0; channel < 3; ++channel) {
+                if (first_time)
+                    target[pixel + 3 * column + channel] = differences[channel][column];
+                differences[channel][column] -= target[pixel + 3 * column + channel];
+            }
+        for (int v = 0; v < VECTORS; ++v) {
+            const int i = row * VECTORS + v;
+            r[i] = 2.0f * VLOAD(v, differences[0]);
+            g[i] = 2.0f * VLOAD(v, differences[1]);
+            b[i] = 2.0f * VLOAD(v, differences[2]);
+        }
     }
 
-    for (uint e = swept; e-- > begin;) {
-        uint splat = entries[e];
-        float4 s0 = shapes[2 * splat], s1 = shapes[2 * splat + 1];
-        float4 colour = colours[splat];
-        int2 rows = touched_rows(s0, s1, origin);
-        rows.y = min(rows.y, pixel_rows);
-        vint number = (vint)((int)(e - begin));
-        vfloat au[VECTORS];
-        for (int v = 0; v < VECTORS; ++v)
-            au[v] = s0.z * ((LANE_NUMBERS + (origin.x + v * LANES + 0.5f)) - s0.x);
-        vfloat effect = (vfloat)(0.0f), importance = (vfloat)(0.0f);
-        for (int row = rows.x; row < rows.y; ++row) {
-            float dy = origin.y + row + 0.5f - s0.y;
-            float bu = s0.w * dy;
-            float cv = s1.x * dy;
-            float level = mad(-cv, cv, s1.y);
-            for (int v = 0; v < VECTORS; ++v) {
-                int i = row * VECTORS + v;
-                vfloat u = au[v] + bu;
-                vfloat power = mad(-u, u, (vfloat)(level));
-                vfloat alpha = fmin(exp2_polynomial(power), ALPHA_CAP);
-                alpha = (power >= LOG2_ALPHA_MIN) && (number <= last[i]) ? alpha : (vfloat)(0.0f);
-                vfloat front = t[i] / (1.0f - alpha);
-                t[i] = front;
-                vfloat weight = front * alpha;
-                vfloat gap_r = br[i] - colour.x, gap_g = bg[i] - colour.y, gap_b = bb[i] - colour.z;
-                vfloat pd_r = weight * gap_r, pd_g = weight * gap_g, pd_b = weight * gap_b;
-                effect = mad(pd_r, pd_r + r[i], effect);
-                effect = mad(pd_g, pd_g + g[i], effect);
-                effect = mad(pd_b, pd_b + b[i], effect);
-                importance += weight;
-                br[i] = mad(-alpha, gap_r, br[i]);
-                bg[i] = mad(-alpha, gap_g, bg[i]);
-                bb[i] = mad(-alpha, gap_b, bb[i]);
+    for (uint block_end = swept; block_end > begin;) {
+        const uint block_begin = block_end - min(block_end - begin, (uint)BLOCK);
+        fetch_block(&block, shapes, colours, entries, block_begin, block_end, origin);
+        for (int k = (int)(block_end - block_begin) - 1; k >= 0; --k) {
+            const int end_row = min(block.end_row[k], pixel_rows);
+            const vint number = (vint)((int)(block_begin - begin) + k);
+            const float x = block.x[k], a = block.a[k];
+            const float red_k = block.red[k], green_k = block.green[k], blue_k = block.blue[k];
+            vfloat au[VECTORS];
+            for (int v = 0; v < VECTORS; ++v)
+                au[v] = a * ((LANE_NUMBERS + (origin.x + v * LANES + 0.5f)) - x);
+            vfloat effect = (vfloat)(0.0f), importance = (vfloat)(0.0f);
+            for (int row = block.first_row[k]; row < end_row; ++row) {
+                const float dy = origin.y + row + 0.5f - block.y[k];
+                const float bu = block.b[k] * dy;
+                const float cv = block.c[k] * dy;
+                const float level = MAD(-cv, cv, block.log2_opacity[k]);
+                for (int v = 0; v < VECTORS; ++v) {
+                    const int i = row * VECTORS + v;
+                    const vfloat u = au[v] + bu;
+                    const vfloat power = MAD(-u, u, (vfloat)(level));
+                    vfloat alpha = min(exp2_polynomial(power), ALPHA_CAP);
+                    alpha = (power >= LOG2_ALPHA_MIN) && (number <= last[i]) ? alpha : (vfloat)(0.0f);
+                    const vfloat front = t[i] / (1.0f - alpha);
+                    t[i] = front;
+                    const vfloat weight = front * alpha;
+                    const vfloat gap_r = br[i] - red_k, gap_g = bg[i] - green_k, gap_b = bb[i] - blue_k;
+                    const vfloat pd_r = weight * gap_r, pd_g = weight * gap_g, pd_b = weight * gap_b;
+                    effect = MAD(pd_r, pd_r + r[i], effect);
+                    effect = MAD(pd_g, pd_g + g[i], effect);
+                    effect = MAD(pd_b, pd_b + b[i], effect);
+                    importance += weight;
+                    br[i] = MAD(-alpha, gap_r, br[i]);
+                    bg[i] = MAD(-alpha, gap_g, bg[i]);
+                    bb[i] = MAD(-alpha, gap_b, bb[i]);
+                }
             }
+            float effects[LANES], importances[LANES];
+            VSTORE(effect, 0, effects);
+            VSTORE(importance, 0, importances);
+            float2 sum = (float2)(0.0f, 0.0f);
+            for (int lane = 0; lane < LANES; ++lane)
+                sum += (float2)(effects[lane], importances[lane]);
+            const uint e = block_begin + k;
+            replace_sums(totals + TOTAL_WORDS * entries[e], sums[e], sum, scale, bound);
+            sums[e] = sum;
         }
-        float effects[LANES], importances[LANES];
-        VSTORE(effect, 0, effects);
-        VSTORE(importance, 0, importances);
-        float2 sum = (float2)(0.0f, 0.0f);
-        for (int lane = 0; lane < LANES; ++lane)
-            sum += (float2)(effects[lane], importances[lane]);
-        replace_sums(totals + TOTAL_WORDS * splat, sums[e], sum, scale, bound);
-        sums[e] = sum;
+        block_end = block_begin;
     }
 }
 
