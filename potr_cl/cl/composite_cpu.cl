@@ -41,8 +41,8 @@ kernel void composite(
     for (uint begin = min(offsets[tile], capacity); begin < end && first_alive < end_alive; begin += BLOCK) {
         fetch_block(&block, shapes, colours, entries, begin, end, origin);
         for (int k = 0; k < BLOCK; ++k) {
-            const int first_row = max(block.first_row[k], first_alive);
-            const int end_row = min(block.end_row[k], end_alive);
+            const int first_row = GREATER(block.first_row[k], first_alive);
+            const int end_row = LESSER(block.end_row[k], end_alive);
             const float x = block.x[k], a = block.a[k];
             vfloat au[VECTORS];
             for (int v = 0; v < VECTORS; ++v)
@@ -56,13 +56,14 @@ kernel void composite(
                     const int i = row * VECTORS + v;
                     const vfloat u = au[v] + bu;
                     const vfloat power = MAD(-u, u, (vfloat)(level));
-                    vfloat alpha = min(exp2_polynomial(power), ALPHA_CAP);
+                    vfloat alpha = exp2_polynomial(power);
+                    alpha = LESSER(alpha, (vfloat)(ALPHA_CAP));
                     alpha = power >= LOG2_ALPHA_MIN ? alpha : (vfloat)(0.0f);
                     const vfloat before = t[i];
                     const vfloat after = MAD(-alpha, before, before);
                     const vint goes_on = after >= STOP;
                     const vfloat weight = goes_on ? alpha * before : (vfloat)(0.0f);
-                    t[i] = goes_on ? after : -fabs(before);
+                    t[i] = goes_on ? after : NEGATIVE(before);
                     r[i] = MAD(weight, (vfloat)(block.red[k]), r[i]);
                     g[i] = MAD(weight, (vfloat)(block.green[k]), g[i]);
                     b[i] = MAD(weight, (vfloat)(block.blue[k]), b[i]);
