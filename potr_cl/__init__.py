@@ -1,7 +1,7 @@
 """potr_cl: post-training compression of 3D Gaussian Splatting scenes with OpenCL.
 
-The public interface: scenes and cameras are loaded by :mod:`potr_cl.formats`, encoded by :mod:`potr_cl.encoder`, decoded
-by :mod:`potr_cl.decoder`, rendered by :mod:`potr_cl.rasterizer`.
+The public interface: scenes and cameras are loaded by :mod:`potr_cl.formats`, encoded by :mod:`potr_cl.encoder`,
+decoded by :mod:`potr_cl.decoder`, rendered by :mod:`potr_cl.rasterizer`.
 """
 
 from potr_cl.cameras import Camera

@@ -117,8 +117,9 @@ def choose(delta_mse: F64, importance: F64, alive: Indices, remaining: int, opti
     budget = weight[candidates].sum() / remaining
     # Up to and including the splat with which the budget is reached.
     chosen = candidates[: int(np.searchsorted(spent, budget)) + 1]
-    unseen = candidates[(weight[candidates] == 0) & (effect[candidates] == 0)]
-    gone: Indices = alive[np.concatenate([unseen, chosen[~np.isin(chosen, unseen)]])]
+    unseen = (weight[candidates] == 0) & (effect[candidates] == 0)
+    unseen[: len(chosen)] = False
+    gone: Indices = alive[np.concatenate([candidates[unseen], chosen])]
     return gone
 
 

@@ -10,6 +10,7 @@ What does not fit the memory budget is made again when it is needed: first the p
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 
@@ -26,6 +27,8 @@ from potr_cl.scene import FloatArray
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+#: Where the removal kernel's argument stands that has it store the target.
+_FIRST_TIME = 12
 #: Part of the device's memory that the views may take unless the caller sets a budget: on CPUs it is everybody's.
 _SHARE = 0.5
 
@@ -59,14 +62,19 @@ class SweepOptions:
 
 @dataclass
 class _Swept:
-    """A view and what is kept of it from sweep to sweep."""
+    """A view and what is kept of it from sweep to sweep.
+
+    The kernels have all their arguments but the place of the tiles to sweep in the list of tiles.
+    """
 
     view: View
     begins: cl.Buffer
     lengths: cl.Buffer
     sums: cl.Buffer
     target: cl.Buffer
-    stale: NDArray[np.float32]
+    first_tile: int
+    sweep: cl.Kernel = None
+    staleness: cl.Kernel = None
 
     def free(self, device: Device) -> None:
         self.view.free()
@@ -127,16 +135,21 @@ class RemovalSweep:
         self._kept: dict[int, _Swept] = {}  # by the number of the view
         self._shared: tuple[cl.Buffer, cl.Buffer] | None = None
         self._tile_count = 0
-        most = 1
+        kept_tiles, most = 0, 1
         for number, camera in enumerate(cameras):
-            swept = self._prepare(camera)
+            swept = self._prepare(camera, kept_tiles)
             most = max(most, swept.view.tiles)
             self._tile_count += swept.view.tiles
-            self._keep(number, swept)
+            if self._keep(number, swept):
+                kept_tiles += swept.view.tiles
             if progress is not None:
                 progress(number + 1, len(cameras))
-        self._tiles = device.allocate(4 * most, "the tiles to sweep")
-        self._stale = device.allocate(4 * most, "the tiles' staleness")
+        # The kept views' tiles are numbered through: importance removed from each since its last sweep.
+        self._stale = np.full(kept_tiles, np.inf, np.float32)
+        self._stale_buffer = device.allocate(4 * kept_tiles, "the tiles' staleness")
+        self._tiles = device.allocate(4 * max(kept_tiles, most), "the tiles to sweep")
+        for swept in self._kept.values():
+            self._bind(swept, True, self._totals)
 
     @property
     def kept_views(self) -> int:
@@ -149,15 +162,14 @@ class RemovalSweep:
             limits["NATIVE_EXP2"] = int(device.native_exp2)
         else:
             limits["LANES"] = max(device.vector_width, 4)
-        source = f"removal_{device.family}.cl"
-        self._kernel = device.kernel(source, "removal", **limits)
-        self._stale_kernel = device.kernel(source, "staleness", **limits)
+        self._limits = limits
+        self._source = f"removal_{device.family}.cl"
         self._group = 64 if device.family == "gpu" else 1
 
     def _zero_totals(self) -> cl.Buffer:
         return self._device.upload(np.zeros((self._rasterizer.stride, 4), np.uint32), "the removal effects")
 
-    def _prepare(self, camera: Camera) -> _Swept:
+    def _prepare(self, camera: Camera, first_tile: int = 0) -> _Swept:
         device = self._device
         view = self._rasterizer.prepare(camera)
         offsets = device.download(view.offsets, (view.tiles + 1,), np.uint32)
@@ -167,11 +179,11 @@ class RemovalSweep:
             lengths=device.upload(np.diff(offsets), "the tile lists"),
             sums=device.upload(np.zeros((view.entry_count, 2), np.float32), "the tiles' removal effects"),
             target=device.allocate(12 * camera.width * camera.height, "the target image"),
-            stale=np.full(view.tiles, np.inf, np.float32),
+            first_tile=first_tile,
         )
 
-    def _keep(self, number: int, swept: _Swept) -> None:
-        """Keep a prepared view as far as the budget allows."""
+    def _keep(self, number: int, swept: _Swept) -> bool:
+        """Keep a prepared view as far as the budget allows; whether it does."""
         view = swept.view
         geometry = 48 * self._rasterizer.stride
         lists = 12 * view.entry_count + 12 * view.tiles + 12 * view.camera.width * view.camera.height
@@ -185,28 +197,26 @@ class RemovalSweep:
         if self._budget < 0:
             self._budget = 0
             swept.free(self._device)
-            return
+            return False
         if self._shared:
             view.free_geometry()
         self._kept[number] = swept
+        return True
 
-    def _sweep(self, swept: _Swept, tiles: NDArray[np.uint32], first: bool, totals: cl.Buffer) -> None:
+    def _bind(self, swept: _Swept, first: bool, totals: cl.Buffer) -> None:
+        """Kernels of its own for a view: setting their arguments takes longer than launching them."""
         device, view = self._device, swept.view
-        shapes, colours = view.shapes, view.colours
-        if shapes is None:
-            assert self._shared is not None
-            shapes, colours = self._shared
-            self._rasterizer.project(view.camera, shapes, colours)
+        shapes, colours = self._shared if view.shapes is None and self._shared else (view.shapes, view.colours)
         weight = self._pixels / (view.camera.width * view.camera.height)
-        cl.enqueue_copy(device.queue, self._tiles, tiles, is_blocking=True)
-        self._kernel.set_args(
+        lists = (swept.begins, swept.lengths, view.entries)
+        swept.sweep = device.kernel(self._source, "removal", **self._limits)
+        swept.sweep.set_args(
+            np.uint32(0),
+            self._tiles,
             shapes,
             colours,
             self._alive_buffer,
-            self._tiles,
-            swept.begins,
-            swept.lengths,
-            view.entries,
+            *lists,
             camera_struct(view.camera),
             *(np.float32(channel) for channel in self._rasterizer.background),
             np.int32(first),
@@ -216,8 +226,38 @@ class RemovalSweep:
             swept.sums,
             totals,
         )
-        device.launch(self._kernel, (len(tiles) * self._group,), (self._group,))
-        self.sweeps += len(tiles) / self._tile_count
+        swept.staleness = device.kernel(self._source, "staleness", **self._limits)
+        swept.staleness.set_args(
+            self._alive_buffer, *lists, swept.sums, np.uint32(swept.first_tile), self._stale_buffer
+        )
+
+    def _sweep(self, swept: _Swept, start: int, count: int) -> None:
+        """Sweep ``count`` of a view's tiles, listed in the tile buffer from ``start`` on."""
+        if swept.view.shapes is None:
+            assert self._shared is not None
+            self._rasterizer.project(swept.view.camera, *self._shared)
+        swept.sweep.set_arg(0, np.uint32(start))
+        self._device.launch(swept.sweep, (count * self._group,), (self._group,))
+        self.sweeps += count / self._tile_count
+
+    def _list_tiles(self, tiles: NDArray[np.int64]) -> None:
+        if len(tiles):
+            cl.enqueue_copy(self._device.queue, self._tiles, tiles.astype(np.uint32), is_blocking=True)
+
+    def _sweep_stale(self, tolerance: float, turns: int = 1) -> None:
+        """Sweep the kept views' tiles that have lost more than ``tolerance``, of every so many-th view only."""
+        wanted = self._stale > tolerance
+        firsts = np.array([swept.first_tile for swept in self._kept.values()] + [len(wanted)], np.int64)
+        for number, (start, stop) in zip(self._kept, itertools.pairwise(firsts), strict=True):
+            if (self._measured + number) % turns:
+                wanted[start:stop] = False
+        numbers = np.flatnonzero(wanted)
+        bounds = np.searchsorted(numbers, firsts)
+        self._list_tiles(numbers - np.repeat(firsts[:-1], np.diff(bounds)))
+        for swept, (start, stop) in zip(self._kept.values(), itertools.pairwise(bounds), strict=True):
+            if stop > start:
+                self._sweep(swept, int(start), int(stop - start))
+        self._stale[numbers] = 0 if self._options.tolerance >= 0 else np.inf
 
     def measure(self) -> tuple[F64, F64]:
         """ΔMSE_k and I_k of all N splats, float64; of removed splats they mean nothing.
@@ -225,14 +265,10 @@ class RemovalSweep:
         ΔMSE is the change of the mean squared error over all views, pixels and channels against the uncompressed
         scene's renders if that splat alone went; I the mean over views and pixels of T α.
         """
-        first = self._measured == 0
-        for number, swept in self._kept.items():
-            if (self._measured + number) % self._options.turns and not first:
-                continue
-            tiles = np.flatnonzero(swept.stale > self._options.tolerance).astype(np.uint32)
-            if len(tiles):
-                self._sweep(swept, tiles, first, self._totals)
-                swept.stale[tiles] = 0 if self._options.tolerance >= 0 else np.inf
+        self._sweep_stale(self._options.tolerance, self._options.turns if self._measured else 1)
+        if self._measured == 0:
+            for swept in self._kept.values():
+                swept.sweep.set_arg(_FIRST_TIME, np.int32(0))
         words = self._device.download(self._totals, (self.splats, 2), np.int64)
         if len(self._kept) < self._views:
             words += self._measure_transient()
@@ -249,19 +285,21 @@ class RemovalSweep:
             if number in self._kept:
                 continue
             swept = self._prepare(camera)
-            tiles = np.arange(swept.view.tiles, dtype=np.uint32)
+            view = swept.view
+            self._list_tiles(np.arange(view.tiles))
             if self._measured:
-                view = swept.view
                 cl.enqueue_copy(device.queue, self._alive_buffer, everything, is_blocking=True)
                 if self._original_sh is not None:
                     self._rasterizer.project(camera, view.shapes, view.colours, self._original_sh)
-                self._sweep(swept, tiles, True, unused)
+                self._bind(swept, True, unused)
+                self._sweep(swept, 0, view.tiles)
                 if self._original_sh is not None:
                     self._rasterizer.project(camera, view.shapes, view.colours)
                 cl.enqueue_copy(device.queue, self._alive_buffer, self._alive, is_blocking=True)
                 device.free(swept.sums)
-                swept.sums = device.upload(np.zeros((swept.view.entry_count, 2), np.float32), "the removal effects")
-            self._sweep(swept, tiles, self._measured == 0, totals)
+                swept.sums = device.upload(np.zeros((view.entry_count, 2), np.float32), "the removal effects")
+            self._bind(swept, self._measured == 0, totals)
+            self._sweep(swept, 0, view.tiles)
             device.queue.finish()
             swept.free(device)
         words = device.download(totals, (self.splats, 2), np.int64)
@@ -275,11 +313,8 @@ class RemovalSweep:
         self._alive[splats] = 2  # just gone
         cl.enqueue_copy(device.queue, self._alive_buffer, self._alive, is_blocking=True)
         for swept in self._kept.values():
-            self._stale_kernel.set_args(
-                self._alive_buffer, swept.begins, swept.lengths, swept.view.entries, swept.sums, self._stale
-            )
-            device.launch(self._stale_kernel, (swept.view.tiles * self._group,), (self._group,))
-            swept.stale += device.download(self._stale, (swept.view.tiles,), np.float32)
+            device.launch(swept.staleness, (swept.view.tiles * self._group,), (self._group,))
+        self._stale += device.download(self._stale_buffer, self._stale.shape, np.float32)
         self._alive[splats] = 0
         cl.enqueue_copy(device.queue, self._alive_buffer, self._alive, is_blocking=True)
 
@@ -307,16 +342,15 @@ class RemovalSweep:
         """
         if not self._measured:
             raise UsageError("importances are known after a measurement")
+        self._sweep_stale(0)
         for number, camera in enumerate(self._cameras):
             kept = self._kept.get(number)
             swept = kept or self._prepare(camera)
-            changed = np.flatnonzero(swept.stale > 0).astype(np.uint32)
             if kept is None:
                 unused = self._zero_totals()
-                self._sweep(swept, changed, True, unused)
-            elif len(changed):
-                self._sweep(swept, changed, False, self._totals)
-                swept.stale[changed] = 0 if self._options.tolerance >= 0 else np.inf
+                self._list_tiles(np.arange(swept.view.tiles))
+                self._bind(swept, True, unused)
+                self._sweep(swept, 0, swept.view.tiles)
             view = swept.view
             entries = self._device.download(view.entries, (view.entry_count,), np.uint32)
             sums = self._device.download(swept.sums, (view.entry_count, 2), np.float32)
@@ -329,15 +363,14 @@ class RemovalSweep:
 
     def sweep_everything(self) -> None:
         """Have the next measurement sweep every tile, whatever has changed."""
-        for swept in self._kept.values():
-            swept.stale[:] = np.inf
+        self._stale[:] = np.inf
 
     def free(self) -> None:
         """Give all device memory back."""
         for swept in self._kept.values():
             swept.free(self._device)
         self._kept = {}
-        for buffer in (self._alive_buffer, self._totals, self._tiles, self._stale, *(self._shared or ())):
+        for buffer in (self._alive_buffer, self._totals, self._tiles, self._stale_buffer, *(self._shared or ())):
             self._device.free(buffer)
         if self._original_sh is not None:
             self._device.free(self._original_sh)

@@ -21,12 +21,13 @@
 
 #define VECTORS (TILE / LANES)
 
-/* Work-item i handles tile tiles[i]. */
+/* Work-item i handles tile tiles[start + i]. */
 kernel void removal(
+    uint start,
+    global const uint *tiles,
     global const float4 *shapes,
     global const float4 *colours,
     global const uchar *alive,
-    global const uint *tiles,
     global const uint *begins,
     global uint *lengths,
     global uint *entries,
@@ -41,7 +42,7 @@ kernel void removal(
     global float2 *sums,
     volatile global uint *totals)
 {
-    const int tile = tiles[get_global_id(0)];
+    const int tile = tiles[start + get_global_id(0)];
     const int2 origin = (int2)(tile % view.columns, tile / view.columns) * TILE;
     const int pixel_rows = min(TILE, view.height - origin.y);
     const int pixel_columns = min(TILE, view.width - origin.x);
@@ -212,6 +213,7 @@ kernel void staleness(
     global const uint *lengths,
     global const uint *entries,
     global const float2 *sums,
+    uint first,
     global float *stale)
 {
     const uint tile = get_global_id(0);
@@ -220,5 +222,5 @@ kernel void staleness(
     for (uint e = begin; e < end; ++e)
         if (alive[entries[e]] == 2)
             gone += sums[e].y;
-    stale[tile] = gone * (1.0f / (TILE * TILE));
+    stale[first + tile] = gone * (1.0f / (TILE * TILE));
 }

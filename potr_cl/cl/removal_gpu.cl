@@ -23,10 +23,11 @@
 
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 void removal(
+    uint start,
+    global const uint *tiles,
     global const float4 *shapes,
     global const float4 *colours,
     global const uchar *alive,
-    global const uint *tiles,
     global const uint *begins,
     global uint *lengths,
     global uint *entries,
@@ -49,7 +50,7 @@ void removal(
     local float2 parts[GROUP_ENTRIES * ITEMS];
 
     const int lid = get_local_id(0);
-    const int tile = tiles[get_group_id(0)];
+    const int tile = tiles[start + get_group_id(0)];
     const int column = tile % view.columns * TILE + lid % TILE;
     const int first_row = tile / view.columns * TILE + lid / TILE * PIXELS;
     const float x = column + 0.5f;
@@ -240,6 +241,7 @@ void staleness(
     global const uint *lengths,
     global const uint *entries,
     global const float2 *sums,
+    uint first,
     global float *stale)
 {
     local float parts[ITEMS];
@@ -257,5 +259,5 @@ void staleness(
         barrier(CLK_LOCAL_MEM_FENCE);
     }
     if (lid == 0)
-        stale[tile] = parts[0] * (1.0f / (TILE * TILE));
+        stale[first + tile] = parts[0] * (1.0f / (TILE * TILE));
 }
