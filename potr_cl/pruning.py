@@ -85,6 +85,20 @@ def mapping(x: F64, a: float) -> F64:
     return np.where(x >= 0, x, (np.sqrt(1 - 2 * a * np.minimum(x, 0)) - 1) / a)
 
 
+def _ascending(score: F64) -> Indices:
+    """Stable argsort: by score, ties by number. The unstable sort is ten times as fast, and ties are few."""
+    order = np.argsort(score)
+    ordered = score[order]
+    same = ordered[1:] == ordered[:-1]
+    if same.any():
+        tied = np.zeros(len(order), bool)
+        tied[1:] = same
+        tied[:-1] |= same
+        members = order[tied]
+        order[tied] = members[np.lexsort((members, score[members]))]
+    return order
+
+
 def choose(delta_mse: F64, importance: F64, alive: Indices, remaining: int, options: PruningOptions) -> Indices:
     """The splats to remove in one iteration, in the order of removal.
 
@@ -97,29 +111,23 @@ def choose(delta_mse: F64, importance: F64, alive: Indices, remaining: int, opti
         remaining: iterations left, this one included.
     """
     effect, weight = delta_mse[alive], importance[alive]
-    surplus = len(alive)
-    if options.count is not None:
-        surplus = max(len(alive) - options.count, 0)
-        ascending = np.argsort(effect, kind="stable")[:surplus]
-        candidates = np.sort(ascending)
-        limit = float(effect[ascending[-1]]) if surplus else 0.0
-    else:
+    if options.count is None:
         candidates = np.flatnonzero(effect < options.delta_mse_max)
         limit = options.delta_mse_max
-    if len(candidates) == 0:
-        return alive[:0]
+    else:
+        cheapest = _ascending(effect)[: max(len(alive) - options.count, 0)]
+        candidates = np.sort(cheapest)
+        limit = float(effect[cheapest[-1]]) if len(cheapest) else 0.0
+    unseen = candidates[(weight[candidates] == 0) & (effect[candidates] == 0)]
+    candidates = candidates[(weight[candidates] != 0) | (effect[candidates] != 0)]
     with np.errstate(divide="ignore", over="ignore"):
         score = mapping(effect[candidates] / limit, options.a) if limit > 0 else effect[candidates]
-    candidates = candidates[np.argsort(score, kind="stable")]
-    if remaining <= 1:
-        return alive[candidates]
-    spent = np.cumsum(weight[candidates])
-    budget = weight[candidates].sum() / remaining
-    # Up to and including the splat with which the budget is reached.
-    chosen = candidates[: int(np.searchsorted(spent, budget)) + 1]
-    unseen = (weight[candidates] == 0) & (effect[candidates] == 0)
-    unseen[: len(chosen)] = False
-    gone: Indices = alive[np.concatenate([candidates[unseen], chosen])]
+    candidates = candidates[_ascending(score)]
+    if remaining > 1 and len(candidates):
+        spent = np.cumsum(weight[candidates])
+        # Up to and including the splat with which the budget is reached.
+        candidates = candidates[: int(np.searchsorted(spent, spent[-1] / remaining)) + 1]
+    gone: Indices = alive[np.concatenate([unseen, candidates])]
     return gone
 
 
