@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from potr_cl import bitstream, octree, quantize
 from potr_cl.bitstream import EntropyCoder, Header, Property, Section
 from potr_cl.cameras import Camera, camera_centres, train_views
-from potr_cl.compaction import REFERENCE_PIXELS, CompactionOptions, Compactor, ViewWeights
+from potr_cl.compaction import CompactionOptions, Compactor, ViewWeights
 from potr_cl.device import Device
 from potr_cl.errors import UsageError
 from potr_cl.pruning import Pruned, PruningOptions, prune
@@ -211,20 +211,17 @@ def reduce_scene(
     sh = scene.sh
     compacted = not options.compact or scene.sh_degree == 0
 
-    def compact(splats: NDArray[np.int64]) -> None:
+    def compact() -> None:
         nonlocal sh, compacted
         assert removal is not None
-        weights = _view_weights(removal, views, splats)
+        weights = ViewWeights.from_importances(len(scene), removal.view_importances())
         how = CompactionOptions(lam=parameters.lam, alpha=parameters.alpha, sf_sh=parameters.sf_sh)
-        eyes = camera_centres(views)
-        sh = sh.copy()
-        sh[splats] = Compactor(device).compact(scene.subset(splats), eyes, weights, how).sh
+        sh = Compactor(device).compact(scene, camera_centres(views), weights, how).sh
         compacted = True
 
     def after_iteration(iteration: int, gone: NDArray[np.int64]) -> None:
-        left[gone] = False
         if not compacted and iteration + 1 >= options.compact_at * options.iterations:
-            compact(np.flatnonzero(left))
+            compact()
             assert removal is not None
             removal.replace_sh(sh)
 
@@ -235,7 +232,6 @@ def reduce_scene(
         )
         pruned: Pruned | None = None
         survivors = np.arange(len(scene))
-        left = np.ones(len(scene), bool)
         if options.prune:
             report("prune", 0.0)
             pruned = prune(
@@ -251,7 +247,7 @@ def reduce_scene(
             report("compact", 0.0)
             if pruned is None:
                 removal.measure()
-            compact(survivors)
+            compact()
             report("compact", 1.0)
         kept = scene.subset(survivors)
         return Scene(kept.means, kept.log_scales, kept.quaternions, kept.opacity_logits, sh[survivors]), pruned
@@ -259,22 +255,6 @@ def reduce_scene(
         if removal is not None:
             removal.free()
         rasterizer.free()
-
-
-def _view_weights(removal: RemovalSweep, views: Sequence[Camera], splats: NDArray[np.int64]) -> ViewWeights:
-    """The importances of some splats to each view, by splat."""
-    number = np.full(removal.splats, -1, np.int64)
-    number[splats] = np.arange(len(splats))
-    rows, columns, values = [], [], []
-    for view, seen, importance in removal.view_importances():
-        mine = number[seen] >= 0
-        rows.append(number[seen[mine]].astype(np.int32))
-        columns.append(np.full(int(mine.sum()), view, np.int32))
-        values.append((importance[mine] * REFERENCE_PIXELS).astype(np.float32))
-    row = np.concatenate(rows)
-    by_splat = np.argsort(row, kind="stable")
-    offsets = np.concatenate([[0], np.cumsum(np.bincount(row, minlength=len(splats)))])
-    return ViewWeights(offsets.astype(np.int64), np.concatenate(columns)[by_splat], np.concatenate(values)[by_splat])
 
 
 def _tolerance(
