@@ -217,17 +217,23 @@ def curves(bench: Bench, shares: Sequence[float], iterations: Sequence[int]) -> 
 
 
 def skip_settings(bench: Bench, iterations: Sequence[int]) -> list[tuple[str, Sequence[Camera], int, SweepOptions]]:
-    """What is skipped, views, iterations and sweep options; the full computation first."""
+    """What is skipped, views, iterations and sweep options; the full computation first.
+
+    The full computation with one and two iterations less says how far results scatter that ought to be the same.
+    """
     most = max(iterations)
-    train = bench.train
-    default = SweepOptions()
-    settings: list[tuple[str, Sequence[Camera], int, SweepOptions]] = [("nothing", train, most, SweepOptions(0))]
+    fewer = [n for n in sorted({*iterations, 24, 32}) if 1 < n < most]
+    train, full, default = bench.train, SweepOptions(0), SweepOptions()
+    settings: list[tuple[str, Sequence[Camera], int, SweepOptions]] = [("nothing", train, most, full)]
+    settings += [(f"nothing, {most - n} iterations", train, most - n, full) for n in (1, 2) if most > n]
     settings += [(f"tolerance {t:g}", train, most, SweepOptions(t)) for t in (0.002, 0.005, 0.01, 0.02, 0.05)]
-    settings += [(f"{n} iterations", train, n, default) for n in sorted(iterations) if 1 < n < most]
-    settings += [(f"a view's turn every {n}", train, most, SweepOptions(default.tolerance, n)) for n in (2, 4)]
-    settings += [(f"every {n}. view", train[::n], most, default) for n in (2, 4)]
+    settings += [(f"{n} iterations", train, n, default) for n in fewer]
+    settings += [(f"views in {n} turns", train, most, SweepOptions(default.tolerance, n)) for n in (2, 4)]
+    settings += [
+        (f"{n} iterations, views in 4 turns", train, n, SweepOptions(default.tolerance, 4)) for n in fewer[-3:]
+    ]
+    settings += [(f"every {name} view", train[::n], most, default) for name, n in (("2nd", 2), ("4th", 4))]
     settings.append(("half-size views", [halved(c) for c in train], most, default))
-    settings.append(("half-size views, 16 iterations", [halved(c) for c in train], 16, default))
     return settings
 
 
