@@ -86,6 +86,11 @@ def decibels(error: float) -> float:
     return -10 * math.log10(error) if error > 0 else math.inf
 
 
+def ours_name(iterations: int) -> str:
+    """What our schedule is called in tables and plots."""
+    return f"ours, {iterations} iteration{'s' if iterations > 1 else ''}"
+
+
 class Bench:
     """One scene on one device: reference renders, and what pruned versions of it are worth.
 
@@ -209,10 +214,10 @@ def curves(bench: Bench, shares: Sequence[float], iterations: Sequence[int]) -> 
     for rounds in iterations:
         for share, kept in counts.items():
             result, cost = bench.ours(kept, rounds)
-            add(f"ours, {rounds}", share, result.survivors, cost)
+            add(ours_name(rounds), share, result.survivors, cost)
     order = bench.one_order(min(counts.values()), max(iterations))
     for share, kept in counts.items():
-        add(f"ours, {max(iterations)}, {ONE_ORDER}", share, order[splats - kept :], {})
+        add(f"{ours_name(max(iterations))}, {ONE_ORDER}", share, order[splats - kept :], {})
     return rows
 
 
@@ -321,7 +326,7 @@ def frames(bench: Bench, truth: bool, iterations: int) -> list[Row]:
         near = fewest(bench, bench.one_order(splats // 5, iterations), good, 0, splats, 6)["kept"]
         order = bench.ours(near, iterations)[0].order
         ours = fewest(bench, order, good, round(0.85 * near), round(1.05 * near), 5)
-        rows.append({"level": level, "method": f"ours, {iterations}", **ours})
+        rows.append({"level": level, "method": ours_name(iterations), **ours})
         log(f"{bench.name}: level {level:g} done")
     return rows
 
@@ -347,7 +352,10 @@ def print_curves(rows: Sequence[Row]) -> None:
     print("|---" * (len(shares) + 1 + truth) + "|")
     for method in methods:
         mine = {r["removed"]: r for r in rows if r["method"] == method}
-        cells = [f"{mine[s]['psnr']:.1f}" + (f" / {mine[s]['loss']:.2f}" if truth else "") for s in shares]
+        cells = [
+            f"{mine[s]['psnr']:.1f}" + (f" / {mine[s]['loss']:.2f}" if truth else "") if s in mine else ""
+            for s in shares
+        ]
         if truth:
             removed = _at(list(mine.values()), LOSS_LEVELS[0])
             cells.append("" if removed is None else f"{1 - removed:.1%}")
@@ -429,7 +437,7 @@ def plot_curves(scenes: Row, key: str, label: str, path: Path) -> None:
             style: Row = {"marker": ".", "linestyle": "--", "linewidth": 1}
             if method in ours:
                 style = {"marker": "o", "markersize": 3.5, "color": shades[ours.index(method)]}
-            axis.plot(*zip(*mine, strict=True), label=method + (" iterations" if method in ours else ""), **style)
+            axis.plot(*zip(*mine, strict=True), label=method, **style)
         axis.set_title(f"{name}, {found['splats']:,} splats")
         axis.set_xlabel("% of the splats removed")
         axis.set_ylabel(label)
@@ -442,25 +450,26 @@ def plot_curves(scenes: Row, key: str, label: str, path: Path) -> None:
 
 
 def plot_skips(scenes: Row, device: str, path: Path) -> None:
-    """Time against loss at equal count, with the Pareto front."""
+    """Time against loss at equal count, with the Pareto front; the points are numbered."""
     from matplotlib import pyplot
 
-    figure, axes = pyplot.subplots(1, len(scenes), figsize=(6 * len(scenes), 4.6), squeeze=False)
+    figure, axes = pyplot.subplots(1, len(scenes), figsize=(7.5 * len(scenes), 5), squeeze=False)
     for axis, (name, found) in zip(axes[0], scenes.items(), strict=True):
         rows, front = found["skips"], pareto(found["skips"])
         full = rows[0]["psnr_at_equal_count"]
         points = [(r["seconds"], full - r["psnr_at_equal_count"]) for r in front]
-        axis.plot(*zip(*points, strict=True), "-", color="0.6", linewidth=1, label="Pareto front", zorder=0)
-        for r in rows:
-            lost = full - r["psnr_at_equal_count"]
-            axis.plot(r["seconds"], lost, "o", color="C0" if r in front else "C1", markersize=5)
-            axis.annotate(r["skipped"], (r["seconds"], lost), (4, 3), textcoords="offset points", fontsize=7)
+        axis.plot(*zip(*points, strict=True), "-", color="0.6", linewidth=1, zorder=0)
+        for number, r in enumerate(rows, 1):
+            point = r["seconds"], full - r["psnr_at_equal_count"]
+            axis.plot(*point, "o", color="C0" if r in front else "C1", markersize=4, label=f"{number}  {r['skipped']}")
+            axis.annotate(str(number), point, (3, 3), textcoords="offset points", fontsize=8)
         axis.axhline(0, color="0.8", linewidth=0.8, zorder=0)
-        axis.set_title(f"{name}, q = 0.5, at {rows[0]['kept']:,} splats; {device}", fontsize=9)
+        axis.set_title(f"{name}, q = 0.5, at {rows[0]['kept']:,} splats\n{device}; Pareto front in blue", fontsize=9)
         axis.set_xscale("log")
+        axis.set_yscale("symlog", linthresh=0.5)
         axis.set_xlabel("seconds, preparation included")
         axis.set_ylabel("dB lost against the full computation (test views)")
-        axis.legend(fontsize=8)
+        axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1, 1), title="skipped", title_fontsize=8)
         axis.grid(alpha=0.3, which="both")
     figure.tight_layout()
     figure.savefig(path, dpi=110)
@@ -472,6 +481,7 @@ def plot(results: Row, folder: Path) -> None:
 
     matplotlib.use("Agg")
     scenes = results["scenes"]
+    folder.mkdir(parents=True, exist_ok=True)
     with_curves = {n: s for n, s in scenes.items() if "curves" in s}
     with_skips = {n: s for n, s in scenes.items() if "skips" in s}
     if with_curves:
