@@ -12,6 +12,7 @@ from potr_cl.rasterizer import GSPLAT, INRIA, Rasterizer
 from potr_cl.removal import RemovalSweep, SweepOptions
 from tests import reference
 from tests.scenes import random_scene, ring_of_cameras
+from tools.bench_pruning import halved, pareto
 from tools.pruning_baselines import mesongs_power, removal_order, scores, transmittance_sums
 
 
@@ -114,3 +115,18 @@ def test_removal_order():
 def test_mesongs_power():
     assert mesongs_power("lego") == 0.05
     assert mesongs_power("unknown") == 0.1
+
+
+def test_halved_views_show_the_same():
+    scene = layered_scene(40, 5)
+    camera = dataclasses.replace(ring_of_cameras(3, size=50)[1], cx=20.0)
+    half = halved(camera)
+    assert (half.width, half.height) == (25, 25)
+    whole, small = (reference.project(scene, c, INRIA) for c in (camera, half))
+    np.testing.assert_allclose(small.centre, whole.centre / 2)
+
+
+def test_pareto_front():
+    points = {"a": (3, 50.0), "b": (1, 40.0), "c": (2, 39.0), "d": (2, 45.0), "e": (4, 50.0)}
+    rows = [{"skipped": n, "seconds": s, "psnr_at_equal_count": p} for n, (s, p) in points.items()]
+    assert [r["skipped"] for r in pareto(rows)] == ["b", "d", "a"]
