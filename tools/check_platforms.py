@@ -24,9 +24,12 @@ from typing import Any
 
 import numpy as np
 
+from potr_cl.cameras import camera_centres
+from potr_cl.compaction import Compactor, ViewWeights
 from potr_cl.device import Device, DeviceInfo, list_devices
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.removal import RemovalSweep, SweepOptions
 from tests import reference
 from tests.raster_scenes import camera, random_splats, splats, tilted_camera
 
@@ -103,6 +106,15 @@ def simulate() -> None:
                 wanted = reference.render(scene, view, rules)
                 error = np.abs(image - wanted.image)[wanted.margin > CLEAR].max()
                 assert error <= TOLERANCE, f"{family}: {error}"
+        scene, views = random_splats(60, 3, seed=2), [tilted_camera(seed, 40, 24) for seed in range(2)]
+        kept.append(Rasterizer(device, scene))
+        removal = RemovalSweep(kept[-1], views, SweepOptions(0))
+        removal.measure()
+        removal.remove(np.arange(0, 60, 5))
+        removal.measure()
+        weights = ViewWeights.from_importances(len(scene), removal.view_importances())
+        for degree in (1, 2, 3):
+            Compactor(device).compact(random_splats(60, degree, seed=2), camera_centres(views), weights)
         centres = np.random.default_rng(0).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (5000, 3))
         kept.append(Rasterizer(device, splats(centres, sigma=1e-3, logit=1)))
         kept[-1].render(camera(16, 16))  # a list longer than local memory
