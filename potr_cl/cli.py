@@ -87,7 +87,7 @@ def _count(args: argparse.Namespace, splats: int) -> int | None:
 
 
 def _sweep_options(args: argparse.Namespace) -> SweepOptions:
-    return SweepOptions(args.tolerance, memory=_bytes(args.memory))
+    return SweepOptions(args.tolerance, args.turns, _bytes(args.memory))
 
 
 def _bytes(gigabytes: float | None) -> int | None:
@@ -321,6 +321,13 @@ def _add_pruning_options(p: argparse.ArgumentParser) -> None:
         metavar="X",
         help="part of a tile that must have been removed before it is looked at again; 0: any; default "
         f"{SweepOptions.tolerance:g}",
+    )
+    group.add_argument(
+        "--turns",
+        type=int,
+        default=SweepOptions.turns,
+        metavar="N",
+        help=f"look at a view again in every N-th iteration only; default {SweepOptions.turns}",
     )
     _add_memory_option(group)
     _add_device_options(group)

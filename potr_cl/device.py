@@ -389,10 +389,16 @@ class Device:
                 cl.enqueue_copy(self.queue, array, buffer, is_blocking=True)
         return array
 
-    def launch(self, kernel: cl.Kernel, items: tuple[int, ...], group: tuple[int, ...] | None = None) -> None:
-        """Enqueue ``kernel`` with the arguments it has."""
+    def launch(
+        self,
+        kernel: cl.Kernel,
+        items: tuple[int, ...],
+        group: tuple[int, ...] | None = None,
+        queue: cl.CommandQueue | None = None,
+    ) -> None:
+        """Enqueue ``kernel`` with the arguments it has; in another queue than the device's own if one is given."""
         try:
-            event = cl.enqueue_nd_range_kernel(self.queue, kernel, items, group)
+            event = cl.enqueue_nd_range_kernel(queue or self.queue, kernel, items, group)
         except cl.Error:
             with self.errors(f"failed to run {kernel.function_name}"):
                 raise

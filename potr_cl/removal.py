@@ -27,6 +27,8 @@ from potr_cl.scene import FloatArray
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
+#: Views that a GPU sweeps at a time.
+_QUEUES = 16
 #: Where the removal kernel's argument stands that has it store the target.
 _FIRST_TIME = 12
 #: Part of the device's memory that the views may take unless the caller sets a budget: on CPUs it is everybody's.
@@ -40,7 +42,8 @@ class SweepOptions:
     Attributes:
         tolerance: a tile is swept again once the importance removed from it, as a part of its area, exceeds this.
             0: whenever anything was removed from it; negative: always.
-        turns: a view is swept in every so many-th measurement only (all of them in the first).
+        turns: a view is swept in every so many-th measurement only (all of them in the first). Views that do not fit
+            the memory budget are swept in each.
         memory: bytes of device memory that the views may take; None: half of the device's.
 
     Raises:
@@ -48,7 +51,7 @@ class SweepOptions:
     """
 
     tolerance: float = 0.01
-    turns: int = 1
+    turns: int = 4
     memory: int | None = None
 
     def __post_init__(self) -> None:
@@ -132,6 +135,7 @@ class RemovalSweep:
 
         memory = self._options.memory
         self._budget = device.info.memory * _SHARE if memory is None else memory
+        self._queues = [device.queue]
         self._kept: dict[int, _Swept] = {}  # by the number of the view
         self._shared: tuple[cl.Buffer, cl.Buffer] | None = None
         self._tile_count = 0
@@ -150,6 +154,9 @@ class RemovalSweep:
         self._tiles = device.allocate(4 * max(kept_tiles, most), "the tiles to sweep")
         for swept in self._kept.values():
             self._bind(swept, True, self._totals)
+        if device.family == "gpu" and not self._shared:
+            # A view's longest tile list keeps one work-group busy when all others are done: other views fill the gap.
+            self._queues = [cl.CommandQueue(device.context, device.info.handle) for _ in range(_QUEUES)]
 
     @property
     def kept_views(self) -> int:
@@ -231,13 +238,13 @@ class RemovalSweep:
             self._alive_buffer, *lists, swept.sums, np.uint32(swept.first_tile), self._stale_buffer
         )
 
-    def _sweep(self, swept: _Swept, start: int, count: int) -> None:
+    def _sweep(self, swept: _Swept, start: int, count: int, queue: cl.CommandQueue | None = None) -> None:
         """Sweep ``count`` of a view's tiles, listed in the tile buffer from ``start`` on."""
         if swept.view.shapes is None:
             assert self._shared is not None
             self._rasterizer.project(swept.view.camera, *self._shared)
         swept.sweep.set_arg(0, np.uint32(start))
-        self._device.launch(swept.sweep, (count * self._group,), (self._group,))
+        self._device.launch(swept.sweep, (count * self._group,), (self._group,), queue)
         self.sweeps += count / self._tile_count
 
     def _list_tiles(self, tiles: NDArray[np.int64]) -> None:
@@ -254,9 +261,13 @@ class RemovalSweep:
         numbers = np.flatnonzero(wanted)
         bounds = np.searchsorted(numbers, firsts)
         self._list_tiles(numbers - np.repeat(firsts[:-1], np.diff(bounds)))
+        self._device.queue.finish()
+        queues = itertools.cycle(self._queues)
         for swept, (start, stop) in zip(self._kept.values(), itertools.pairwise(bounds), strict=True):
             if stop > start:
-                self._sweep(swept, int(start), int(stop - start))
+                self._sweep(swept, int(start), int(stop - start), next(queues))
+        for queue in self._queues:
+            queue.finish()
         self._stale[numbers] = 0 if self._options.tolerance >= 0 else np.inf
 
     def measure(self) -> tuple[F64, F64]:

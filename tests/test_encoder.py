@@ -18,9 +18,9 @@ from tests.scenes import random_scene, ring_of_cameras
 FEW = EncodeOptions(iterations=6)
 
 
-@pytest.fixture(scope="module")
-def device():
-    device = Device()
+@pytest.fixture(scope="module", params=["cpu", "gpu"])
+def device(request):
+    device = Device(family=request.param)
     yield device
     assert device.allocated == 0, "the encoder did not give all its memory back"
 
@@ -66,7 +66,7 @@ def test_a_small_memory_budget_gives_the_same_scene(device, lego_excerpt, views,
     results = []
     for memory in (None, 48 * 1600, 0):
         # Views that are made anew each time are swept in full: so must those be that are kept.
-        options = dataclasses.replace(FEW, iterations=4, compact_at=compact_at, sweep=SweepOptions(0, memory=memory))
+        options = dataclasses.replace(FEW, iterations=4, compact_at=compact_at, sweep=SweepOptions(0, 1, memory))
         results.append(reduce_scene(lego_excerpt, views, options, device=device)[0])
     assert same(results[0], results[1])
     assert same(results[0], results[2])

@@ -66,7 +66,7 @@ def close(predicted, true):
 
 def sweep(device, scene, cameras, tolerance=0.0, background=(0.0, 0.0, 0.0)):
     rasterizer = Rasterizer(device, scene, background=background)
-    return rasterizer, RemovalSweep(rasterizer, cameras, SweepOptions(tolerance))
+    return rasterizer, RemovalSweep(rasterizer, cameras, SweepOptions(tolerance, turns=1))
 
 
 def finish(rasterizer, removal):
@@ -162,7 +162,7 @@ def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, lego_ex
     results = []
     for memory in (None, int(share * 4 * 48 * 1536)):
         rasterizer = Rasterizer(device, lego_excerpt)
-        removal = RemovalSweep(rasterizer, cameras, SweepOptions(0, memory=memory))
+        removal = RemovalSweep(rasterizer, cameras, SweepOptions(0, 1, memory))
         kept = removal.kept_views
         removal.measure()
         for start in (0, 5):

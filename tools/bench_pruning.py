@@ -228,12 +228,12 @@ def skip_settings(bench: Bench, iterations: Sequence[int]) -> list[tuple[str, Se
     """
     most = max(iterations)
     fewer = [n for n in sorted({*iterations, 24, 32}) if 1 < n < most]
-    train, full, default = bench.train, SweepOptions(0), SweepOptions()
+    train, full, default = bench.train, SweepOptions(0, 1), SweepOptions()
     settings: list[tuple[str, Sequence[Camera], int, SweepOptions]] = [("nothing", train, most, full)]
     settings += [(f"nothing, {most - n} iterations", train, most - n, full) for n in (1, 2) if most > n]
-    settings += [(f"tolerance {t:g}", train, most, SweepOptions(t)) for t in (0.002, 0.005, 0.01, 0.02, 0.05)]
+    settings += [(f"tolerance {t:g}", train, most, SweepOptions(t, 1)) for t in (0.002, 0.005, 0.01, 0.02, 0.05)]
     settings += [(f"{n} iterations", train, n, default) for n in fewer]
-    settings += [(f"views in {n} turns", train, most, SweepOptions(default.tolerance, n)) for n in (2, 4)]
+    settings += [(f"views in {n} turns", train, most, SweepOptions(default.tolerance, n)) for n in (1, 2, 4)]
     settings += [
         (f"{n} iterations, views in 4 turns", train, n, SweepOptions(default.tolerance, 4)) for n in fewer[-3:]
     ]

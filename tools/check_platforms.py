@@ -108,7 +108,7 @@ def simulate() -> None:
                 assert error <= TOLERANCE, f"{family}: {error}"
         scene, views = random_splats(60, 3, seed=2), [tilted_camera(seed, 40, 24) for seed in range(2)]
         kept.append(Rasterizer(device, scene))
-        removal = RemovalSweep(kept[-1], views, SweepOptions(0))
+        removal = RemovalSweep(kept[-1], views, SweepOptions(0, 1))
         removal.measure()
         removal.remove(np.arange(0, 60, 5))
         removal.measure()

@@ -221,6 +221,6 @@ kernel void staleness(
     float gone = 0.0f;
     for (uint e = begin; e < end; ++e)
         if (alive[entries[e]] == 2)
-            gone += sums[e].y;
+            gone += fmax(sums[e].y, LEAST_STALENESS);
     stale[first + tile] = gone * (1.0f / (TILE * TILE));
 }

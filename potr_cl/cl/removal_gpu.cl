@@ -250,7 +250,7 @@ void staleness(
     float gone = 0.0f;
     for (uint e = begin + lid; e < end; e += ITEMS)
         if (alive[entries[e]] == 2)
-            gone += sums[e].y;
+            gone += fmax(sums[e].y, LEAST_STALENESS);
     parts[lid] = gone;
     barrier(CLK_LOCAL_MEM_FENCE);
     for (uint step = ITEMS / 2; step > 0; step /= 2) {
