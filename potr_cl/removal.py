@@ -50,8 +50,8 @@ class SweepOptions:
         UsageError: a value is out of range.
     """
 
-    tolerance: float = 0.01
-    turns: int = 4
+    tolerance: float = 0.002
+    turns: int = 1
     memory: int | None = None
 
     def __post_init__(self) -> None:
