@@ -1,0 +1,47 @@
+"""The paper's formula of removal effects, which the package does not use, gives what the package's gives."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from potr_cl.rasterizer import Rasterizer
+from potr_cl.removal import RemovalSweep, SweepOptions
+from tests.scenes import ring_of_cameras
+from tests.test_removal import visible_scene
+from tools.removal_formulas import devices, prefix_sums_source
+
+
+def measure(device, scene, cameras, background):
+    """Effects and importances of the whole scene, and of what is left when every third splat is gone."""
+    rasterizer = Rasterizer(device, scene, background=background)
+    removal = RemovalSweep(rasterizer, cameras, SweepOptions(0))
+    whole = np.stack(removal.measure())
+    gone = np.arange(0, len(scene), 3)
+    removal.remove(gone)
+    rest = np.delete(np.stack(removal.measure()), gone, axis=1)
+    removal.free()
+    rasterizer.free()
+    assert device.allocated == 0
+    return whole, rest
+
+
+def agree(scene, cameras, background=(0.0, 0.0, 0.0)):
+    mine, theirs = (measure(device, scene, cameras, background) for device in devices())
+    assert not np.array_equal(mine[0], theirs[0])  # two kernels, not one
+    for a, b in zip(mine, theirs, strict=True):
+        assert (np.abs(a - b).max(axis=1) < 1e-5 * np.abs(a).max(axis=1)).all()
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 0.3, 0.0)])
+def test_prefix_sums_agree_with_back_to_front(background):
+    agree(visible_scene(60, 1), ring_of_cameras(2, size=40), background)
+
+
+def test_prefix_sums_agree_where_pixels_end_early():
+    agree(visible_scene(600).subset(np.repeat(np.arange(600), 4)), ring_of_cameras(2, size=40))
+
+
+def test_only_the_removal_kernel_is_replaced():
+    assert "P_{k+1}" in prefix_sums_source("removal_cpu.cl")
+    assert "P_{k+1}" not in prefix_sums_source("composite_cpu.cl")
