@@ -23,6 +23,8 @@ from potr_cl.errors import DataError
 
 #: Levels that float64 arithmetic on the root cube can tell apart.
 DEEPEST_LEVEL = 52
+#: Splats worked on at a time where each stands for itself: the temporaries of a block stay in the cache.
+_BLOCK = 1 << 15
 #: Levels whose octants fit a 64-bit Morton word.
 _LEVELS_A_WORD = 21
 
@@ -103,7 +105,13 @@ def build(means: NDArray[np.float32], tolerance: F64 | float) -> tuple[OctreeStr
     occupancy, several, starts = _serialise_tree(grid, common, alone, depth)
     multiplicities = np.diff(np.append(starts, n))[~single[starts]] if not single.all() else np.empty(0, np.int64)
 
-    leaf_level = _leaf_levels([a[order] for a in axes], low, side, grid, alone, depth, limit[order])
+    leaf_level = np.empty(n, np.int8)
+    for start in range(0, n, _BLOCK):
+        block = slice(start, start + _BLOCK)
+        rows = order[block]
+        leaf_level[block] = _leaf_levels(
+            [a[rows] for a in axes], low, side, [g[block] for g in grid], alone[block], depth, limit[rows]
+        )
     tail_lengths, tails = _serialise_tails(
         [g[single] for g in grid] if len(multiplicities) else grid, leaf_level[single], alone[single], depth
     )
@@ -130,14 +138,17 @@ def _depth_for(side: float, tolerance: float) -> int:
 
 def _morton_words(grid: list[U64], depth: int) -> list[U64]:
     """Interleaved coordinates, most significant word first, 21 levels a word, left-aligned."""
-    words = []
-    for first in range(0, max(depth, 1), _LEVELS_A_WORD):
-        shift = depth - first - _LEVELS_A_WORD
-        word = np.zeros(len(grid[0]), np.uint64)
-        for axis, g in enumerate(grid):
-            part = g >> np.uint64(shift) if shift >= 0 else g << np.uint64(-shift)
-            word |= _spread(part & np.uint64(0x1FFFFF)) << np.uint64(axis)
-        words.append(word)
+    n = len(grid[0])
+    words = [np.empty(n, np.uint64) for _ in range(0, max(depth, 1), _LEVELS_A_WORD)]
+    for start in range(0, n, _BLOCK):
+        block = slice(start, start + _BLOCK)
+        for number, word in enumerate(words):
+            shift = depth - (number + 1) * _LEVELS_A_WORD
+            bits = np.zeros(len(word[block]), np.uint64)
+            for axis, g in enumerate(grid):
+                part = g[block] >> np.uint64(shift) if shift >= 0 else g[block] << np.uint64(-shift)
+                bits |= _spread(part & np.uint64(0x1FFFFF)) << np.uint64(axis)
+            word[block] = bits
     return words
 
 
@@ -220,7 +231,8 @@ def _leaf_levels(
     pending = np.flatnonzero(alone <= depth)
     squared = limit * limit
     for level in range(depth):
-        here = pending[alone[pending] <= level]
+        ready = alone[pending] <= level
+        here = pending[ready]
         if len(here) == 0:
             continue
         distance = np.zeros(len(here))
@@ -229,11 +241,10 @@ def _leaf_levels(
             centre = lo + ((g[here] >> np.uint64(depth - level)).astype(np.float64) + 0.5) * cell
             centre -= axis[here]
             distance += centre * centre
-        done = here[distance < squared[here]]
-        level_of[done] = level
-        settled = np.zeros(len(alone), bool)
-        settled[done] = True
-        pending = pending[~settled[pending]]
+        done = distance < squared[here]
+        level_of[here[done]] = level
+        ready[ready] = done
+        pending = pending[~ready]
     return level_of
 
 
