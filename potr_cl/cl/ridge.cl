@@ -44,7 +44,7 @@ inline void drop_parallel(const VREAL *state, REAL threshold, VREAL *keep)
 kernel void compact(
     global float *sh,                /* splats x SH_COUNT x 3, R, G, B; replaced */
     global const float4 *means,
-    global const uint *order,        /* splats in the order of their numbers of views */
+    global const uint *order,        /* splats seen by any view in the order of their numbers of views */
     global const uint *offsets,      /* of each splat's run in views and weights, splats + 1 */
     global const uint *views,
     global const float *weights,
@@ -57,8 +57,6 @@ kernel void compact(
     int ycocg)
 {
     const uint first = get_global_id(0) * LANES;
-    if (first >= splats)
-        return;
 
     uint splat[LANES], cursor[LANES], end[LANES];
     REAL4 centre[LANES];
@@ -66,10 +64,14 @@ kernel void compact(
     for (int lane = 0; lane < LANES; ++lane) {
         splat[lane] = order[min(first + lane, splats - 1)];
         cursor[lane] = offsets[splat[lane]];
-        end[lane] = offsets[splat[lane] + 1];
+        end[lane] = first < splats ? offsets[splat[lane] + 1] : cursor[lane];
         centre[lane] = TO_REAL4(means[splat[lane]]);
         longest = max(longest, end[lane] - cursor[lane]);
     }
+    /* Work-items beyond the last splat. Not known by their number alone: Intel's CPU runtime would run a work-group cut
+       short by that through its scalar code, which rounds differently (it fuses other products and sums). */
+    if (longest == 0)
+        return;
 
     VREAL state[TRIANGLE];
     for (int i = 0; i < TRIANGLE; ++i)
@@ -156,8 +158,11 @@ kernel void compact(
         x[0] += coefficients[c][0];
 #endif
         for (int k = 0; k < SH_COUNT; ++k) {
-            VREAL accepted = objective <= LITERAL(1.01) * start + noise ? x[k] : coefficients[c][k];
-            coefficients[c][k] = largest <= limit ? accepted : coefficients[c][k];
+            /* Read before the choice: Intel's CPU compiler makes of a choice between two private array elements a read
+               at a chosen address, and its vectoriser gives all work-items what the first one reads there. */
+            VREAL own = coefficients[c][k];
+            VREAL accepted = objective <= LITERAL(1.01) * start + noise ? x[k] : own;
+            coefficients[c][k] = largest <= limit ? accepted : own;
         }
     }
 
