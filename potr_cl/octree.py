@@ -31,6 +31,7 @@ _LEVELS_A_WORD = 21
 U8 = NDArray[np.uint8]
 U64 = NDArray[np.uint64]
 F64 = NDArray[np.float64]
+Cells = NDArray[np.unsignedinteger]
 
 
 @dataclass(frozen=True)
@@ -296,12 +297,13 @@ def parse(streams: OctreeStreams, splats: int) -> NDArray[np.float32]:
     ranks = _morton_ranks(levels)
     leaves = singles + crowded
     alone_level = np.empty(leaves, np.uint8)
-    coordinates = [np.empty(leaves, np.uint64) for _ in range(3)]
+    word = np.uint32 if depth < 32 else np.uint64
+    coordinates: list[Cells] = [np.empty(leaves, word) for _ in range(3)]
     is_crowded = np.zeros(leaves, bool) if crowded else None
-    path = [np.zeros(1, np.uint64) for _ in range(3)]
+    path: list[Cells] = [np.zeros(1, word) for _ in range(3)]
     for number, level in enumerate(levels):
         if number:
-            path = [p[level.parent] << np.uint64(1) for p in path]
+            path = [p[level.parent] << word(1) for p in path]
             for axis, p in enumerate(path):
                 p += (level.octant >> np.uint8(axis)) & np.uint8(1)
         ended = ~level.several if number < depth else slice(None)
@@ -324,11 +326,12 @@ def parse(streams: OctreeStreams, splats: int) -> NDArray[np.float32]:
     _append_tails(coordinates, lengths, streams.tails)
 
     cell = streams.side * 2.0 ** -np.arange(depth + 1)
-    size = cell[level_of]
     means = np.empty((leaves, 3), np.float32)
-    for axis, c in enumerate(coordinates):
-        with np.errstate(over="ignore"):  # a hostile root cube may lie outside float32; the caller checks the result
-            means[:, axis] = (c + 0.5) * size + streams.origin[axis]
+    for start in range(0, leaves, _BLOCK):
+        block = slice(start, start + _BLOCK)
+        size = cell[level_of[block]]
+        for axis, c in enumerate(coordinates):
+            means[block, axis] = (c[block].astype(np.float64) + 0.5) * size + streams.origin[axis]
     if is_crowded is not None:
         counts = np.ones(leaves, np.int64)
         counts[is_crowded] = streams.multiplicities.astype(np.int64)
@@ -407,7 +410,7 @@ def _morton_ranks(levels: list[_Level]) -> list[NDArray[np.int64]]:
     return ranks
 
 
-def _append_tails(coordinates: list[U64], lengths: U8, tails: U8) -> None:
+def _append_tails(coordinates: list[Cells], lengths: U8, tails: U8) -> None:
     """Shift the tails' bits into the leaves' coordinates, in place."""
     histogram = np.bincount(lengths, minlength=1)
     reach = np.cumsum(histogram[::-1])[::-1]
@@ -416,16 +419,17 @@ def _append_tails(coordinates: list[U64], lengths: U8, tails: U8) -> None:
         raise DataError(f"positions: {len(tails)} bytes of tails where their lengths ask for {expected}")
     longest_first = np.argsort(np.uint8(255) - lengths, kind="stable")[: reach[1] if len(reach) > 1 else 0]
     at = 0
-    values = [np.zeros(len(longest_first), np.uint64) for _ in range(3)]
+    word = coordinates[0].dtype.type
+    values: list[Cells] = [np.zeros(len(longest_first), word) for _ in range(3)]
     for k in reach[1:]:
         nbytes = (int(k) + 7) // 8
         for value in values:
             bits = np.unpackbits(tails[at : at + nbytes], bitorder="little")
             if bits[k:].any():
                 raise DataError("positions: a tail's padding is not zero")
-            value[:k] <<= np.uint64(1)
+            value[:k] <<= word(1)
             value[:k] |= bits[:k]
             at += nbytes
     for c, value in zip(coordinates, values, strict=True):
-        c <<= lengths.astype(np.uint64)
+        c <<= lengths
         c[longest_first] |= value
