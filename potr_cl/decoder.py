@@ -19,8 +19,8 @@ from potr_cl.bitstream import Header, Property
 from potr_cl.errors import DataError, UsageError
 from potr_cl.scene import SH_COEFFICIENTS, Scene
 
-#: Splats dequantised at a time: the temporaries of a block stay in a processor's second-level cache.
-_BLOCK = 1 << 15
+#: Splats dequantised at a time: few enough for bounded temporaries, enough that threads seldom wait for each other.
+_BLOCK = 1 << 17
 
 _EMPTY = np.empty(0, np.uint8)
 
