@@ -183,6 +183,44 @@ def test_interrupted_pruning_leaves_nothing(tmp_path, scene_path, capsys, monkey
         assert sorted(tmp_path.iterdir()) == before
 
 
+def test_compact(tmp_path, scene_path, capsys):
+    cameras, out = cameras_json(tmp_path / "cameras.json"), tmp_path / "compact.ply"
+    assert cli.main(["compact", str(scene_path), "--cameras", str(cameras), "-o", str(out), "--lambda", "10"]) == 0
+    assert "quantise to 0" in capsys.readouterr().out
+    scene, compacted = ply.load(scene_path), ply.load(out)
+    assert np.array_equal(scene.means, compacted.means)
+    assert np.abs(compacted.sh[:, 1:]).sum() < np.abs(scene.sh[:, 1:]).sum()
+
+
+@pytest.mark.parametrize(
+    ("options", "word"),
+    [
+        (["--lambda", "-1"], "lam"),
+        (["--alpha", "0"], "alpha"),
+        (["--alpha", "1.5"], "alpha"),
+        (["--sf-sh", "0"], "sf_sh"),
+        (["-q", "2"], "quality"),
+        (["--memory", "-1"], "memory"),
+        (["--background", "octarine"], "octarine"),
+        (["--device", "abacus"], "abacus"),
+    ],
+)
+def test_wrong_compaction_options(tmp_path, scene_path, capsys, options, word):
+    cameras, out = cameras_json(tmp_path / "cameras.json"), tmp_path / "out.ply"
+    code = 1 if "--device" in options else 2
+    fails(capsys, ["compact", scene_path, "--cameras", cameras, "-o", out, *options], code, word)
+    assert not out.exists()
+
+
+def test_compaction_of_bad_files(tmp_path, scene_path, capsys):
+    cameras, out = cameras_json(tmp_path / "cameras.json"), tmp_path / "out.ply"
+    fails(capsys, ["compact", tmp_path / "none.ply", "--cameras", cameras, "-o", out], 2, "none.ply")
+    fails(capsys, ["compact", scene_path, "--cameras", tmp_path / "none.json", "-o", out], 2, "none.json")
+    fails(capsys, ["compact", scene_path, "--cameras", scene_path, "-o", out], 2, "scene.ply")
+    fails(capsys, ["encode", scene_path, "--cameras", cameras, "-o", out, "--compact-at", "2"], 2, "compact_at")
+    assert not out.exists()
+
+
 def test_counts_need_cameras(tmp_path, scene_path, capsys):
     fails(capsys, ["encode", scene_path, "-o", tmp_path / "a.potr", "--keep", "0.5"], 2, "--cameras")
 
