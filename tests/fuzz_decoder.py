@@ -17,8 +17,9 @@ import numpy as np
 
 from potr_cl.bitstream import EntropyCoder
 from potr_cl.decoder import PotrFile
-from potr_cl.encoder import EncodeOptions, encode
+from potr_cl.encoder import encode
 from potr_cl.errors import PotrError
+from potr_cl.options import EncodeOptions
 from potr_cl.report import file_report
 from tests.scenes import random_scene, ring_of_cameras
 

@@ -175,7 +175,7 @@ def test_interrupted_pruning_leaves_nothing(tmp_path, scene_path, capsys, monkey
     def interrupted(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("potr_cl.encoder.prune", interrupted)
+    monkeypatch.setattr("potr_cl.reduction.prune", interrupted)
     cameras = cameras_json(tmp_path / "cameras.json")
     before = sorted(tmp_path.iterdir())
     for command in ("prune", "encode"):
@@ -360,7 +360,7 @@ def test_interrupt(tmp_path, scene_path, capsys, monkeypatch):
     def interrupted(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli, "encode", interrupted)
+    monkeypatch.setattr(cli.encode, "encode", interrupted)
     fails(capsys, ["encode", scene_path, "-o", tmp_path / "a.potr"], 130, "interrupted")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.ply"]
 

@@ -15,8 +15,9 @@ from potr_cl import quantize
 from potr_cl.bitstream import EntropyCoder, Property
 from potr_cl.cameras import camera_centres, train_views
 from potr_cl.decoder import PotrFile, decode
-from potr_cl.encoder import EncodeOptions, encode
+from potr_cl.encoder import encode
 from potr_cl.errors import DataError, UsageError
+from potr_cl.options import EncodeOptions
 from potr_cl.scene import SH_COEFFICIENTS, Scene
 from tests.independent_decoder import decode as decode_independently
 from tests.scenes import random_scene, ring_of_cameras

@@ -8,10 +8,12 @@ import numpy as np
 import pytest
 
 from potr_cl.device import Device
-from potr_cl.encoder import EncodeOptions, encode, reduce_scene
+from potr_cl.encoder import encode
 from potr_cl.errors import UsageError
+from potr_cl.options import EncodeOptions
 from potr_cl.quantize import ac_sparsity
 from potr_cl.rasterizer import Rasterizer
+from potr_cl.reduction import reduce_scene
 from potr_cl.removal import SweepOptions
 from tests.scenes import random_scene, ring_of_cameras
 
@@ -73,14 +75,14 @@ def test_a_small_memory_budget_gives_the_same_scene(device, lego_excerpt, views,
 
 
 def test_degree_0_has_nothing_to_compact(device, monkeypatch):
-    monkeypatch.setattr("potr_cl.encoder.Compactor", None)  # would fail if it were asked
+    monkeypatch.setattr("potr_cl.reduction.Compactor", None)  # would fail if it were asked
     scene = random_scene(100, 0)
     reduced, _ = reduce_scene(scene, ring_of_cameras(4), dataclasses.replace(FEW, count=50), device=device)
     assert len(reduced) == 50
 
 
 def test_nothing_to_do_needs_no_device(monkeypatch):
-    monkeypatch.setattr("potr_cl.encoder.Device", None)
+    monkeypatch.setattr("potr_cl.reduction.Device", None)
     encode(random_scene(20, 0), ring_of_cameras(4), EncodeOptions(prune=False))
     encode(random_scene(20, 3), None)
 

@@ -26,8 +26,9 @@ import numpy as np
 from potr_cl import octree
 from potr_cl.bitstream import EntropyCoder
 from potr_cl.decoder import PotrFile
-from potr_cl.encoder import EncodeOptions, encode
+from potr_cl.encoder import encode
 from potr_cl.formats import load_cameras, load_scene, ply
+from potr_cl.options import EncodeOptions
 from potr_cl.report import file_report
 from tools.large_scene import DEFAULT_SCENE, EXCERPT, large_scene
 

@@ -14,9 +14,10 @@ import numpy as np
 from potr_cl.cameras import Camera, test_views
 from potr_cl.decoder import decode
 from potr_cl.device import Device
-from potr_cl.encoder import EncodeOptions, encode
+from potr_cl.encoder import encode
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.metrics import psnr
+from potr_cl.options import EncodeOptions
 from potr_cl.quantize import ac_sparsity
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.scene import FloatArray, Scene

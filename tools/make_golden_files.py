@@ -11,7 +11,8 @@ from pathlib import Path
 import numpy as np
 
 from potr_cl.bitstream import VERSION, EntropyCoder
-from potr_cl.encoder import EncodeOptions, encode
+from potr_cl.encoder import encode
+from potr_cl.options import EncodeOptions
 from potr_cl.scene import Scene
 from tests.independent_decoder import decode
 from tests.scenes import random_scene, ring_of_cameras

@@ -1,0 +1,57 @@
+"""How to encode: every choice that a caller has."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, field
+
+from potr_cl import quantize
+from potr_cl.bitstream import EntropyCoder
+from potr_cl.removal import SweepOptions
+
+
+@dataclass(frozen=True)
+class EncodeOptions:
+    """How to encode.
+
+    Attributes:
+        q: quality, 0 to 1; sets every hyper-parameter that is not given on its own.
+        lam, alpha, delta_mse_max, beta, gamma, sf_sh, sf_opacity, sf_rotation, sf_scale: replace single
+            hyper-parameters (:class:`potr_cl.quantize.HyperParameters`).
+        prune: remove splats; needs cameras, without them nothing is removed.
+        iterations: of the pruning schedule.
+        compact: make the SH coefficients sparse; needs cameras, as pruning does.
+        compact_at: the part of the pruning iterations after which that is done: later ones see its effect.
+        count: number of splats to keep, instead of ΔMSE_MAX.
+        sweep: what measuring removal effects may skip.
+        background: R, G, B behind the scene in the views that pruning looks at.
+        entropy: the entropy stage.
+        threads: for the entropy stage; the bytes do not depend on it. 0: one a processor.
+        source_bytes: size of the file that the scene came from, for the metadata; None if it came from none.
+    """
+
+    q: float = 0.5
+    lam: float | None = None
+    alpha: float | None = None
+    delta_mse_max: float | None = None
+    beta: float | None = None
+    gamma: float | None = None
+    sf_sh: float | None = None
+    sf_opacity: float | None = None
+    sf_rotation: float | None = None
+    sf_scale: float | None = None
+    prune: bool = True
+    iterations: int = 48
+    compact: bool = True
+    compact_at: float = 0.5
+    count: int | None = None
+    sweep: SweepOptions = field(default_factory=SweepOptions)
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0)
+    entropy: EntropyCoder = field(default_factory=EntropyCoder)
+    threads: int = 0
+    source_bytes: int | None = None
+
+    @property
+    def parameters(self) -> quantize.HyperParameters:
+        """The hyper-parameters that result."""
+        names = ("lam", "alpha", "delta_mse_max", "beta", "gamma", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale")
+        return quantize.HyperParameters.from_quality(self.q, **{name: getattr(self, name) for name in names})

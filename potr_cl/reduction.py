@@ -1,0 +1,102 @@
+"""From the scene to fewer splats with sparser colours: pruning, and compaction on the way."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.cameras import Camera, camera_centres, train_views
+from potr_cl.compaction import CompactionOptions, Compactor, ViewWeights
+from potr_cl.device import Device
+from potr_cl.errors import UsageError
+from potr_cl.options import EncodeOptions
+from potr_cl.pruning import Pruned, PruningOptions, prune
+from potr_cl.rasterizer import Rasterizer
+from potr_cl.removal import RemovalSweep
+from potr_cl.scene import Scene
+
+#: Called with the stage's name and the part of it that is done, 0 to 1.
+Progress = Callable[[str, float], None]
+
+
+def reduce_scene(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    options: EncodeOptions,
+    progress: Progress | None = None,
+    device: Device | None = None,
+) -> tuple[Scene, Pruned | None]:
+    """Remove splats and make the colours of the others sparse, as far as the options say.
+
+    Args:
+        scene: uncompressed; its renders are the target.
+        cameras: only the training views among them are looked at.
+        options: the hyper-parameters of pruning and compaction count here.
+        progress: told how far the stages are.
+        device: the best one there is by default.
+
+    Returns:
+        The splats that are left, in their order, and what pruning did (None if it was left out).
+
+    Raises:
+        UsageError: options out of range, or no training view.
+        DeviceError: the scene does not fit the device.
+    """
+    report = progress or (lambda stage, done: None)
+    parameters = options.parameters
+    schedule = PruningOptions(parameters.delta_mse_max, options.iterations, count=options.count)
+    if not 0 <= options.compact_at <= 1:
+        raise UsageError(f"compact_at is {options.compact_at:g}, it must lie between 0 and 1")
+    views = train_views(cameras)
+    device = device or Device()
+    rasterizer = Rasterizer(device, scene, background=options.background)
+    removal: RemovalSweep | None = None
+    sh = scene.sh
+    compacted = not options.compact or scene.sh_degree == 0
+
+    def compact() -> None:
+        nonlocal sh, compacted
+        assert removal is not None
+        weights = ViewWeights.from_importances(len(scene), removal.view_importances())
+        how = CompactionOptions(lam=parameters.lam, alpha=parameters.alpha, sf_sh=parameters.sf_sh)
+        sh = Compactor(device).compact(scene, camera_centres(views), weights, how).sh
+        compacted = True
+
+    def after_iteration(iteration: int, gone: NDArray[np.int64]) -> None:
+        if not compacted and iteration + 1 >= options.compact_at * options.iterations:
+            compact()
+            assert removal is not None
+            removal.replace_sh(sh)
+
+    try:
+        report("prepare views", 0.0)
+        removal = RemovalSweep(
+            rasterizer, views, options.sweep, lambda done, count: report("prepare views", done / count)
+        )
+        pruned: Pruned | None = None
+        survivors = np.arange(len(scene))
+        if options.prune:
+            report("prune", 0.0)
+            pruned = prune(
+                removal,
+                len(scene),
+                schedule,
+                lambda done, kept: report("prune", min(done / options.iterations, 0.99)),
+                after_iteration,
+            )
+            report("prune", 1.0)
+            survivors = pruned.survivors
+        if not compacted:
+            report("compact", 0.0)
+            if pruned is None:
+                removal.measure()
+            compact()
+            report("compact", 1.0)
+        kept = scene.subset(survivors)
+        return Scene(kept.means, kept.log_scales, kept.quaternions, kept.opacity_logits, sh[survivors]), pruned
+    finally:
+        if removal is not None:
+            removal.free()
+        rasterizer.free()
