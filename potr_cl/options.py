@@ -6,6 +6,7 @@ from dataclasses import dataclass, field
 
 from potr_cl import quantize
 from potr_cl.bitstream import EntropyCoder
+from potr_cl.compaction import ColourModel, CompactionOptions, Weighting
 from potr_cl.removal import SweepOptions
 
 
@@ -21,6 +22,7 @@ class EncodeOptions:
         iterations: of the pruning schedule.
         compact: make the SH coefficients sparse; needs cameras, as pruning does.
         compact_at: the part of the pruning iterations after which that is done: later ones see its effect.
+        colour_model, weighting, two_pass: of the compaction (:class:`potr_cl.compaction.CompactionOptions`).
         count: number of splats to keep, instead of ΔMSE_MAX.
         sweep: what measuring removal effects may skip.
         background: R, G, B behind the scene in the views that pruning looks at.
@@ -42,7 +44,10 @@ class EncodeOptions:
     prune: bool = True
     iterations: int = 48
     compact: bool = True
-    compact_at: float = 0.5
+    compact_at: float = 0.75
+    colour_model: ColourModel = CompactionOptions.colour_model
+    weighting: Weighting = CompactionOptions.weighting
+    two_pass: bool = CompactionOptions.two_pass
     count: int | None = None
     sweep: SweepOptions = field(default_factory=SweepOptions)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)

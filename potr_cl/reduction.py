@@ -49,6 +49,14 @@ def reduce_scene(
     schedule = PruningOptions(parameters.delta_mse_max, options.iterations, count=options.count)
     if not 0 <= options.compact_at <= 1:
         raise UsageError(f"compact_at is {options.compact_at:g}, it must lie between 0 and 1")
+    how = CompactionOptions(
+        lam=parameters.lam,
+        alpha=parameters.alpha,
+        sf_sh=parameters.sf_sh,
+        two_pass=options.two_pass,
+        colour_model=options.colour_model,
+        weighting=options.weighting,
+    )
     views = train_views(cameras)
     device = device or Device()
     rasterizer = Rasterizer(device, scene, background=options.background)
@@ -60,7 +68,6 @@ def reduce_scene(
         nonlocal sh, compacted
         assert removal is not None
         weights = ViewWeights.from_importances(len(scene), removal.view_importances())
-        how = CompactionOptions(lam=parameters.lam, alpha=parameters.alpha, sf_sh=parameters.sf_sh)
         sh = Compactor(device).compact(scene, camera_centres(views), weights, how).sh
         compacted = True
 

@@ -192,6 +192,18 @@ def test_compact(tmp_path, scene_path, capsys):
     assert np.abs(compacted.sh[:, 1:]).sum() < np.abs(scene.sh[:, 1:]).sum()
 
 
+def test_each_part_of_compaction_can_be_left_out(tmp_path, scene_path):
+    cameras = cameras_json(tmp_path / "cameras.json")
+    choices = ([], ["--colour-model", "rgb"], ["--weighting", "visibility"], ["--one-pass"], ["--alpha", "1"])
+    for command, suffix in (("compact", ".ply"), ("encode", ".potr")):
+        files = set()
+        for number, options in enumerate(choices):
+            out = tmp_path / f"{command}{number}{suffix}"
+            assert cli.main([command, str(scene_path), "--cameras", str(cameras), "-o", str(out), *options]) == 0
+            files.add(out.read_bytes())
+        assert len(files) == len(choices)
+
+
 @pytest.mark.parametrize(
     ("options", "word"),
     [

@@ -63,7 +63,7 @@ def test_each_on_its_own(device, lego_excerpt, views):
     assert not np.array_equal(compacted.sh, lego_excerpt.sh)
 
 
-@pytest.mark.parametrize("compact_at", [0.0, 0.5, 1.0])
+@pytest.mark.parametrize("compact_at", [0.0, EncodeOptions.compact_at, 1.0])
 def test_a_small_memory_budget_gives_the_same_scene(device, lego_excerpt, views, compact_at):
     results = []
     for memory in (None, 48 * 1600, 0):

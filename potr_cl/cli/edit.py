@@ -18,6 +18,7 @@ from potr_cl.cli.options import (
     add_memory_option,
     add_pruning_options,
     as_bytes,
+    compaction_choices,
     count,
     sweep_options,
 )
@@ -81,8 +82,7 @@ def add_prune(commands: Commands) -> None:
 def _compact(args: argparse.Namespace) -> None:
     options = EncodeOptions(
         q=args.quality,
-        lam=args.lam,
-        alpha=args.alpha,
+        **compaction_choices(args),
         sf_sh=args.sf_sh,
         prune=False,
         sweep=SweepOptions(memory=as_bytes(args.memory)),

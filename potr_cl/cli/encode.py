@@ -14,6 +14,7 @@ from potr_cl.cli.options import (
     Commands,
     add_compaction_options,
     add_pruning_options,
+    compaction_choices,
     count,
     sweep_options,
 )
@@ -32,8 +33,7 @@ def _encode(args: argparse.Namespace) -> None:
     options = EncodeOptions(
         q=args.quality,
         delta_mse_max=args.delta_mse_max,
-        lam=args.lam,
-        alpha=args.alpha,
+        **compaction_choices(args),
         prune=not args.no_prune,
         iterations=args.iterations,
         compact=not args.no_compact,

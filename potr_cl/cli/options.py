@@ -3,8 +3,9 @@
 from __future__ import annotations
 
 import argparse
-from typing import TypeAlias
+from typing import Any, TypeAlias, get_args
 
+from potr_cl.compaction import ColourModel, CompactionOptions, Weighting
 from potr_cl.device import DEVICE_VARIABLE
 from potr_cl.errors import UsageError
 from potr_cl.rasterizer import GSPLAT, INRIA
@@ -73,6 +74,36 @@ def add_compaction_options(p: argparse._ActionsContainer) -> None:
     p.add_argument(
         "--alpha", type=float, metavar="X", help="cosine above which two coefficients count as one; 1: never"
     )
+    p.add_argument(
+        "--colour-model",
+        choices=get_args(ColourModel),
+        default=CompactionOptions.colour_model,
+        help="channels to make sparse, each on its own; ycocg pulls Co and Cg three times as hard; "
+        f"default {CompactionOptions.colour_model}",
+    )
+    p.add_argument(
+        "--weighting",
+        choices=get_args(Weighting),
+        default=CompactionOptions.weighting,
+        help="a view counts as much as it shows of the splat (importance), or as any other that sees it (visibility); "
+        f"default {CompactionOptions.weighting}",
+    )
+    p.add_argument(
+        "--one-pass",
+        action="store_true",
+        help="do not solve again without the coefficients that would be quantised to 0",
+    )
+
+
+def compaction_choices(args: argparse.Namespace) -> dict[str, Any]:
+    """What :func:`add_compaction_options` added, as keywords of EncodeOptions."""
+    return {
+        "lam": args.lam,
+        "alpha": args.alpha,
+        "colour_model": args.colour_model,
+        "weighting": args.weighting,
+        "two_pass": not args.one_pass,
+    }
 
 
 def add_device_options(p: argparse._ActionsContainer) -> None:
