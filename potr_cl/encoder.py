@@ -38,17 +38,24 @@ class Encoded:
     seconds: dict[str, float]
 
 
-class _Stopwatch:
-    """Passes progress on and notes how long each stage took."""
+class Stopwatch:
+    """Passes progress on and notes how long each stage took; a stage within another counts for itself alone.
 
-    def __init__(self, progress: Progress | None) -> None:
+    Attributes:
+        seconds: wall time by stage, in the order in which they began.
+    """
+
+    def __init__(self, progress: Progress | None = None) -> None:
         self._progress = progress
-        self._began: dict[str, float] = {}
+        self._running: str | None = None
+        self._last = time.perf_counter()
         self.seconds: dict[str, float] = {}
 
     def __call__(self, stage: str, done: float) -> None:
         now = time.perf_counter()
-        self.seconds[stage] = now - self._began.setdefault(stage, now)
+        self.seconds.setdefault(stage, 0.0)
+        self.seconds[self._running or stage] += now - self._last
+        self._running, self._last = stage if done < 1 else None, now
         if self._progress is not None:
             self._progress(stage, done)
 
@@ -76,7 +83,7 @@ def encode(
     """
     options = options or EncodeOptions()
     parameters = options.parameters
-    watch = _Stopwatch(progress)
+    watch = Stopwatch(progress)
     views = [] if cameras is None else train_views(cameras)
     reduced, pruned = scene, None
     if views and (options.prune or (options.compact and scene.sh_degree > 0)):

@@ -59,6 +59,23 @@ class PruningOptions:
 
 
 @dataclass(frozen=True)
+class Iteration:
+    """One round of pruning.
+
+    Attributes:
+        left: splats after it.
+        importance: I_k of the splats that went, summed.
+        effect: their ΔMSE_k, summed: by how much the mean squared error should have grown.
+        largest_effect: the largest ΔMSE_k among them.
+    """
+
+    left: int
+    importance: float
+    effect: float
+    largest_effect: float
+
+
+@dataclass(frozen=True)
 class Pruned:
     """What a pruning run did.
 
@@ -67,12 +84,14 @@ class Pruned:
         kept: number of splats at the end of ``order`` that were kept.
         iteration_of: (N,) int32, the iteration (from 0) in which each splat went; -1 for the kept ones.
         iterations: rounds that were run: fewer than asked for when nothing was left to decide.
+        history: of the rounds that removed splats.
     """
 
     order: Indices
     kept: int
     iteration_of: NDArray[np.int32]
     iterations: int
+    history: tuple[Iteration, ...] = ()
 
     @property
     def survivors(self) -> Indices:
@@ -150,6 +169,7 @@ def prune(
     alive = np.arange(splats, dtype=np.int64)
     iteration_of = np.full(splats, -1, np.int32)
     removed: list[Indices] = []
+    history: list[Iteration] = []
     done = 0
     delta_mse = np.zeros(splats)
     for iteration in range(options.iterations):
@@ -163,10 +183,12 @@ def prune(
         iteration_of[gone] = iteration
         removed.append(gone)
         alive = alive[iteration_of[alive] < 0]
+        effect = delta_mse[gone]
+        history.append(Iteration(len(alive), float(importance[gone].sum()), float(effect.sum()), float(effect.max())))
         effects.remove(gone)
         if progress is not None:
             progress(done, len(alive))
         if after_iteration is not None:
             after_iteration(iteration, gone)
     kept = alive[np.argsort(delta_mse[alive], kind="stable")]
-    return Pruned(np.concatenate([*removed, kept]), len(kept), iteration_of, done)
+    return Pruned(np.concatenate([*removed, kept]), len(kept), iteration_of, done, tuple(history))

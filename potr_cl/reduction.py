@@ -58,6 +58,7 @@ def reduce_scene(
         weighting=options.weighting,
     )
     views = train_views(cameras)
+    report("prepare views", 0.0)
     device = device or Device()
     rasterizer = Rasterizer(device, scene, background=options.background)
     removal: RemovalSweep | None = None
@@ -67,9 +68,11 @@ def reduce_scene(
     def compact() -> None:
         nonlocal sh, compacted
         assert removal is not None
+        report("compact", 0.0)
         weights = ViewWeights.from_importances(len(scene), removal.view_importances())
         sh = Compactor(device).compact(scene, camera_centres(views), weights, how).sh
         compacted = True
+        report("compact", 1.0)
 
     def after_iteration(iteration: int, gone: NDArray[np.int64]) -> None:
         if not compacted and iteration + 1 >= options.compact_at * options.iterations:
@@ -78,7 +81,6 @@ def reduce_scene(
             removal.replace_sh(sh)
 
     try:
-        report("prepare views", 0.0)
         removal = RemovalSweep(
             rasterizer, views, options.sweep, lambda done, count: report("prepare views", done / count)
         )
@@ -96,11 +98,9 @@ def reduce_scene(
             report("prune", 1.0)
             survivors = pruned.survivors
         if not compacted:
-            report("compact", 0.0)
             if pruned is None:
                 removal.measure()
             compact()
-            report("compact", 1.0)
         kept = scene.subset(survivors)
         return Scene(kept.means, kept.log_scales, kept.quaternions, kept.opacity_logits, sh[survivors]), pruned
     finally:

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from potr_cl.device import Device
-from potr_cl.encoder import encode
+from potr_cl.encoder import Stopwatch, encode
 from potr_cl.errors import UsageError
 from potr_cl.options import EncodeOptions
 from potr_cl.quantize import ac_sparsity
@@ -101,7 +101,16 @@ def test_order_names_the_splats_of_the_source(device, lego_excerpt, views):
 def test_progress_comes_to_an_end(device, lego_excerpt, views):
     seen = []
     encode(lego_excerpt, views, FEW, lambda stage, done: seen.append((stage, done)), device)
-    assert [s for s, d in seen if d == 1] == ["prepare views", "prune", "octree", "quantise and code"]
+    assert [s for s, d in seen if d == 1] == ["prepare views", "compact", "prune", "octree", "quantise and code"]
+
+
+def test_a_stage_within_another_counts_for_itself(monkeypatch):
+    now = iter([0.0, 1.0, 2.0, 5.0, 9.0, 10.0, 20.0, 21.0])
+    monkeypatch.setattr("potr_cl.encoder.time.perf_counter", lambda: next(now))
+    watch = Stopwatch()
+    for stage, done in (("a", 0.0), ("a", 0.5), ("b", 0.0), ("b", 1.0), ("a", 0.7), ("a", 1.0), ("c", 1.0)):
+        watch(stage, done)
+    assert watch.seconds == {"a": 1 + 1 + 3 + 1 + 10, "b": 4, "c": 1}
 
 
 def test_views_that_see_nothing(device):

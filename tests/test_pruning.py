@@ -75,6 +75,17 @@ def test_budget_is_reached_and_not_passed_by_more_than_one_splat(effect, remaini
         assert len(rest) == 0 or score[gone].max() <= score[rest].min()
 
 
+def test_history_adds_up():
+    effects = Additive(EFFECTS, IMPORTANCES)
+    pruned = prune(effects, 400, PruningOptions(0.4, 7))
+    assert [entry.left for entry in pruned.history] == (400 - np.cumsum([len(g) for g in effects.removed])).tolist()
+    assert pruned.history[-1].left == pruned.kept
+    for gone, entry in zip(effects.removed, pruned.history, strict=True):
+        assert entry.effect == pytest.approx(EFFECTS[gone].sum())
+        assert entry.importance == pytest.approx(IMPORTANCES[gone].sum())
+        assert entry.largest_effect == EFFECTS[gone].max()
+
+
 def test_removes_all_candidates_and_nothing_else():
     effects = Additive(EFFECTS, IMPORTANCES)
     pruned = prune(effects, 400, PruningOptions(0.4, 7))
