@@ -6,7 +6,10 @@ A is the reference scene (uncompressed), B the candidate. With photographs, both
 from __future__ import annotations
 
 import math
+import os
+from collections import deque
 from collections.abc import Callable, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -28,6 +31,9 @@ _TITLES = {
     "b_against_photograph": "B against photo",
     "loss": "loss by photo",
 }
+
+#: Views judged at a time: each takes some ten times the memory of its picture.
+_MOST_THREADS = 8
 
 #: Factors by which an error map may be amplified.
 _FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
@@ -154,7 +160,7 @@ def compare(
         progress: called with the stage and the part of it that is done.
 
     Raises:
-        UsageError: scikit-image is not installed, or a photograph cannot be opened.
+        UsageError: no camera, or a photograph cannot be opened.
         DataError: a photograph is damaged.
         DeviceError: a view does not fit the device.
     """
@@ -162,24 +168,41 @@ def compare(
     def against(image: NDArray[Any], reference: NDArray[Any]) -> Figures:
         return Figures(psnr(image, reference), ssim(image, reference), lpips(image, reference) if lpips else None)
 
-    stage = f"comparing {len(cameras)} view{'s' if len(cameras) > 1 else ''}"
-    views: list[ViewFigures] = []
-    worst = 0
-    worst_pictures: tuple[FloatArray, FloatArray] | None = None
-    progress(stage, 0.0)
-    for index, camera in enumerate(cameras):
-        picture_a, _ = a.render(camera)
-        picture_b, _ = b.render(camera)
+    def judge(camera: Camera, picture_a: FloatArray, picture_b: FloatArray) -> ViewFigures:
         figures = {"b_against_a": against(picture_b, picture_a)}
         if photographs is not None:
             photograph = read_photograph(photographs[camera.name], a.background)
             figures["a_against_photograph"] = against(picture_a, photograph)
             figures["b_against_photograph"] = against(picture_b, photograph)
             figures["loss"] = _loss(figures["a_against_photograph"], figures["b_against_photograph"])
-        views.append(ViewFigures(camera.name, figures))
-        if worst_pictures is None or figures["b_against_a"].psnr < views[worst].figures["b_against_a"].psnr:
-            worst, worst_pictures = index, (picture_a, picture_b)
-        progress(stage, (index + 1) / len(cameras))
+        return ViewFigures(camera.name, figures)
+
+    stage = f"comparing {len(cameras)} view{'s' if len(cameras) > 1 else ''}"
+    views: list[ViewFigures] = []
+    worst = 0
+    worst_pictures: tuple[FloatArray, FloatArray] | None = None
+    pending: deque[tuple[FloatArray, FloatArray, Future[ViewFigures]]] = deque()
+
+    def take() -> None:
+        nonlocal worst, worst_pictures
+        picture_a, picture_b, judged = pending.popleft()
+        view = judged.result()
+        if worst_pictures is None or view.figures["b_against_a"].psnr < views[worst].figures["b_against_a"].psnr:
+            worst, worst_pictures = len(views), (picture_a, picture_b)
+        views.append(view)
+        progress(stage, len(views) / len(cameras))
+
+    progress(stage, 0.0)
+    # The next views are rendered while others are judged; a network of LPIPS uses all processors by itself.
+    threads = 1 if lpips else min(os.cpu_count() or 1, _MOST_THREADS)
+    with ThreadPoolExecutor(threads) as pool:
+        for camera in cameras:
+            picture_a, picture_b = a.render(camera)[0], b.render(camera)[0]
+            pending.append((picture_a, picture_b, pool.submit(judge, camera, picture_a, picture_b)))
+            if len(pending) > threads:
+                take()
+        while pending:
+            take()
     if worst_pictures is None:
         raise UsageError("there is no view to compare")
     return Comparison(views, worst, *worst_pictures)
