@@ -19,7 +19,7 @@ from typing import Any, Literal
 import numpy as np
 import pyopencl as cl
 
-from potr_cl.errors import DeviceError
+from potr_cl.errors import DeviceError, DeviceMemoryError
 
 Family = Literal["cpu", "gpu"]
 
@@ -293,11 +293,13 @@ class Device:
 
     @contextmanager
     def errors(self, what: str) -> Iterator[None]:
-        """Turn pyopencl's errors into a DeviceError that says ``what`` about this device."""
+        """Turn pyopencl's errors into a DeviceError that says ``what`` about this device, or a DeviceMemoryError."""
         try:
             yield
         except cl.MemoryError as error:
-            raise DeviceError(f"device {self.info} ran out of memory ({error}): {self._memory_advice()}") from None
+            raise DeviceMemoryError(
+                f"device {self.info} ran out of memory ({error}): {self._memory_advice()}"
+            ) from None
         except cl.Error as error:
             first = str(error).strip().splitlines()[0]
             raise DeviceError(f"device {self.info} {what} ({first}): choose another with --device") from None
@@ -333,11 +335,11 @@ class Device:
             what: the buffer holds, for the error's sake.
 
         Raises:
-            DeviceError: it would not fit one buffer or the device's memory.
+            DeviceMemoryError: it would not fit one buffer or the device's memory.
         """
         nbytes = max(int(nbytes), 16)
         if nbytes > self.info.largest_buffer or self.allocated + nbytes > self.info.memory:
-            raise DeviceError(
+            raise DeviceMemoryError(
                 f"device {self.info} cannot hold {what}: {nbytes / 1e6:.0f} MB beside {self.allocated / 1e6:.0f} MB "
                 f"taken, of {self.info.memory / 1e6:.0f} MB in buffers of at most {self.info.largest_buffer / 1e6:.0f} "
                 f"MB: {self._memory_advice()}"

@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 
 from potr_cl.cameras import Camera, train_views
 from potr_cl.device import Device
+from potr_cl.fallback import on_device
 from potr_cl.options import EncodeOptions
 from potr_cl.pruning import Pruned
 from potr_cl.reduction import Progress, reduce_scene
@@ -28,6 +29,8 @@ class Encoded:
         nbytes: their number.
         order: (N,) index in the source scene of each splat of the file.
         pruned: what pruning did; None if it was left out.
+        device: that the views were looked at on, another than asked for where that had too little memory; None if there
+            was nothing to look at.
         seconds: wall time by stage.
     """
 
@@ -35,6 +38,7 @@ class Encoded:
     nbytes: int
     order: NDArray[np.int64]
     pruned: Pruned | None
+    device: Device | None
     seconds: dict[str, float]
 
 
@@ -75,23 +79,31 @@ def encode(
             cameras every splat is kept and γ alone decides.
         options: defaults to quality 0.5.
         progress: told how far each stage is.
-        device: to prune on; the best one there is by default.
+        device: to prune on; the best one there is by default. Where its memory is too small, less is kept in it, and
+            if that is not enough a CPU does the work; either is said by a warning.
 
     Raises:
         UsageError: options out of range, or cameras without a training view.
         DataError: a value too large to quantise.
+        DeviceError: no device does the work.
     """
     options = options or EncodeOptions()
-    parameters = options.parameters
     watch = Stopwatch(progress)
     views = [] if cameras is None else train_views(cameras)
-    reduced, pruned = scene, None
+    reduced: Scene = scene
+    pruned: Pruned | None = None
+    used: Device | None = None
     if views and (options.prune or (options.compact and scene.sh_degree > 0)):
-        reduced, pruned = reduce_scene(scene, views, options, watch, device)
+
+        def work(device: Device, options: EncodeOptions) -> tuple[Scene, Pruned | None]:
+            return reduce_scene(scene, views, options, watch, device)
+
+        result, used = on_device(device or Device(), options, work)
+        reduced, pruned = result
     metadata = _metadata(scene, bool(views), options, pruned)
-    coded = code_scene(reduced, parameters, views, metadata, options.entropy, options.threads, watch)
+    coded = code_scene(reduced, options.parameters, views, metadata, options.entropy, options.threads, watch)
     order = coded.order if pruned is None else pruned.survivors[coded.order]
-    return Encoded(coded.pieces, coded.nbytes, order, pruned, watch.seconds)
+    return Encoded(coded.pieces, coded.nbytes, order, pruned, used, watch.seconds)
 
 
 def _metadata(scene: Scene, cameras: bool, options: EncodeOptions, pruned: Pruned | None) -> bytes:

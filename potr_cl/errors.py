@@ -21,3 +21,7 @@ class UsageError(PotrError):
 
 class DeviceError(PotrError):
     """An OpenCL device is missing, failed to build a program, or ran out of memory."""
+
+
+class DeviceMemoryError(DeviceError):
+    """What was asked for does not fit an OpenCL device's memory."""
