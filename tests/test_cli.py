@@ -74,7 +74,7 @@ def test_encode_decode_info(tmp_path, scene_path, capsys):
     cameras = cameras_json(tmp_path / "cameras.json")
     arguments = ["encode", scene_path, "-o", potr, "-q", "0.7", "--cameras", cameras, "--no-prune", "--no-compact"]
     assert cli.main([str(a) for a in arguments]) == 0
-    assert "200 splats" in capsys.readouterr().out
+    assert "200 of 200" in capsys.readouterr().out
     assert cli.main(["decode", str(potr), "-o", str(back)]) == 0
     assert len(ply.load(back)) == 200
     capsys.readouterr()
@@ -88,6 +88,55 @@ def test_encode_decode_info(tmp_path, scene_path, capsys):
     text = capsys.readouterr().out
     assert "colour: AC degree 2" in text
     assert "rotation" in text
+
+
+def test_encode_tells_what_it_did(tmp_path, scene_path, capsys):
+    potr, cameras = tmp_path / "a.potr", cameras_json(tmp_path / "cameras.json")
+    encode = ["encode", scene_path, "-o", potr, "--cameras", cameras, "--iterations", "3", "--count", "90"]
+    report = json.loads(run(capsys, *encode, "--json"))
+    assert (report["bytes"], report["source"]["bytes"]) == (potr.stat().st_size, scene_path.stat().st_size)
+    assert report["ratio"] == report["source"]["bytes"] / report["bytes"]
+    assert (report["splats"], report["source"]["splats"]) == (90, 200)
+    assert sum(report["properties"].values()) == report["bytes"]
+    assert report["pruning"]["history"][-1]["left"] == 90
+    stages = ["prepare views", "prune", "compact", "octree", "quantise and code", "judge", "total"]
+    assert list(report["seconds"]) == stages
+    assert sum(report["seconds"][stage] for stage in stages[:-1]) <= report["seconds"]["total"]
+    assert report["device"]["name"] == Device().info.name
+
+    judged = json.loads(run(capsys, "compare", scene_path, potr, "--cameras", cameras, "--json"))
+    quality = report["quality"]
+    assert quality["kind"] == "test"
+    assert quality["psnr"] == pytest.approx(judged["mean"]["b_against_a"]["psnr"])
+    assert quality["ssim"] == pytest.approx(judged["mean"]["b_against_a"]["ssim"])
+    assert quality["worst"]["name"] == judged["worst_view"]
+    assert [view["name"] for view in quality["views"]] == ["view_0", "view_4"]
+
+    text = run(capsys, *encode)
+    for part in (f"{report['bytes']:,} bytes", "90 of 200", f"PSNR {quality['psnr']:.2f} dB", "colour: AC", "compact"):
+        assert part in text
+    assert f"worst view {quality['worst']['name']}" in text
+    assert "not judged, as asked" in run(capsys, *encode, "--no-quality")
+    assert "judge" not in json.loads(run(capsys, *encode, "--no-quality", "--json"))["seconds"]
+
+
+def test_encode_judges_by_training_views_if_there_are_no_others(tmp_path, scene_path, capsys):
+    path = cameras_json(tmp_path / "cameras.json")
+    path.write_text(json.dumps([view for view in json.loads(path.read_text()) if view["split"] == "train"]))
+    text = run(capsys, "encode", scene_path, "-o", tmp_path / "a.potr", "--cameras", path, "--iterations", "2")
+    assert "all 6 training views, for the cameras name no test views" in text
+
+
+def test_a_device_that_fails_while_judging_leaves_the_file(tmp_path, scene_path, capsys, monkeypatch):
+    potr, cameras = tmp_path / "a.potr", cameras_json(tmp_path / "cameras.json")
+
+    def fail(*_args):
+        raise DeviceError("device 'X' vanished")
+
+    monkeypatch.setattr(cli.encode, "Judge", fail)
+    text = run(capsys, "encode", scene_path, "-o", potr, "--cameras", cameras, "--iterations", "2")
+    assert "not judged: device 'X' vanished" in text
+    assert load_scene(potr)
 
 
 def test_every_parameter_can_be_set(tmp_path, scene_path, capsys):
@@ -144,7 +193,7 @@ def test_encode_prunes(tmp_path, scene_path, capsys):
     potr = tmp_path / "a.potr"
     arguments = ["encode", scene_path, "-o", potr, "--cameras", cameras, "--iterations", "3", "--memory", "0.00001"]
     assert cli.main([str(a) for a in [*arguments, "--count", "60"]]) == 0
-    assert "60 of 200 splats" in capsys.readouterr().out
+    assert "60 of 200, " in capsys.readouterr().out
     assert cli.main(["info", str(potr), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert (report["splats"], report["source_splats"]) == (60, 200)

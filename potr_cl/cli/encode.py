@@ -5,7 +5,9 @@ from __future__ import annotations
 import argparse
 import contextlib
 import dataclasses
+import json
 import sys
+import time
 from pathlib import Path
 
 from potr_cl.atomic_write import replacing
@@ -19,15 +21,20 @@ from potr_cl.cli.options import (
     sweep_options,
 )
 from potr_cl.cli.progress import Progress
+from potr_cl.compare import Comparison
+from potr_cl.decoder import PotrFile, decode
 from potr_cl.device import Device
-from potr_cl.encoder import encode
-from potr_cl.errors import UsageError
+from potr_cl.encoder import Stopwatch, encode
+from potr_cl.errors import DeviceError, UsageError
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.images import parse_colour
+from potr_cl.judging import Judge, JudgingViews
 from potr_cl.options import EncodeOptions
+from potr_cl.scene import Scene
+from potr_cl.summary import encode_report, format_encode_report
 
 
-def _encode(args: argparse.Namespace) -> None:
+def _options(args: argparse.Namespace) -> EncodeOptions:
     if args.threads < 0:
         raise UsageError(f"--threads is {args.threads}, it must be 0 or more")
     options = EncodeOptions(
@@ -51,24 +58,57 @@ def _encode(args: argparse.Namespace) -> None:
         source_bytes=args.scene.stat().st_size if args.scene.is_file() else None,
     )
     _ = options.parameters  # a wrong option is told before a gigabyte is read
+    return options
+
+
+def _encode(args: argparse.Namespace) -> None:
+    began = time.perf_counter()
+    options = _options(args)
     cameras = load_cameras(args.cameras) if args.cameras is not None else None
     if cameras is None and (args.keep is not None or args.count is not None):
         raise UsageError("--keep and --count need --cameras, the views that show which splats matter")
     scene = load_scene(args.scene)
     options = dataclasses.replace(options, count=count(args, len(scene)))
     device = Device(args.device) if (options.prune or options.compact) and cameras is not None else None
-    with replacing(args.output) as file, contextlib.closing(Progress()) as progress:
-        encoded = encode(scene, cameras, options, progress, device)
-        for piece in encoded.pieces:
-            file.write(piece)
-    if (options.prune or options.compact) and cameras is None:
-        print("every splat and colour was kept: give --cameras to remove what no view misses", file=sys.stderr)
-    before = options.source_bytes or scene.nbytes
-    kept = len(encoded.order)
-    print(
-        f"{args.output}: {kept} of {len(scene)} splats, {encoded.nbytes} bytes, "
-        f"{encoded.nbytes / kept:.2f} bytes a splat, {before / encoded.nbytes:.1f} times smaller"
-    )
+    with contextlib.closing(Progress()) as progress:
+        with replacing(args.output) as file:
+            encoded = encode(scene, cameras, options, progress, device)
+            for piece in encoded.pieces:
+                file.write(piece)
+        if (options.prune or options.compact) and cameras is None:
+            print("every splat and colour was kept: give --cameras to remove what no view misses", file=sys.stderr)
+        written = PotrFile.from_bytes(b"".join(encoded.pieces))
+        watch = Stopwatch(progress)
+        quality: tuple[JudgingViews, Comparison] | str
+        if args.no_quality:
+            quality = "not judged, as asked"
+        elif cameras is None:
+            quality = "not judged: there are no cameras to look from"
+        else:
+            quality = _judge(args, scene, written, JudgingViews.of(cameras), encoded.device or device, watch)
+    seconds = encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
+    report = encode_report(args.scene, scene, args.output, written, encoded, options, quality, seconds)
+    print(json.dumps(report, indent=1, allow_nan=False) if args.json else format_encode_report(report))
+
+
+def _judge(
+    args: argparse.Namespace,
+    scene: Scene,
+    written: PotrFile,
+    views: JudgingViews,
+    device: Device | None,
+    watch: Stopwatch,
+) -> tuple[JudgingViews, Comparison] | str:
+    """The figures, or why there are none: a device that fails now must not take the finished file with it."""
+    watch("judge", 0.0)
+    try:
+        judge = Judge(device or Device(args.device), scene, views, parse_colour(args.background))
+        try:
+            return views, judge.compare(decode(written.data), lambda _, done: watch("judge", done))
+        finally:
+            judge.free()
+    except DeviceError as error:
+        return f"not judged: {error}"
 
 
 def add_encode(commands: Commands) -> None:
@@ -85,6 +125,8 @@ def add_encode(commands: Commands) -> None:
         help="cameras.json, transforms.json, or a COLMAP model's folder: with them, splats that no view misses are "
         "removed, and far ones placed more coarsely",
     )
+    p.add_argument("--no-quality", action="store_true", help="do not judge the result; saves time")
+    p.add_argument("--json", action="store_true", help="the summary for programs")
     p.add_argument("--no-prune", action="store_true", help="keep every splat")
     add_pruning_options(p)
     p.add_argument("--no-compact", action="store_true", help="keep the colours' coefficients as they are")

@@ -10,27 +10,31 @@ from tqdm import tqdm
 
 
 class Progress:
-    """A bar with the time left on a terminal; elsewhere a line when a stage begins and ends."""
+    """A bar with the time left on a terminal; elsewhere a line when a stage begins and ends.
+
+    A stage may be interrupted by another and go on.
+    """
 
     def __init__(self) -> None:
         self._stage = ""
         self._bar: Any = None
-        self._began = 0.0
+        self._began: dict[str, float] = {}
 
     def __call__(self, stage: str, done: float) -> None:
         if stage != self._stage:
             self.close()
-            self._stage, self._began = stage, time.perf_counter()
+            self._stage = stage
             if sys.stderr.isatty():
                 form = "{desc}: {percentage:3.0f}% |{bar}| {elapsed} elapsed, {remaining} left"
-                self._bar = tqdm(total=1.0, desc=stage, bar_format=form, leave=False)
-            else:
+                self._bar = tqdm(total=1.0, initial=done, desc=stage, bar_format=form, leave=False)
+            elif stage not in self._began:
                 print(f"{stage} …", file=sys.stderr, flush=True)
+            self._began.setdefault(stage, time.perf_counter())
         if self._bar is not None:
             self._bar.update(done - self._bar.n)
         if done >= 1:
             self.close()
-            print(f"{stage}: {time.perf_counter() - self._began:.1f} s", file=sys.stderr, flush=True)
+            print(f"{stage}: {time.perf_counter() - self._began.pop(stage):.1f} s", file=sys.stderr, flush=True)
             self._stage = ""
 
     def close(self) -> None:

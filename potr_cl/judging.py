@@ -1,0 +1,138 @@
+"""How close a compressed scene comes to the uncompressed one, in pictures from views that it is judged by."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+
+from potr_cl.cameras import Camera, test_views, train_views
+from potr_cl.compare import Comparison, compare
+from potr_cl.device import Device
+from potr_cl.errors import UsageError
+from potr_cl.images import Colour
+from potr_cl.metrics import psnr
+from potr_cl.rasterizer import Rasterizer
+from potr_cl.scene import FloatArray, Scene
+
+#: So many training views, spread evenly, stand for all of them where there are no test views.
+_MOST_TRAINING_VIEWS = 32
+#: Bytes of the uncompressed scene's pictures that are kept from one candidate to the next; others are rendered again.
+_KEPT_PICTURES = 1 << 30
+
+
+@dataclass(frozen=True)
+class JudgingViews:
+    """The views that a scene is judged by.
+
+    Attributes:
+        views: at least one.
+        kind: "test", held out of encoding, or "train", which encoding has looked at.
+        available: how many of that kind the cameras hold.
+    """
+
+    views: list[Camera]
+    kind: Literal["test", "train"]
+    available: int
+
+    @staticmethod
+    def of(cameras: Sequence[Camera]) -> JudgingViews:
+        """All test views; without any, up to 32 training views spread evenly.
+
+        Raises:
+            UsageError: there is no camera.
+        """
+        views = test_views(cameras)
+        if views:
+            return JudgingViews(views, "test", len(views))
+        views = train_views(cameras)
+        some = np.linspace(0, len(views) - 1, min(len(views), _MOST_TRAINING_VIEWS)).round().astype(int)
+        return JudgingViews([views[k] for k in some], "train", len(views))
+
+    def __str__(self) -> str:
+        if self.kind == "test":
+            return f"{len(self.views)} held-out test view{'s' if len(self.views) > 1 else ''}"
+        which = "all" if len(self.views) == self.available else f"{len(self.views)} of"
+        return f"{which} {self.available} training views, for the cameras name no test views"
+
+
+class Judge:
+    """Compares candidates with one uncompressed scene.
+
+    Args:
+        device: to render on.
+        scene: the uncompressed one.
+        views: to judge by.
+        background: behind both.
+
+    Raises:
+        DeviceError: the scene does not fit the device.
+    """
+
+    def __init__(self, device: Device, scene: Scene, views: JudgingViews, background: Colour) -> None:
+        self.views = views
+        self._device = device
+        self._background = background
+        self._reference = Rasterizer(device, scene, background=background)
+        self._pictures: dict[str, FloatArray] = {}
+        self._room = _KEPT_PICTURES
+
+    def psnr(self, candidate: Scene, most: int | None = None) -> float:
+        """Mean over the views of the PSNR against the uncompressed scene's pictures, in decibels.
+
+        Identical pictures are left out of the mean; it is infinite if all are identical.
+
+        Args:
+            candidate: to judge.
+            most: look at so many views only, spread evenly.
+        """
+        views = self.views.views
+        if most is not None and most < len(views):
+            views = [views[k] for k in np.linspace(0, len(views) - 1, most).round().astype(int)]
+        rasterizer = Rasterizer(self._device, candidate, background=self._background)
+        try:
+            values = [psnr(rasterizer.render(camera)[0], self._picture(camera)) for camera in views]
+        finally:
+            rasterizer.free()
+        finite = [value for value in values if math.isfinite(value)]
+        return sum(finite) / len(finite) if finite else math.inf
+
+    def _picture(self, camera: Camera) -> FloatArray:
+        picture = self._pictures.get(camera.name)
+        if picture is None:
+            picture, _ = self._reference.render(camera)
+            if picture.nbytes <= self._room:
+                self._room -= picture.nbytes
+                self._pictures[camera.name] = picture
+        return picture
+
+    def compare(self, candidate: Scene, progress: Callable[[str, float], None]) -> Comparison:
+        """PSNR and SSIM from every view; see :func:`potr_cl.compare.compare`."""
+        rasterizer = Rasterizer(self._device, candidate, background=self._background)
+        try:
+            return compare(self._reference, rasterizer, self.views.views, progress=progress)
+        finally:
+            rasterizer.free()
+
+    def pictures(self, candidate: Scene, names: Sequence[str]) -> list[tuple[FloatArray, FloatArray]]:
+        """(H, W, 3) float32 pictures of both scenes from the named views.
+
+        Raises:
+            UsageError: there is no such view.
+        """
+        cameras = {camera.name: camera for camera in self.views.views}
+        for name in names:
+            if name not in cameras:
+                raise UsageError(f"there is no view '{name}' among the {self.views}")
+        rasterizer = Rasterizer(self._device, candidate, background=self._background)
+        try:
+            return [(self._picture(cameras[name]), rasterizer.render(cameras[name])[0]) for name in names]
+        finally:
+            rasterizer.free()
+
+    def free(self) -> None:
+        """Give all device memory back."""
+        self._reference.free()
