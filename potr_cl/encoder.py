@@ -42,6 +42,20 @@ class Encoded:
     seconds: dict[str, float]
 
 
+@dataclass(frozen=True)
+class Reduced:
+    """A scene between the two halves of an encode.
+
+    Attributes:
+        scene: what is left to code.
+        pruned, device: as :class:`Encoded` has them.
+    """
+
+    scene: Scene
+    pruned: Pruned | None
+    device: Device | None
+
+
 class Stopwatch:
     """Passes progress on and notes how long each stage took; a stage within another counts for itself alone.
 
@@ -90,20 +104,30 @@ def encode(
     options = options or EncodeOptions()
     watch = Stopwatch(progress)
     views = [] if cameras is None else train_views(cameras)
-    reduced: Scene = scene
-    pruned: Pruned | None = None
-    used: Device | None = None
-    if views and (options.prune or (options.compact and scene.sh_degree > 0)):
+    return code(scene, reduce(scene, views, options, watch, device), views, options, watch)
 
-        def work(device: Device, options: EncodeOptions) -> tuple[Scene, Pruned | None]:
-            return reduce_scene(scene, views, options, watch, device)
 
-        result, used = on_device(device or Device(), options, work)
-        reduced, pruned = result
+def reduce(
+    scene: Scene, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch, device: Device | None = None
+) -> Reduced:
+    """The first half of :func:`encode`: fewer splats with sparser colours, as far as views and options allow."""
+    if not views or not (options.prune or (options.compact and scene.sh_degree > 0)):
+        return Reduced(scene, None, None)
+
+    def work(device: Device, options: EncodeOptions) -> tuple[Scene, Pruned | None]:
+        return reduce_scene(scene, views, options, watch, device)
+
+    (reduced, pruned), used = on_device(device or Device(), options, work)
+    return Reduced(reduced, pruned, used)
+
+
+def code(scene: Scene, reduced: Reduced, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch) -> Encoded:
+    """The second half of :func:`encode`: bytes."""
+    pruned = reduced.pruned
     metadata = _metadata(scene, bool(views), options, pruned)
-    coded = code_scene(reduced, options.parameters, views, metadata, options.entropy, options.threads, watch)
+    coded = code_scene(reduced.scene, options.parameters, views, metadata, options.entropy, options.threads, watch)
     order = coded.order if pruned is None else pruned.survivors[coded.order]
-    return Encoded(coded.pieces, coded.nbytes, order, pruned, used, watch.seconds)
+    return Encoded(coded.pieces, coded.nbytes, order, pruned, reduced.device, watch.seconds)
 
 
 def _metadata(scene: Scene, cameras: bool, options: EncodeOptions, pruned: Pruned | None) -> bytes:
