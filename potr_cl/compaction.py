@@ -7,7 +7,9 @@ coefficients but the constant (DC) one are pulled towards zero. Kernels: cl/ridg
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+import contextlib
+from collections.abc import Iterable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from typing import Any, Literal
 
@@ -41,6 +43,12 @@ _VARIANTS: dict[str, dict[str, int]] = {
 }
 #: Work-items of a GPU's work-group.
 _GROUP = 64
+#: Splats whose view weights are gathered at a time.
+_GATHERED = 2048
+#: Bytes of the splats that are on the device at a time: enough to fill it, little to pin.
+_BATCHES = 128 << 20
+#: Threads that copy to pinned memory: one does not reach what the bus carries.
+_COPIERS = 4
 
 
 @dataclass(frozen=True)
@@ -81,23 +89,30 @@ class ViewWeights:
 
         Args:
             splats: N.
-            importances: per view its number, the splats that it sees, and I_k(s) of each, the mean over the view's
-                pixels.
+            importances: per view its number, the splats that it sees, ascending, and I_k(s) of each, the mean over the
+                view's pixels.
         """
         per_view = [(view, seen.astype(np.uint32), values.astype(np.float32)) for view, seen, values in importances]
+        numbers = np.tile(np.array([view for view, _, _ in per_view], np.int32), _GATHERED)
+        starts = np.arange(0, splats + _GATHERED, _GATHERED)
+        bounds = [np.searchsorted(seen, starts) for _, seen, _ in per_view]
         offsets = np.zeros(splats + 1, np.int64)
-        for _, seen, _ in per_view:
-            offsets[1:] += np.bincount(seen, minlength=splats)
-        np.cumsum(offsets, out=offsets)
-        views = np.empty(offsets[-1], np.int32)
-        weights = np.empty(offsets[-1], np.float32)
-        free = offsets[:-1].copy()
-        for view, seen, values in per_view:
-            places = free[seen]
-            views[places] = view
-            weights[places] = values * np.float32(REFERENCE_PIXELS)
-            free[seen] += 1
-        return ViewWeights(offsets, views, weights)
+        views = np.empty(sum(len(seen) for _, seen, _ in per_view), np.int32)
+        weights = np.empty(len(views), np.float32)
+        # Some splats at a time, so that what is written here and there stays in the cache.
+        for block, start in enumerate(starts[:-1]):
+            dense = np.zeros((min(_GATHERED, splats - start), len(per_view)), np.float32)
+            for column, ((_, seen, values), bound) in enumerate(zip(per_view, bounds, strict=True)):
+                run = slice(bound[block], bound[block + 1])
+                dense[seen[run] - start, column] = values[run]
+            counts = offsets[start + 1 : start + 1 + len(dense)]
+            np.cumsum(np.count_nonzero(dense, axis=1), out=counts)
+            counts += offsets[start]
+            run = slice(offsets[start], offsets[start + len(dense)])
+            present = np.flatnonzero(dense)
+            views[run] = numbers[present]
+            np.multiply(dense.ravel()[present], np.float32(REFERENCE_PIXELS), out=weights[run])
+        return ViewWeights(offsets, views[: offsets[-1]], weights[: offsets[-1]])
 
 
 @dataclass(frozen=True)
@@ -148,17 +163,98 @@ class CompactionOptions:
                 raise UsageError(f"unknown {name} '{value}': choose one of {', '.join(known)}")
 
 
+class _Slot:
+    """Device memory and a queue for one batch of splats.
+
+    Two slots take turns, so that the host fills one while the device works on the other. GPUs copy from and to pinned
+    memory, which they do on their own and several times as fast as from ordinary memory; CPUs copy from where data lie.
+    """
+
+    def __init__(self, device: Device, sizes: Sequence[tuple[int, str]]) -> None:
+        self._device = device
+        self._target: FloatArray | None = None
+        self._compacted: FloatArray | None = None
+        self._copied: Future[None] | None = None
+        self._events: list[cl.Event] = []  # letting go of one waits for it
+        self._mapped: list[NDArray[np.uint8]] = []
+        self._maps: list[cl.MemoryMap] = []
+        with device.all_or_nothing(), device.errors("cannot hold the splats to compact"):
+            self.queue = cl.CommandQueue(device.context, device.info.handle, properties=device.queue.properties)
+            self.buffers = [device.allocate(nbytes, what) for nbytes, what in sizes]
+            if device.family == "gpu":
+                # One more than there are buffers: results are fetched while the next batch is filled in.
+                self._mapped = [self._pinned(nbytes) for nbytes, _ in (*sizes, sizes[0])]
+
+    def _pinned(self, nbytes: int) -> NDArray[np.uint8]:
+        flags = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
+        buffer = cl.Buffer(self._device.context, flags, nbytes)
+        access = cl.map_flags.READ | cl.map_flags.WRITE
+        mapped: NDArray[np.uint8] = cl.enqueue_map_buffer(self.queue, buffer, access, 0, (nbytes,), np.uint8)[0]
+        self._maps.append(mapped.base)
+        return mapped
+
+    def _staged(self, number: int, array: NDArray[Any]) -> NDArray[Any]:
+        """The array where the device copies it from."""
+        if not self._mapped:
+            return np.ascontiguousarray(array)
+        staged = self._mapped[number][: array.nbytes].view(array.dtype).reshape(array.shape)
+        np.copyto(staged, array)
+        return staged
+
+    def upload(self, arrays: Sequence[NDArray[Any]], pool: ThreadPoolExecutor) -> None:
+        """Fill the buffers, in their order."""
+        staged = pool.map(self._staged, range(len(arrays)), arrays)
+        with self._device.errors("failed to take the splats to compact"):
+            for buffer, array in zip(self.buffers, staged, strict=True):
+                if array.nbytes:
+                    self._events.append(cl.enqueue_copy(self.queue, buffer, array, is_blocking=False))
+            self.queue.flush()
+
+    def download(self, target: FloatArray) -> None:
+        """Begin to fetch the first buffer to a contiguous array; :meth:`collect` ends it."""
+        if self._copied is not None:
+            self._copied.result()
+        self._target = self._compacted = target
+        if self._mapped:
+            self._compacted = self._mapped[-1][: target.nbytes].view(np.float32).reshape(target.shape)
+        with self._device.errors("failed while computing"):
+            self._events.append(cl.enqueue_copy(self.queue, self._compacted, self.buffers[0], is_blocking=False))
+            self.queue.flush()
+
+    def collect(self, pool: ThreadPoolExecutor) -> None:
+        """Wait for what :meth:`download` began. The target is complete once the pool is."""
+        if self._target is None or self._compacted is None:
+            return
+        with self._device.errors("failed while computing"):
+            self.queue.finish()
+        self._events.clear()
+        if self._mapped:
+            self._copied = pool.submit(np.copyto, self._target, self._compacted)
+        self._target = None
+
+    def close(self) -> None:
+        """Give everything back."""
+        with contextlib.suppress(cl.Error):
+            self.queue.finish()
+        self._events.clear()
+        for mapped in self._maps:
+            mapped.release(self.queue)
+        for buffer in self.buffers:
+            self._device.free(buffer)
+
+
 class Compactor:
     """Compacts scenes on one device.
 
     Args:
         device: to compute on.
-        memory: bytes of the device that a batch of splats may take; by default a quarter of what it has, at most 1 GiB.
+        memory: bytes of the device that splats may take at a time, in two batches; by default as much as keeps the
+            device busy (128 MiB), at most a quarter of what it has.
     """
 
     def __init__(self, device: Device, memory: int | None = None) -> None:
         self.device = device
-        self.memory = memory or min(device.info.memory // 4, 1 << 30)
+        self.memory = memory or min(device.info.memory // 4, _BATCHES)
 
     def compact(
         self,
@@ -189,36 +285,40 @@ class Compactor:
         kernel, lanes = self._kernel(count, options)
 
         offsets = weights.offsets
-        seen = np.diff(offsets) > 0
         result = np.empty(scene.sh.shape, np.float32)
-        result[~seen, 0] = scene.sh[~seen, 0]
-        result[~seen, 1:] = 0
         batches = self._batches(offsets, count)
-        if not seen.any():
-            return replace(scene, sh=result)
-
-        most = max(stop - start for start, stop in batches)
-        entries = max(int(offsets[stop] - offsets[start]) for start, stop in batches)
+        most = max((stop - start for start, stop in batches), default=0)
+        entries = max((int(offsets[stop] - offsets[start]) for start, stop in batches), default=0)
+        sizes = (
+            (12 * count * most, "the SH coefficients"),
+            (16 * most, "the centres"),
+            (4 * most, "the order of the splats"),
+            (4 * (most + 1), "the offsets of the view weights"),
+            (4 * max(entries, 1), "the views"),
+            (4 * max(entries, 1), "the view weights"),
+        )
         eyes = np.zeros((len(camera_centres), 2, 4), np.float32)
         eyes[:, 0, :3] = camera_centres
         eyes[:, 1, :3] = camera_centres - eyes[:, 0, :3].astype(np.float64)
-        buffers: list[cl.Buffer] = []
-        try:
-            for nbytes, what in (
-                (12 * count * most, "the SH coefficients"),
-                (16 * most, "the centres"),
-                (4 * most, "the order of the splats"),
-                (4 * (most + 1), "the offsets of the view weights"),
-                (4 * entries, "the views"),
-                (4 * entries, "the view weights"),
-            ):
-                buffers.append(self.device.allocate(nbytes, what))
-            buffers.append(self.device.upload(eyes, "the cameras"))
-            for start, stop in batches:
-                self._run(kernel, lanes, buffers, scene, weights, options, slice(start, stop), result)
-        finally:
-            for buffer in buffers:
-                self.device.free(buffer)
+        with contextlib.ExitStack() as stack:
+            device_eyes = self.device.upload(eyes, "the cameras")
+            stack.callback(self.device.free, device_eyes)
+            slots = [
+                stack.enter_context(contextlib.closing(_Slot(self.device, sizes))) for _ in range(min(len(batches), 2))
+            ]
+            pool = stack.enter_context(ThreadPoolExecutor(_COPIERS))
+            for number, (start, stop) in enumerate(batches):
+                slot = slots[number % len(slots)]
+                slot.collect(pool)
+                slot.upload(_arrays(scene, weights, options, slice(start, stop)), pool)
+                seen = int(np.count_nonzero(offsets[start + 1 : stop + 1] > offsets[start:stop]))
+                if seen:
+                    self._launch(kernel, lanes, slot, device_eyes, seen, options)
+                slot.download(result[start:stop])
+            for slot in slots:
+                slot.collect(pool)
+        # These came back as they were.
+        result[np.diff(offsets) == 0, 1:] = 0
         return replace(scene, sh=result)
 
     def _kernel(self, sh_count: int, options: CompactionOptions) -> tuple[cl.Kernel, int]:
@@ -234,7 +334,7 @@ class Compactor:
         return device.kernel("ridge.cl", "compact", LANES=lanes, SH_COUNT=sh_count, BLOCK=block, **variant), lanes
 
     def _batches(self, offsets: NDArray[np.int64], sh_count: int) -> list[tuple[int, int]]:
-        """Runs of splats that fit the memory budget and the device's largest buffer."""
+        """Runs of splats of which two fit the memory budget, and one each of the device's buffers."""
         splats = len(offsets) - 1
         per_splat = 12 * sh_count + 24
         used = 8 * offsets + per_splat * np.arange(splats + 1)
@@ -242,7 +342,7 @@ class Compactor:
         batches = []
         start = 0
         while start < splats:
-            stop = int(np.searchsorted(used, used[start] + self.memory, side="right")) - 1
+            stop = int(np.searchsorted(used, used[start] + self.memory // 2, side="right")) - 1
             stop = min(stop, start + largest // (12 * sh_count))
             stop = min(stop, int(np.searchsorted(offsets, offsets[start] + min(largest // 4, 2**32 - 1), "right")) - 1)
             stop = max(stop, start + 1)
@@ -250,61 +350,51 @@ class Compactor:
             start = stop
         return batches
 
-    def _run(
+    def _launch(
         self,
         kernel: cl.Kernel,
         lanes: int,
-        buffers: list[cl.Buffer],
-        scene: Scene,
-        weights: ViewWeights,
+        slot: _Slot,
+        eyes: cl.Buffer,
+        splats: int,
         options: CompactionOptions,
-        batch: slice,
-        result: FloatArray,
     ) -> None:
-        device = self.device
-        offsets = weights.offsets[batch.start : batch.stop + 1]
-        entries = slice(int(offsets[0]), int(offsets[-1]))
-        counts = np.diff(offsets)
-        # Neighbours in a vector or a work-group run as long as the longest of them: they shall be alike.
-        order = np.argsort(np.minimum(counts, 0xFFFF).astype(np.uint16), kind="stable").astype(np.uint32)
-        order = order[np.count_nonzero(counts == 0) :]
-        if not len(order):
-            return
-        means = np.zeros((len(counts), 4), np.float32)
-        means[:, :3] = scene.means[batch]
-        values = weights.weights[entries]
-        if options.weighting == "visibility":
-            values = (values > 0).astype(np.float32)
-        uploads = (
-            scene.sh[batch],
-            means,
-            order,
-            (offsets - offsets[0]).astype(np.uint32),
-            weights.views[entries],
-            values,
-        )
-        with device.errors("failed to take the splats to compact"):
-            for buffer, array in zip(buffers, uploads, strict=False):
-                cl.enqueue_copy(device.queue, buffer, np.ascontiguousarray(array), is_blocking=True)
         kernel.set_args(
-            *buffers,
-            np.uint32(len(order)),
+            *slot.buffers,
+            eyes,
+            np.uint32(splats),
             np.float32(options.alpha),
             np.float32(options.lam),
             np.float32(options.lam * options.chroma_factor),
             np.float32(options.sf_sh if options.two_pass else 0),
             np.int32(options.colour_model == "ycocg"),
         )
-        items = -(-len(order) // lanes)
+        items = -(-splats // lanes)
         # CPUs get one work-item a work-group: their kernels keep kilobytes of private memory each.
-        group = _GROUP if device.family == "gpu" else 1
-        device.launch(kernel, (-(-items // group) * group,), (group,))
-        compacted = device.download(buffers[0], (len(counts), *scene.sh.shape[1:]), np.float32)
-        seen = counts > 0
-        if seen.all():
-            result[batch] = compacted
-        else:
-            result[batch][seen] = compacted[seen]
+        group = _GROUP if self.device.family == "gpu" else 1
+        self.device.launch(kernel, (-(-items // group) * group,), (group,), slot.queue)
+
+
+def _arrays(scene: Scene, weights: ViewWeights, options: CompactionOptions, batch: slice) -> tuple[NDArray[Any], ...]:
+    """What the kernel takes of a batch of splats, in the order of its arguments."""
+    offsets = weights.offsets[batch.start : batch.stop + 1]
+    entries = slice(int(offsets[0]), int(offsets[-1]))
+    counts = np.diff(offsets)
+    # Neighbours in a vector or a work-group run as long as the longest of them: they shall be alike.
+    order = np.argsort(np.minimum(counts, 0xFFFF).astype(np.uint16), kind="stable").astype(np.uint32)
+    means = np.zeros((len(counts), 4), np.float32)
+    means[:, :3] = scene.means[batch]
+    values = weights.weights[entries]
+    if options.weighting == "visibility":
+        values = (values > 0).astype(np.float32)
+    return (
+        scene.sh[batch],
+        means,
+        order[np.count_nonzero(counts == 0) :],
+        (offsets - offsets[0]).astype(np.uint32),
+        weights.views[entries],
+        values,
+    )
 
 
 def _check(splats: int, camera_centres: NDArray[np.floating[Any]], weights: ViewWeights) -> None:

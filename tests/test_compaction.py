@@ -163,6 +163,22 @@ def test_batches_and_repetition_change_no_byte(device: Device) -> None:
         assert again.sh.tobytes() == whole.sh.tobytes()
 
 
+def test_memory_that_runs_out_half_way_is_given_back(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    taken = 0
+
+    def allocate(nbytes: int, what: str) -> object:
+        nonlocal taken
+        taken += 1
+        if taken == 9:  # within the second batch's buffers
+            raise DeviceError("full")
+        return Device.allocate(device, nbytes, what)
+
+    monkeypatch.setattr(device, "allocate", allocate)
+    with pytest.raises(DeviceError, match="full"):
+        Compactor(device, 1).compact(random_scene(9), on_a_sphere(4), dense_weights(np.ones((9, 4))))
+    assert device.allocated == 0
+
+
 def test_sh_of_any_strides(device: Device) -> None:
     scene = random_scene(30, seed=4)
     strided = replace(scene, sh=np.asfortranarray(scene.sh))
