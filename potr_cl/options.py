@@ -60,3 +60,16 @@ class EncodeOptions:
         """The hyper-parameters that result."""
         names = ("lam", "alpha", "delta_mse_max", "beta", "gamma", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale")
         return quantize.HyperParameters.from_quality(self.q, **{name: getattr(self, name) for name in names})
+
+    @property
+    def compaction(self) -> CompactionOptions:
+        """How to compact with them."""
+        parameters = self.parameters
+        return CompactionOptions(
+            lam=parameters.lam,
+            alpha=parameters.alpha,
+            sf_sh=parameters.sf_sh,
+            two_pass=self.two_pass,
+            colour_model=self.colour_model,
+            weighting=self.weighting,
+        )

@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.cameras import Camera, camera_centres, train_views
-from potr_cl.compaction import CompactionOptions, Compactor, ViewWeights
+from potr_cl.compaction import Compactor, ViewWeights
 from potr_cl.device import Device
 from potr_cl.errors import UsageError
 from potr_cl.options import EncodeOptions
@@ -45,18 +45,10 @@ def reduce_scene(
         DeviceError: the scene does not fit the device.
     """
     report = progress or (lambda stage, done: None)
-    parameters = options.parameters
-    schedule = PruningOptions(parameters.delta_mse_max, options.iterations, count=options.count)
+    schedule = PruningOptions(options.parameters.delta_mse_max, options.iterations, count=options.count)
     if not 0 <= options.compact_at <= 1:
         raise UsageError(f"compact_at is {options.compact_at:g}, it must lie between 0 and 1")
-    how = CompactionOptions(
-        lam=parameters.lam,
-        alpha=parameters.alpha,
-        sf_sh=parameters.sf_sh,
-        two_pass=options.two_pass,
-        colour_model=options.colour_model,
-        weighting=options.weighting,
-    )
+    how = options.compaction
     views = train_views(cameras)
     report("prepare views", 0.0)
     device = device or Device()
