@@ -19,7 +19,17 @@ from potr_cl.quantize import quantize_sh, to_ycocg
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.removal import RemovalSweep
 from potr_cl.scene import Scene
-from tests.ridge_reference import YCOCG, compact_channel, objective, ridge, weighted_basis
+from tests.ridge_reference import (
+    YCOCG,
+    Ridges,
+    compact_channel,
+    objective,
+    ridge,
+    triangles,
+    usable_columns,
+    usable_columns_of,
+    weighted_basis,
+)
 from tests.scenes import random_scene
 
 #: Colour error, in colour units, that is a matter of rounding: 1/2000 of a step of 8 bits.
@@ -227,6 +237,30 @@ def test_lambda_zero_without_drops_changes_no_colour(device: Device) -> None:
     options = CompactionOptions(lam=0, alpha=1, two_pass=False)
     compacted = Compactor(device).compact(scene, centres, dense_weights(dense), options)
     np.testing.assert_allclose(compacted.sh, scene.sh, atol=2e-5)
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_the_definition_of_many_splats_is_that_of_one(degree: int) -> None:
+    scene = random_scene(40, degree, seed=21)
+    centres, dense = on_a_sphere(30), sparse_weights(40, 30, seed=21)
+    channel = np.random.default_rng(21).normal(size=(40, (degree + 1) ** 2))
+    known = 0
+    for splats, triangle in triangles(scene.means.astype(np.float64), centres, dense_weights(dense), degree, 7):
+        used = usable_columns_of(triangle, 0.9)
+        ridges = Ridges(triangle, channel[splats], used, 0.3)
+        solved = ridges.solution()
+        excess, optimum = ridges.excess(channel[splats])
+        for i, k in enumerate(splats):
+            basis = weighted_basis(scene.means[k].astype(np.float64), centres, dense[k].astype(np.float64), degree)
+            np.testing.assert_array_equal(used[i], usable_columns(basis, 0.9))
+            x = ridge(basis, channel[k], used[i], 0.3)
+            np.testing.assert_allclose(solved[i], x, rtol=1e-6, atol=1e-9)
+            best = objective(basis, channel[k], x, 0.3)
+            assert optimum[i] == pytest.approx(best, rel=1e-9)
+            ours = np.where(used[i], channel[k], 0)
+            assert excess[i] == pytest.approx(objective(basis, channel[k], ours, 0.3) - best, rel=1e-6)
+            known += 1
+    assert known == np.count_nonzero((dense > 0).any(axis=1))
 
 
 # ------------------------------------------------------------------------------------------------ stress

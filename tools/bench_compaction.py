@@ -1,10 +1,10 @@
-"""Speed, accuracy and effect of the SH energy compaction: python -m tools.bench_compaction PART … [options]
+"""Speed and accuracy of the SH energy compaction: python -m tools.bench_compaction PART … [options]
 
 Parts:
   speed     synthetic splats, each seen by --views views; needs no files
-  accuracy  run time against error on a real scene's own systems, with float64 for the optimum
-  curves    sparsity, magnitude and test PSNR against lambda and alpha, and at half the resolution, on a real scene
-Prints Markdown. Real scenes: --scene FOLDER with point_cloud.ply and cameras.json, and images for PSNR.
+  accuracy  every splat's own system of real scenes against float64, by default with the default method
+Prints Markdown. Real scenes: --scene FOLDER … with point_cloud.ply and cameras.json. Effects on sparsity and pictures:
+tools.compaction_curves.
 """
 
 from __future__ import annotations
@@ -13,31 +13,30 @@ import argparse
 import os
 import platform
 import time
-from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any, get_args
+from typing import get_args
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
-from potr_cl.cameras import Camera, camera_centres, test_views, train_views
+from potr_cl.cameras import camera_centres, train_views
 from potr_cl.compaction import CompactionOptions, Compactor, Precision, ViewWeights
 from potr_cl.device import Device
 from potr_cl.formats import load_cameras, load_scene
-from potr_cl.quantize import quantize_sh, to_ycocg
-from potr_cl.rasterizer import Rasterizer
-from potr_cl.removal import RemovalSweep
-from potr_cl.scene import SH_COEFFICIENTS, FloatArray, Scene
-from tests.ridge_reference import YCOCG, weighted_basis
+from potr_cl.options import EncodeOptions
+from potr_cl.scene import SH_COEFFICIENTS, Scene
+from tests.ridge_reference import YCOCG, Mask, Ridges, triangles, usable_columns_of
 from tests.scenes import random_scene
+from tools.compaction_curves import measured_weights
 from tools.large_scene import DEFAULT_SCENE
 
 F64 = NDArray[np.float64]
 
 #: Colour error that counts as rounding: 1/2000 of a step of 8 bits.
 ROUNDING = 2e-6
+#: Device memory that takes a whole scene at once.
+_WHOLE = 1 << 33
 
 
 def operations(views: int, degree: int) -> dict[str, float]:
@@ -88,8 +87,6 @@ def _precisions(device: Device) -> list[Precision]:
 def _speed(device: Device, splats: int, views: int) -> None:
     print(f"## Speed: {splats} synthetic splats, {views} views each")
     _heading(device)
-    print("| degree | method | k splats/s, kernel | with transfers | k operations a splat | Gflop/s |")
-    print("|---|---|---|---|---|---|")
     rng = np.random.default_rng(0)
     centres = rng.normal(size=(views, 3))
     centres *= 6 / np.linalg.norm(centres, axis=1, keepdims=True)
@@ -99,193 +96,181 @@ def _speed(device: Device, splats: int, views: int) -> None:
         np.tile(np.arange(views, dtype=np.int32), splats),
         rng.exponential(10, size=views * splats).astype(np.float32),
     )
-    compactor = Compactor(device)
+    # In one batch kernels do not overlap, so that their times add up; in many all is as fast as it gets.
+    whole_scene, batches = Compactor(device, min(_WHOLE, device.info.memory)), Compactor(device)
+    print("| degree | method | k splats/s, kernel | with transfers | k operations a splat | Gflop/s |")
+    print("|---|---|---|---|---|---|")
     for degree in (3, 2, 1):
         scene = random_scene(splats, degree)
         precisions: list[Precision] = _precisions(device) if degree == 3 else ["orthogonal"]
         for precision in precisions:
             options = CompactionOptions(precision=precision)
-            _, kernel, whole = _timed(device, compactor, scene, centres, weights, options)
+            _, kernel, _ = _timed(device, whole_scene, scene, centres, weights, options)
+            _, _, whole = _timed(device, batches, scene, centres, weights, options)
             flops = operations(views, degree)["orthogonal" if precision == "orthogonal" else "scaled"]
             print(
                 f"| {degree} | {precision} | {splats / kernel / 1e3:.0f} | {splats / whole / 1e3:.0f} "
                 f"| {flops / 1e3:.0f} | {flops * splats / kernel / 1e9:.1f} |",
                 flush=True,
             )
+    print("\n| MiB on the device at a time (degree 3, orthogonal) | k splats/s with transfers |\n|---|---|")
+    scene = random_scene(splats, 3)
+    for mebibytes in (16, 32, 64, 128, 256, 512):
+        compactor = Compactor(device, mebibytes << 20)
+        _, _, whole = _timed(device, compactor, scene, centres, weights, CompactionOptions())
+        print(f"| {mebibytes} | {splats / whole / 1e3:.0f} |", flush=True)
+    host = np.empty_like(weights.weights)
+    started = time.perf_counter()
+    for _ in range(3):
+        np.copyto(host, weights.weights)
+    rate = 3 * host.nbytes / (time.perf_counter() - started)
+    print(f"\nOne CPU thread copies {rate / 1e9:.1f} GB/s of the same arrays.")
 
 
-def _measured_weights(device: Device, scene: Scene, cameras: list[Camera]) -> ViewWeights:
-    rasterizer = Rasterizer(device, scene)
-    sweep = RemovalSweep(rasterizer, cameras)
-    sweep.measure()
-    weights = ViewWeights.from_importances(len(scene), sweep.view_importances())
-    sweep.free()
-    rasterizer.free()
-    return weights
+@dataclass
+class _Check:
+    """Every channel of the splats that were checked: (K, 3) unless said otherwise.
 
-
-def _excesses(
-    scene: Scene, compacted: Scene, centres: F64, weights: ViewWeights, options: CompactionOptions, splats: int
-) -> Iterator[tuple[float, float, float]]:
-    """Per splat: squared objective above the optimum, the optimum, and what :data:`ROUNDING` makes of it.
-
-    The optimum is over the coefficients that the result left free, by QR in float64; the excess is exact, the squared
-    norm of the difference to the optimum under the system's own matrix, not a difference of two objectives.
+    Attributes:
+        splats: (K,) their numbers.
+        above: relative excess over the optimum of the coefficients that the result left free, less :data:`ROUNDING`.
+        total: the same, all channels together, (K,).
+        against: objective of the result over that of the whole method in float64, less :data:`ROUNDING`.
+        support: whether other coefficients are free than float64 leaves.
+        kept: whether the channel kept its coefficients, and has others than DC.
+        growth: largest AC coefficient over max(1, norm of the original ones).
     """
-    seen = np.flatnonzero(np.diff(weights.offsets))
-    chosen = np.random.default_rng(1).permutation(seen)[:splats]
-    m = scene.sh.shape[1]
-    ridge = np.eye(m)
-    ridge[0, 0] = 0
-    for k in chosen:
-        run = slice(weights.offsets[k], weights.offsets[k + 1])
-        w = weights.weights[run].astype(np.float64)
-        basis = weighted_basis(scene.means[k].astype(np.float64), centres[weights.views[run]], w, scene.sh_degree)
-        before, after = YCOCG @ scene.sh[k].T, YCOCG @ compacted.sh[k].T
-        excess = optimum = 0.0
+
+    splats: NDArray[np.int64]
+    above: F64
+    total: F64
+    against: F64
+    support: NDArray[np.bool_]
+    kept: NDArray[np.bool_]
+    growth: F64
+
+
+def _check(
+    scene: Scene,
+    compacted: Scene,
+    weights: ViewWeights,
+    options: CompactionOptions,
+    systems: list[tuple[NDArray[np.int64], F64]],
+) -> _Check:
+    parts = []
+    for splats, triangle in systems:
+        before, after = (s.sh[splats].astype(np.float64) @ YCOCG.T for s in (scene, compacted))
+        usable = usable_columns_of(triangle, options.alpha)
+        squares = np.array([np.sum(weights.weights[slice(*weights.offsets[k : k + 2])] ** 2.0) for k in splats])
+        rounding = ROUNDING**2 * squares
+        columns: list[tuple[F64, F64, F64, Mask, Mask, F64]] = []
         for c in range(3):
             lam = options.lam * (options.chroma_factor if c else 1)
-            used = np.abs(after[c]) > 1e-6 * np.abs(after).max()
-            used[0] = True
-            right = np.concatenate([basis[:, 1:] @ before[c, 1:], np.zeros(m)])
-            stacked = np.concatenate([basis, np.sqrt(lam) * ridge])[:, used]
-            q, r = np.linalg.qr(stacked)
-            best = np.linalg.lstsq(r, q.T @ right, rcond=1e-15)[0]
-            ours = after[c, used]
-            ours[0] -= before[c, 0]
-            excess += float(np.sum((r @ (ours - best)) ** 2))
-            optimum += float(np.sum((stacked @ best - right) ** 2))
-        yield excess, optimum, float(ROUNDING**2 * np.sum(w * w))
+            old, new = before[..., c], after[..., c]
+            free = np.abs(new) > 1e-6 * np.abs(new).max(axis=1, keepdims=True)
+            free[:, 0] = True
+            excess, optimum = Ridges(triangle, old, free, lam).excess(new)
+
+            used = usable.copy()
+            first = Ridges(triangle, old, used, lam).solution()
+            used[:, 1:] &= np.floor(0.5 + first[:, 1:] * options.sf_sh) != 0
+            second = Ridges(triangle, old, used, lam)
+            x = second.solution()
+            best = second.excess(x)[1]
+            wanted = used & (np.abs(x) > 1e-6 * np.abs(x).max(axis=1, keepdims=True))
+            wanted[:, 0] = True
+            columns.append(
+                (
+                    excess,
+                    optimum,
+                    np.maximum(excess + optimum - rounding, 0) / np.maximum(best, 1e-300),
+                    (free != wanted).any(axis=1),
+                    (np.abs(new - old) <= 1e-6 * np.abs(old).max(axis=1, keepdims=True)).all(axis=1)
+                    & (old[:, 1:] != 0).any(axis=1),
+                    np.abs(new[:, 1:]).max(axis=1) / np.maximum(np.linalg.norm(old, axis=1), 1),
+                )
+            )
+        excess, optimum, against, support, kept, growth = (np.stack(c, axis=1) for c in zip(*columns, strict=True))
+        above = np.maximum(excess - rounding[:, None], 0) / np.maximum(optimum, 1e-300)
+        total = np.maximum(excess.sum(axis=1) - rounding, 0) / np.maximum(optimum.sum(axis=1), 1e-300)
+        parts.append((splats, above, total, against, support, kept, growth))
+    return _Check(*(np.concatenate(p) for p in zip(*parts, strict=True)))
 
 
-def _accuracy(device: Device, folder: Path, splats: int) -> None:
+def _accuracy(device: Device, folder: Path, every: int, precisions: list[Precision]) -> None:
     scene, _ = load_scene(folder / "point_cloud.ply").cleaned()
     views = train_views(load_cameras(folder / "cameras.json"))
     centres = camera_centres(views)
-    weights = _measured_weights(device, scene, views)
-    print(f"## Accuracy: {folder.name}, {splats} of {len(scene)} splats, ", end="")
+    weights = measured_weights(device, scene, views)
+    systems = [
+        (splats[::every], triangle[::every])
+        for splats, triangle in triangles(scene.means.astype(np.float64), centres, weights, scene.sh_degree)
+    ]
+    checked, seen = sum(len(s) for s, _ in systems), int(np.count_nonzero(np.diff(weights.offsets)))
+    print(f"## Accuracy: {folder.name}, {checked} of the {seen} splats that a view sees (of {len(scene)}), ", end="")
     print(f"{np.diff(weights.offsets).mean():.0f} views a splat")
     _heading(device)
-    print("| λ | α | method | k splats/s | above the optimum by > 0.1 % | 99.99th percentile | worst |")
-    print("|---|---|---|---|---|---|---|")
-    for lam, alpha in ((1.0, 0.9), (1.0, 1.0), (0.01, 0.9), (0.01, 1.0)):
-        for precision in _precisions(device):
-            options = CompactionOptions(lam=lam, alpha=alpha, precision=precision)
-            compacted, kernel, _ = _timed(device, Compactor(device), scene, centres, weights, options)
-            excess, optimum, rounding = np.array(list(_excesses(scene, compacted, centres, weights, options, splats))).T
-            relative = np.maximum(excess - rounding, 0) / np.maximum(optimum, 1e-300)
+    print(
+        "| λ | α | method | splats above the optimum by > 0.1 % | 99.99th percentile | worst | channels kept "
+        "| channels that leave others free than float64 | their objective over float64's: median, 99th percentile "
+        "| largest AC coefficient / max(1, norm) |"
+    )
+    print("|---|---|---|---|---|---|---|---|---|---|")
+    parameters = EncodeOptions().parameters
+    violators: list[str] = []
+    for lam, alpha in ((1.0, 0.9), (parameters.lam, parameters.alpha), (0.01, 1.0)):
+        for precision in precisions:
+            options = CompactionOptions(lam=lam, alpha=alpha, sf_sh=parameters.sf_sh, precision=precision)
+            compacted = Compactor(device).compact(scene, centres, weights, options)
+            assert np.isfinite(compacted.sh).all()
+            check = _check(scene, compacted, weights, options, systems)
+            beyond = check.total > 1e-3
+            changed = check.against[check.support & ~check.kept]
             print(
-                f"| {lam:g} | {alpha:g} | {precision} | {len(scene) / kernel / 1e3:.0f} "
-                f"| {100 * np.mean(relative > 1e-3):.3f} % | {np.quantile(relative, 0.9999):.1e} "
-                f"| {relative.max():.1e} |",
+                f"| {lam:.3g} | {alpha:.3g} | {precision} | {np.count_nonzero(beyond)} = {100 * np.mean(beyond):.4f} % "
+                f"| {np.quantile(check.total, 0.9999):.1e} | {check.total.max():.1e} "
+                f"| {np.count_nonzero(check.kept)} | {np.count_nonzero(check.support & ~check.kept)} = "
+                f"{100 * np.mean(check.support & ~check.kept):.4f} % "
+                f"| {np.median(changed) if len(changed) else 1:.5f}, "
+                f"{np.quantile(changed, 0.99) if len(changed) else 1:.5f} | {check.growth.max():.3g} |",
                 flush=True,
             )
-
-
-def _quantized(sh: FloatArray, sf_sh: float) -> tuple[FloatArray, float, float]:
-    """SH through the quantiser and back, share of AC coefficients that are zero, mean magnitude of the others."""
-    back = np.empty_like(sh)
-    zeros = coefficients = 0
-    magnitude = 0.0
-    for k in range(sh.shape[1]):
-        y, co, cg = (quantize_sh(c, sf_sh) / sf_sh for c in to_ycocg(sh[:, k].astype(np.float64)))
-        back[:, k] = np.stack([y - cg + co, y + cg, y - cg - co], axis=1)
-        if k:
-            zeros += sum(int(np.count_nonzero(c == 0)) for c in (y, co, cg))
-            magnitude += sum(float(np.abs(c).sum()) for c in (y, co, cg))
-            coefficients += 3 * len(y)
-    return back, zeros / coefficients, magnitude / max(coefficients - zeros, 1)
-
-
-def _photo(camera: Camera) -> F64:
-    assert camera.image_path is not None
-    pixels: F64 = np.asarray(Image.open(camera.image_path)).astype(np.float64) / 255
-    return pixels[..., :3] * pixels[..., 3:] if pixels.shape[2] == 4 else pixels
-
-
-def _psnr(images: list[Any], targets: list[Any]) -> float:
-    return float(np.mean([-10 * np.log10(np.mean((a - b) ** 2)) for a, b in zip(images, targets, strict=True)]))
-
-
-def _halved(camera: Camera) -> Camera:
-    intrinsics = {name: getattr(camera, name) / 2 for name in ("fx", "fy", "cx", "cy")}
-    return replace(camera, width=camera.width // 2, height=camera.height // 2, **intrinsics)
-
-
-def _curves(device: Device, folder: Path, every: int) -> None:
-    scene, _ = load_scene(folder / "point_cloud.ply").cleaned()
-    cameras = load_cameras(folder / "cameras.json")
-    views, tests = train_views(cameras), test_views(cameras)[::every]
-    centres = camera_centres(views)
-    rasterizer = Rasterizer(device, scene)
-    photos = [_photo(c) for c in tests]
-    sf_sh = CompactionOptions().sf_sh
-
-    def renders() -> list[Any]:
-        return [np.clip(rasterizer.render(c)[0], 0, 1) for c in tests]
-
-    originals = renders()
-    print(f"## Effect: {folder.name}, {len(scene)} splats, none pruned, SF_SH = {sf_sh:g}, {len(tests)} test views")
-    _heading(device)
-    print(f"Uncompressed: {_psnr(originals, photos):.3f} dB against the photographs.\n")
-    print("| | AC zeros | mean non-zero | PSNR, photographs | PSNR, uncompressed |")
-    print("|---|---|---|---|---|")
-
-    def row(label: str, sh: FloatArray) -> None:
-        quantized, zeros, magnitude = _quantized(sh, sf_sh)
-        device.free(rasterizer.replace_sh(quantized))
-        images = renders()
-        print(
-            f"| {label} | {100 * zeros:.2f} % | {magnitude:.4f} | {_psnr(images, photos):.3f} "
-            f"| {_psnr(images, originals):.2f} |",
-            flush=True,
-        )
-
-    row("no compaction", scene.sh)
-    weights = _measured_weights(device, scene, views)
-    compactor = Compactor(device)
-
-    def compact(label: str, **options: Any) -> None:
-        chosen = replace(CompactionOptions(), **options)
-        row(label, compactor.compact(scene, centres, weights, chosen).sh)
-
-    for alpha in (1.0, 0.9, 0.7):
-        for power in np.arange(-4, 5.1):
-            compact(f"α = {alpha:g}, λ = 10^{power:g}", alpha=alpha, lam=10.0**power)
-    compact("α = 0.9, λ = 1, one pass", two_pass=False)
-    compact("α = 0.9, λ = 1, RGB", colour_model="rgb")
-    compact("α = 0.9, λ = 1 for chroma too", chroma_factor=1.0)
-    compact("α = 0.9, λ = 1, visibility", weighting="visibility")
-    compact("α = 0.9, λ = 100, visibility", lam=100.0, weighting="visibility")
-    rasterizer.free()
-
-    half = _measured_weights(device, scene, [_halved(c) for c in views])
-    print("\n| λ (α = 0.9) | AC zeros | weights from views of half the size |")
-    print("|---|---|---|")
-    for lam in (0.1, 1.0, 10.0):
-        options = CompactionOptions(lam=lam)
-        shares = [_quantized(compactor.compact(scene, centres, w, options).sh, sf_sh)[1] for w in (weights, half)]
-        print(f"| {lam:g} | {100 * shares[0]:.2f} % | {100 * shares[1]:.2f} % |", flush=True)
+            channels = (check.above > 1e-3) & beyond[:, None]
+            if beyond.any():
+                violators.append(
+                    f"λ = {lam:.3g}, α = {alpha:.3g}, {precision}: {channels.sum()} channels of {beyond.sum()} splats "
+                    f"above, of which {(channels & check.kept).sum()} kept their coefficients"
+                )
+            for i in np.flatnonzero(beyond)[:20]:
+                k = check.splats[i]
+                run = slice(*weights.offsets[k : k + 2])
+                violators.append(
+                    f"splat {k}, {check.total[i]:.1e} above, "
+                    f"{run.stop - run.start} views, weights {weights.weights[run].min():.1e} to "
+                    f"{weights.weights[run].max():.1e}; channels above: {channels[i].sum()}, of these kept: "
+                    f"{(channels[i] & check.kept[i]).sum()}"
+                )
+    print("\n" + "\n".join(f"- {line}" for line in violators))
 
 
 def main() -> None:
+    """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("parts", nargs="+", choices=["speed", "accuracy", "curves"])
+    parser.add_argument("parts", nargs="+", choices=["speed", "accuracy"])
     parser.add_argument("--device", help="as for potr-cl")
     parser.add_argument("--family", choices=["cpu", "gpu"], help="kernels to run; by default the device's own")
-    parser.add_argument("--splats", type=int, default=20_000, help="of the synthetic scene, or to check")
+    parser.add_argument("--splats", type=int, default=20_000, help="of the synthetic scene")
     parser.add_argument("--views", type=int, default=100, help="of the synthetic scene")
-    parser.add_argument("--scene", type=Path, default=DEFAULT_SCENE.parent, help="folder of a real scene")
-    parser.add_argument("--every", type=int, default=1, help="render every so many-th test view")
+    parser.add_argument("--scene", type=Path, nargs="+", default=[DEFAULT_SCENE.parent], help="folders of real scenes")
+    parser.add_argument("--every", type=int, default=1, help="check every so many-th splat")
+    parser.add_argument("--precisions", nargs="+", choices=get_args(Precision), default=["orthogonal"])
     args = parser.parse_args()
     device = Device(args.device, profiling=True, family=args.family)
-    for part in args.parts:
-        if part == "speed":
-            _speed(device, args.splats, args.views)
-        elif part == "accuracy":
-            _accuracy(device, args.scene, args.splats)
-        else:
-            _curves(device, args.scene, args.every)
+    if "speed" in args.parts:
+        _speed(device, args.splats, args.views)
+    if "accuracy" in args.parts:
+        for folder in args.scene:
+            _accuracy(device, folder, args.every, args.precisions)
 
 
 if __name__ == "__main__":
