@@ -1,0 +1,240 @@
+/* The re-fit's stages on splats and coefficients, LANES splats a work-item.
+
+   Coefficient vectors are SH_COUNT x 3 columns of `stride` floats each, column 3 m + c: coefficient m, channel c of
+   Y, Co, Cg. R = Y + Co - Cg, G = Y + Cg, B = Y - Co - Cg.
+
+   Macros: LANES, SH_COUNT, WEIGHTS (1: the totals hold the sums of w^2 too). */
+
+#define DOUBLE 0
+#include "reals.clh"
+#include "sh_basis.clh"
+#include "splat.clh"
+
+#define TOTALS 4
+#define TRIANGLE (SH_COUNT * (SH_COUNT + 1) / 2)
+/* Element i, j of a packed upper triangle, i <= j. */
+#define AT(i, j) ((i) * (2 * SH_COUNT - (i) - 1) / 2 + (j))
+/* The diagonal's least part of its mean: columns that no view tells apart get no huge steps. */
+#define DAMPING 1e-5f
+
+inline void basis_towards(global const float *means, size_t stride, size_t index, View view, vfloat *values)
+{
+    const vfloat x = (VLOAD(index, means) - view.eye_high[0]) - view.eye_low[0];
+    const vfloat y = (VLOAD(index, means + stride) - view.eye_high[1]) - view.eye_low[1];
+    const vfloat z = (VLOAD(index, means + 2 * stride) - view.eye_high[2]) - view.eye_low[2];
+    const vfloat length = sqrt(x * x + y * y + z * z);
+    const vfloat inverse = 1.0f / (length > 0.0f ? length : (vfloat)(1.0f));
+    sh_basis(x * inverse, y * inverse, z * inverse, values);
+}
+
+/* The splats' colours in a view: of the coefficients themselves (direction == 0), cut at 0, w telling which channels are
+   free (1, 2, 4: above 0); or their change along a direction, 0 where `free` says that the channel is cut. */
+kernel void view_colours(
+    global const float *coefficients,
+    global const float *means,
+    uint stride_,
+    View view,
+    int direction,
+    float unit,
+    global const float4 *free,
+    global float4 *colours)
+{
+    const size_t index = get_global_id(0), stride = stride_;
+    VREAL basis[SH_COUNT];
+    basis_towards(means, stride, index, view, basis);
+    vfloat sums[3] = {(vfloat)(0.0f), (vfloat)(0.0f), (vfloat)(0.0f)};
+    for (int m = 0; m < SH_COUNT; ++m)
+        for (int c = 0; c < 3; ++c)
+            sums[c] = MAD(basis[m], VLOAD(index, coefficients + (3 * m + c) * stride), sums[c]);
+    float rgb[3][LANES];
+    VSTORE(sums[0] + sums[1] - sums[2], 0, rgb[0]);
+    VSTORE(sums[0] + sums[2], 0, rgb[1]);
+    VSTORE(sums[0] - sums[1] - sums[2], 0, rgb[2]);
+    for (int lane = 0; lane < LANES; ++lane) {
+        const size_t splat = index * LANES + lane;
+        float4 colour = (float4)(rgb[0][lane], rgb[1][lane], rgb[2][lane], 0.0f);
+        if (direction) {
+            const int channels = (int)free[splat].w;
+            colour.x = channels & 1 ? colour.x * unit : 0.0f;
+            colour.y = channels & 2 ? colour.y * unit : 0.0f;
+            colour.z = channels & 4 ? colour.z * unit : 0.0f;
+        } else {
+            colour = fmin(colour + (float4)(0.5f, 0.5f, 0.5f, 0.0f), 1e30f);
+            colour.w = (colour.x > 0.0f ? 1.0f : 0.0f) + (colour.y > 0.0f ? 2.0f : 0.0f) + (colour.z > 0.0f ? 4.0f : 0.0f);
+            colour = fmax(colour, 0.0f);
+        }
+        colours[splat] = colour;
+    }
+}
+
+/* A view's totals, times `scale`, onto the coefficients: result += basis x (Y, Co, Cg) of the free channels' sums.
+   With WEIGHTS also gram += the sum of w^2 x basis x basis. Leaves the totals zero for the next view. */
+kernel void gather(
+    global long *totals,
+    global const float *means,
+    uint stride_,
+    View view,
+    float scale,
+    global const float4 *free,
+    global float *result,
+    global float *gram)
+{
+    const size_t index = get_global_id(0), stride = stride_;
+    float parts[4][LANES];
+    int any_sum = 0;
+    for (int lane = 0; lane < LANES; ++lane) {
+        const size_t splat = index * LANES + lane;
+        const int channels = (int)free[splat].w;
+        for (int i = 0; i < 3 + WEIGHTS; ++i) {
+            const long total = totals[TOTALS * splat + i];
+            any_sum |= total != 0;
+            parts[i][lane] = i < 3 && !(channels & (1 << i)) ? 0.0f : (float)total * scale;
+            totals[TOTALS * splat + i] = 0;
+        }
+    }
+    if (!any_sum)
+        return;
+    VREAL basis[SH_COUNT];
+    basis_towards(means, stride, index, view, basis);
+    const vfloat r = VLOAD(0, parts[0]), g = VLOAD(0, parts[1]), b = VLOAD(0, parts[2]);
+    const vfloat channels[3] = {r + g + b, r - b, g - r - b};
+    for (int m = 0; m < SH_COUNT; ++m)
+        for (int c = 0; c < 3; ++c) {
+            global float *column = result + (3 * m + c) * stride;
+            VSTORE(MAD(basis[m], channels[c], VLOAD(index, column)), index, column);
+        }
+#if WEIGHTS
+    const vfloat weight = VLOAD(0, parts[3]);
+    for (int i = 0; i < SH_COUNT; ++i)
+        for (int j = i; j < SH_COUNT; ++j) {
+            global float *column = gram + AT(i, j) * stride;
+            VSTORE(MAD(weight * basis[i], basis[j], VLOAD(index, column)), index, column);
+        }
+#endif
+}
+
+/* sums += (lambda, on AC only, + prior) x coefficients, and 0 where a coefficient is not active. */
+kernel void regularise(
+    global float *sums,
+    global const float *coefficients,
+    global const uint *active,
+    uint stride_,
+    float lambda_luma,
+    float lambda_chroma,
+    float prior)
+{
+    const size_t index = get_global_id(0), stride = stride_;
+    for (int m = 0; m < SH_COUNT; ++m)
+        for (int c = 0; c < 3; ++c) {
+            const size_t column = 3 * m + c;
+            float keep[LANES];
+            for (int lane = 0; lane < LANES; ++lane)
+                keep[lane] = active[(column / 24) * stride + index * LANES + lane] >> (column % 24) & 1 ? 1.0f : 0.0f;
+            const float pull = prior + (m == 0 ? 0.0f : c == 0 ? lambda_luma : lambda_chroma);
+            const vfloat value =
+                MAD(pull, VLOAD(index, coefficients + column * stride), VLOAD(index, sums + column * stride));
+            VSTORE(value * VLOAD(0, keep), index, sums + column * stride);
+        }
+}
+
+/* result = the inverse of each splat's own block of the normal equations, restricted to the active coefficients, times
+   residual: a Cholesky factorisation a channel. The squared lengths of Y, Co and Cg in R, G, B are 3, 2 and 3. */
+kernel void precondition(
+    global const float *residual,
+    global const float *gram,
+    global const uint *active,
+    uint stride_,
+    float lambda_luma,
+    float lambda_chroma,
+    float prior,
+    global float *result)
+{
+    const size_t index = get_global_id(0), stride = stride_;
+    float trace = 0.0f;
+    for (int i = 0; i < SH_COUNT; ++i)
+        trace += gram[AT(i, i) * stride + index];
+    const uint words[2] = {active[index], active[stride + index]};
+    for (int c = 0; c < 3; ++c) {
+        const float length = c == 1 ? 2.0f : 3.0f;
+        const float lambda = c == 0 ? lambda_luma : lambda_chroma;
+        const float least = DAMPING * length * trace / SH_COUNT;
+        float factor[TRIANGLE], y[SH_COUNT];
+        /* Row by row, U with U^T U = block; the diagonal holds the pivots' inverse square roots. */
+        for (int j = 0; j < SH_COUNT; ++j) {
+            const int column = 3 * j + c;
+            const int keep = words[column / 24] >> (column % 24) & 1;
+            float pivot = MAD(length, gram[AT(j, j) * stride + index], prior + (j ? lambda : 0.0f) + least);
+            float rest = residual[column * stride + index];
+            const float floor_ = 1e-6f * pivot;
+            for (int i = 0; i < j; ++i) {
+                pivot = MAD(-factor[AT(i, j)], factor[AT(i, j)], pivot);
+                rest = MAD(-factor[AT(i, j)], y[i], rest);
+            }
+            const float inverse = keep && pivot > floor_ && pivot > 1e-30f ? 1.0f / sqrt(pivot) : 0.0f;
+            factor[AT(j, j)] = inverse;
+            y[j] = rest * inverse;
+            for (int k = j + 1; k < SH_COUNT; ++k) {
+                const int other = 3 * k + c;
+                const int both = keep && words[other / 24] >> (other % 24) & 1;
+                float sum = both ? length * gram[AT(j, k) * stride + index] : 0.0f;
+                if (both)
+                    for (int i = 0; i < j; ++i)
+                        sum = MAD(-factor[AT(i, j)], factor[AT(i, k)], sum);
+                factor[AT(j, k)] = sum * inverse;
+            }
+        }
+        for (int j = SH_COUNT - 1; j >= 0; --j) {
+            for (int k = j + 1; k < SH_COUNT; ++k)
+                y[j] = MAD(-factor[AT(j, k)], y[k], y[j]);
+            y[j] *= factor[AT(j, j)];
+            result[(3 * j + c) * stride + index] = y[j];
+        }
+    }
+}
+
+/* Drop the AC coefficients that cost little: those that add less than `least` to the weighted squared error if they alone
+   were 0, by the diagonal of the splat's own block. */
+kernel void select_active(
+    global float *coefficients,
+    global const float *gram,
+    global uint *active,
+    uint stride_,
+    float least)
+{
+    const size_t index = get_global_id(0), stride = stride_;
+    for (int m = 1; m < SH_COUNT; ++m)
+        for (int c = 0; c < 3; ++c) {
+            const size_t column = 3 * m + c;
+            const float x = coefficients[column * stride + index];
+            const float cost = x * x * (c == 1 ? 2.0f : 3.0f) * gram[AT(m, m) * stride + index];
+            if (!(cost >= least)) {
+                coefficients[column * stride + index] = 0.0f;
+                active[(column / 24) * stride + index] &= ~(1u << (column % 24));
+            }
+        }
+}
+
+/* y = a y + b x. */
+kernel void combine(float a, global float *y, float b, global const float *x)
+{
+    const size_t i = get_global_id(0);
+    y[i] = a * y[i] + b * x[i];
+}
+
+/* parts[i] = sum of x y over every get_global_size(0)-th element from i on, in a fixed order; parts[size + i] = the largest
+   |x| of them. */
+kernel void dot_parts(global const float *x, global const float *y, ulong count, global float *parts)
+{
+    const size_t items = get_global_size(0), first = get_global_id(0);
+    float sum = 0.0f, lost = 0.0f, largest = 0.0f;
+    for (size_t i = first; i < count; i += items) {
+        /* Kahan's compensated sum. */
+        const float term = MAD(x[i], y[i], -lost);
+        const float next = sum + term;
+        lost = (next - sum) - term;
+        sum = next;
+        largest = fmax(largest, fabs(x[i]));
+    }
+    parts[first] = sum;
+    parts[items + first] = largest;
+}

@@ -1,0 +1,583 @@
+"""Joint re-fit of the colours: what pruning and compaction lost, won back in closed form.
+
+For fixed geometry and opacity the picture is linear in the SH coefficients, image = A x (where no colour is cut at
+0). So the coefficients of all splats are solved for together, against given pictures in all views: linear least squares
+with the compaction's ridge on the AC coefficients,
+
+    minimise over x: sum over views s of w_s |A_s x - target_s|^2 + lambda |x_AC|^2 + prior |x - start|^2
+    (lambda threefold on chroma),
+
+by conjugate gradients on the normal equations, preconditioned by each splat's own block. A product with the normal
+matrix is one sweep over the tiles of every view (cl/refit_*.cl). Colours that are cut at 0 stay so while a solution is
+sought; the true error of the result is measured, and the start is kept if it was better.
+
+Which AC coefficients are worth their bytes is seen here too: after a few steps those are given up whose loss would cost
+less than a given mean squared error, and the rest is solved again.
+
+Not in the paper, which solves for each splat alone.
+"""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from potr_cl.cameras import Camera
+from potr_cl.compaction import REFERENCE_PIXELS
+from potr_cl.device import Device
+from potr_cl.errors import UsageError
+from potr_cl.quantize import quantize_sh, to_ycocg
+from potr_cl.rasterizer import INRIA, TILE, Rasterizer, RasterRules, View, camera_struct
+from potr_cl.scene import FloatArray, Scene
+
+#: Gives the picture that view number i should show: a device buffer that begins with (H, W, 3) float32, valid until the
+#: next call.
+Targets = Callable[[int], cl.Buffer]
+
+#: Views that a GPU sweeps at a time.
+_SLOTS = 16
+#: Work-items of a work-group of the stages on splats.
+_GROUP = 64
+#: Work-items that share a dot product.
+_DOT_ITEMS = 16384
+#: Part of the device's memory that the prepared views may take unless the caller sets a budget.
+_SHARE = 0.5
+#: Pixel values beyond this are cut in the kernels (LARGEST_VALUE).
+_LARGEST_VALUE = 64.0
+#: Half steps tried when a solution is worse than its start because colours were cut at 0 on the way.
+_HALVINGS = 4
+
+
+@dataclass(frozen=True)
+class RefitOptions:
+    """How to re-fit.
+
+    Attributes:
+        steps: conjugate-gradient steps at the most.
+        drop: mean squared error for which an AC coefficient is given up; with it, ``selection_steps`` come first, then
+            the coefficients that cost less than this are set to 0 for good.
+        selection_steps, selection_lam: steps and lambda before that choice.
+        gain: stop when a step takes less than this part off the squared error.
+        lam: lambda on the AC coefficients of Y, in pixels of an image of :data:`REFERENCE_PIXELS`.
+        chroma_factor: lambda of Co and Cg over that of Y.
+        prior: the same on every coefficient's distance to its start: what the views do not tell stays as it was.
+        memory: bytes of device memory that prepared views may take; None: half of the device's.
+
+    Raises:
+        UsageError: a value is out of range.
+    """
+
+    steps: int = 8
+    drop: float = 0.0
+    selection_steps: int = 4
+    selection_lam: float = 0.0
+    gain: float = 0.01
+    lam: float = 0.0
+    chroma_factor: float = 3.0
+    prior: float = 0.1
+    memory: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.steps < 0:
+            raise UsageError(f"{self.steps} re-fit steps: it must be 0 or more")
+        if not 0 <= self.gain < 1:
+            raise UsageError(f"the re-fit's least gain a step is {self.gain:g}, it must be 0 or more and below 1")
+        if self.selection_steps < 0:
+            raise UsageError(f"{self.selection_steps} re-fit steps: it must be 0 or more")
+        for name in ("lam", "chroma_factor", "prior", "drop", "selection_lam"):
+            if not 0 <= getattr(self, name) <= 1e12:
+                raise UsageError(f"the re-fit's {name} is {getattr(self, name):g}, it must lie between 0 and 1e12")
+
+
+@dataclass(frozen=True)
+class Refitted:
+    """What a re-fit did.
+
+    Attributes:
+        sh: (N, M, 3) float32 coefficients, R, G, B.
+        errors: mean squared error over views, pixels and channels before, and after.
+        steps: conjugate-gradient steps that were taken.
+    """
+
+    sh: FloatArray
+    errors: tuple[float, float]
+    steps: int
+
+
+def active_coefficients(sh: FloatArray, sf_sh: float) -> NDArray[np.bool_]:
+    """(N, M, 3) the coefficients in Y, Co, Cg that the quantiser would not round to 0; DC always.
+
+    Args:
+        sh: (N, M, 3) R, G, B.
+        sf_sh: the quantiser's scale factor.
+    """
+    active = np.ones(sh.shape, bool)
+    for m in range(1, sh.shape[1]):
+        for c, channel in enumerate(to_ycocg(sh[:, m].astype(np.float64))):
+            active[:, m, c] = quantize_sh(channel, sf_sh) != 0
+    return active
+
+
+@dataclass(frozen=True)
+class _State:
+    """Weighted squared error at some coefficients, and with the regularisers."""
+
+    error: float
+    objective: float
+
+
+class RenderedTargets:
+    """The pictures that another scene gives: the uncompressed one's.
+
+    Args:
+        rasterizer: of that scene.
+        cameras: the views.
+    """
+
+    def __init__(self, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> None:
+        self._rasterizer = rasterizer
+        self._cameras = list(cameras)
+
+    def __call__(self, number: int) -> cl.Buffer:
+        return self._rasterizer.render_device(self._cameras[number])[0]
+
+
+class _Slot:
+    """What one view of a batch needs for itself."""
+
+    def __init__(self, device: Device, stride: int, pixels: int, tiles: int, queue: cl.CommandQueue) -> None:
+        self.queue = queue
+        with device.all_or_nothing():
+            self.colours = device.allocate(16 * stride, "the colours' change")
+            self.totals = device.upload(np.zeros((stride, 4), np.int64), "the re-fit's sums")
+            self.errors = device.allocate(4 * tiles, "the tiles' errors")
+            self.target = device.allocate(12 * pixels, "the target image")
+
+    def free(self, device: Device) -> None:
+        for buffer in (self.colours, self.totals, self.errors, self.target):
+            device.free(buffer)
+
+
+class ColourRefit:
+    """The linear map from SH coefficients to pictures of one scene, its transpose, and the solver.
+
+    Args:
+        device: to compute on.
+        scene: whose geometry and opacities are used; its colours are the start.
+        cameras: the views that count, all the same whatever their size.
+        options: of the solver.
+        rules, background: of the rasterizer.
+        progress: called with the views prepared and their number.
+
+    Raises:
+        UsageError: no camera.
+        DeviceError: the scene or a view does not fit the device.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        scene: Scene,
+        cameras: Sequence[Camera],
+        options: RefitOptions | None = None,
+        rules: RasterRules = INRIA,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        if not cameras:
+            raise UsageError("a re-fit needs at least one view")
+        self.device = device
+        self.options = options or RefitOptions()
+        self._cameras = list(cameras)
+        self._background = background
+        self._sh_count = scene.sh.shape[1]
+        self._columns = 3 * self._sh_count
+        # The rasterizer's own colours are never looked at.
+        self._rasterizer = Rasterizer(device, replace(scene, sh=scene.sh[:, :1]), rules)
+        self._splats, self._stride = len(scene), self._rasterizer.stride
+        self._build(rules)
+        means = np.zeros((3, self._stride), np.float32)
+        means[:, : self._splats] = scene.means.T
+        nbytes = 4 * self._columns * self._stride
+        self._vectors: list[cl.Buffer] = []
+        self._views: dict[int, View] = {}
+        self._slots: list[_Slot] = []
+        try:
+            self._means = device.upload(means, "the centres")
+            self._vectors.append(self._means)
+            self._x, self._start, self._residual, self._direction, self._product, self._preconditioned = (
+                self._allocate(nbytes, "the SH coefficients") for _ in range(6)
+            )
+            self._gram = self._allocate(4 * self._triangle * self._stride, "the splats' normal equations")
+            self._active = self._allocate(8 * self._stride, "the active coefficients")
+            self._parts = self._allocate(8 * _DOT_ITEMS, "a dot product")
+            self.set_coefficients(scene.sh)
+            self._make_slots()
+            self._prepare_views(progress)
+        except BaseException:
+            self.free()
+            raise
+
+    # ------------------------------------------------------------------------------------------ set-up
+
+    def _allocate(self, nbytes: int, what: str) -> cl.Buffer:
+        self._vectors.append(self.device.allocate(nbytes, what))
+        return self._vectors[-1]
+
+    def _build(self, rules: RasterRules) -> None:
+        device, count = self.device, self._sh_count
+        self._triangle = count * (count + 1) // 2
+        self._lanes = 1 if device.family == "gpu" else device.vector_width
+        limits: dict[str, float | int] = {"ALPHA_CAP": float(rules.alpha_cap), "STOP": rules.stop}
+        if device.family == "gpu":
+            limits["NATIVE_EXP2"] = int(device.native_exp2)
+        else:
+            limits["LANES"] = max(device.vector_width, 4)
+        source = f"refit_{device.family}.cl"
+        self._tile_group = 64 if device.family == "gpu" else 1
+        self._sweeps = [device.kernel(source, "refit_sweep", WEIGHTS=weights, **limits) for weights in (0, 1)]
+
+        def stage(name: str, weights: int = 0) -> cl.Kernel:
+            return device.kernel("refit.cl", name, LANES=self._lanes, SH_COUNT=count, WEIGHTS=weights)
+
+        self._view_colours = stage("view_colours")
+        self._gathers = [stage("gather", weights) for weights in (0, 1)]
+        self._regularise = stage("regularise")
+        self._precondition = stage("precondition")
+        self._select_active = stage("select_active")
+        self._combine = stage("combine")
+        self._dot_parts = stage("dot_parts")
+
+    def _make_slots(self) -> None:
+        device = self.device
+        pixels = max(c.width * c.height for c in self._cameras)
+        tiles = max(-(-c.width // TILE) * -(-c.height // TILE) for c in self._cameras)
+        count = min(_SLOTS, len(self._cameras)) if device.family == "gpu" else 1
+        for number in range(count):
+            queue = device.queue if number == 0 else cl.CommandQueue(device.context, device.info.handle)
+            self._slots.append(_Slot(device, self._stride, pixels, tiles, queue))
+
+    def _prepare_views(self, progress: Callable[[int, int], None] | None) -> None:
+        memory = self.options.memory
+        budget = self.device.info.memory * _SHARE if memory is None else memory
+        for number, camera in enumerate(self._cameras):
+            view = self._rasterizer.prepare(camera)
+            budget -= 48 * self._stride + 4 * (view.entry_count + view.tiles)
+            if budget < 0:
+                budget = 0
+                view.free()
+            else:
+                self._views[number] = view
+            if progress is not None:
+                progress(number + 1, len(self._cameras))
+
+    def set_coefficients(self, sh: FloatArray, active: NDArray[np.bool_] | None = None) -> None:
+        """Where to start.
+
+        Args:
+            sh: (N, M, 3) R, G, B.
+            active: (N, M, 3) in Y, Co, Cg: the coefficients that may differ from 0; all by default.
+        """
+        columns = np.zeros((self._columns, self._stride), np.float32)
+        for m in range(self._sh_count):
+            columns[3 * m : 3 * m + 3, : self._splats] = to_ycocg(sh[:, m].astype(np.float64))
+        words = np.zeros((2, self._stride), np.uint32)
+        for column in range(self._columns):
+            flags = np.ones(self._splats, bool) if active is None else active[:, column // 3, column % 3]
+            columns[column, : self._splats] *= flags
+            words[column // 24, : self._splats] |= flags.astype(np.uint32) << np.uint32(column % 24)
+        cl.enqueue_copy(self.device.queue, self._x, columns, is_blocking=True)
+        cl.enqueue_copy(self.device.queue, self._active, words, is_blocking=True)
+
+    def _coefficients(self, buffer: cl.Buffer) -> FloatArray:
+        """A vector on the device as (N, M, 3) R, G, B."""
+        columns = self.device.download(buffer, (self._sh_count, 3, self._stride), np.float32)[:, :, : self._splats]
+        y, co, cg = columns[:, 0], columns[:, 1], columns[:, 2]
+        return np.ascontiguousarray(np.stack([y + co - cg, y + cg, y - co - cg]).transpose(2, 1, 0))
+
+    # ------------------------------------------------------------------------------------------ vectors
+
+    def _over_splats(self, kernel: cl.Kernel, lanes: int) -> None:
+        self.device.launch(kernel, (self._stride // lanes,), (max(_GROUP // lanes, 1),))
+
+    def _linear(self, a: float, y: cl.Buffer, b: float, x: cl.Buffer) -> None:
+        """y = a y + b x."""
+        self._combine.set_args(np.float32(a), y, np.float32(b), x)
+        self.device.launch(self._combine, (self._columns * self._stride,), (_GROUP,))
+
+    def _zero(self, buffer: cl.Buffer) -> None:
+        cl.enqueue_fill_buffer(self.device.queue, buffer, np.float32(0), 0, buffer.size)
+
+    def _copy(self, target: cl.Buffer, source: cl.Buffer) -> None:
+        cl.enqueue_copy(self.device.queue, target, source, byte_count=4 * self._columns * self._stride)
+
+    def _dot(self, x: cl.Buffer, y: cl.Buffer) -> tuple[float, float]:
+        """x · y, and the largest |x|."""
+        self._dot_parts.set_args(x, y, np.uint64(self._columns * self._stride), self._parts)
+        self.device.launch(self._dot_parts, (_DOT_ITEMS,), (_GROUP,))
+        parts = self.device.download(self._parts, (2, _DOT_ITEMS), np.float32)
+        return float(parts[0].sum(dtype=np.float64)), float(parts[1].max())
+
+    def _add_ridge(self, sums: cl.Buffer, coefficients: cl.Buffer, lam: float, prior: float) -> None:
+        """sums += Γ coefficients + prior · coefficients, on the active coefficients; the others' sums become 0."""
+        self._regularise.set_args(
+            sums,
+            coefficients,
+            self._active,
+            np.uint32(self._stride),
+            np.float32(lam),
+            np.float32(lam * self.options.chroma_factor),
+            np.float32(prior),
+        )
+        self._over_splats(self._regularise, self._lanes)
+
+    # ------------------------------------------------------------------------------------------ sweeps
+
+    def _weight(self, camera: Camera) -> float:
+        """What a pixel of a view counts."""
+        return REFERENCE_PIXELS / (camera.width * camera.height)
+
+    def _sweep_views(
+        self,
+        coefficients: cl.Buffer,
+        result: cl.Buffer,
+        targets: Targets | None,
+        unit: float = 1.0,
+        weights: bool = False,
+    ) -> float:
+        """result += Aᵀ W (A coefficients - targets), of the colours themselves; without targets of their change.
+
+        Args:
+            unit: factor that keeps the change's colours near 1.
+            weights: sum up the splats' own blocks of the normal equations too.
+
+        Returns:
+            The weighted squared error of the colours themselves.
+        """
+        device, stride = self.device, np.uint32(self._stride)
+        sweep, gather = self._sweeps[weights], self._gathers[weights]
+        background = self._background if targets is not None else (0.0, 0.0, 0.0)
+        error = 0.0
+        numbers = iter(range(len(self._cameras)))
+        while batch := list(itertools.islice(numbers, len(self._slots))):
+            views = []
+            device.queue.finish()
+            for slot, number in zip(self._slots, batch, strict=False):
+                camera = self._cameras[number]
+                struct = camera_struct(camera)
+                view = self._views.get(number) or self._rasterizer.prepare(camera)
+                views.append(view)
+                if targets is not None:
+                    cl.enqueue_copy(
+                        device.queue, slot.target, targets(number), byte_count=12 * camera.width * camera.height
+                    )
+                    device.queue.finish()
+                if targets is not None or number not in self._views:
+                    x = coefficients if targets is not None else self._start
+                    self._view_colours.set_args(
+                        x, self._means, stride, struct, np.int32(0), np.float32(1), view.colours, view.colours
+                    )
+                    device.launch(
+                        self._view_colours, (self._stride // self._lanes,), (_GROUP // self._lanes,), slot.queue
+                    )
+                colours = view.colours
+                if targets is None:
+                    colours = slot.colours
+                    self._view_colours.set_args(
+                        coefficients, self._means, stride, struct, np.int32(1), np.float32(unit), view.colours, colours
+                    )
+                    device.launch(
+                        self._view_colours, (self._stride // self._lanes,), (_GROUP // self._lanes,), slot.queue
+                    )
+                sweep.set_args(
+                    view.shapes,
+                    colours,
+                    view.offsets,
+                    view.entries,
+                    struct,
+                    *(np.float32(channel) for channel in background),
+                    slot.target,
+                    np.int32(targets is not None),
+                    np.float32(self._fixed_scale(camera)),
+                    slot.errors,
+                    slot.totals,
+                )
+                device.launch(sweep, (view.tiles * self._tile_group,), (self._tile_group,), slot.queue)
+            for slot in self._slots:
+                slot.queue.finish()
+            # One after the other: sums of floats depend on their order.
+            for slot, number, view in zip(self._slots, batch, views, strict=False):
+                camera = self._cameras[number]
+                scale = self._weight(camera) / (self._fixed_scale(camera) * unit)
+                gather.set_args(
+                    slot.totals,
+                    self._means,
+                    stride,
+                    camera_struct(camera),
+                    np.float32(scale),
+                    view.colours,
+                    result,
+                    self._gram,
+                )
+                self._over_splats(gather, self._lanes)
+                if targets is not None:
+                    tiles = device.download(slot.errors, (view.tiles,), np.float32)
+                    error += self._weight(camera) * float(tiles.sum(dtype=np.float64))
+                if number not in self._views:
+                    view.free()
+        return error
+
+    def _fixed_scale(self, camera: Camera) -> float:
+        """Fixed point of 62 bits for sums over a view's pixels, the largest power of two that cannot overflow."""
+        area = (camera.width + TILE - 1) * (camera.height + TILE - 1)
+        return float(2.0 ** np.floor(62 - np.log2(_LARGEST_VALUE * area)))
+
+    # ------------------------------------------------------------------------------------------ the solver
+
+    def _linearise(self, targets: Targets, lam: float, weights: bool) -> _State:
+        """Make the residual: minus half the objective's gradient at the present coefficients."""
+        prior = self.options.prior
+        self._zero(self._residual)
+        error = self._sweep_views(self._x, self._residual, targets, weights=weights)
+        self._add_ridge(self._residual, self._x, lam, 0.0)
+        self._zero(self._product)
+        self._add_ridge(self._product, self._x, lam, 0.0)
+        ridge = self._dot(self._x, self._product)[0]
+        way = self._direction
+        self._copy(way, self._x)
+        self._linear(1.0, way, -1.0, self._start)
+        ridge += prior * self._dot(way, way)[0]
+        self._linear(-1.0, self._residual, -prior, way)
+        return _State(error, error + ridge)
+
+    def _apply_preconditioner(self, lam: float) -> None:
+        self._precondition.set_args(
+            self._residual,
+            self._gram,
+            self._active,
+            np.uint32(self._stride),
+            np.float32(lam),
+            np.float32(lam * self.options.chroma_factor),
+            np.float32(self.options.prior),
+            self._preconditioned,
+        )
+        self._over_splats(self._precondition, 1)
+
+    def solve(self, targets: Targets, progress: Callable[[int, int], None] | None = None) -> Refitted:
+        """Re-fit the active coefficients, after choosing among them if the options say so.
+
+        Args:
+            targets: the pictures to come near to.
+            progress: called with the steps done and their greatest number.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        options = self.options
+        values = 3 * REFERENCE_PIXELS * len(self._cameras)
+        total = options.steps + (options.selection_steps if options.drop else 0)
+
+        def told(steps: int) -> None:
+            if progress is not None:
+                progress(steps, total)
+
+        self._zero(self._gram)
+        self._copy(self._start, self._x)
+        first = state = self._linearise(targets, options.selection_lam if options.drop else options.lam, True)
+        steps = 0
+        if options.drop:
+            steps = self._descend(state, options.selection_steps, options.selection_lam, told)
+            self._select_active.set_args(
+                self._x, self._gram, self._active, np.uint32(self._stride), np.float32(options.drop * values)
+            )
+            self._over_splats(self._select_active, 1)
+            self._copy(self._start, self._x)
+            state = self._linearise(targets, options.lam, False)
+        more = self._descend(state, options.steps, options.lam, lambda done: told(steps + done))
+        last = self._linearise(targets, options.lam, False)
+        for _ in range(_HALVINGS):
+            if last.objective <= state.objective:
+                break
+            self._linear(0.5, self._x, 0.5, self._start)
+            last = self._linearise(targets, options.lam, False)
+        if not last.objective <= state.objective:
+            self._copy(self._x, self._start)
+            last, more = state, 0
+        return Refitted(self._coefficients(self._x), (first.error / values, last.error / values), steps + more)
+
+    def _descend(self, state: _State, most: int, lam: float, told: Callable[[int], None]) -> int:
+        """Conjugate-gradient steps from a linearised state; returns how many paid."""
+        remaining, slope = state.objective, 0.0
+        for step in range(most):
+            self._apply_preconditioner(lam)
+            new_slope = self._dot(self._preconditioned, self._residual)[0]
+            if not (new_slope > 0 and np.isfinite(new_slope)):
+                return step
+            self._linear(new_slope / slope if step else 0.0, self._direction, 1.0, self._preconditioned)
+            slope = new_slope
+            largest = self._dot(self._direction, self._direction)[1]
+            self._zero(self._product)
+            self._sweep_views(self._direction, self._product, None, unit=1 / largest)
+            self._add_ridge(self._product, self._direction, lam, self.options.prior)
+            curvature = self._dot(self._direction, self._product)[0]
+            if not (curvature > 0 and np.isfinite(curvature)):
+                return step
+            length = slope / curvature
+            self._linear(1.0, self._x, length, self._direction)
+            self._linear(1.0, self._residual, -length, self._product)
+            gained = length * slope
+            remaining -= gained
+            told(step + 1)
+            if gained < self.options.gain * remaining:
+                return step + 1
+        return most
+
+    def free(self) -> None:
+        """Give all device memory back."""
+        for view in self._views.values():
+            view.free()
+        for slot in self._slots:
+            slot.free(self.device)
+        for buffer in self._vectors:
+            self.device.free(buffer)
+        self._views, self._slots, self._vectors = {}, [], []
+        self._rasterizer.free()
+
+
+def refit_colours(
+    device: Device,
+    scene: Scene,
+    cameras: Sequence[Camera],
+    targets: Targets,
+    options: RefitOptions | None = None,
+    active: NDArray[np.bool_] | None = None,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    progress: Callable[[int, int], None] | None = None,
+) -> Refitted:
+    """Re-fit a scene's colours to pictures of all views together.
+
+    Args:
+        device: to compute on.
+        scene: its geometry and opacities stay, its colours are the start.
+        cameras: the views that count.
+        targets: the picture that each of them should show.
+        options: of the solver.
+        active: (N, M, 3) in Y, Co, Cg: the coefficients that may differ from 0; all by default.
+        background: R, G, B behind the scene.
+        progress: called with the steps done and their greatest number.
+
+    Raises:
+        UsageError: no camera.
+        DeviceError: the scene does not fit the device.
+    """
+    refit = ColourRefit(device, scene, cameras, options, background=background)
+    try:
+        refit.set_coefficients(scene.sh, active)
+        return refit.solve(targets, progress)
+    finally:
+        refit.free()
