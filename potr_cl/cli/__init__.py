@@ -8,7 +8,7 @@ import sys
 from collections.abc import Sequence
 
 from potr_cl import __version__
-from potr_cl.cli import devices, edit, encode, files, pictures
+from potr_cl.cli import convert, devices, edit, encode, files, pictures
 from potr_cl.errors import PotrError
 
 
@@ -23,6 +23,7 @@ def _parser() -> argparse.ArgumentParser:
     edit.add_compact(commands)
     files.add_decode(commands)
     files.add_info(commands)
+    convert.add_convert(commands)
     pictures.add_render(commands)
     pictures.add_compare(commands)
     devices.add_devices(commands)

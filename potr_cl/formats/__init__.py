@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from functools import partial
 from pathlib import Path
 
 from potr_cl.cameras import Camera
 from potr_cl.decoder import decode
 from potr_cl.errors import DataError, UsageError
-from potr_cl.formats import cameras_json, colmap, ply, transforms
+from potr_cl.formats import cameras_json, colmap, compressed_ply, ply, sog, spz, transforms
 from potr_cl.formats.view_files import read_json
 from potr_cl.scene import Scene
 
@@ -16,19 +18,41 @@ def load_scene(path: Path) -> Scene:
     """Read a trained scene; the extension tells the format.
 
     Args:
-        path: of a .ply file, or of a .potr file, which is decoded.
+        path: of a .ply file, of a .potr file, which is decoded, or, with the extra ``convert``, of a compressed .ply,
+            an .spz or a .sog file.
 
     Raises:
-        UsageError: the file cannot be opened, or its extension is unknown.
+        UsageError: the file cannot be opened, its extension is unknown, or it needs an extra.
         DataError: its content is damaged.
     """
     path = Path(path)
     suffix = path.suffix.lower()
     if suffix == ".ply":
-        return ply.load(path)
+        return compressed_ply.load(path) if compressed_ply.is_compressed_ply(path) else ply.load(path)
     if suffix == ".potr":
         return decode(path)
-    raise UsageError(f"'{path}': unknown kind of scene, expected a .ply or .potr file")
+    if suffix == ".spz":
+        return spz.load(path)
+    if suffix == ".sog":
+        return sog.load(path)
+    raise UsageError(f"'{path}': unknown kind of scene, expected a .ply, .potr, .spz or .sog file")
+
+
+def scene_writer(path: Path) -> Callable[[Scene], None]:
+    """What writes a scene to ``path`` in the format that its extension tells.
+
+    Raises:
+        UsageError: no format for whole scenes has this extension (a .potr file is what an encoder makes).
+    """
+    path = Path(path)
+    suffixes = [suffix.lower() for suffix in path.suffixes]
+    if suffixes[-2:] == [".compressed", ".ply"]:
+        return partial(compressed_ply.save, path)
+    if suffixes[-1:] == [".ply"]:
+        return partial(ply.save, path)
+    if suffixes[-1:] == [".spz"]:
+        return partial(spz.save, path)
+    raise UsageError(f"'{path}': scenes are written as .ply, .compressed.ply or .spz")
 
 
 def load_cameras(path: Path) -> list[Camera]:
