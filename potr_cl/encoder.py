@@ -5,17 +5,21 @@ from __future__ import annotations
 import json
 import time
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.bitstream import EntropyCoder
 from potr_cl.cameras import Camera, train_views
+from potr_cl.decoder import decode
 from potr_cl.device import Device
 from potr_cl.fallback import on_device
 from potr_cl.options import EncodeOptions
 from potr_cl.pruning import Pruned
+from potr_cl.rasterizer import Rasterizer
 from potr_cl.reduction import Progress, reduce_scene
+from potr_cl.refit import RefitOptions, Refitted, RenderedTargets, active_coefficients, refit_colours
 from potr_cl.scene import Scene
 from potr_cl.streams import code_scene
 
@@ -29,6 +33,7 @@ class Encoded:
         nbytes: their number.
         order: (N,) index in the source scene of each splat of the file.
         pruned: what pruning did; None if it was left out.
+        refitted: what the re-fit of the colours did; None if it was left out.
         device: that the views were looked at on, another than asked for where that had too little memory; None if there
             was nothing to look at.
         seconds: wall time by stage.
@@ -38,6 +43,7 @@ class Encoded:
     nbytes: int
     order: NDArray[np.int64]
     pruned: Pruned | None
+    refitted: Refitted | None
     device: Device | None
     seconds: dict[str, float]
 
@@ -48,11 +54,12 @@ class Reduced:
 
     Attributes:
         scene: what is left to code.
-        pruned, device: as :class:`Encoded` has them.
+        pruned, refitted, device: as :class:`Encoded` has them.
     """
 
     scene: Scene
     pruned: Pruned | None
+    refitted: Refitted | None
     device: Device | None
 
 
@@ -111,14 +118,56 @@ def reduce(
     scene: Scene, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch, device: Device | None = None
 ) -> Reduced:
     """The first half of :func:`encode`: fewer splats with sparser colours, as far as views and options allow."""
-    if not views or not (options.prune or (options.compact and scene.sh_degree > 0)):
-        return Reduced(scene, None, None)
+    if not views or not (options.prune or options.refit or (options.compact and scene.sh_degree > 0)):
+        return Reduced(scene, None, None, None)
 
-    def work(device: Device, options: EncodeOptions) -> tuple[Scene, Pruned | None]:
-        return reduce_scene(scene, views, options, watch, device)
+    def work(device: Device, options: EncodeOptions) -> Reduced:
+        reduced, pruned = reduce_scene(scene, views, options, watch, device)
+        refitted = None
+        if options.refit:
+            refitted = refit(scene, reduced, views, options, watch, device)
+            reduced = replace(reduced, sh=refitted.sh)
+        return Reduced(reduced, pruned, refitted, device)
 
-    (reduced, pruned), used = on_device(device or Device(), options, work)
-    return Reduced(reduced, pruned, used)
+    return on_device(device or Device(), options, work)[0]
+
+
+def refit(
+    scene: Scene,
+    reduced: Scene,
+    views: Sequence[Camera],
+    options: EncodeOptions,
+    watch: Stopwatch,
+    device: Device,
+) -> Refitted:
+    """Re-fit the colours of what is left of a scene, on the geometry and the opacities that a decoder will see.
+
+    So the colours make up for quantised geometry too.
+    """
+    watch("refit", 0.0)
+    parameters = options.parameters
+    # The geometry alone: a file of degree 0, decoded again and brought back to the order of the splats.
+    bare = code_scene(replace(reduced, sh=reduced.sh[:, :1]), parameters, views, entropy=EntropyCoder("zstd", 1))
+    place = np.empty(len(reduced), np.int64)
+    place[bare.order] = np.arange(len(reduced))
+    decoded = decode(b"".join(bare.pieces)).subset(place)
+    active = active_coefficients(reduced.sh, parameters.sf_sh) if options.compact else None
+    how = RefitOptions(steps=options.refit, drop=options.drop, memory=options.sweep.memory)
+    rasterizer = Rasterizer(device, scene, background=options.background)
+    try:
+        return refit_colours(
+            device,
+            replace(decoded, sh=reduced.sh),
+            views,
+            RenderedTargets(rasterizer, views),
+            how,
+            active,
+            options.background,
+            lambda done, steps: watch("refit", done / steps),
+        )
+    finally:
+        rasterizer.free()
+        watch("refit", 1.0)
 
 
 def code(scene: Scene, reduced: Reduced, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch) -> Encoded:
@@ -127,7 +176,7 @@ def code(scene: Scene, reduced: Reduced, views: Sequence[Camera], options: Encod
     metadata = _metadata(scene, bool(views), options, pruned)
     coded = code_scene(reduced.scene, options.parameters, views, metadata, options.entropy, options.threads, watch)
     order = coded.order if pruned is None else pruned.survivors[coded.order]
-    return Encoded(coded.pieces, coded.nbytes, order, pruned, reduced.device, watch.seconds)
+    return Encoded(coded.pieces, coded.nbytes, order, pruned, reduced.refitted, reduced.device, watch.seconds)
 
 
 def _metadata(scene: Scene, cameras: bool, options: EncodeOptions, pruned: Pruned | None) -> bytes:

@@ -23,6 +23,8 @@ class EncodeOptions:
         compact: make the SH coefficients sparse; needs cameras, as pruning does.
         compact_at: the part of the pruning iterations after which that is done: later ones see its effect.
         colour_model, weighting, two_pass: of the compaction (:class:`potr_cl.compaction.CompactionOptions`).
+        refit: conjugate-gradient steps of the joint re-fit of the colours; 0 leaves it out. Needs cameras.
+        drop: mean squared error for which the re-fit gives up a coefficient; 0: none is.
         count: number of splats to keep, instead of ΔMSE_MAX.
         sweep: what measuring removal effects may skip.
         background: R, G, B behind the scene in the views that pruning looks at.
@@ -48,6 +50,8 @@ class EncodeOptions:
     colour_model: ColourModel = CompactionOptions.colour_model
     weighting: Weighting = CompactionOptions.weighting
     two_pass: bool = CompactionOptions.two_pass
+    refit: int = 0
+    drop: float = 0.0
     count: int | None = None
     sweep: SweepOptions = field(default_factory=SweepOptions)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
