@@ -11,6 +11,7 @@ from typing import Any
 
 import numpy as np
 
+from potr_cl import octree
 from potr_cl.errors import DataError, PotrError, UsageError
 from potr_cl.scene import Scene
 
@@ -99,7 +100,12 @@ def to_scene(path: str | os.PathLike[str], data: Any) -> Scene:
 
 
 def from_scene(gsply: Any, scene: Scene) -> Any:
-    """A scene as gsply's arrays, with unit quaternions."""
+    """A scene as gsply's arrays, with unit quaternions, its splats in an order that keeps neighbours together.
+
+    A compressed PLY has one set of bounds for 256 splats in sequence: in a trainer's order they span the scene.
+    """
+    side = float(np.ptp(scene.means, axis=0).max())
+    scene = scene.subset(octree.build(scene.means, max(side * 2.0**-20, 1e-30))[1])
     quaternions = scene.quaternions / np.linalg.norm(scene.quaternions, axis=1, keepdims=True)
     return gsply.GSData.from_arrays(
         means=np.ascontiguousarray(scene.means),
