@@ -466,7 +466,7 @@ class ColourRefit:
             np.float32(self.options.prior),
             self._preconditioned,
         )
-        self._over_splats(self._precondition, 1)
+        self._over_splats(self._precondition, self._lanes)
 
     def solve(self, targets: Targets, progress: Callable[[int, int], None] | None = None) -> Refitted:
         """Re-fit the active coefficients, after choosing among them if the options say so.

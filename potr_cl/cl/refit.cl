@@ -16,6 +16,17 @@
 #define AT(i, j) ((i) * (2 * SH_COUNT - (i) - 1) / 2 + (j))
 /* The diagonal's least part of its mean: columns that no view tells apart get no huge steps. */
 #define DAMPING 1e-5f
+/* The least part of its diagonal that a pivot keeps; below, the coefficient is left as it is. */
+#define LEAST_PIVOT 1e-6f
+
+/* 1 where a coefficient may change, 0 where not. */
+inline vfloat active_lanes(global const uint *active, size_t stride, size_t index, size_t column)
+{
+    float lanes[LANES];
+    for (int lane = 0; lane < LANES; ++lane)
+        lanes[lane] = (float)(active[(column / 24) * stride + index * LANES + lane] >> (column % 24) & 1);
+    return VLOAD(0, lanes);
+}
 
 inline void basis_towards(global const float *means, size_t stride, size_t index, View view, vfloat *values)
 {
@@ -127,13 +138,10 @@ kernel void regularise(
     for (int m = 0; m < SH_COUNT; ++m)
         for (int c = 0; c < 3; ++c) {
             const size_t column = 3 * m + c;
-            float keep[LANES];
-            for (int lane = 0; lane < LANES; ++lane)
-                keep[lane] = active[(column / 24) * stride + index * LANES + lane] >> (column % 24) & 1 ? 1.0f : 0.0f;
             const float pull = prior + (m == 0 ? 0.0f : c == 0 ? lambda_luma : lambda_chroma);
             const vfloat value =
                 MAD(pull, VLOAD(index, coefficients + column * stride), VLOAD(index, sums + column * stride));
-            VSTORE(value * VLOAD(0, keep), index, sums + column * stride);
+            VSTORE(value * active_lanes(active, stride, index, column), index, sums + column * stride);
         }
 }
 
@@ -150,44 +158,39 @@ kernel void precondition(
     global float *result)
 {
     const size_t index = get_global_id(0), stride = stride_;
-    float trace = 0.0f;
+    vfloat trace = (vfloat)(0.0f);
     for (int i = 0; i < SH_COUNT; ++i)
-        trace += gram[AT(i, i) * stride + index];
-    const uint words[2] = {active[index], active[stride + index]};
+        trace += VLOAD(index, gram + AT(i, i) * stride);
     for (int c = 0; c < 3; ++c) {
         const float length = c == 1 ? 2.0f : 3.0f;
         const float lambda = c == 0 ? lambda_luma : lambda_chroma;
-        const float least = DAMPING * length * trace / SH_COUNT;
-        float factor[TRIANGLE], y[SH_COUNT];
-        /* Row by row, U with U^T U = block; the diagonal holds the pivots' inverse square roots. */
+        const vfloat least = trace * (DAMPING * length / SH_COUNT);
+        /* Row by row, U with U^T U = block; the diagonal holds the pivots' inverse square roots, 0 for what is left out. */
+        vfloat factor[TRIANGLE], y[SH_COUNT];
         for (int j = 0; j < SH_COUNT; ++j) {
-            const int column = 3 * j + c;
-            const int keep = words[column / 24] >> (column % 24) & 1;
-            float pivot = MAD(length, gram[AT(j, j) * stride + index], prior + (j ? lambda : 0.0f) + least);
-            float rest = residual[column * stride + index];
-            const float floor_ = 1e-6f * pivot;
+            const size_t column = 3 * j + c;
+            const vfloat diagonal = MAD(length, VLOAD(index, gram + AT(j, j) * stride), least + (prior + (j ? lambda : 0.0f)));
+            vfloat pivot = diagonal, rest = VLOAD(index, residual + column * stride);
             for (int i = 0; i < j; ++i) {
                 pivot = MAD(-factor[AT(i, j)], factor[AT(i, j)], pivot);
                 rest = MAD(-factor[AT(i, j)], y[i], rest);
             }
-            const float inverse = keep && pivot > floor_ && pivot > 1e-30f ? 1.0f / sqrt(pivot) : 0.0f;
+            const vint keep = (pivot > LEAST_PIVOT * diagonal) && (pivot > 1e-30f);
+            const vfloat inverse = (keep ? 1.0f / sqrt(pivot) : (vfloat)(0.0f)) * active_lanes(active, stride, index, column);
             factor[AT(j, j)] = inverse;
             y[j] = rest * inverse;
             for (int k = j + 1; k < SH_COUNT; ++k) {
-                const int other = 3 * k + c;
-                const int both = keep && words[other / 24] >> (other % 24) & 1;
-                float sum = both ? length * gram[AT(j, k) * stride + index] : 0.0f;
-                if (both)
-                    for (int i = 0; i < j; ++i)
-                        sum = MAD(-factor[AT(i, j)], factor[AT(i, k)], sum);
-                factor[AT(j, k)] = sum * inverse;
+                vfloat sum = length * VLOAD(index, gram + AT(j, k) * stride);
+                for (int i = 0; i < j; ++i)
+                    sum = MAD(-factor[AT(i, j)], factor[AT(i, k)], sum);
+                factor[AT(j, k)] = sum * inverse * active_lanes(active, stride, index, 3 * k + c);
             }
         }
         for (int j = SH_COUNT - 1; j >= 0; --j) {
             for (int k = j + 1; k < SH_COUNT; ++k)
                 y[j] = MAD(-factor[AT(j, k)], y[k], y[j]);
             y[j] *= factor[AT(j, j)];
-            result[(3 * j + c) * stride + index] = y[j];
+            VSTORE(y[j], index, result + (3 * j + c) * stride);
         }
     }
 }
