@@ -22,12 +22,12 @@ from potr_cl import quantize
 from potr_cl.cameras import train_views
 from potr_cl.decoder import PotrFile
 from potr_cl.device import Device
+from potr_cl.encoder import Stopwatch, reduce
 from potr_cl.options import EncodeOptions
-from potr_cl.reduction import reduce_scene
 from potr_cl.report import file_report
 from potr_cl.scene import Scene
 from potr_cl.streams import code_scene
-from tools.judging import Judge
+from tools.judging import JudgedScene
 from tools.rate_distortion import write_json
 
 #: The paper's properties, the sections of a file that hold each, and float32 values a splat in a PLY of degree 3.
@@ -53,7 +53,7 @@ def from_channels(scene: Scene) -> Scene:
     return dataclasses.replace(scene, sh=np.stack(channels, axis=-1).astype(np.float32).reshape(scene.sh.shape))
 
 
-def _coded(judge: Judge, scene: Scene, options: EncodeOptions, rgb: bool) -> dict[str, Any]:
+def _coded(judge: JudgedScene, scene: Scene, options: EncodeOptions, rgb: bool) -> dict[str, Any]:
     """Code a scene as R, G, B or as Y, Co, Cg; what the file takes by property, and what it keeps."""
     views = train_views(judge.cameras)
     coded = code_scene(as_channels(scene) if rgb else scene, options.parameters, views, entropy=options.entropy)
@@ -70,7 +70,7 @@ def _coded(judge: Judge, scene: Scene, options: EncodeOptions, rgb: bool) -> dic
     return figures
 
 
-def measure_steps(judge: Judge, device: Device, q: float) -> list[dict[str, Any]]:
+def measure_steps(judge: JudgedScene, device: Device, q: float) -> list[dict[str, Any]]:
     """All steps on one scene, the first without entropy coding."""
     options = EncodeOptions(q=q)
     plain = _coded(judge, judge.source, options, rgb=True)
@@ -82,8 +82,8 @@ def measure_steps(judge: Judge, device: Device, q: float) -> list[dict[str, Any]
         ("RGB → YCoCg", {}),
     ):
         changed = dataclasses.replace(options, **changes)
-        reduced, _ = reduce_scene(judge.source, judge.cameras, changed, device=device)
-        steps.append({"step": name, **_coded(judge, reduced, changed, rgb=name != "RGB → YCoCg")})
+        reduced = reduce(judge.source, train_views(judge.cameras), changed, Stopwatch(), device)
+        steps.append({"step": name, **_coded(judge, reduced.scene, changed, rgb=name != "RGB → YCoCg")})
     return steps
 
 
@@ -91,7 +91,7 @@ def _measure(args: argparse.Namespace) -> None:
     device = Device(args.device)
     results: dict[str, Any] = {"device": device.info.name, "q": args.quality, "scenes": {}}
     for folder in args.scenes:
-        judge = Judge(folder, device)
+        judge = JudgedScene(folder, device)
         steps = measure_steps(judge, device, args.quality)
         results["scenes"][judge.name] = {**judge.facts(), "steps": steps}
         write_json(args.json, results)

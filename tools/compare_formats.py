@@ -26,7 +26,7 @@ import numpy as np
 from potr_cl.device import Device
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene
-from tools.judging import Judge
+from tools.judging import JudgedScene
 from tools.rate_distortion import write_json
 
 FORMATS = ("compressed.ply", "spz", "sog")
@@ -65,7 +65,9 @@ def _run(command: list[str], timeout: float) -> None:
         raise UsageError(f"'{shlex.join(command)}' failed: {error.stderr.strip()[-300:]}") from error
 
 
-def _through(judge: Judge, source: Path, suffix: str, transform: list[str], timeout: float) -> dict[str, Any] | None:
+def _through(
+    judge: JudgedScene, source: Path, suffix: str, transform: list[str], timeout: float
+) -> dict[str, Any] | None:
     """Write a scene in one format, decode it, judge it; None if that did not finish."""
     with tempfile.TemporaryDirectory() as folder:
         coded, decoded = Path(folder) / f"scene.{suffix}", Path(folder) / "decoded.ply"
@@ -87,7 +89,7 @@ def _measure(args: argparse.Namespace) -> None:
     device = Device(args.device)
     results: dict[str, Any] = {"tool": (version.stdout + version.stderr).strip(), "scenes": {}}
     for folder in args.scenes:
-        judge = Judge(folder, device)
+        judge = JudgedScene(folder, device)
         rows = [_through(judge, folder / "point_cloud.ply", f, transform, args.timeout) for f in args.formats]
         measured = [row for row in rows if row is not None]
         for name, (size, lost, psnr) in EARLIER.get(judge.name, {}).items():

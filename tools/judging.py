@@ -15,7 +15,7 @@ from potr_cl.rasterizer import Rasterizer
 from potr_cl.scene import Scene
 
 
-class Judge:
+class JudgedScene:
     """An uncompressed scene on the device, ready to be compared with others.
 
     Args:

@@ -25,7 +25,7 @@ from potr_cl.encoder import encode
 from potr_cl.errors import UsageError
 from potr_cl.options import EncodeOptions
 from potr_cl.report import file_report
-from tools.judging import Judge
+from tools.judging import JudgedScene
 
 QUALITIES = tuple(round(0.1 * step, 1) for step in range(1, 11))
 
@@ -53,7 +53,7 @@ def parse_series(text: str) -> tuple[str, dict[str, Any]]:
     return name, options
 
 
-def measure_encode(judge: Judge, options: EncodeOptions, device: Device) -> dict[str, Any]:
+def measure_encode(judge: JudgedScene, options: EncodeOptions, device: Device) -> dict[str, Any]:
     """One encode with everything that it costs and keeps."""
     encoded = encode(judge.source, judge.cameras, options, device=device)
     file = PotrFile.from_bytes(b"".join(encoded.pieces))
@@ -81,7 +81,7 @@ def _measure(args: argparse.Namespace) -> None:
         results = json.loads(args.json.read_text())
     results["device"] = device.info.name
     for folder in args.scenes:
-        judge = Judge(folder, device)
+        judge = JudgedScene(folder, device)
         entry = results["scenes"].setdefault(judge.name, {**judge.facts(), "series": {}})
         for name, options in series.items():
             curve = entry["series"].setdefault(name, {"options": options, "encodes": []})
