@@ -39,6 +39,7 @@ def test_series():
 
 
 def test_a_curve_is_measured_written_and_continued(monkeypatch, folder, tmp_path, capsys):
+    pytest.importorskip("matplotlib", reason="the extra bench is not installed")
     out, images = tmp_path / "out.json", tmp_path / "images"
     call(monkeypatch, rate_distortion, "measure", folder, "--json", out, "--qualities", 0.3)
     first = json.loads(out.read_text())["scenes"]["excerpt"]["series"]["default"]["encodes"]
