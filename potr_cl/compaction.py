@@ -46,7 +46,7 @@ _GROUP = 64
 #: Splats whose view weights are gathered at a time.
 _GATHERED = 2048
 #: Bytes of the splats that are on the device at a time: enough to fill it, little to pin.
-_BATCHES = 128 << 20
+_BATCHES = 64 << 20
 #: Threads that copy to pinned memory: one does not reach what the bus carries.
 _COPIERS = 4
 
@@ -249,7 +249,7 @@ class Compactor:
     Args:
         device: to compute on.
         memory: bytes of the device that splats may take at a time, in two batches; by default as much as keeps the
-            device busy (128 MiB), at most a quarter of what it has.
+            device busy (64 MiB), at most a quarter of what it has.
     """
 
     def __init__(self, device: Device, memory: int | None = None) -> None:
