@@ -37,6 +37,9 @@ class PruningOptions:
         iterations: rounds in which effects are measured anew.
         a: the mapping function's curvature: how much a negative ΔMSE is preferred to a small one.
         count: if given, the number of splats to keep, exactly.
+        damping: splats are ranked by the weighted mean of all their measurements, each counting this many times as
+            much as the next one; 0: by the newest alone, as in the paper. Splats that make up for the same error all
+            look removable at once; with the newest effects all of them go, and the error turns round.
 
     Raises:
         UsageError: a value is out of range.
@@ -46,6 +49,7 @@ class PruningOptions:
     iterations: int = 48
     a: float = 10.0
     count: int | None = None
+    damping: float = 0.8
 
     def __post_init__(self) -> None:
         if not self.delta_mse_max >= 0:
@@ -56,6 +60,8 @@ class PruningOptions:
             raise UsageError(f"the mapping's a is {self.a:g}, it must be positive")
         if self.count is not None and self.count < 1:
             raise UsageError(f"{self.count} splats to keep: at least 1 is needed")
+        if not 0 <= self.damping <= 1:
+            raise UsageError(f"the damping is {self.damping:g}, it must lie between 0 and 1")
 
 
 @dataclass(frozen=True)
@@ -80,7 +86,7 @@ class Pruned:
     """What a pruning run did.
 
     Attributes:
-        order: (N,) all splats: first the removed ones as they went, then the kept ones by ascending ΔMSE.
+        order: (N,) all splats: first the removed ones as they went, then the kept ones by ascending (damped) ΔMSE.
         kept: number of splats at the end of ``order`` that were kept.
         iteration_of: (N,) int32, the iteration (from 0) in which each splat went; -1 for the kept ones.
         iterations: rounds that were run: fewer than asked for when nothing was left to decide.
@@ -171,9 +177,11 @@ def prune(
     removed: list[Indices] = []
     history: list[Iteration] = []
     done = 0
-    delta_mse = np.zeros(splats)
+    delta_mse, measurements = np.zeros(splats), 0.0
     for iteration in range(options.iterations):
-        delta_mse, importance = effects.measure()
+        newest, importance = effects.measure()
+        measurements = options.damping * measurements + 1
+        delta_mse += (newest - delta_mse) / measurements
         gone = choose(delta_mse, importance, alive, options.iterations - iteration, options)
         if len(gone) >= len(alive) and options.count is None:
             gone = gone[: len(alive) - 1]  # an empty scene is no scene
@@ -183,7 +191,7 @@ def prune(
         iteration_of[gone] = iteration
         removed.append(gone)
         alive = alive[iteration_of[alive] < 0]
-        effect = delta_mse[gone]
+        effect = newest[gone]
         history.append(Iteration(len(alive), float(importance[gone].sum()), float(effect.sum()), float(effect.max())))
         effects.remove(gone)
         if progress is not None:

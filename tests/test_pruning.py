@@ -86,6 +86,18 @@ def test_history_adds_up():
         assert entry.largest_effect == EFFECTS[gone].max()
 
 
+@pytest.mark.parametrize(("damping", "order"), [(0.0, [0, 2, 1]), (0.5, [0, 2, 1]), (0.8, [0, 1, 2]), (1.0, [0, 1, 2])])
+def test_damping_is_a_weighted_mean_of_the_measurements(damping, order):
+    class Moving(Additive):
+        def measure(self):
+            super().measure()
+            return np.array([0.0, 2.0, 5.0] if self.measured == 1 else [9.0, 6.0, 4.4]), self.importance
+
+    # The first splat uses up the first iteration's budget. Means of the others with 0.5: 7 / 1.5 and 6.9 / 1.5.
+    effects = Moving(np.zeros(3), [100.0, 1.0, 1.0])
+    assert prune(effects, 3, PruningOptions(1, 2, count=1, damping=damping)).order.tolist()[:2] == order[:2]
+
+
 def test_removes_all_candidates_and_nothing_else():
     effects = Additive(EFFECTS, IMPORTANCES)
     pruned = prune(effects, 400, PruningOptions(0.4, 7))
@@ -145,7 +157,17 @@ def test_ties_fall_by_number():
 
 @pytest.mark.parametrize(
     "bad",
-    [{"delta_mse_max": -1}, {"delta_mse_max": np.nan}, {"iterations": 0}, {"a": 0}, {"a": np.inf}, {"count": 0}],
+    [
+        {"delta_mse_max": -1},
+        {"delta_mse_max": np.nan},
+        {"iterations": 0},
+        {"a": 0},
+        {"a": np.inf},
+        {"count": 0},
+        {"damping": -0.1},
+        {"damping": 1.1},
+        {"damping": np.nan},
+    ],
 )
 def test_options_out_of_range(bad):
     with pytest.raises(UsageError):
