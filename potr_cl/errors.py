@@ -25,3 +25,7 @@ class DeviceError(PotrError):
 
 class DeviceMemoryError(DeviceError):
     """What was asked for does not fit an OpenCL device's memory."""
+
+
+class UnreachableError(PotrError):
+    """No quality gives what was asked for; the message says what the extremes give."""
