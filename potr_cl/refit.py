@@ -493,9 +493,14 @@ class ColourRefit:
         if options.drop:
             steps = self._descend(state, options.selection_steps, options.selection_lam, told)
             self._select_active.set_args(
-                self._x, self._gram, self._active, np.uint32(self._stride), np.float32(options.drop * values)
+                self._x,
+                self._gram,
+                self._active,
+                np.uint32(self._stride),
+                np.float32(options.prior),
+                np.float32(options.drop * values),
             )
-            self._over_splats(self._select_active, 1)
+            self._over_splats(self._select_active, self._lanes)
             self._copy(self._start, self._x)
             state = self._linearise(targets, options.lam, False)
         more = self._descend(state, options.steps, options.lam, lambda done: told(steps + done))

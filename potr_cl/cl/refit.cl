@@ -18,6 +18,8 @@
 #define DAMPING 1e-5f
 /* The least part of its diagonal that a pivot keeps; below, the coefficient is left as it is. */
 #define LEAST_PIVOT 1e-6f
+/* Added to the unit diagonal of a scaled block before it is inverted in single precision. */
+#define UNIT_DAMPING 1e-4f
 
 /* 1 where a coefficient may change, 0 where not. */
 inline vfloat active_lanes(global const uint *active, size_t stride, size_t index, size_t column)
@@ -195,26 +197,88 @@ kernel void precondition(
     }
 }
 
-/* Drop the AC coefficients that cost little: those that add less than `least` to the weighted squared error if they alone
-   were 0, by the diagonal of the splat's own block. */
+/* Give up AC coefficients, splat by splat and channel by channel: again and again the one whose loss costs least, the others
+   of its channel making up for it as well as they can, while it costs less than `least` (by the splat's own block of the
+   normal equations, the rest of the scene held). With P the inverse of the block, losing x_m costs x_m^2 / P_mm, moves the
+   others by -x_m P_jm / P_mm, and takes P_im P_jm / P_mm off P. */
 kernel void select_active(
     global float *coefficients,
     global const float *gram,
     global uint *active,
     uint stride_,
+    float prior,
     float least)
 {
     const size_t index = get_global_id(0), stride = stride_;
-    for (int m = 1; m < SH_COUNT; ++m)
-        for (int c = 0; c < 3; ++c) {
-            const size_t column = 3 * m + c;
-            const float x = coefficients[column * stride + index];
-            const float cost = x * x * (c == 1 ? 2.0f : 3.0f) * gram[AT(m, m) * stride + index];
-            if (!(cost >= least)) {
-                coefficients[column * stride + index] = 0.0f;
-                active[(column / 24) * stride + index] &= ~(1u << (column % 24));
+    for (int c = 0; c < 3; ++c) {
+        const float length = c == 1 ? 2.0f : 3.0f;
+        /* Scaled to a unit diagonal; what is not active has an empty row and column. */
+        vfloat p[TRIANGLE], x[SH_COUNT], scale[SH_COUNT], keep[SH_COUNT];
+        for (int j = 0; j < SH_COUNT; ++j) {
+            const vfloat diagonal = MAD(length, VLOAD(index, gram + AT(j, j) * stride), (vfloat)(prior));
+            keep[j] = active_lanes(active, stride, index, 3 * j + c);
+            scale[j] = sqrt(fmax(diagonal, (vfloat)(1e-30f)));
+            x[j] = keep[j] * scale[j] * VLOAD(index, coefficients + (3 * j + c) * stride);
+        }
+        for (int i = 0; i < SH_COUNT; ++i)
+            for (int j = i; j < SH_COUNT; ++j) {
+                const vfloat product = length * VLOAD(index, gram + AT(i, j) * stride) / (scale[i] * scale[j]);
+                p[AT(i, j)] = i == j ? (vfloat)(1.0f + UNIT_DAMPING) : product * keep[i] * keep[j];
+            }
+        /* p becomes minus the inverse: one sweep a column, symmetric all the way. */
+        for (int k = 0; k < SH_COUNT; ++k) {
+            vfloat column[SH_COUNT];
+            for (int j = 0; j < SH_COUNT; ++j)
+                column[j] = j < k ? p[AT(j, k)] : p[AT(k, j)];
+            const vfloat inverse = 1.0f / fmax(column[k], (vfloat)(UNIT_DAMPING));
+            for (int i = 0; i < SH_COUNT; ++i)
+                for (int j = i; j < SH_COUNT; ++j)
+                    if (i == k || j == k)
+                        p[AT(i, j)] = i == j ? -inverse : column[i == k ? j : i] * inverse;
+                    else
+                        p[AT(i, j)] = MAD(-column[i] * inverse, column[j], p[AT(i, j)]);
+        }
+        for (int round = 1; round < SH_COUNT; ++round) {
+            vfloat best = (vfloat)(least);
+            vint worst = (vint)(0);
+            for (int m = 1; m < SH_COUNT; ++m) {
+                const vfloat cost = x[m] * x[m] / fmax(-p[AT(m, m)], (vfloat)(1e-30f));
+                const vint cheaper = (keep[m] > 0.0f) && !(cost >= best);
+                best = cheaper ? cost : best;
+                worst = cheaper ? (vint)(m) : worst;
+            }
+            if (!VANY(worst > 0))
+                break;
+            vfloat column[SH_COUNT], value = (vfloat)(0.0f), pivot = (vfloat)(-1.0f);
+            for (int j = 0; j < SH_COUNT; ++j) {
+                column[j] = (vfloat)(0.0f);
+                for (int m = 1; m < SH_COUNT; ++m)
+                    column[j] = worst == m ? p[j < m ? AT(j, m) : AT(m, j)] : column[j];
+            }
+            for (int m = 1; m < SH_COUNT; ++m) {
+                value = worst == m ? x[m] : value;
+                pivot = worst == m ? p[AT(m, m)] : pivot;
+                keep[m] = worst == m ? (vfloat)(0.0f) : keep[m];
+            }
+            const vfloat inverse = 1.0f / fmin(pivot, (vfloat)(-1e-30f));
+            for (int i = 0; i < SH_COUNT; ++i) {
+                x[i] = (MAD(-column[i] * inverse, value, x[i])) * (i ? keep[i] : (vfloat)(1.0f));
+                for (int j = i; j < SH_COUNT; ++j)
+                    p[AT(i, j)] = MAD(-column[i] * inverse, column[j], p[AT(i, j)]);
             }
         }
+        for (int j = 0; j < SH_COUNT; ++j) {
+            const size_t column = 3 * j + c;
+            const vfloat value = x[j] / scale[j];
+            const vint sound = fabs(value) < 1e30f;
+            VSTORE(sound ? value : (vfloat)(0.0f), index, coefficients + column * stride);
+            float kept[LANES];
+            VSTORE(keep[j], 0, kept);
+            for (int lane = 0; lane < LANES; ++lane)
+                if (j && kept[lane] == 0.0f)
+                    active[(column / 24) * stride + index * LANES + lane] &= ~(1u << (column % 24));
+        }
+    }
 }
 
 /* y = a y + b x. */
