@@ -22,6 +22,7 @@ from potr_cl.reduction import Progress, reduce_scene
 from potr_cl.refit import RefitOptions, Refitted, RenderedTargets, active_coefficients, refit_colours
 from potr_cl.scene import Scene
 from potr_cl.streams import code_scene
+from potr_cl.virtual_cameras import is_virtual, place_cameras
 
 
 @dataclass(frozen=True)
@@ -96,8 +97,8 @@ def encode(
 
     Args:
         scene: clean (:meth:`potr_cl.scene.Scene.cleaned`), at least one splat.
-        cameras: the training views among them decide which splats may go, and how coarse centres may be; without
-            cameras every splat is kept and γ alone decides.
+        cameras: the training views among them decide which splats may go, and how coarse centres may be. None: virtual
+            ones are placed if the options ask for anything that looks at views; if not, γ alone decides about centres.
         options: defaults to quality 0.5.
         progress: told how far each stage is.
         device: to prune on; the best one there is by default. Where its memory is too small, less is kept in it, and
@@ -110,15 +111,24 @@ def encode(
     """
     options = options or EncodeOptions()
     watch = Stopwatch(progress)
+    if cameras is None and needs_views(scene, options):
+        watch("place cameras", 0.0)
+        cameras = place_cameras(scene)
+        watch("place cameras", 1.0)
     views = [] if cameras is None else train_views(cameras)
     return code(scene, reduce(scene, views, options, watch, device), views, options, watch)
+
+
+def needs_views(scene: Scene, options: EncodeOptions) -> bool:
+    """Whether the options ask for a stage that looks at views."""
+    return options.prune or options.refit > 0 or (options.compact and scene.sh_degree > 0)
 
 
 def reduce(
     scene: Scene, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch, device: Device | None = None
 ) -> Reduced:
     """The first half of :func:`encode`: fewer splats with sparser colours, as far as views and options allow."""
-    if not views or not (options.prune or options.refit or (options.compact and scene.sh_degree > 0)):
+    if not views or not needs_views(scene, options):
         return Reduced(scene, None, None, None)
 
     def work(device: Device, options: EncodeOptions) -> Reduced:
@@ -173,21 +183,22 @@ def refit(
 def code(scene: Scene, reduced: Reduced, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch) -> Encoded:
     """The second half of :func:`encode`: bytes."""
     pruned = reduced.pruned
-    metadata = _metadata(scene, bool(views), options, pruned)
+    metadata = _metadata(scene, views, options, pruned)
     coded = code_scene(reduced.scene, options.parameters, views, metadata, options.entropy, options.threads, watch)
     order = coded.order if pruned is None else pruned.survivors[coded.order]
     return Encoded(coded.pieces, coded.nbytes, order, pruned, reduced.refitted, reduced.device, watch.seconds)
 
 
-def _metadata(scene: Scene, cameras: bool, options: EncodeOptions, pruned: Pruned | None) -> bytes:
+def _metadata(scene: Scene, views: Sequence[Camera], options: EncodeOptions, pruned: Pruned | None) -> bytes:
     parameters = options.parameters
     facts = {
         "q": options.q,
-        "beta": parameters.beta if cameras else None,
+        "cameras": ("virtual" if is_virtual(views) else "given") if views else None,
+        "beta": parameters.beta if views else None,
         "gamma": parameters.gamma,
         "delta_mse_max": parameters.delta_mse_max if pruned is not None and options.count is None else None,
-        "lambda": parameters.lam if cameras and options.compact else None,
-        "alpha": parameters.alpha if cameras and options.compact else None,
+        "lambda": parameters.lam if views and options.compact else None,
+        "alpha": parameters.alpha if views and options.compact else None,
         "source_splats": len(scene),
         "source_bytes": options.source_bytes,
     }

@@ -17,6 +17,7 @@ from potr_cl.images import Colour
 from potr_cl.metrics import psnr
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.scene import FloatArray, Scene
+from potr_cl.virtual_cameras import is_virtual
 
 #: So many training views, spread evenly, stand for all of them where there are no test views.
 _MOST_TRAINING_VIEWS = 32
@@ -54,7 +55,8 @@ class JudgingViews:
 
     def __str__(self) -> str:
         if self.kind == "test":
-            return f"{len(self.views)} held-out test view{'s' if len(self.views) > 1 else ''}"
+            what = "virtual view" if is_virtual(self.views) else "test view"
+            return f"{len(self.views)} held-out {what}{'s' if len(self.views) > 1 else ''}"
         which = "all" if len(self.views) == self.available else f"{len(self.views)} of"
         return f"{which} {self.available} training views, for the cameras name no test views"
 

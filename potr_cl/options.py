@@ -18,12 +18,12 @@ class EncodeOptions:
         q: quality, 0 to 1; sets every hyper-parameter that is not given on its own.
         lam, alpha, delta_mse_max, beta, gamma, sf_sh, sf_opacity, sf_rotation, sf_scale: replace single
             hyper-parameters (:class:`potr_cl.quantize.HyperParameters`).
-        prune: remove splats; needs cameras, without them nothing is removed.
+        prune: remove splats; looks at views.
         iterations: of the pruning schedule.
-        compact: make the SH coefficients sparse; needs cameras, as pruning does.
+        compact: make the SH coefficients sparse; looks at views.
         compact_at: the part of the pruning iterations after which that is done: later ones see its effect.
         colour_model, weighting, two_pass: of the compaction (:class:`potr_cl.compaction.CompactionOptions`).
-        refit: conjugate-gradient steps of the joint re-fit of the colours; 0 leaves it out. Needs cameras.
+        refit: conjugate-gradient steps of the joint re-fit of the colours; 0 leaves it out. Looks at views.
         drop: mean squared error for which the re-fit gives up a coefficient; 0: none is.
         count: number of splats to keep, instead of ΔMSE_MAX.
         sweep: what measuring removal effects may skip.

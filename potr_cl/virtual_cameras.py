@@ -14,17 +14,23 @@ from __future__ import annotations
 
 import heapq
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.cameras import Camera
+from potr_cl.cameras import Camera, camera_centres
 from potr_cl.errors import UsageError
 from potr_cl.scene import Scene
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
+
+#: Training views that are placed, and pixels along a side of each, unless told otherwise.
+COUNT, SIZE = 100, 800
+#: What the names of virtual cameras begin with.
+_PREFIX = "virtual_"
 
 #: Half the field of view: tan of 25 degrees, both ways.
 _HALF_VIEW = math.tan(math.radians(25))
@@ -33,7 +39,7 @@ _NEAR = 0.25
 #: Splats that the views are judged by, points that hide them, and places to stand that are tried.
 _TARGETS = 3000
 _OCCLUDERS = 20000
-_PLACES = 1200
+_PLACES = 800
 #: Views that are tried at each place.
 _AIMS = 6
 #: Distances of the places from the centre, in units of the scene's median radius.
@@ -117,7 +123,7 @@ class _Candidates:
     trained: bool
 
 
-def place_cameras(scene: Scene, count: int = 100, size: int = 800) -> list[Camera]:
+def place_cameras(scene: Scene, count: int = COUNT, size: int = SIZE) -> list[Camera]:
     """Views that cover what someone would look at.
 
     Args:
@@ -132,7 +138,7 @@ def place_cameras(scene: Scene, count: int = 100, size: int = 800) -> list[Camer
         UsageError: ``count`` or ``size`` below 1.
     """
     if count < 1 or size < 1:
-        raise UsageError(f"{count} virtual views of {size} x {size} pixels: at least 1 of each is needed")
+        raise UsageError(f"{count} virtual views of {size} x {size} pixels: both must be at least 1")
     frame = _frame(scene)
     matter = _matter(scene, frame)
     candidates = _candidates(frame, matter)
@@ -145,10 +151,28 @@ def place_cameras(scene: Scene, count: int = 100, size: int = 800) -> list[Camer
         eye = frame.centre + frame.unit * candidates.eyes[view]
         cameras.append(
             _camera(
-                f"virtual_{number:03d}", eye, candidates.forward[view], frame.up, candidates.tangent[view], size, split
+                f"{_PREFIX}{number:03d}", eye, candidates.forward[view], frame.up, candidates.tangent[view], size, split
             )
         )
     return cameras
+
+
+def is_virtual(cameras: Sequence[Camera]) -> bool:
+    """Whether they were placed by :func:`place_cameras`, by their names."""
+    return bool(cameras) and all(camera.name.startswith(_PREFIX) for camera in cameras)
+
+
+def describe(cameras: Sequence[Camera]) -> str:
+    """How many views, and where, in words."""
+    eyes = camera_centres(cameras)
+    across = np.eye(3) - np.stack([np.outer(c.rotation[2], c.rotation[2]) for c in cameras])
+    # The point that their lines of sight come nearest to.
+    focus = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, eyes), rcond=1e-9)[0]
+    distance = np.linalg.norm(eyes - focus, axis=1)
+    at = ", ".join(f"{x:.3g}" for x in focus)
+    train, test = (sum(c.split == split for c in cameras) for split in ("train", "test"))
+    judges = f" and {test} to judge by" if test else ""
+    return f"{train} virtual views{judges} placed {distance.min():.3g} to {distance.max():.3g} units from ({at})"
 
 
 def _camera(name: str, eye: F64, forward: F64, up: F64, tangent: float, size: int, split: str) -> Camera:

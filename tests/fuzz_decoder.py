@@ -5,6 +5,7 @@ python -m tests.fuzz_decoder COUNT SEED: prints a JSON line with what happened.
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import resource
 import signal
@@ -24,16 +25,17 @@ from potr_cl.report import file_report
 from tests.scenes import random_scene, ring_of_cameras
 
 HEADER, ENTRY = 120, 24
+KEEP = EncodeOptions(prune=False, compact=False)
 SECONDS_A_FILE = 20  # a file of this size decodes in milliseconds: whatever reaches this hangs
 
 
 def seeds() -> list[bytes]:
     coincident = random_scene(120, 1, seed=2).subset(np.r_[np.arange(120), np.arange(40), [3, 3]])
     encoded = [
-        encode(random_scene(150, 3, seed=1), ring_of_cameras(6), EncodeOptions(prune=False, compact=False)),
-        encode(coincident, None, EncodeOptions(q=0.3, entropy=EntropyCoder("npz"))),
-        encode(random_scene(400, 0, seed=3), None, EncodeOptions(q=1.0, entropy=EntropyCoder("zstd", 1))),
-        encode(random_scene(1, 0, seed=4)),
+        encode(random_scene(150, 3, seed=1), ring_of_cameras(6), KEEP),
+        encode(coincident, None, dataclasses.replace(KEEP, q=0.3, entropy=EntropyCoder("npz"))),
+        encode(random_scene(400, 0, seed=3), None, dataclasses.replace(KEEP, q=1.0, entropy=EntropyCoder("zstd", 1))),
+        encode(random_scene(1, 0, seed=4), None, KEEP),
     ]
     return [b"".join(e.pieces) for e in encoded]
 

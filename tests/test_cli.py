@@ -22,6 +22,9 @@ from potr_cl.images import to_8_bits
 from potr_cl.rasterizer import GSPLAT, Rasterizer
 from tests.scenes import random_scene, ring_of_cameras
 
+#: Options of an encode that keeps everything, and so looks at no views.
+KEEP = ("--no-prune", "--no-compact")
+
 
 @pytest.fixture
 def scene_path(tmp_path):
@@ -33,7 +36,7 @@ def scene_path(tmp_path):
 @pytest.fixture
 def potr_path(tmp_path, scene_path, capsys):
     path = tmp_path / "scene.potr"
-    assert cli.main(["encode", str(scene_path), "-o", str(path), "--zstd-level", "1"]) == 0
+    assert cli.main(["encode", str(scene_path), "-o", str(path), "--zstd-level", "1", *KEEP]) == 0
     capsys.readouterr()
     return path
 
@@ -72,7 +75,7 @@ def fails(capsys, arguments, code, *words) -> None:
 def test_encode_decode_info(tmp_path, scene_path, capsys):
     potr, back = tmp_path / "a.potr", tmp_path / "back.ply"
     cameras = cameras_json(tmp_path / "cameras.json")
-    arguments = ["encode", scene_path, "-o", potr, "-q", "0.7", "--cameras", cameras, "--no-prune", "--no-compact"]
+    arguments = ["encode", scene_path, "-o", potr, "-q", "0.7", "--cameras", cameras, *KEEP]
     assert cli.main([str(a) for a in arguments]) == 0
     assert "200 of 200" in capsys.readouterr().out
     assert cli.main(["decode", str(potr), "-o", str(back)]) == 0
@@ -163,7 +166,7 @@ def test_both_entropy_stages(tmp_path, scene_path, capsys):
     scenes = []
     for entropy in ("zstd", "npz"):
         potr = tmp_path / f"{entropy}.potr"
-        assert cli.main(["encode", str(scene_path), "-o", str(potr), "--entropy", entropy]) == 0
+        assert cli.main(["encode", str(scene_path), "-o", str(potr), "--entropy", entropy, *KEEP]) == 0
         assert cli.main(["decode", str(potr), "-o", str(tmp_path / "back.ply")]) == 0
         scenes.append(ply.load(tmp_path / "back.ply"))
     assert np.array_equal(scenes[0].sh, scenes[1].sh)
@@ -282,8 +285,29 @@ def test_compaction_of_bad_files(tmp_path, scene_path, capsys):
     assert not out.exists()
 
 
-def test_counts_need_cameras(tmp_path, scene_path, capsys):
-    fails(capsys, ["encode", scene_path, "-o", tmp_path / "a.potr", "--keep", "0.5"], 2, "--cameras")
+def test_without_cameras_virtual_ones_are_placed(tmp_path, scene_path, capsys):
+    potr = tmp_path / "a.potr"
+    few = ["--iterations", "2", "--virtual-views", "8", "--count", "90"]
+    assert cli.main(["encode", str(scene_path), "-o", str(potr), *few]) == 0
+    said = capsys.readouterr()
+    assert "no --cameras: 8 virtual views and 1 to judge by placed" in said.err
+    assert "1 held-out virtual view" in said.out
+    assert "place cameras" in said.out
+    assert json.loads(run(capsys, "info", potr, "--json"))["cameras"] == "virtual"
+    assert "virtual" in run(capsys, "info", potr)
+    for command, options in (("prune", few), ("compact", few[2:4])):
+        assert cli.main([command, str(scene_path), "-o", str(tmp_path / "out.ply"), *options]) == 0
+        assert "8 virtual views" in capsys.readouterr().err
+        assert len(ply.load(tmp_path / "out.ply")) == (90 if command == "prune" else 200)
+    fails(capsys, ["encode", scene_path, "-o", tmp_path / "b.potr", "--virtual-views", "0"], 2, "at least 1")
+    assert not (tmp_path / "b.potr").exists()
+
+
+def test_whose_cameras_is_in_the_file(tmp_path, scene_path, capsys):
+    cameras, potr = cameras_json(tmp_path / "cameras.json"), tmp_path / "a.potr"
+    for options, said in (([*KEEP], None), ([*KEEP, "--cameras", cameras], "given")):
+        run(capsys, "encode", scene_path, "-o", potr, *options)
+        assert json.loads(run(capsys, "info", potr, "--json"))["cameras"] == said
 
 
 def test_order_and_output_must_differ(tmp_path, scene_path, capsys):
@@ -372,7 +396,7 @@ def test_a_scene_too_large_to_quantise(tmp_path, capsys):
     scene = random_scene(5, 0)
     scene.sh[2] = 1e30
     ply.save(tmp_path / "scene.ply", scene)
-    fails(capsys, ["encode", tmp_path / "scene.ply", "-o", tmp_path / "a.potr"], 1, "too large to quantise")
+    fails(capsys, ["encode", tmp_path / "scene.ply", "-o", tmp_path / "a.potr", *KEEP], 1, "too large to quantise")
     assert not (tmp_path / "a.potr").exists()
 
 
@@ -384,7 +408,7 @@ def test_disk_full(tmp_path, scene_path, potr_path):
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000));"
         "from potr_cl.cli import main; sys.exit(main(sys.argv[1:]))"
     )
-    for arguments in (["encode", scene_path, "-o", tmp_path / "x"], ["decode", potr_path, "-o", tmp_path / "x"]):
+    for arguments in (["encode", scene_path, "-o", tmp_path / "x", *KEEP], ["decode", potr_path, "-o", tmp_path / "x"]):
         result = subprocess.run(
             [sys.executable, "-c", script, *map(str, arguments)], capture_output=True, text=True, check=False
         )
@@ -409,7 +433,7 @@ def test_no_permission(scene_path):
             "import os, sys; from potr_cl.cli import main;os.geteuid() or os.setuid(65534);sys.exit(main(sys.argv[1:]))"
         )
         for source, target in ((scene, locked / "a.potr"), (secret, Path(folder) / "a.potr")):
-            command = [sys.executable, "-c", script, "encode", str(source), "-o", str(target)]
+            command = [sys.executable, "-c", script, "encode", str(source), "-o", str(target), *KEEP]
             result = subprocess.run(command, capture_output=True, text=True, check=False)
             assert result.returncode == 2, result.stderr
             assert "Permission denied" in result.stderr
@@ -422,7 +446,7 @@ def test_interrupt(tmp_path, scene_path, capsys, monkeypatch):
         raise KeyboardInterrupt
 
     monkeypatch.setattr(cli.encode, "encode", interrupted)
-    fails(capsys, ["encode", scene_path, "-o", tmp_path / "a.potr"], 130, "interrupted")
+    fails(capsys, ["encode", scene_path, "-o", tmp_path / "a.potr", *KEEP], 130, "interrupted")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.ply"]
 
 

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 from pathlib import Path
 
@@ -65,7 +66,7 @@ def check_within_steps(source: Scene, decoded: Scene, order, parameters, toleran
 @pytest.mark.parametrize("q", [0.0, 0.5, 1.0])
 def test_within_steps(degree, entropy, q):
     scene = random_scene(500, degree, seed=degree)
-    options = EncodeOptions(q=q, entropy=entropy)
+    options = dataclasses.replace(KEEP, q=q, entropy=entropy)
     encoded = encode(scene, options=options)
     assert encoded.nbytes == len(joined(encoded))
     decoded = decode(joined(encoded))
@@ -76,7 +77,7 @@ def test_within_steps(degree, entropy, q):
 def test_within_the_criterion_of_the_cameras():
     scene = random_scene(2000, 0, extent=20)
     cameras = ring_of_cameras(12)
-    options = EncodeOptions(entropy=FAST, prune=False, compact=False)
+    options = dataclasses.replace(KEEP, entropy=FAST)
     eyes = camera_centres(train_views(cameras))
     nearest = np.linalg.norm(scene.means[:, None].astype(np.float64) - eyes, axis=2).min(axis=1)
     p = options.parameters
@@ -119,16 +120,16 @@ def test_any_scene(data, degree, splats, q):
         array(splats, st.floats(-50, 50, width=32)),
         array((splats, SH_COEFFICIENTS[degree], 3), st.floats(-1000, 1000, width=32)),
     )
-    options = EncodeOptions(q=q, entropy=FAST)
+    options = dataclasses.replace(KEEP, q=q, entropy=FAST)
     encoded = encode(scene, options=options)
     check_within_steps(scene, decode(joined(encoded)), encoded.order, options.parameters, options.parameters.gamma)
 
 
 def test_same_input_same_bytes_whatever_the_threads():
     scene = random_scene(3000)
-    first = joined(encode(scene, options=EncodeOptions(threads=1)))
+    first = joined(encode(scene, options=dataclasses.replace(KEEP, threads=1)))
     for threads in (1, 2, 5):
-        assert joined(encode(scene, options=EncodeOptions(threads=threads))) == first
+        assert joined(encode(scene, options=dataclasses.replace(KEEP, threads=threads))) == first
     a, b = decode(first), PotrFile.from_bytes(first).scene(threads=1)
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
         assert np.array_equal(getattr(a, name), getattr(b, name))
@@ -143,12 +144,12 @@ def test_strides_do_not_matter():
         scene.opacity_logits,
         scene.sh.transpose(1, 2, 0).copy().transpose(2, 0, 1),
     )
-    assert joined(encode(scene)) == joined(encode(strided))
+    assert joined(encode(scene, options=KEEP)) == joined(encode(strided, options=KEEP))
 
 
 def test_decoding_again_loses_nothing_more():
     """A decoded scene, encoded with the same steps, comes back the same: re-encoding does not wear a scene out."""
-    options = EncodeOptions(entropy=FAST)
+    options = dataclasses.replace(KEEP, entropy=FAST)
     once = decode(joined(encode(random_scene(400), options=options)))
     encoded = encode(once, options=options)
     twice = decode(joined(encoded))
@@ -160,7 +161,7 @@ def test_decoding_again_loses_nothing_more():
 
 def test_sections_decode_alone():
     scene = random_scene(300)
-    data = joined(encode(scene))
+    data = joined(encode(scene, options=KEEP))
     whole = decode(data)
     assert np.array_equal(PotrFile.from_bytes(data).means(), whole.means)
     assert np.array_equal(PotrFile.from_bytes(data).log_scales(), whole.log_scales)
@@ -181,7 +182,7 @@ def test_zero_streams_take_no_bytes():
     scene = random_scene(300)
     quiet = Scene(scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh.copy())
     quiet.sh[:, 4:] = 0
-    encoded = encode(quiet)
+    encoded = encode(quiet, options=KEEP)
     kinds = [(s.kind, s.index) for s in PotrFile.from_bytes(joined(encoded)).header.sections]
     assert max(index for kind, index in kinds if kind == Property.SH) < 12
     assert (decode(joined(encoded)).sh[:, 4:] == 0).all()
@@ -189,7 +190,7 @@ def test_zero_streams_take_no_bytes():
 
 def test_progress_reaches_the_end():
     seen = []
-    encode(random_scene(50), progress=lambda stage, done: seen.append((stage, done)))
+    encode(random_scene(50), options=KEEP, progress=lambda stage, done: seen.append((stage, done)))
     assert [s for s, d in seen if d == 1.0] == ["octree", "quantise and code"]
     assert all(0 <= d <= 1 for _, d in seen)
 

@@ -84,7 +84,7 @@ def test_degree_0_has_nothing_to_compact(device, monkeypatch):
 def test_nothing_to_do_needs_no_device(monkeypatch):
     monkeypatch.setattr("potr_cl.reduction.Device", None)
     encode(random_scene(20, 0), ring_of_cameras(4), EncodeOptions(prune=False))
-    encode(random_scene(20, 3), None)
+    encode(random_scene(20, 3), None, EncodeOptions(prune=False, compact=False))
 
 
 def test_same_bytes_every_time(device, lego_excerpt, views):

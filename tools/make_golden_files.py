@@ -6,6 +6,7 @@ for ever. Refuses to touch a golden file that exists: those are never made again
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -18,6 +19,7 @@ from tests.independent_decoder import decode
 from tests.scenes import random_scene, ring_of_cameras
 
 DATA = Path(__file__).parent.parent / "tests" / "data"
+KEEP = EncodeOptions(prune=False, compact=False)
 
 
 def _with_means(scene: Scene, means: np.ndarray) -> Scene:
@@ -32,19 +34,19 @@ def main() -> None:
     still = random_scene(50, 3, seed=8)
     still.sh[:, 4:] = 0
     scenes = {
-        "degree3_cameras": encode(random_scene(200, 3, seed=1), cameras, EncodeOptions(prune=False, compact=False)),
-        "degree1_npz": encode(random_scene(80, 1, seed=2), None, EncodeOptions(q=0.8, entropy=EntropyCoder("npz"))),
-        "degree2_coincident": encode(coincident, None, EncodeOptions(q=0.2)),
-        "degree0_one_splat": encode(random_scene(1, 0, seed=4), None),
-        "degree0_deep": encode(_with_means(random_scene(40, 0, seed=5), deep), None, EncodeOptions(q=1.0)),
+        "degree3_cameras": encode(random_scene(200, 3, seed=1), cameras, KEEP),
+        "degree1_npz": encode(random_scene(80, 1, seed=2), None, replace(KEEP, q=0.8, entropy=EntropyCoder("npz"))),
+        "degree2_coincident": encode(coincident, None, replace(KEEP, q=0.2)),
+        "degree0_one_splat": encode(random_scene(1, 0, seed=4), None, KEEP),
+        "degree0_deep": encode(_with_means(random_scene(40, 0, seed=5), deep), None, replace(KEEP, q=1.0)),
         "degree0_all_coincident": encode(
             _with_means(random_scene(30, 0, seed=6), np.full((30, 3), 0.7)),
             cameras,
-            EncodeOptions(prune=False, compact=False),
+            KEEP,
         ),
-        "degree3_zero_bands": encode(still, cameras, EncodeOptions(q=0.0, prune=False, compact=False)),
+        "degree3_zero_bands": encode(still, cameras, replace(KEEP, q=0.0)),
         "degree0_wide_integers": encode(
-            random_scene(30, 0, seed=9, extent=1e3), None, EncodeOptions(sf_scale=1e8, sf_sh=1e6)
+            random_scene(30, 0, seed=9, extent=1e3), None, replace(KEEP, sf_scale=1e8, sf_sh=1e6)
         ),
     }
     for name, encoded in scenes.items():

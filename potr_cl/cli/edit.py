@@ -11,7 +11,6 @@ import numpy as np
 
 from potr_cl.atomic_write import replacing
 from potr_cl.cli.options import (
-    CAMERAS_HELP,
     Commands,
     add_compaction_options,
     add_device_options,
@@ -23,9 +22,10 @@ from potr_cl.cli.options import (
     sweep_options,
 )
 from potr_cl.cli.progress import Progress
+from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
 from potr_cl.device import Device
 from potr_cl.errors import UsageError
-from potr_cl.formats import load_cameras, load_scene, ply
+from potr_cl.formats import load_scene, ply
 from potr_cl.images import parse_colour
 from potr_cl.options import EncodeOptions
 from potr_cl.quantize import ac_sparsity
@@ -45,13 +45,14 @@ def _prune(args: argparse.Namespace) -> None:
         background=parse_colour(args.background),
     )
     _ = options.parameters  # a wrong option is told before a gigabyte is read
-    cameras = load_cameras(args.cameras)
+    cameras = given_cameras(args)
     scene = load_scene(args.scene)
     options = dataclasses.replace(options, count=count(args, len(scene)))
     device = Device(args.device)
     with contextlib.ExitStack() as stack:
         order = stack.enter_context(replacing(args.order)) if args.order is not None else None
         progress = stack.enter_context(contextlib.closing(Progress()))
+        cameras = cameras or virtual_cameras(args, scene, progress)
         kept, pruned = reduce_scene(scene, cameras, options, progress, device)
         assert pruned is not None
         ply.save(args.output, kept)
@@ -66,7 +67,7 @@ def _prune(args: argparse.Namespace) -> None:
 def add_prune(commands: Commands) -> None:
     p = commands.add_parser("prune", help="remove the splats that no view misses; nothing else changes")
     p.add_argument("scene", type=Path, metavar="SCENE", help=".ply or .potr")
-    p.add_argument("--cameras", type=Path, required=True, metavar="PATH", help=CAMERAS_HELP)
+    add_cameras_options(p)
     p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.ply")
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (fewest splats) to 1; default 0.5")
     p.add_argument(
@@ -89,10 +90,11 @@ def _compact(args: argparse.Namespace) -> None:
         background=parse_colour(args.background),
     )
     _ = options.parameters
-    cameras = load_cameras(args.cameras)
+    cameras = given_cameras(args)
     scene = load_scene(args.scene)
     device = Device(args.device)
     with contextlib.closing(Progress()) as progress:
+        cameras = cameras or virtual_cameras(args, scene, progress)
         compacted, _ = reduce_scene(scene, cameras, options, progress, device)
     ply.save(args.output, compacted)
     before, after = (100 * ac_sparsity(s.sh, options.parameters.sf_sh) for s in (scene, compacted))
@@ -104,7 +106,7 @@ def _compact(args: argparse.Namespace) -> None:
 def add_compact(commands: Commands) -> None:
     p = commands.add_parser("compact", help="make the colours' coefficients sparse; nothing else changes")
     p.add_argument("scene", type=Path, metavar="SCENE", help=".ply or .potr")
-    p.add_argument("--cameras", type=Path, required=True, metavar="PATH", help=CAMERAS_HELP)
+    add_cameras_options(p)
     p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.ply")
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (sparsest) to 1; default 0.5")
     add_compaction_options(p)

@@ -6,7 +6,6 @@ import argparse
 import contextlib
 import dataclasses
 import json
-import sys
 import time
 from pathlib import Path
 
@@ -21,12 +20,13 @@ from potr_cl.cli.options import (
     sweep_options,
 )
 from potr_cl.cli.progress import Progress
+from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
 from potr_cl.compare import Comparison
 from potr_cl.decoder import PotrFile, decode
 from potr_cl.device import Device
-from potr_cl.encoder import Stopwatch, encode
+from potr_cl.encoder import Stopwatch, encode, needs_views
 from potr_cl.errors import DeviceError, UsageError
-from potr_cl.formats import load_cameras, load_scene
+from potr_cl.formats import load_scene
 from potr_cl.images import parse_colour
 from potr_cl.judging import Judge, JudgingViews
 from potr_cl.options import EncodeOptions
@@ -64,19 +64,18 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
 def _encode(args: argparse.Namespace) -> None:
     began = time.perf_counter()
     options = _options(args)
-    cameras = load_cameras(args.cameras) if args.cameras is not None else None
-    if cameras is None and (args.keep is not None or args.count is not None):
-        raise UsageError("--keep and --count need --cameras, the views that show which splats matter")
+    cameras = given_cameras(args)
     scene = load_scene(args.scene)
     options = dataclasses.replace(options, count=count(args, len(scene)))
-    device = Device(args.device) if (options.prune or options.compact) and cameras is not None else None
+    device = Device(args.device) if needs_views(scene, options) else None
     with contextlib.closing(Progress()) as progress:
+        placing = Stopwatch(progress)
         with replacing(args.output) as file:
+            if cameras is None and device is not None:
+                cameras = virtual_cameras(args, scene, placing)
             encoded = encode(scene, cameras, options, progress, device)
             for piece in encoded.pieces:
                 file.write(piece)
-        if (options.prune or options.compact) and cameras is None:
-            print("every splat and colour was kept: give --cameras to remove what no view misses", file=sys.stderr)
         written = PotrFile.from_bytes(b"".join(encoded.pieces))
         watch = Stopwatch(progress)
         quality: tuple[JudgingViews, Comparison] | str
@@ -86,7 +85,7 @@ def _encode(args: argparse.Namespace) -> None:
             quality = "not judged: there are no cameras to look from"
         else:
             quality = _judge(args, scene, written, JudgingViews.of(cameras), encoded.device or device, watch)
-    seconds = encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
+    seconds = placing.seconds | encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
     report = encode_report(args.scene, scene, args.output, written, encoded, options, quality, seconds)
     print(json.dumps(report, indent=1, allow_nan=False) if args.json else format_encode_report(report))
 
@@ -118,13 +117,7 @@ def add_encode(commands: Commands) -> None:
     p.add_argument(
         "-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (smallest) to 1 (best); default 0.5"
     )
-    p.add_argument(
-        "--cameras",
-        type=Path,
-        metavar="PATH",
-        help="cameras.json, transforms.json, or a COLMAP model's folder: with them, splats that no view misses are "
-        "removed, and far ones placed more coarsely",
-    )
+    add_cameras_options(p)
     p.add_argument("--no-quality", action="store_true", help="do not judge the result; saves time")
     p.add_argument("--json", action="store_true", help="the summary for programs")
     p.add_argument("--no-prune", action="store_true", help="keep every splat")

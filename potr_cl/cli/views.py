@@ -1,0 +1,36 @@
+"""The views that a command looks at: those of a file, or virtual ones."""
+
+from __future__ import annotations
+
+import argparse
+import sys
+from pathlib import Path
+
+from potr_cl.cameras import Camera
+from potr_cl.cli.options import CAMERAS_HELP
+from potr_cl.formats import load_cameras
+from potr_cl.reduction import Progress
+from potr_cl.scene import Scene
+from potr_cl.virtual_cameras import COUNT, describe, place_cameras
+
+
+def add_cameras_options(p: argparse.ArgumentParser) -> None:
+    """``--cameras``, and what to do without."""
+    p.add_argument("--cameras", type=Path, metavar="PATH", help=f"{CAMERAS_HELP}; without, virtual cameras are placed")
+    p.add_argument(
+        "--virtual-views", type=int, default=COUNT, metavar="N", help=f"to place without --cameras; default {COUNT}"
+    )
+
+
+def given_cameras(args: argparse.Namespace) -> list[Camera] | None:
+    """The cameras of the file that ``--cameras`` names, if it names one."""
+    return None if args.cameras is None else load_cameras(args.cameras)
+
+
+def virtual_cameras(args: argparse.Namespace, scene: Scene, progress: Progress) -> list[Camera]:
+    """Virtual cameras, and a line that says so."""
+    progress("place cameras", 0.0)
+    cameras = place_cameras(scene, args.virtual_views)
+    progress("place cameras", 1.0)
+    print(f"no --cameras: {describe(cameras)}; the cameras of the photographs do better", file=sys.stderr)
+    return cameras
