@@ -319,16 +319,20 @@ def format_comparison(comparison: Comparison) -> str:
 
 
 def side_by_side(a: NDArray[Any], b: NDArray[Any]) -> tuple[NDArray[np.uint8], int]:
-    """A, B and a map of their difference in one picture.
+    """A, B and their :func:`difference_map` in one picture, (H, 3 W, 3) uint8, and the map's factor."""
+    heat, factor = difference_map(a, b)
+    return to_8_bits(np.concatenate([a, b, heat], axis=1)), factor
 
-    The map shows each pixel's largest difference of a channel, amplified, from black over red and yellow to white.
+
+def difference_map(a: NDArray[Any], b: NDArray[Any]) -> tuple[FloatArray, int]:
+    """Each pixel's largest difference of a channel, amplified, from black over red and yellow to white.
 
     Returns:
-        (H, 3 W, 3) uint8, and the factor: the largest of 1, 2, 5, 10 … that leaves all but a thousandth of the pixels
+        (H, W, 3) float32, and the factor: the largest of 1, 2, 5, 10 … that leaves all but a thousandth of the pixels
         below full white.
     """
     difference = np.abs(np.clip(a, 0, 1) - np.clip(b, 0, 1)).max(axis=-1)
     largest = float(np.quantile(difference, 0.999))
     factor = max(f for f in _FACTORS if f == 1 or f * largest <= 1)
     heat = np.clip(3 * factor * difference[..., None] - np.array([0, 1, 2]), 0, 1)
-    return to_8_bits(np.concatenate([a, b, heat], axis=1)), factor
+    return heat.astype(np.float32), factor
