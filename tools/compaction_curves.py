@@ -38,6 +38,8 @@ from potr_cl.scene import FloatArray, Scene
 
 ALPHAS = (1.0, 0.9, 0.7)
 POWERS = tuple(range(-5, 6))
+#: Shares of zeros that the curves are compared at, by interpolation.
+SHARES = (0.8, 0.9, 0.95, 0.97)
 #: Single parts of the method left out, and the end of the curves.
 PARTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("α = 0.9, λ = 1, one pass", {"two_pass": False}),
@@ -233,6 +235,20 @@ def show(result: dict[str, Any]) -> None:
             f"| {row['label']} | {100 * row['zeros']:.2f} % ({degrees}) | {row['magnitude']:.2f} "
             f"| {row['uncompressed']:.2f} | {row['uncompacted']:.2f} | {photographs} |"
         )
+    photographed = "photographs" in result["rows"][0]
+    columns = ["α", "AC zeros", "PSNR, uncompacted", *(["lost on the photographs"] if photographed else [])]
+    print(f"\n| {' | '.join(columns)} |\n" + "|---" * len(columns) + "|")
+    for alpha in ALPHAS:
+        rows = [r for r in result["rows"] if r["label"].startswith(f"α = {alpha:g}, λ = 10^")]
+        zeros = [r["zeros"] for r in rows]
+        for share in SHARES:
+            if not zeros[0] <= share <= zeros[-1]:
+                continue
+            cells = [f"{np.interp(share, zeros, [r['uncompacted'] for r in rows]):.1f} dB"]
+            if photographed:
+                left = float(np.interp(share, zeros, [r["photographs"] for r in rows]))
+                cells.append(f"{result['rows'][0]['photographs'] - left:.2f} dB")
+            print(f"| {alpha:g} | {100 * share:g} % | {' | '.join(cells)} |")
     print("\n| λ (α = 0.9) | AC zeros | from views of half the size | the same, low-pass of full size |")
     print("|---|---|---|---|")
     for row in result["resolution"]:
