@@ -207,6 +207,8 @@ class ColourRefit:
         self._vectors: list[cl.Buffer] = []
         self._views: dict[int, View] = {}
         self._slots: list[_Slot] = []
+        self._kept: dict[int, cl.Buffer] = {}
+        self._kept_of: Targets | None = None
         try:
             self._means = device.upload(means, "the centres")
             self._vectors.append(self._means)
@@ -264,24 +266,25 @@ class ColourRefit:
 
     def _prepare_views(self, progress: Callable[[int, int], None] | None) -> None:
         memory = self.options.memory
-        budget = self.device.info.memory * _SHARE if memory is None else memory
+        self._budget: float = self.device.info.memory * _SHARE if memory is None else memory
         for number, camera in enumerate(self._cameras):
             view = self._rasterizer.prepare(camera)
-            budget -= 48 * self._stride + 4 * (view.entry_count + view.tiles)
-            if budget < 0:
-                budget = 0
+            nbytes = 48 * self._stride + 4 * (view.entry_count + view.tiles)
+            if nbytes > self._budget:
                 view.free()
             else:
+                self._budget -= nbytes
                 self._views[number] = view
             if progress is not None:
                 progress(number + 1, len(self._cameras))
 
-    def set_coefficients(self, sh: FloatArray, active: NDArray[np.bool_] | None = None) -> None:
+    def set_coefficients(self, sh: FloatArray, active: NDArray[np.bool_] | None = None, hold: bool = False) -> None:
         """Where to start.
 
         Args:
             sh: (N, M, 3) R, G, B.
-            active: (N, M, 3) in Y, Co, Cg: the coefficients that may differ from 0; all by default.
+            active: (N, M, 3) in Y, Co, Cg: the coefficients that may change; all by default.
+            hold: the others keep their values; without, they are 0.
         """
         columns = np.zeros((self._columns, self._stride), np.float32)
         for m in range(self._sh_count):
@@ -289,7 +292,8 @@ class ColourRefit:
         words = np.zeros((2, self._stride), np.uint32)
         for column in range(self._columns):
             flags = np.ones(self._splats, bool) if active is None else active[:, column // 3, column % 3]
-            columns[column, : self._splats] *= flags
+            if not hold:
+                columns[column, : self._splats] *= flags
             words[column // 24, : self._splats] |= flags.astype(np.uint32) << np.uint32(column % 24)
         cl.enqueue_copy(self.device.queue, self._x, columns, is_blocking=True)
         cl.enqueue_copy(self.device.queue, self._active, words, is_blocking=True)
@@ -359,78 +363,117 @@ class ColourRefit:
         Returns:
             The weighted squared error of the colours themselves.
         """
-        device, stride = self.device, np.uint32(self._stride)
-        sweep, gather = self._sweeps[weights], self._gathers[weights]
-        background = self._background if targets is not None else (0.0, 0.0, 0.0)
         error = 0.0
         numbers = iter(range(len(self._cameras)))
         while batch := list(itertools.islice(numbers, len(self._slots))):
-            views = []
-            device.queue.finish()
-            for slot, number in zip(self._slots, batch, strict=False):
-                camera = self._cameras[number]
-                struct = camera_struct(camera)
-                view = self._views.get(number) or self._rasterizer.prepare(camera)
-                views.append(view)
-                if targets is not None:
-                    cl.enqueue_copy(
-                        device.queue, slot.target, targets(number), byte_count=12 * camera.width * camera.height
-                    )
-                    device.queue.finish()
-                if targets is not None or number not in self._views:
-                    x = coefficients if targets is not None else self._start
-                    self._view_colours.set_args(
-                        x, self._means, stride, struct, np.int32(0), np.float32(1), view.colours, view.colours
-                    )
-                    device.launch(
-                        self._view_colours, (self._stride // self._lanes,), (_GROUP // self._lanes,), slot.queue
-                    )
-                colours = view.colours
-                if targets is None:
-                    colours = slot.colours
-                    self._view_colours.set_args(
-                        coefficients, self._means, stride, struct, np.int32(1), np.float32(unit), view.colours, colours
-                    )
-                    device.launch(
-                        self._view_colours, (self._stride // self._lanes,), (_GROUP // self._lanes,), slot.queue
-                    )
-                sweep.set_args(
-                    view.shapes,
-                    colours,
-                    view.offsets,
-                    view.entries,
-                    struct,
-                    *(np.float32(channel) for channel in background),
-                    slot.target,
-                    np.int32(targets is not None),
-                    np.float32(self._fixed_scale(camera)),
-                    slot.errors,
-                    slot.totals,
-                )
-                device.launch(sweep, (view.tiles * self._tile_group,), (self._tile_group,), slot.queue)
+            work = [(slot, number, self._view(number)) for slot, number in zip(self._slots, batch, strict=False)]
+            self.device.queue.finish()
+            for slot, number, view in work:
+                self._enqueue_sweep(slot, number, view, coefficients, targets, unit, weights)
             for slot in self._slots:
                 slot.queue.finish()
             # One after the other: sums of floats depend on their order.
-            for slot, number, view in zip(self._slots, batch, views, strict=False):
-                camera = self._cameras[number]
-                scale = self._weight(camera) / (self._fixed_scale(camera) * unit)
-                gather.set_args(
-                    slot.totals,
-                    self._means,
-                    stride,
-                    camera_struct(camera),
-                    np.float32(scale),
-                    view.colours,
-                    result,
-                    self._gram,
-                )
-                self._over_splats(gather, self._lanes)
+            for slot, number, view in work:
+                self._gather(slot, view, result, unit, weights)
                 if targets is not None:
-                    tiles = device.download(slot.errors, (view.tiles,), np.float32)
-                    error += self._weight(camera) * float(tiles.sum(dtype=np.float64))
+                    tiles = self.device.download(slot.errors, (view.tiles,), np.float32)
+                    error += self._weight(view.camera) * float(tiles.sum(dtype=np.float64))
                 if number not in self._views:
                     view.free()
         return error
+
+    def _view(self, number: int) -> View:
+        return self._views.get(number) or self._rasterizer.prepare(self._cameras[number])
+
+    def _enqueue_sweep(
+        self,
+        slot: _Slot,
+        number: int,
+        view: View,
+        coefficients: cl.Buffer,
+        targets: Targets | None,
+        unit: float,
+        weights: bool,
+    ) -> None:
+        """Enqueue the sweep of one view in its slot's queue."""
+        if targets is not None:
+            self._enqueue_colours(slot, view, coefficients, None, 1.0)
+        elif number not in self._views:
+            # Which colours are cut at 0 was settled where the way began.
+            self._enqueue_colours(slot, view, self._start, None, 1.0)
+        if targets is None:
+            self._enqueue_colours(slot, view, coefficients, slot.colours, unit)
+        sweep = self._sweeps[weights]
+        sweep.set_args(
+            view.shapes,
+            view.colours if targets is not None else slot.colours,
+            view.offsets,
+            view.entries,
+            camera_struct(view.camera),
+            *(np.float32(channel if targets is not None else 0) for channel in self._background),
+            slot.target if targets is None else self._target(slot, number, targets),
+            np.int32(targets is not None),
+            np.float32(self._fixed_scale(view.camera)),
+            slot.errors,
+            slot.totals,
+        )
+        self.device.launch(sweep, (view.tiles * self._tile_group,), (self._tile_group,), slot.queue)
+
+    def _enqueue_colours(
+        self, slot: _Slot, view: View, coefficients: cl.Buffer, change: cl.Buffer | None, unit: float
+    ) -> None:
+        """Enqueue a view's colours, or into ``change`` those that a direction adds where none is cut at 0."""
+        self._view_colours.set_args(
+            coefficients,
+            self._means,
+            np.uint32(self._stride),
+            camera_struct(view.camera),
+            np.int32(change is not None),
+            np.float32(unit),
+            view.colours,
+            view.colours if change is None else change,
+        )
+        group = max(_GROUP // self._lanes, 1)
+        self.device.launch(self._view_colours, (self._stride // self._lanes,), (group,), slot.queue)
+
+    def _target(self, slot: _Slot, number: int, targets: Targets) -> cl.Buffer:
+        """What a view should show, kept from the first time on while the memory budget lasts."""
+        if targets is not self._kept_of:
+            self._forget_targets()
+            self._kept_of = targets
+        if number in self._kept:
+            return self._kept[number]
+        camera = self._cameras[number]
+        nbytes = 12 * camera.width * camera.height
+        buffer = slot.target
+        if nbytes <= self._budget:
+            self._budget -= nbytes
+            buffer = self._kept[number] = self.device.allocate(nbytes, "the target images")
+        cl.enqueue_copy(self.device.queue, buffer, targets(number), byte_count=nbytes)
+        self.device.queue.finish()
+        return buffer
+
+    def _forget_targets(self) -> None:
+        for number, buffer in self._kept.items():
+            self._budget += 12 * self._cameras[number].width * self._cameras[number].height
+            self.device.free(buffer)
+        self._kept, self._kept_of = {}, None
+
+    def _gather(self, slot: _Slot, view: View, result: cl.Buffer, unit: float, weights: bool) -> None:
+        """Enqueue the way from a view's sums to the coefficients."""
+        scale = self._weight(view.camera) / (self._fixed_scale(view.camera) * unit)
+        gather = self._gathers[weights]
+        gather.set_args(
+            slot.totals,
+            self._means,
+            np.uint32(self._stride),
+            camera_struct(view.camera),
+            np.float32(scale),
+            view.colours,
+            result,
+            self._gram,
+        )
+        self._over_splats(gather, self._lanes)
 
     def _fixed_scale(self, camera: Camera) -> float:
         """Fixed point of 62 bits for sums over a view's pixels, the largest power of two that cannot overflow."""
@@ -548,6 +591,7 @@ class ColourRefit:
             view.free()
         for slot in self._slots:
             slot.free(self.device)
+        self._forget_targets()
         for buffer in self._vectors:
             self.device.free(buffer)
         self._views, self._slots, self._vectors = {}, [], []

@@ -269,9 +269,9 @@ kernel void select_active(
         }
         for (int j = 0; j < SH_COUNT; ++j) {
             const size_t column = 3 * j + c;
-            const vfloat value = x[j] / scale[j];
-            const vint sound = fabs(value) < 1e30f;
-            VSTORE(sound ? value : (vfloat)(0.0f), index, coefficients + column * stride);
+            const vfloat was = VLOAD(index, coefficients + column * stride), value = x[j] / scale[j];
+            const vint changed = active_lanes(active, stride, index, column) > 0.0f;
+            VSTORE(changed ? (fabs(value) < 1e30f ? value : (vfloat)(0.0f)) : was, index, coefficients + column * stride);
             float kept[LANES];
             VSTORE(keep[j], 0, kept);
             for (int lane = 0; lane < LANES; ++lane)
