@@ -53,6 +53,17 @@ class JudgingViews:
         some = np.linspace(0, len(views) - 1, min(len(views), _MOST_TRAINING_VIEWS)).round().astype(int)
         return JudgingViews([views[k] for k in some], "train", len(views))
 
+    def named(self, name: str) -> Camera:
+        """The view of a name.
+
+        Raises:
+            UsageError: there is none.
+        """
+        for camera in self.views:
+            if camera.name == name:
+                return camera
+        raise UsageError(f"there is no view '{name}' among the {self}: '{self.views[0].name}' is the first of them")
+
     def __str__(self) -> str:
         if self.kind == "test":
             what = "virtual view" if is_virtual(self.views) else "test view"
@@ -125,13 +136,10 @@ class Judge:
         Raises:
             UsageError: there is no such view.
         """
-        cameras = {camera.name: camera for camera in self.views.views}
-        for name in names:
-            if name not in cameras:
-                raise UsageError(f"there is no view '{name}' among the {self.views}")
+        cameras = [self.views.named(name) for name in names]
         rasterizer = Rasterizer(self._device, candidate, background=self._background)
         try:
-            return [(self._picture(cameras[name]), rasterizer.render(cameras[name])[0]) for name in names]
+            return [(self._picture(camera), rasterizer.render(camera)[0]) for camera in cameras]
         finally:
             rasterizer.free()
 

@@ -23,7 +23,7 @@ from potr_cl.cameras import Camera, camera_centres, train_views
 from potr_cl.compaction import Compactor, ViewWeights
 from potr_cl.decoder import decode
 from potr_cl.device import Device
-from potr_cl.encoder import Encoded, Reduced, Stopwatch, code, reduce
+from potr_cl.encoder import Encoded, Reduced, Stopwatch, code, needs_views, reduce
 from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.fallback import on_device
 from potr_cl.judging import Judge, JudgingViews
@@ -34,6 +34,7 @@ from potr_cl.reduction import Progress
 from potr_cl.removal import RemovalSweep
 from potr_cl.scene import Scene
 from potr_cl.streams import code_scene
+from potr_cl.virtual_cameras import place_cameras
 
 #: The survey's stages, in steps of q, and the pruning iterations of each.
 _STAGE = 0.25
@@ -78,7 +79,7 @@ class Target:
 
     @property
     def window(self) -> tuple[float, float]:
-        """The values, as :meth:`value_of_size` or decibels, with which the search is content."""
+        """The values with which the search is content: logarithms of sizes, or decibels."""
         if self.max_bytes is not None:
             return math.log(0.98 * self.max_bytes), math.log(self.max_bytes)
         assert self.min_psnr is not None
@@ -99,9 +100,13 @@ class Target:
         low, high = self.window
         return value <= high if self.max_bytes is not None else value >= low
 
+    def plain(self, value: float) -> float:
+        """A value as bytes or decibels."""
+        return round(math.exp(value)) if self.max_bytes is not None else value
+
     def describe(self, value: float) -> str:
         """A value for people."""
-        return f"{round(math.exp(value)):,} bytes" if self.max_bytes is not None else f"{value:.2f} dB"
+        return f"{self.plain(value):,} bytes" if self.max_bytes is not None else f"{value:.2f} dB"
 
     def __str__(self) -> str:
         return f"at most {self.max_bytes:,} bytes" if self.max_bytes is not None else f"at least {self.min_psnr:g} dB"
@@ -114,7 +119,7 @@ class Try:
     Attributes:
         kind: "estimate", "encode" (in full), or "steps" (other quantiser steps for the last full encode).
         q: of the encode; of the quantiser for "steps".
-        value: bytes or decibels, as the target has them.
+        value: see :meth:`Target.plain`.
     """
 
     kind: str
@@ -129,7 +134,7 @@ class Found:
     Attributes:
         encoded: the file that meets the target.
         options: that it was encoded with: q, and quantiser steps of their own where they differ from that q's.
-        value: bytes or decibels that were reached.
+        value: that was reached; see :meth:`Target.plain`.
         tries: all steps, in order.
     """
 
@@ -163,9 +168,13 @@ def encode_to_target(
         DeviceError: no device does the work.
     """
     options = options or EncodeOptions()
+    watch = Stopwatch(progress)
+    if cameras is None and needs_views(scene, options):
+        watch("place cameras", 0.0)
+        cameras = place_cameras(scene)
+        watch("place cameras", 1.0)
     if target.min_psnr is not None and not cameras:
         raise UsageError("a PSNR can be reached with cameras only: without them there is no view to judge by")
-    watch = Stopwatch(progress)
 
     def work(device: Device, options: EncodeOptions) -> Found:
         search = _Search(scene, cameras or [], target, options, watch, device, tell or (lambda _line: None))

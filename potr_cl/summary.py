@@ -17,6 +17,7 @@ from potr_cl.judging import JudgingViews
 from potr_cl.options import EncodeOptions
 from potr_cl.report import file_report
 from potr_cl.scene import Scene
+from potr_cl.search import Found, Target
 
 #: Sections of :func:`potr_cl.report.file_report` by the property that they belong to, as their names begin.
 _PROPERTIES = ("position", "scale", "rotation", "opacity", "colour: DC", "colour: AC")
@@ -31,7 +32,8 @@ def encode_report(
     file: PotrFile,
     encoded: Encoded,
     options: EncodeOptions,
-    quality: tuple[JudgingViews, Comparison] | str,
+    search: dict[str, Any] | None,
+    quality: dict[str, Any] | str,
     seconds: dict[str, float],
 ) -> dict[str, Any]:
     """The facts of an encode, ready for JSON.
@@ -42,7 +44,8 @@ def encode_report(
         file: what was written to ``target``.
         encoded: how it came about.
         options: that it was encoded with.
-        quality: the views it was judged by and the figures, or why it was not judged.
+        search: of :func:`search_report`, where ``options`` were found by a search.
+        quality: of :func:`quality_report`, or why it was not judged.
         seconds: wall time by stage, in order; "total" last.
     """
     contents = file_report(file)
@@ -59,8 +62,9 @@ def encode_report(
         "splats": file.header.splats,
         "bytes_a_splat": len(file.data) / file.header.splats,
         "properties": _properties(contents["sections"]),
-        "quality": quality if isinstance(quality, str) else _quality(*quality),
+        "quality": quality,
         "pruning": None,
+        "search": search,
         "options": dataclasses.asdict(options),
         "parameters": dataclasses.asdict(options.parameters),
         "device": None,
@@ -87,7 +91,23 @@ def _properties(sections: dict[str, dict[str, float]]) -> dict[str, int]:
     return {name: nbytes for name, nbytes in sums.items() if nbytes}
 
 
-def _quality(views: JudgingViews, comparison: Comparison) -> dict[str, Any]:
+def search_report(target: Target, found: Found) -> dict[str, Any]:
+    """What was searched for, and how it was found."""
+    return {
+        "target": str(target),
+        "max_bytes": target.max_bytes,
+        "min_psnr": target.min_psnr,
+        "reached": target.describe(found.value),
+        "tries": [
+            {"kind": step.kind, "q": step.q, "value": target.plain(step.value), "said": target.describe(step.value)}
+            for step in found.tries
+        ],
+    }
+
+
+def quality_report(views: JudgingViews, comparison: Comparison) -> dict[str, Any]:
+    """The figures of the views that an encode was judged by."""
+
     def entry(name: str, figures: Figures) -> dict[str, Any]:
         """JSON knows no infinity: a PSNR of null means identical pictures."""
         return {"name": name, "psnr": figures.psnr if math.isfinite(figures.psnr) else None, "ssim": figures.ssim}
@@ -131,6 +151,12 @@ def format_encode_report(report: dict[str, Any]) -> str:
             f"           mean of {quality['judged_by']}",
             f"           worst view {worst['name']}: PSNR {decibels(worst['psnr'])}, SSIM {worst['ssim']:.4f}",
         ]
+    search = report["search"]
+    if search is not None:
+        encodes = sum(step["kind"] == "encode" for step in search["tries"])
+        full = f"{encodes} full encode{'s' if encodes > 1 else ''}"
+        q = report["options"]["q"]
+        lines.append(f"asked for  {search['target']}; reached {search['reached']} by quality {q:g} after {full}")
     times = dict(report["seconds"])
     total = times.pop("total")
     lines.append(f"time       {total:.1f} s: " + ", ".join(f"{stage} {time:.1f}" for stage, time in times.items()))

@@ -123,6 +123,80 @@ def test_encode_tells_what_it_did(tmp_path, scene_path, capsys):
     assert "judge" not in json.loads(run(capsys, *encode, "--no-quality", "--json"))["seconds"]
 
 
+@pytest.fixture
+def excerpt(data):
+    """Arguments that encode a real excerpt fast."""
+    return ["encode", data / "lego_excerpt.ply", "--cameras", data / "lego_cameras.json", "--iterations", "4"]
+
+
+def test_encode_to_a_size(tmp_path, excerpt, capsys):
+    potr = tmp_path / "a.potr"
+    report = json.loads(run(capsys, *excerpt, "-o", potr, "--max-size", "20 kB", "--json"))
+    assert 19_600 <= potr.stat().st_size == report["bytes"] <= 20_000
+    assert report["search"]["target"] == "at most 20,000 bytes"
+    assert report["search"]["max_bytes"] == 20_000
+    assert report["search"]["tries"][-1]["value"] == report["bytes"]
+    assert report["search"]["reached"] == f"{report['bytes']:,} bytes"
+    assert "asked for  at most 20,480 bytes; reached" in run(capsys, *excerpt, "-o", potr, "--max-size", "20KiB")
+
+
+def test_encode_to_a_psnr(tmp_path, excerpt, capsys):
+    report = json.loads(run(capsys, *excerpt, "-o", tmp_path / "a.potr", "--min-psnr", "43", "--json"))
+    assert 43 <= report["quality"]["psnr"] <= 43.1
+
+
+def test_encode_to_the_impossible(tmp_path, excerpt, capsys):
+    potr = tmp_path / "a.potr"
+    fails(
+        capsys, [*excerpt, "-o", potr, "--max-size", "1k"], 1, "at most 1,000 bytes cannot be reached: quality 0 gives"
+    )
+    fails(capsys, [*excerpt, "-o", potr, "--min-psnr", "99"], 1, "at least 99 dB cannot be reached", "quality 1 gives")
+    for size in ("8 bananas", "", "-5", "1e", "0.1", "1.2.3M"):
+        fails(capsys, [*excerpt, "-o", potr, f"--max-size={size}"], 2)
+    fails(capsys, [*excerpt, "-o", potr, "--min-psnr", "-3"], 2, "-3 dB")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(SystemExit) as exit_:
+        cli.main([str(a) for a in [*excerpt, "-o", potr, "--max-size", "1M", "-q", "0.2"]])
+    assert exit_.value.code == 2
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [
+        ("1234567", 1_234_567),
+        ("8MB", 8_000_000),
+        ("8 MiB", 8 << 20),
+        ("800k", 800_000),
+        ("1.5e6", 1_500_000),
+        ("2 gib", 2 << 30),
+        ("0.5GB", 500_000_000),
+        ("12_000 B", 12_000),
+        ("3Ki", 3072),
+    ],
+)
+def test_sizes_as_people_write_them(text, size):
+    assert cli.options.size_in_bytes(text) == size
+
+
+def test_encode_report_page(tmp_path, excerpt, capsys):
+    page = tmp_path / "page.html"
+    encode = [*excerpt, "-o", tmp_path / "a.potr"]
+    run(capsys, *encode, "--report", page, "--report-view", "test_r_0")
+    text = page.read_text()
+    assert "worst view: test_r_66" in text
+    assert "chosen view: test_r_0" in text
+    assert text.count("<img") == 9
+    run(capsys, *encode, "--report", page, "--no-quality")
+    assert "not judged, as asked" in page.read_text()
+    page.unlink()
+    fails(capsys, [*encode, "--report", page, "--report-view", "nobody"], 2, "no view 'nobody'", "'test_r_0'")
+    fails(capsys, [*encode, "--report-view", "test_r_0"], 2, "--report")
+    fails(capsys, [*encode, "--report", tmp_path / "a.potr"], 2, "name the same file")
+    fails(capsys, [*encode, "--report", tmp_path / "nowhere" / "page.html"], 2, "does not exist")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.potr"]
+
+
 def test_encode_judges_by_training_views_if_there_are_no_others(tmp_path, scene_path, capsys):
     path = cameras_json(tmp_path / "cameras.json")
     path.write_text(json.dumps([view for view in json.loads(path.read_text()) if view["split"] == "train"]))
@@ -158,7 +232,7 @@ def test_every_parameter_can_be_set(tmp_path, scene_path, capsys):
     capsys.readouterr()
     assert cli.main(["info", str(potr), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
-    assert report["scale_factors"] == {"scale": 50, "rotation": 40, "opacity": 30, "sh": 20}
+    assert report["scale_factors"] == {"scale": 50, "rotation": 40, "opacity": 30, "DC": 20, "AC": 20}
     assert (report["gamma"], report["beta"]) == (0.01, 0.001)
 
 

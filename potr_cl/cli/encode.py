@@ -8,6 +8,7 @@ import dataclasses
 import json
 import time
 from pathlib import Path
+from typing import Any
 
 from potr_cl.atomic_write import replacing
 from potr_cl.bitstream import EntropyCoder
@@ -17,21 +18,23 @@ from potr_cl.cli.options import (
     add_pruning_options,
     compaction_choices,
     count,
+    size_in_bytes,
     sweep_options,
 )
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
-from potr_cl.compare import Comparison
 from potr_cl.decoder import PotrFile, decode
 from potr_cl.device import Device
 from potr_cl.encoder import Stopwatch, encode, needs_views
 from potr_cl.errors import DeviceError, UsageError
 from potr_cl.formats import load_scene
+from potr_cl.html_report import PicturePair, html_report, views_to_show
 from potr_cl.images import parse_colour
 from potr_cl.judging import Judge, JudgingViews
 from potr_cl.options import EncodeOptions
 from potr_cl.scene import Scene
-from potr_cl.summary import encode_report, format_encode_report
+from potr_cl.search import Target, encode_to_target
+from potr_cl.summary import encode_report, format_encode_report, quality_report, search_report
 
 
 def _options(args: argparse.Namespace) -> EncodeOptions:
@@ -61,32 +64,53 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
     return options
 
 
+def _target(args: argparse.Namespace) -> Target | None:
+    if args.max_size is not None:
+        return Target(max_bytes=size_in_bytes(args.max_size))
+    return None if args.min_psnr is None else Target(min_psnr=args.min_psnr)
+
+
 def _encode(args: argparse.Namespace) -> None:
     began = time.perf_counter()
-    options = _options(args)
+    options, target = _options(args), _target(args)
+    if args.report is None and args.report_view is not None:
+        raise UsageError("--report-view needs --report, the page that shows it")
+    if args.report is not None and args.report.resolve() == args.output.resolve():
+        raise UsageError("--report and --output name the same file")
     cameras = given_cameras(args)
     scene = load_scene(args.scene)
     options = dataclasses.replace(options, count=count(args, len(scene)))
     device = Device(args.device) if needs_views(scene, options) else None
-    with contextlib.closing(Progress()) as progress:
+    with contextlib.ExitStack() as stack:
+        progress = stack.enter_context(contextlib.closing(Progress()))
+        page = stack.enter_context(replacing(args.report)) if args.report is not None else None
         placing = Stopwatch(progress)
+        search: dict[str, Any] | None = None
         with replacing(args.output) as file:
             if cameras is None and device is not None:
                 cameras = virtual_cameras(args, scene, placing)
-            encoded = encode(scene, cameras, options, progress, device)
+            views = JudgingViews.of(cameras) if cameras is not None and not args.no_quality else None
+            if args.report_view is not None:
+                _ = views and views.named(args.report_view)  # an unknown name is told before the work
+            if target is None:
+                encoded = encode(scene, cameras, options, progress, device)
+            else:
+                found = encode_to_target(scene, cameras, target, options, progress, device, progress.tell)
+                encoded, options, search = found.encoded, found.options, search_report(target, found)
             for piece in encoded.pieces:
                 file.write(piece)
         written = PotrFile.from_bytes(b"".join(encoded.pieces))
         watch = Stopwatch(progress)
-        quality: tuple[JudgingViews, Comparison] | str
-        if args.no_quality:
-            quality = "not judged, as asked"
+        pictures: list[PicturePair] = []
+        quality: dict[str, Any] | str = "not judged, as asked"
+        if views is not None:
+            quality, pictures = _judge(args, scene, written, views, encoded.device or device, watch)
         elif cameras is None:
             quality = "not judged: there are no cameras to look from"
-        else:
-            quality = _judge(args, scene, written, JudgingViews.of(cameras), encoded.device or device, watch)
-    seconds = placing.seconds | encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
-    report = encode_report(args.scene, scene, args.output, written, encoded, options, quality, seconds)
+        seconds = placing.seconds | encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
+        report = encode_report(args.scene, scene, args.output, written, encoded, options, search, quality, seconds)
+        if page is not None:
+            page.write(html_report(report, pictures).encode())
     print(json.dumps(report, indent=1, allow_nan=False) if args.json else format_encode_report(report))
 
 
@@ -97,29 +121,56 @@ def _judge(
     views: JudgingViews,
     device: Device | None,
     watch: Stopwatch,
-) -> tuple[JudgingViews, Comparison] | str:
-    """The figures, or why there are none: a device that fails now must not take the finished file with it."""
+) -> tuple[dict[str, Any] | str, list[PicturePair]]:
+    """The figures, or why there are none: a device that fails now must not take the finished file with it.
+
+    With pictures for the report, if there is to be one.
+    """
     watch("judge", 0.0)
     try:
         judge = Judge(device or Device(args.device), scene, views, parse_colour(args.background))
         try:
-            return views, judge.compare(decode(written.data), lambda _, done: watch("judge", done))
+            candidate = decode(written.data)
+            quality = quality_report(views, judge.compare(candidate, lambda _, done: watch("judge", done)))
+            shown = views_to_show(quality, args.report_view) if args.report is not None else []
+            pairs = judge.pictures(candidate, [view["name"] for _, view in shown])
         finally:
             judge.free()
     except DeviceError as error:
-        return f"not judged: {error}"
+        return f"not judged: {error}", []
+    return quality, [
+        PicturePair(title, view["name"], view["psnr"], *pair) for (title, view), pair in zip(shown, pairs, strict=True)
+    ]
 
 
 def add_encode(commands: Commands) -> None:
     p = commands.add_parser("encode", help="a scene (.ply) to a .potr file")
     p.add_argument("scene", type=Path, metavar="SCENE.ply")
     p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.potr")
-    p.add_argument(
+    goal = p.add_mutually_exclusive_group()
+    goal.add_argument(
         "-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (smallest) to 1 (best); default 0.5"
+    )
+    goal.add_argument(
+        "--max-size", metavar="SIZE", help="find the quality that fills this size: 8MB, 8 MiB, 800k, or bytes"
+    )
+    goal.add_argument(
+        "--min-psnr",
+        type=float,
+        metavar="DB",
+        help="find the quality that just reaches this mean PSNR against the uncompressed scene, on the views that the "
+        "result is judged by",
     )
     add_cameras_options(p)
     p.add_argument("--no-quality", action="store_true", help="do not judge the result; saves time")
     p.add_argument("--json", action="store_true", help="the summary for programs")
+    p.add_argument(
+        "--report",
+        type=Path,
+        metavar="OUT.html",
+        help="a page of its own with sizes, quality by view, pictures before and after, and the course of pruning",
+    )
+    p.add_argument("--report-view", metavar="NAME", help="a judging view to show besides the worst and the median one")
     p.add_argument("--no-prune", action="store_true", help="keep every splat")
     add_pruning_options(p)
     p.add_argument("--no-compact", action="store_true", help="keep the colours' coefficients as they are")

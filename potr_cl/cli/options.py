@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import argparse
+import contextlib
+import re
 from typing import Any, TypeAlias, get_args
 
 from potr_cl.compaction import ColourModel, CompactionOptions, Weighting
@@ -32,6 +34,20 @@ def sweep_options(args: argparse.Namespace) -> SweepOptions:
 
 def as_bytes(gigabytes: float | None) -> int | None:
     return None if gigabytes is None else int(gigabytes * 2**30)
+
+
+def size_in_bytes(text: str) -> int:
+    """Bytes of a size as people write it: 8MB (10⁶), 8 MiB (2²⁰), 800k, 1.5e6.
+
+    Raises:
+        UsageError: it is none.
+    """
+    match = re.fullmatch(r"\s*([0-9][0-9._]*(?:e[0-9]+)?)\s*(?:([kmg])(i?))?b?\s*", text, re.IGNORECASE)
+    if match is not None:
+        with contextlib.suppress(ValueError):
+            power = " kmg".index((match[2] or " ").lower())
+            return int(float(match[1]) * (1024 if match[3] else 1000) ** power)
+    raise UsageError(f"'{text}' is no size: give bytes, or a number with k, MB, GB, KiB, MiB or GiB")
 
 
 def add_pruning_options(p: argparse.ArgumentParser) -> None:

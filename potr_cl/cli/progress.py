@@ -37,6 +37,10 @@ class Progress:
             print(f"{stage}: {time.perf_counter() - self._began.pop(stage):.1f} s", file=sys.stderr, flush=True)
             self._stage = ""
 
+    def tell(self, line: str) -> None:
+        """Print a line of its own."""
+        tqdm.write(line, file=sys.stderr)
+
     def close(self) -> None:
         if self._bar is not None:
             self._bar.close()
