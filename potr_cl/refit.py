@@ -45,8 +45,8 @@ _SLOTS = 16
 _GROUP = 64
 #: Work-items that share a dot product.
 _DOT_ITEMS = 16384
-#: Part of the device's memory that the prepared views may take unless the caller sets a budget.
-_SHARE = 0.5
+#: Part of the device's memory not yet taken that views and targets may take unless the caller sets a budget.
+_SHARE = 0.25
 #: Pixel values beyond this are cut in the kernels (LARGEST_VALUE).
 _LARGEST_VALUE = 64.0
 #: Half steps tried when a solution is worse than its start because colours were cut at 0 on the way.
@@ -66,7 +66,7 @@ class RefitOptions:
         lam: lambda on the AC coefficients of Y, in pixels of an image of :data:`REFERENCE_PIXELS`.
         chroma_factor: lambda of Co and Cg over that of Y.
         prior: the same on every coefficient's distance to its start: what the views do not tell stays as it was.
-        memory: bytes of device memory that prepared views may take; None: half of the device's.
+        memory: bytes of device memory that prepared views and targets may take; None: a quarter of what is free.
 
     Raises:
         UsageError: a value is out of range.
@@ -266,7 +266,8 @@ class ColourRefit:
 
     def _prepare_views(self, progress: Callable[[int, int], None] | None) -> None:
         memory = self.options.memory
-        self._budget: float = self.device.info.memory * _SHARE if memory is None else memory
+        free = self.device.info.memory - self.device.allocated
+        self._budget: float = free * _SHARE if memory is None else memory
         for number, camera in enumerate(self._cameras):
             view = self._rasterizer.prepare(camera)
             nbytes = 48 * self._stride + 4 * (view.entry_count + view.tiles)
