@@ -1,13 +1,83 @@
 """potr_cl: post-training compression of 3D Gaussian Splatting scenes with OpenCL.
 
-The public interface: scenes and cameras are loaded by :mod:`potr_cl.formats`, encoded by :mod:`potr_cl.encoder`,
-decoded by :mod:`potr_cl.decoder`, rendered by :mod:`potr_cl.rasterizer`.
+The public interface in short; everything else has its module:
+
+- :func:`load_scene`, :func:`load_cameras`: from the files of :mod:`potr_cl.formats`;
+- :func:`encode` with :class:`EncodeOptions`, or :func:`encode_to_target` with a :class:`Target`, a size or a PSNR;
+- :func:`decode`: back from a .potr file;
+- :func:`render`: a picture of a scene;
+- :class:`Scene`, :class:`Camera`: what they work on;
+- :class:`PotrError` and its subclasses: what they raise.
 """
 
-from potr_cl.cameras import Camera
-from potr_cl.errors import DataError, DeviceError, PotrError, UsageError
-from potr_cl.scene import Scene
+from __future__ import annotations
+
+from importlib import import_module
+from typing import TYPE_CHECKING, Any
+
+if TYPE_CHECKING:
+    from potr_cl.cameras import Camera
+    from potr_cl.decoder import decode
+    from potr_cl.encoder import Encoded, encode
+    from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, PotrError, UnreachableError, UsageError
+    from potr_cl.formats import load_cameras, load_scene
+    from potr_cl.options import EncodeOptions
+    from potr_cl.rasterizer import render
+    from potr_cl.scene import Scene
+    from potr_cl.search import Target, encode_to_target
 
 __version__ = "0.1.0"
 
-__all__ = ["Camera", "DataError", "DeviceError", "PotrError", "Scene", "UsageError", "__version__"]
+__all__ = [
+    "Camera",
+    "DataError",
+    "DeviceError",
+    "DeviceMemoryError",
+    "EncodeOptions",
+    "Encoded",
+    "PotrError",
+    "Scene",
+    "Target",
+    "UnreachableError",
+    "UsageError",
+    "__version__",
+    "decode",
+    "encode",
+    "encode_to_target",
+    "load_cameras",
+    "load_scene",
+    "render",
+]
+
+#: Imported on first use: the OpenCL loader and NumPy are not everybody's who asks for the version.
+_HOMES = {
+    "Camera": "cameras",
+    "DataError": "errors",
+    "DeviceError": "errors",
+    "DeviceMemoryError": "errors",
+    "EncodeOptions": "options",
+    "Encoded": "encoder",
+    "PotrError": "errors",
+    "Scene": "scene",
+    "Target": "search",
+    "UnreachableError": "errors",
+    "UsageError": "errors",
+    "decode": "decoder",
+    "encode": "encoder",
+    "encode_to_target": "search",
+    "load_cameras": "formats",
+    "load_scene": "formats",
+    "render": "rasterizer",
+}
+
+
+def __getattr__(name: str) -> Any:
+    if name not in _HOMES:
+        raise AttributeError(f"module 'potr_cl' has no attribute '{name}'")
+    value = getattr(import_module(f"potr_cl.{_HOMES[name]}"), name)
+    globals()[name] = value
+    return value
+
+
+def __dir__() -> list[str]:
+    return __all__

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import os
 import time
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
@@ -10,6 +11,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.atomic_write import replacing
 from potr_cl.bitstream import EntropyCoder
 from potr_cl.cameras import Camera, train_views
 from potr_cl.decoder import decode
@@ -47,6 +49,17 @@ class Encoded:
     refitted: Refitted | None
     device: Device | None
     seconds: dict[str, float]
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the file, whole or not at all.
+
+        Raises:
+            UsageError: it cannot be written there.
+            PotrError: the system failed to write.
+        """
+        with replacing(path) as file:
+            for piece in self.pieces:
+                file.write(piece)
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Callable
 from functools import partial
 from pathlib import Path
@@ -14,7 +15,7 @@ from potr_cl.formats.view_files import read_json
 from potr_cl.scene import Scene
 
 
-def load_scene(path: Path) -> Scene:
+def load_scene(path: str | os.PathLike[str]) -> Scene:
     """Read a trained scene; the extension tells the format.
 
     Args:
@@ -55,7 +56,7 @@ def scene_writer(path: Path) -> Callable[[Scene], None]:
     raise UsageError(f"'{path}': scenes are written as .ply, .compressed.ply or .spz")
 
 
-def load_cameras(path: Path) -> list[Camera]:
+def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     """Read the views of a scene; the content tells the format.
 
     Args:
