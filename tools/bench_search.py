@@ -1,0 +1,90 @@
+"""Encoding to a size or a PSNR: python -m tools.bench_search SCENE … [--sizes B …] [--psnrs DB …] [--device D]
+
+A SCENE is a folder with point_cloud.ply and cameras.json. For each target: what was reached, the steps, the time as a
+multiple of one encode's at quality 0.5, and what the file loses to a plain encode of its size. That is read off a curve
+through plain encodes at several qualities; --qualities with nothing after it leaves it out. Prints Markdown.
+"""
+
+from __future__ import annotations
+
+import argparse
+import time
+from collections import Counter
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+
+from potr_cl.decoder import decode
+from potr_cl.device import Device
+from potr_cl.encoder import Encoded, encode
+from potr_cl.errors import UnreachableError
+from potr_cl.formats import load_cameras, load_scene
+from potr_cl.judging import Judge, JudgingViews
+from potr_cl.options import EncodeOptions
+from potr_cl.search import Target, encode_to_target
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", nargs="+", type=Path)
+    parser.add_argument("--sizes", nargs="*", type=float, default=[1.2e6, 2e6, 3e6, 5e6], help="bytes")
+    parser.add_argument("--psnrs", nargs="*", type=float, default=[38, 42, 45], help="dB")
+    parser.add_argument("--qualities", nargs="*", type=float, default=[0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1])
+    parser.add_argument("--every", type=int, default=1, metavar="N", help="only every N-th view")
+    parser.add_argument("--device")
+    args = parser.parse_args()
+    device = Device(args.device)
+    print(device.info)
+    for folder in args.scenes:
+        scene, cameras = load_scene(folder / "point_cloud.ply"), load_cameras(folder / "cameras.json")
+        cameras = [c for split in ("train", "test") for c in [c for c in cameras if c.split == split][:: args.every]]
+        judge = Judge(device, scene, JudgingViews.of(cameras), (0.0, 0.0, 0.0))
+        options = EncodeOptions()
+        encode(scene, cameras, replace(options, iterations=1), device=device)  # builds the kernels
+
+        def measured(encoded: Encoded, judge: Judge = judge) -> float:
+            return judge.psnr(decode(b"".join(encoded.pieces)))
+
+        began = time.perf_counter()
+        once = encode(scene, cameras, options, device=device)
+        one = time.perf_counter() - began
+        print(
+            f"\n{folder.name}: {once.nbytes:,} bytes, {measured(once):.2f} dB at quality {options.q:g} in {one:.1f} s\n"
+        )
+
+        curve = []
+        for q in args.qualities:
+            plain = encode(scene, cameras, replace(options, q=q), device=device)
+            curve.append((np.log(plain.nbytes), measured(plain)))
+            print(f"quality {q:g}: {plain.nbytes:,} bytes, {curve[-1][1]:.2f} dB", flush=True)
+
+        print(
+            "\n| target | bytes | PSNR | against a plain encode | quality | full encodes, others | time / one encode |"
+        )
+        print("|---|---|---|---|---|---|---|")
+        targets = [Target(max_bytes=int(size)) for size in args.sizes] + [Target(min_psnr=psnr) for psnr in args.psnrs]
+        for target in targets:
+            began = time.perf_counter()
+            try:
+                found = encode_to_target(scene, cameras, target, options, device=device)
+            except UnreachableError as error:
+                print(f"| {target} | {error} | | | | | {(time.perf_counter() - began) / one:.2f} |", flush=True)
+                continue
+            ratio = (time.perf_counter() - began) / one
+            psnr = measured(found.encoded)
+            size = np.log(found.encoded.nbytes)
+            inside = bool(curve) and curve[0][0] <= size <= curve[-1][0]
+            gain = f"{psnr - np.interp(size, *zip(*curve, strict=True)):+.2f} dB" if inside else "–"
+            kinds = Counter(step.kind for step in found.tries)
+            print(
+                f"| {target} | {found.encoded.nbytes:,} | {psnr:.2f} dB | {gain} | {found.options.q:.4f} | "
+                f"{kinds['encode']}, {kinds['estimate']} + {kinds['steps']} | {ratio:.2f} |",
+                flush=True,
+            )
+        judge.free()
+
+
+if __name__ == "__main__":
+    main()
