@@ -50,7 +50,7 @@ _FAR = 1e6
 _CELLS = 24
 #: A splat's opacity above which it counts as matter.
 _OPAQUE = 0.1
-#: A place is in dense matter if more than this part of all directions is blocked within this (in median radii).
+#: A place is in dense matter if more than this part of all directions is taken up within this (in median radii).
 _CROWDED, _ELBOW_ROOM = 0.005, 0.2
 #: Distance, in median radii, up to which a splat of median size shows all its detail.
 _REACH = 2.5
@@ -92,12 +92,14 @@ class _Matter:
         reach: (K,) distance up to which each shows all its detail.
         colours: (K, M - 1, 3) their AC coefficients, of unit norm; zero if there are none to speak of.
         occluders: (3, P) points on all opaque splats.
+        areas: (P,) of the surface that each point stands for.
     """
 
     targets: F64
     reach: F64
     colours: F32
     occluders: F32
+    areas: F32
 
 
 @dataclass(frozen=True)
@@ -244,17 +246,23 @@ def _matter(scene: Scene, frame: _Frame) -> _Matter:
     colours = np.where(norm > 1e-4, 1 / np.maximum(norm, 1e-4), 0)[:, None, None] * colours
 
     # Half of the points by number, half by area: a wall may be a few large splats, a small thing thousands.
-    area = np.sort(scales, axis=1)[:, 1:].prod(axis=1) * opacity[solid]
-    area = np.minimum(area, 1000 * area.mean())
-    sums = np.cumsum(area / max(area.sum(), 1e-300) + 1 / len(area))
+    area = 2 * np.pi * np.sort(scales, axis=1)[:, 1:].prod(axis=1) * opacity[solid]
+    capped = np.minimum(area, 1000 * area.mean())
+    odds = capped / max(capped.sum(), 1e-300) + 1 / len(area)
+    sums = np.cumsum(odds)
     rows = np.searchsorted(sums, (np.arange(_OCCLUDERS) + 0.5) / _OCCLUDERS * sums[-1]).clip(0, len(solid) - 1)
+    areas = area[rows] * sums[-1] / (odds[rows] * _OCCLUDERS)
     q = scene.quaternions[solid[rows]].astype(np.float64)
     q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-30)
     local = (2 * _low_discrepancy(_OCCLUDERS, 3) - 1) * scales[rows]
     across = 2 * np.cross(q[:, 1:], local)
     points = means[rows] + local + q[:, :1] * across + np.cross(q[:, 1:], across)
     return _Matter(
-        means[chosen], _REACH * relative.clip(0.5, 4), colours.astype(np.float32), points.T.astype(np.float32)
+        means[chosen],
+        _REACH * relative.clip(0.5, 4),
+        colours.astype(np.float32),
+        points.T.astype(np.float32),
+        areas.astype(np.float32),
     )
 
 
@@ -286,19 +294,27 @@ def _places(frame: _Frame) -> tuple[F64, F64]:
     return _on_sphere(spread[:, :2]) * away[:, None], _HALF_VIEW * distance / away
 
 
-def _horizon(eye: F64, occluders: F32) -> F32:
-    """Distance of the nearest point in each cell of the cube map around ``eye``; infinite where there is none."""
-    rays = occluders - eye.astype(np.float32)[:, None]
+def _surroundings(eye: F64, matter: _Matter) -> tuple[F32, float]:
+    """What is around ``eye``.
+
+    Returns:
+        Distance of the nearest point in each cell of the cube map, infinite where there is none; and the part of all
+        directions that matter within arm's length takes up.
+    """
+    rays = matter.occluders - eye.astype(np.float32)[:, None]
+    squared = np.einsum("ij,ij->j", rays, rays)
     horizon = np.full(6 * _CELLS * _CELLS, np.inf, np.float32)
-    np.minimum.at(horizon, _cell(rays), np.sqrt(np.einsum("ij,ij->j", rays, rays)))
-    return horizon
+    np.minimum.at(horizon, _cell(rays), np.sqrt(squared))
+    near = squared < _ELBOW_ROOM**2
+    blocked = np.minimum(matter.areas[near] / np.maximum(4 * np.pi * squared[near], 1e-30), 1)
+    return horizon, float(blocked.sum(dtype=np.float64))
 
 
 def _candidates(frame: _Frame, matter: _Matter) -> _Candidates:
     """All views from all places that are free; from the freest tenth if too few are."""
     places, tangents = _places(frame)
-    horizons = [_horizon(eye, matter.occluders) for eye in places]
-    crowd = np.array([np.mean(horizon < _ELBOW_ROOM) for horizon in horizons])
+    horizons, blocked = zip(*[_surroundings(eye, matter) for eye in places], strict=True)
+    crowd = np.array(blocked)
     free = np.flatnonzero(crowd <= max(_CROWDED, float(np.quantile(crowd, 0.1))))
     views = [_views_from(places[place], tangents[place], horizons[place], frame, matter) for place in free]
     worths = [worth for _, worth, _ in views]
