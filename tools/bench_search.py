@@ -8,6 +8,7 @@ through plain encodes at several qualities; --qualities with nothing after it le
 from __future__ import annotations
 
 import argparse
+import math
 import time
 from collections import Counter
 from dataclasses import replace
@@ -50,19 +51,17 @@ def main() -> None:
         began = time.perf_counter()
         once = encode(scene, cameras, options, device=device)
         one = time.perf_counter() - began
-        print(
-            f"\n{folder.name}: {once.nbytes:,} bytes, {measured(once):.2f} dB at quality {options.q:g} in {one:.1f} s\n"
-        )
+        print(f"\n{folder.name}: quality {options.q:g}: {once.nbytes:,} bytes, {measured(once):.2f} dB, {one:.1f} s\n")
 
-        curve = []
+        sizes: list[float] = []
+        psnrs: list[float] = []
         for q in args.qualities:
             plain = encode(scene, cameras, replace(options, q=q), device=device)
-            curve.append((np.log(plain.nbytes), measured(plain)))
-            print(f"quality {q:g}: {plain.nbytes:,} bytes, {curve[-1][1]:.2f} dB", flush=True)
+            sizes.append(math.log(plain.nbytes))
+            psnrs.append(measured(plain))
+            print(f"quality {q:g}: {plain.nbytes:,} bytes, {psnrs[-1]:.2f} dB", flush=True)
 
-        print(
-            "\n| target | bytes | PSNR | against a plain encode | quality | full encodes, others | time / one encode |"
-        )
+        print("\n| target | bytes | PSNR | against plain | quality | full encodes, others | time / one encode |")
         print("|---|---|---|---|---|---|---|")
         targets = [Target(max_bytes=int(size)) for size in args.sizes] + [Target(min_psnr=psnr) for psnr in args.psnrs]
         for target in targets:
@@ -74,9 +73,9 @@ def main() -> None:
                 continue
             ratio = (time.perf_counter() - began) / one
             psnr = measured(found.encoded)
-            size = np.log(found.encoded.nbytes)
-            inside = bool(curve) and curve[0][0] <= size <= curve[-1][0]
-            gain = f"{psnr - np.interp(size, *zip(*curve, strict=True)):+.2f} dB" if inside else "–"
+            size = math.log(found.encoded.nbytes)
+            inside = bool(sizes) and sizes[0] <= size <= sizes[-1]
+            gain = f"{psnr - float(np.interp(size, sizes, psnrs)):+.2f} dB" if inside else "–"
             kinds = Counter(step.kind for step in found.tries)
             print(
                 f"| {target} | {found.encoded.nbytes:,} | {psnr:.2f} dB | {gain} | {found.options.q:.4f} | "
