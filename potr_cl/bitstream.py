@@ -19,11 +19,13 @@ from potr_cl.errors import DataError, UsageError
 from potr_cl.scene import SH_COEFFICIENTS
 
 MAGIC = b"POTR\r\n\x1a\n"
-VERSION = 1
+#: The newest version that is read; which one is written depends on the quantiser.
+VERSION = 2
 #: Longest metadata that a reader accepts, bytes.
 MAX_METADATA = 1 << 16
 
-_FIXED = struct.Struct("<8sHHIQQBBHI8d16s")
+_FIXED = struct.Struct("<8sHHIQQBBHI8d8s8s")
+_FACTOR = struct.Struct("<d")
 _ENTRY = struct.Struct("<BBBBIQQ")
 _CRC = struct.Struct("<I")
 
@@ -49,10 +51,11 @@ class Coder(enum.IntEnum):
     RAW = 0
     ZSTD = 1
     DEFLATE = 2
+    CONTEXT = 3
 
 
 #: The most that a coder's format can expand one stored byte to: a claim beyond is a lie, found before memory is taken.
-_MOST_EXPANSION = {Coder.RAW: 1, Coder.ZSTD: 1 << 15, Coder.DEFLATE: 1032}
+_MOST_EXPANSION = {Coder.RAW: 1, Coder.ZSTD: 1 << 15, Coder.DEFLATE: 1032, Coder.CONTEXT: 1 << 15}
 
 #: Property -> (indices allowed, True if it holds one integer a splat)
 _INDICES = {
@@ -71,6 +74,15 @@ _SIGNED = {Property.ROTATION, Property.SH}
 _A_SPLAT = {Property.SCALE, Property.ROTATION, Property.OPACITY, Property.SH}
 
 
+def context_groups(prop: Property, degree: int) -> list[tuple[int, int]]:
+    """First index and number of the streams that one section of coder CONTEXT holds: the sections that there can be."""
+    if prop == Property.SH:
+        return [(3 * band**2, 3 * (2 * band + 1)) for band in range(degree + 1)]
+    if prop in _A_SPLAT:
+        return [(0, _INDICES[prop])]
+    return []
+
+
 @dataclass(frozen=True)
 class Section:
     """One entry of the section table.
@@ -79,9 +91,9 @@ class Section:
         kind: what it holds.
         index: axis of a scale or rotation; 3 · coefficient + channel of an SH stream; else 0.
         coder: how it is stored.
-        planes: bytes an integer.
+        planes: bytes an integer; coder CONTEXT: streams in the section, ``index`` the first one's.
         crc: CRC-32 of the stored bytes.
-        raw_bytes, stored_bytes: sizes before and after the coder.
+        raw_bytes, stored_bytes: sizes before and after the coder; CONTEXT: ``raw_bytes`` is the number of integers.
         offset: of the stored bytes in the file.
     """
 
@@ -108,10 +120,11 @@ class Header:
         splats: number of splats, >= 1.
         sh_degree: 0 to 3.
         origin, side, depth: root cube and deepest level of the octree (:class:`potr_cl.octree.OctreeStreams`).
-        sf_scale, sf_rotation, sf_opacity, sf_sh: scale factors.
+        sf_scale, sf_rotation, sf_opacity, sf_dc, sf_ac: scale factors; version 1 has one for all of SH.
         sections: in the order of their bytes.
     """
 
+    version: int
     splats: int
     sh_degree: int
     origin: tuple[float, float, float]
@@ -120,7 +133,8 @@ class Header:
     sf_scale: float
     sf_rotation: float
     sf_opacity: float
-    sf_sh: float
+    sf_dc: float
+    sf_ac: float
     sections: tuple[Section, ...] = field(default=())
 
     def find(self, prop: Property, index: int = 0) -> Section | None:
@@ -178,26 +192,33 @@ def unpack_integers(raw: NDArray[np.uint8], planes: int, signed: bool, start: in
 # ------------------------------------------------------------------------------------------------ entropy coding
 
 
+ENTROPY_CODERS = ("context", "zstd", "npz")
+
+
 @dataclass(frozen=True)
 class EntropyCoder:
-    """The entropy stage: zstd at a level (1 to 22), or deflate at zlib's default level, which is what .npz holds.
+    """The entropy stage.
+
+    "context": :mod:`potr_cl.context_coder` for all that there is one of a splat, zstd for the rest; format version 2
+    only, version 1 takes zstd. "zstd" at a level (1 to 22). "npz": deflate at zlib's default level, which is what .npz
+    holds.
 
     Raises:
         UsageError: unknown name or level.
     """
 
-    name: str = "zstd"
+    name: str = "context"
     level: int = 19
 
     def __post_init__(self) -> None:
-        if self.name not in ("zstd", "npz"):
-            raise UsageError(f"entropy coder '{self.name}' is unknown: choose 'zstd' or 'npz'")
+        if self.name not in ENTROPY_CODERS:
+            raise UsageError(f"entropy coder '{self.name}' is unknown: choose one of {', '.join(ENTROPY_CODERS)}")
         if not 1 <= self.level <= 22:
             raise UsageError(f"zstd level {self.level} is unknown: choose 1 to 22")
 
     def section(self, prop: Property, index: int, raw: bytes, planes: int) -> tuple[Section, bytes]:
         """Code a section's bytes; stored as they are where coding does not make them smaller."""
-        if self.name == "zstd":
+        if self.name != "npz":
             coder, stored = Coder.ZSTD, zstandard.ZstdCompressor(level=self.level, write_checksum=False).compress(raw)
         else:
             coder, stored = Coder.DEFLATE, zlib.compress(raw)
@@ -206,15 +227,30 @@ class EntropyCoder:
         return Section(prop, index, coder, planes, zlib.crc32(stored), len(raw), len(stored)), stored
 
 
-def read_section(data: bytes | memoryview, section: Section) -> NDArray[np.uint8]:
-    """A section's bytes before coding: (raw_bytes,) uint8.
+def context_section(prop: Property, index: int, streams: int, integers: int, stored: bytes) -> tuple[Section, bytes]:
+    """A section of coder CONTEXT from its stored bytes."""
+    return Section(prop, index, Coder.CONTEXT, streams, zlib.crc32(stored), integers, len(stored)), stored
+
+
+def stored_bytes(data: bytes | memoryview, section: Section) -> memoryview:
+    """A section's bytes as they are stored.
 
     Raises:
-        DataError: the stored bytes are damaged.
+        DataError: they are damaged.
     """
     stored = memoryview(data)[section.offset : section.offset + section.stored_bytes]
     if len(stored) != section.stored_bytes or zlib.crc32(stored) != section.crc:
         raise DataError(f"section '{section.name}' is damaged (its checksum does not match): get the file again")
+    return stored
+
+
+def read_section(data: bytes | memoryview, section: Section) -> NDArray[np.uint8]:
+    """A section's bytes before coding, for every coder but CONTEXT: (raw_bytes,) uint8.
+
+    Raises:
+        DataError: the stored bytes are damaged.
+    """
+    stored = stored_bytes(data, section)
     raw: bytes | memoryview
     try:
         if section.coder == Coder.RAW:
@@ -244,7 +280,7 @@ def assemble(header: Header, coded: list[tuple[Section, bytes]]) -> list[bytes]:
     file_bytes = header_bytes + sum(len(stored) for _, stored in coded)
     fixed = _FIXED.pack(
         MAGIC,
-        VERSION,
+        header.version,
         0,
         header_bytes,
         file_bytes,
@@ -258,8 +294,9 @@ def assemble(header: Header, coded: list[tuple[Section, bytes]]) -> list[bytes]:
         header.sf_scale,
         header.sf_rotation,
         header.sf_opacity,
-        header.sf_sh,
-        bytes(16),
+        header.sf_dc,
+        bytes(8) if header.version == 1 else _FACTOR.pack(header.sf_ac),
+        bytes(8),
     )
     table = b"".join(
         _ENTRY.pack(s.kind, s.index, s.coder, s.planes, s.crc, s.raw_bytes, s.stored_bytes) for s, _ in coded
@@ -302,21 +339,29 @@ def read_header(data: bytes | memoryview, file_bytes: int) -> Header:
     if said_bytes != file_bytes:
         how = "truncated" if file_bytes < said_bytes else "followed by something else"
         raise DataError(f"{how}: the file has {file_bytes} bytes, its header says {said_bytes}")
-    if version != VERSION or flags or reserved or any(fields[18]):
+    if version == 1:
+        sf_ac = numbers[7]
+        reserved = reserved or any(fields[18])
+    else:
+        (sf_ac,) = _FACTOR.unpack(fields[18])
+    if version < 1 or flags or reserved or any(fields[19]):
         raise DataError(f"format version {version} with flags {flags} is unknown")
     if degree >= len(SH_COEFFICIENTS) or splats < 1 or depth > 52:
         raise DataError(f"the header makes no sense: {splats} splats, SH degree {degree}, octree of {depth} levels")
     if not all(math.isfinite(x) and abs(x) < 1e38 for x in numbers) or numbers[3] < 0:
         raise DataError("the header makes no sense: its root cube is not finite")
-    if not all(1e-3 <= x <= 1e9 for x in numbers[4:]):
+    if not all(1e-3 <= x <= 1e9 for x in (*numbers[4:], sf_ac)):
         raise DataError("the header makes no sense: a scale factor outside 0.001 to 1e9")
-    sections = _read_table(data, count, header_bytes, file_bytes, splats, degree)
-    origin, side, factors = (numbers[0], numbers[1], numbers[2]), numbers[3], numbers[4:8]
-    return Header(splats, degree, origin, side, depth, factors[0], factors[1], factors[2], factors[3], sections)
+    sections = _read_table(data, count, header_bytes, file_bytes, version, splats, degree)
+    origin, side = (numbers[0], numbers[1], numbers[2]), numbers[3]
+    sf_scale, sf_rotation, sf_opacity, sf_dc = numbers[4:8]
+    return Header(
+        version, splats, degree, origin, side, depth, sf_scale, sf_rotation, sf_opacity, sf_dc, sf_ac, sections
+    )
 
 
 def _read_table(
-    data: bytes | memoryview, count: int, offset: int, file_bytes: int, splats: int, degree: int
+    data: bytes | memoryview, count: int, offset: int, file_bytes: int, version: int, splats: int, degree: int
 ) -> tuple[Section, ...]:
     sections: list[Section] = []
     seen: set[tuple[int, int]] = set()
@@ -329,11 +374,18 @@ def _read_table(
         except ValueError:
             raise DataError(f"section {i} has an unknown kind ({prop}) or coder ({coder}): update potr_cl") from None
         what = f"section '{section.name}'"
-        if index >= _INDICES[section.kind] or (prop, index) in seen:
+        indices = range(index, index + (planes if coder == Coder.CONTEXT else 1))
+        if index >= _INDICES[section.kind] or any((prop, i) in seen for i in indices):
             raise DataError(f"{what} has an impossible index or stands twice")
         if section.kind == Property.SH and index >= 3 * SH_COEFFICIENTS[degree]:
             raise DataError(f"{what} does not belong to SH degree {degree}")
-        if not 1 <= planes <= 8 or (section.kind in _A_SPLAT and raw_bytes != planes * splats):
+        if coder == Coder.CONTEXT:
+            possible = version >= 2 and (index, planes) in context_groups(section.kind, degree)
+            if not possible:
+                raise DataError(f"{what} cannot hold {planes} streams of coder {coder}")
+        elif not 1 <= planes <= 8:
+            raise DataError(f"{what} holds integers of {planes} bytes")
+        if raw_bytes % planes or (section.kind in _A_SPLAT and raw_bytes != planes * splats):
             raise DataError(
                 f"{what} holds {raw_bytes} bytes, which does not fit {splats} splats of {planes} bytes each"
             )
@@ -343,7 +395,7 @@ def _read_table(
             raise DataError(f"{what} claims {raw_bytes} bytes, more than its {stored_bytes} stored bytes can hold")
         if section.kind == Property.METADATA and raw_bytes > MAX_METADATA:
             raise DataError(f"{what} is longer than {MAX_METADATA} bytes")
-        seen.add((prop, index))
+        seen.update((prop, i) for i in indices)
         sections.append(section)
         offset += stored_bytes
     if offset != file_bytes:
@@ -351,6 +403,16 @@ def _read_table(
     if (Property.OPACITY, 0) not in seen:
         raise DataError("there is no opacity section")
     return tuple(sections)
+
+
+def indices(prop: Property) -> int:
+    """Number of streams that a property can have."""
+    return _INDICES[prop]
+
+
+def is_predicted(prop: Property, index: int) -> bool:
+    """Whether coder CONTEXT stores a property's differences from the splats before."""
+    return prop == Property.SH and index == 0
 
 
 def is_signed(prop: Property) -> bool:

@@ -47,7 +47,8 @@ class OctreeStreams:
         several: uint8, bits packed with the first in the lowest bit: one a child in the order of ``occupancy``, set if
             the child holds several splats.
         multiplicities: uint64, number of splats of each leaf at ``depth`` that holds several, in Morton order.
-        tail_lengths: uint8, one a leaf with a single splat, in Morton order: levels below the one where it is alone.
+        tail_lengths: uint8, one a leaf with a single splat, in Morton order: levels below the one where it is alone; if
+            ``absolute``, the level itself, which is not reached where the splat is still in company there.
         tails: uint8, bit planes: for level 1, 2, … of the tails and axis x, y, z one plane, padded to whole bytes
             (first bit lowest), of the leaves whose tail reaches that level, longest tail first, then Morton order.
     """
@@ -60,18 +61,23 @@ class OctreeStreams:
     multiplicities: U64
     tail_lengths: U8
     tails: U8
+    absolute: bool = False
 
 
 # ---------------------------------------------------------------------------------------------------- build
 
 
-def build(means: NDArray[np.float32], tolerance: F64 | float) -> tuple[OctreeStreams, NDArray[np.int64]]:
+def build(
+    means: NDArray[np.float32], tolerance: F64 | float, absolute: bool = False
+) -> tuple[OctreeStreams, NDArray[np.int64]]:
     """Build and serialise the octree of a scene's centres.
 
     Args:
         means: (N, 3) float32 centres, world units, finite, N >= 1.
         tolerance: the largest allowed distance of a centre to its leaf's centre, world units, > 0: (N,) or one for all.
             Never taken finer than float32 can hold the coordinates themselves.
+        absolute: leaves lie at the first level at which no point of a cell is farther than that from its centre, which
+            the level of leaves nearby foretells; without, at the first whose centre happens to be near enough.
 
     Returns:
         The streams, and ``order`` (N,): the splats' indices in the order of the leaves.
@@ -106,16 +112,19 @@ def build(means: NDArray[np.float32], tolerance: F64 | float) -> tuple[OctreeStr
     occupancy, several, starts = _serialise_tree(grid, common, alone, depth)
     multiplicities = np.diff(np.append(starts, n))[~single[starts]] if not single.all() else np.empty(0, np.int64)
 
-    leaf_level = np.empty(n, np.int8)
-    for start in range(0, n, _BLOCK):
-        block = slice(start, start + _BLOCK)
-        rows = order[block]
-        leaf_level[block] = _leaf_levels(
-            [a[rows] for a in axes], low, side, [g[block] for g in grid], alone[block], depth, limit[rows]
-        )
-    tail_lengths, tails = _serialise_tails(
-        [g[single] for g in grid] if len(multiplicities) else grid, leaf_level[single], alone[single], depth
-    )
+    if absolute:
+        wanted = _levels_for(side, limit, depth)[order]
+        leaf_level = np.maximum(wanted, alone)
+    else:
+        leaf_level = np.empty(n, np.int8)
+        for start in range(0, n, _BLOCK):
+            block = slice(start, start + _BLOCK)
+            rows = order[block]
+            leaf_level[block] = _leaf_levels(
+                [a[rows] for a in axes], low, side, [g[block] for g in grid], alone[block], depth, limit[rows]
+            )
+    lengths = (leaf_level[single] - alone[single]).astype(np.uint8)
+    tails = _serialise_tails([g[single] for g in grid] if len(multiplicities) else grid, lengths, alone[single], depth)
     streams = OctreeStreams(
         origin=(low[0], low[1], low[2]),
         side=side,
@@ -123,8 +132,9 @@ def build(means: NDArray[np.float32], tolerance: F64 | float) -> tuple[OctreeStr
         occupancy=occupancy,
         several=several,
         multiplicities=multiplicities.astype(np.uint64),
-        tail_lengths=tail_lengths,
+        tail_lengths=wanted[single].astype(np.uint8) if absolute else lengths,
         tails=tails,
+        absolute=absolute,
     )
     return streams, order
 
@@ -135,6 +145,16 @@ def _depth_for(side: float, tolerance: float) -> int:
     if half_diagonal == 0 or half_diagonal < tolerance:
         return 0
     return min(DEEPEST_LEVEL, int(np.floor(np.log2(half_diagonal / tolerance) + 1e-6)) + 1)
+
+
+def _levels_for(side: float, tolerance: F64, depth: int) -> NDArray[np.int8]:
+    """:func:`_depth_for` of each tolerance."""
+    half_diagonal = side * (np.sqrt(3) / 2)
+    if half_diagonal == 0:
+        return np.zeros(len(tolerance), np.int8)
+    levels = np.floor(np.log2(half_diagonal / tolerance) + 1e-6) + 1
+    clipped: NDArray[np.int8] = np.clip(levels, 0, depth).astype(np.int8)
+    return clipped
 
 
 def _morton_words(grid: list[U64], depth: int) -> list[U64]:
@@ -249,10 +269,7 @@ def _leaf_levels(
     return level_of
 
 
-def _serialise_tails(
-    grid: list[U64], leaf_level: NDArray[np.int8], alone: NDArray[np.int8], depth: int
-) -> tuple[U8, U8]:
-    lengths = (leaf_level - alone).astype(np.uint8)
+def _serialise_tails(grid: list[U64], lengths: U8, alone: NDArray[np.int8], depth: int) -> U8:
     longest_first = np.argsort(np.uint8(255) - lengths, kind="stable")
     reach = np.cumsum(np.bincount(lengths, minlength=1)[::-1])[::-1]  # leaves whose tail has at least this length
     shift = (depth - 1 - alone).astype(np.int16)[longest_first]
@@ -264,7 +281,7 @@ def _serialise_tails(
         planes.extend(
             np.packbits(((g[:k] >> down) & np.uint64(1)).astype(np.uint8), bitorder="little") for g in sorted_grid
         )
-    return lengths, np.concatenate(planes) if planes else np.empty(0, np.uint8)
+    return np.concatenate(planes) if planes else np.empty(0, np.uint8)
 
 
 # ---------------------------------------------------------------------------------------------------- parse
@@ -317,9 +334,15 @@ def parse(streams: OctreeStreams, splats: int) -> NDArray[np.float32]:
             path = [p[level.several] for p in path]
 
     lengths = streams.tail_lengths
+    if streams.absolute:
+        alone = alone_level if is_crowded is None else alone_level[~is_crowded]
+        if len(lengths) and int(lengths.max()) > depth:
+            raise DataError(f"positions: a leaf lies below the octree's deepest level {depth}")
+        lengths = np.maximum(lengths, alone) - alone
     if is_crowded is not None:
+        of_singles = lengths
         lengths = np.zeros(leaves, np.uint8)
-        lengths[~is_crowded] = streams.tail_lengths
+        lengths[~is_crowded] = of_singles
     level_of = alone_level.astype(np.uint16) + lengths
     if leaves and int(level_of.max()) > depth:
         raise DataError(f"positions: a tail leads below the octree's deepest level {depth}")

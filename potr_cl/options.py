@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from typing import Any
 
 from potr_cl import quantize
 from potr_cl.bitstream import EntropyCoder
@@ -16,7 +17,9 @@ class EncodeOptions:
 
     Attributes:
         q: quality, 0 to 1; sets every hyper-parameter that is not given on its own.
-        lam, alpha, delta_mse_max, beta, gamma, sf_sh, sf_opacity, sf_rotation, sf_scale: replace single
+        preset: how q sets them, and the file's version: :meth:`potr_cl.quantize.HyperParameters.from_quality`. What
+            else belongs to a preset comes with :meth:`for_preset`.
+        lam, alpha, delta_mse_max, beta, gamma, sf_dc, sf_sh, sf_opacity, sf_rotation, sf_scale: replace single
             hyper-parameters (:class:`potr_cl.quantize.HyperParameters`).
         prune: remove splats; looks at views.
         iterations: of the pruning schedule.
@@ -25,6 +28,8 @@ class EncodeOptions:
         colour_model, weighting, two_pass: of the compaction (:class:`potr_cl.compaction.CompactionOptions`).
         refit: conjugate-gradient steps of the joint re-fit of the colours; 0 leaves it out. Looks at views.
         drop: mean squared error for which the re-fit gives up a coefficient; 0: none is.
+        refit_at, refit_at_steps: the parts of the pruning iterations after which colours are re-fitted too, so that
+            later ones judge by colours that have made up for what went, and the steps of each.
         count: number of splats to keep, instead of ΔMSE_MAX.
         sweep: what measuring removal effects may skip.
         background: R, G, B behind the scene in the views that pruning looks at.
@@ -34,11 +39,13 @@ class EncodeOptions:
     """
 
     q: float = 0.5
+    preset: quantize.Preset = "paper"
     lam: float | None = None
     alpha: float | None = None
     delta_mse_max: float | None = None
     beta: float | None = None
     gamma: float | None = None
+    sf_dc: float | None = None
     sf_sh: float | None = None
     sf_opacity: float | None = None
     sf_rotation: float | None = None
@@ -52,6 +59,8 @@ class EncodeOptions:
     two_pass: bool = CompactionOptions.two_pass
     refit: int = 0
     drop: float = 0.0
+    refit_at: tuple[float, ...] = ()
+    refit_at_steps: int = 3
     count: int | None = None
     sweep: SweepOptions = field(default_factory=SweepOptions)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
@@ -59,11 +68,20 @@ class EncodeOptions:
     threads: int = 0
     source_bytes: int | None = None
 
+    @staticmethod
+    def for_preset(preset: quantize.Preset, **changes: Any) -> EncodeOptions:
+        """All that a preset means, with changes: keywords are attributes."""
+        quick: dict[str, Any] = {"iterations": 12, "entropy": EntropyCoder("zstd", 9)}
+        return EncodeOptions(**{"preset": preset, **(quick if preset == "fast" else {}), **changes})
+
     @property
     def parameters(self) -> quantize.HyperParameters:
         """The hyper-parameters that result."""
-        names = ("lam", "alpha", "delta_mse_max", "beta", "gamma", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale")
-        return quantize.HyperParameters.from_quality(self.q, **{name: getattr(self, name) for name in names})
+        names = ("lam", "alpha", "delta_mse_max", "beta", "gamma")
+        factors = ("sf_dc", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale")
+        return quantize.HyperParameters.from_quality(
+            self.q, self.preset, **{name: getattr(self, name) for name in (*names, *factors)}
+        )
 
     @property
     def compaction(self) -> CompactionOptions:

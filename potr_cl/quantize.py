@@ -7,7 +7,9 @@ standard deviations, opacities after the sigmoid, unit quaternions without their
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass, fields, replace
+from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -18,8 +20,15 @@ Integers = NDArray[np.signedinteger]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
+#: "paper": the paper's steps and its file (version 1). "best": steps of equal worth, the smallest file. "fast": the
+#: same with fewer looks at the views and quick coding.
+Preset = Literal["paper", "fast", "best"]
+PRESETS: tuple[Preset, ...] = ("paper", "fast", "best")
+
 #: Added to a quantised opacity before the division: the paper's shift of the reconstruction off the bin's centre.
 OPACITY_SHIFT = 0.25
+#: What the smallest logit stands for in version 2: such an opacity shows nowhere. And the largest told apart.
+LEAST_LOGIT, _LARGEST_LOGIT = -8.0, 12.0
 #: A standard deviation that rounds to 0 comes back as this part of a step: its logarithm must stay finite.
 ZERO_SCALE = 0.25
 #: Integers beyond this are not exact in float64; no sane scene comes near.
@@ -28,48 +37,55 @@ _LARGEST = 2.0**53
 
 @dataclass(frozen=True)
 class HyperParameters:
-    """What one quality q sets (paper table "Hyperparameters as functions of q"); each can be replaced on its own.
+    """What one quality q sets; each can be replaced on its own.
 
     Attributes:
+        version: of the file format, 1 or 2: how integers are made of values (docs/format.md).
         lam: λ, how strongly SH compaction pulls AC coefficients to zero, pixels squared.
         alpha: two SH columns whose cosine exceeds it count as parallel.
         delta_mse_max: ΔMSE_MAX: a splat may go if its removal changes the mean squared error by less.
-        beta: allowed distance of a centre to its leaf's centre, as a part of the distance to the nearest camera.
+        beta: allowed distance of a centre to its leaf's centre: version 1: as a part of the distance to the nearest
+            camera; version 2: as a part of a typical splat's size at that distance.
         gamma: the least such distance, world units.
-        sf_sh, sf_opacity, sf_rotation, sf_scale: scale factors; a quantiser step is 1 / SF.
+        sf_dc, sf_sh: scale factors of constant and of all other SH coefficients; a quantiser step is 1 / SF.
+        sf_opacity: of opacities; version 2: of their logits.
+        sf_rotation: of quaternions; version 2: divided by the root of the splat's largest standard deviation in steps.
+        sf_scale: of standard deviations, world units; version 2: steps in a typical splat's size.
     """
 
+    version: int
     lam: float
     alpha: float
     delta_mse_max: float
     beta: float
     gamma: float
     sf_sh: float
+    sf_dc: float
     sf_opacity: float
     sf_rotation: float
     sf_scale: float
 
     @staticmethod
-    def from_quality(q: float, **replaced: float | None) -> HyperParameters:
-        """The paper's values for quality q in [0, 1]; keywords that are not None replace single ones.
+    def from_quality(q: float, preset: Preset = "paper", **replaced: float | None) -> HyperParameters:
+        """The values for quality q in [0, 1]; keywords that are not None replace single ones.
+
+        "paper" is the paper's table "Hyperparameters as functions of q"; docs/method.md tells where the others come
+        from. Where only ``sf_sh`` is replaced, ``sf_dc`` follows it in "paper", which has one for both.
 
         Raises:
-            UsageError: q or a replaced value is out of range.
+            UsageError: q, the preset or a replaced value is out of range.
         """
         if not 0 <= q <= 1:
             raise UsageError(f"the quality q is {q:g}, it must lie between 0 and 1")
-        values = HyperParameters(
-            lam=10**-q,
-            alpha=1 / (1 + math.exp(-3 * q)),
-            delta_mse_max=10 ** (-8.8 - 2 * q),
-            beta=1.4e-4 * q,
-            gamma=5.0 * 10 ** (-3 - 5 * q),
-            sf_sh=1 + 100 * q,
-            sf_opacity=1 + 200 * q,
-            sf_rotation=1 + 400 * q,
-            sf_scale=1 + 4000 * q,
-        )
-        values = replace(values, **{k: float(v) for k, v in replaced.items() if v is not None})
+        if preset not in PRESETS:
+            raise UsageError(f"preset '{preset}' is unknown: choose one of {', '.join(PRESETS)}")
+        given = {k: float(v) for k, v in replaced.items() if v is not None}
+        if preset == "paper":
+            values = _paper(q)
+            given.setdefault("sf_dc", given.get("sf_sh", values.sf_dc))
+        else:
+            values = _balanced(q)
+        values = replace(values, **given)  # type: ignore[arg-type]
         for field in fields(values):
             value = getattr(values, field.name)
             low, high = (1e-30, 1e30) if field.name == "gamma" else (0.0, 1e30)
@@ -82,13 +98,46 @@ class HyperParameters:
         return values
 
 
-def _to_steps(values: F64, scale_factor: float, what: str) -> Integers:
+def _paper(q: float) -> HyperParameters:
+    return HyperParameters(
+        version=1,
+        lam=10**-q,
+        alpha=1 / (1 + math.exp(-3 * q)),
+        delta_mse_max=10 ** (-8.8 - 2 * q),
+        beta=1.4e-4 * q,
+        gamma=5.0 * 10 ** (-3 - 5 * q),
+        sf_dc=1 + 100 * q,
+        sf_sh=1 + 100 * q,
+        sf_opacity=1 + 200 * q,
+        sf_rotation=1 + 400 * q,
+        sf_scale=1 + 4000 * q,
+    )
+
+
+def _balanced(q: float) -> HyperParameters:
+    """Steps at which a bit more buys the same everywhere; all errors grow with ΔMSE_MAX, so steps with its root."""
+    paper = _paper(q)
+    finer = 10 ** (q - 0.5)
+    return replace(
+        paper,
+        version=2,
+        beta=0.04 / finer,
+        gamma=1e-30,
+        sf_dc=31 * finer,
+        sf_sh=24 * finer,
+        sf_opacity=5.5 * finer,
+        sf_rotation=9.5 * finer,
+        sf_scale=11 * finer,
+    )
+
+
+def _to_steps(values: F64, scale_factor: float | F32, what: str) -> Integers:
     """⌊½ + x · SF⌋ in the smallest of the signed integer types that holds it."""
     steps = np.floor(0.5 + values * scale_factor)
     largest = float(np.abs(steps).max(initial=0))
     if not largest < _LARGEST:
         raise DataError(
-            f"a {what} of {largest / scale_factor:.3g} is too large to quantise: remove that splat or lower SF"
+            f"a {what} of {np.abs(values).max():.3g} is too large to quantise: remove that splat or lower SF"
         )
     for dtype in (np.int16, np.int32):
         if largest <= np.iinfo(dtype).max:
@@ -125,6 +174,17 @@ def dequantize_opacities(steps: NDArray[np.integer], sf_opacity: float) -> F32:
     opacity = (steps.astype(np.float32) + np.float32(OPACITY_SHIFT)) / np.float32(sf_opacity)
     opacity = np.minimum(opacity, np.float32(1 - 2.0**-24))
     logits: F32 = np.log(opacity / (1 - opacity), dtype=np.float32)
+    return logits
+
+
+def quantize_logits(logits: F64, sf_opacity: float) -> Integers:
+    """Logits to steps of 1 / SF above the least one (format version 2)."""
+    return _to_steps(np.clip(logits, LEAST_LOGIT, _LARGEST_LOGIT) - LEAST_LOGIT, sf_opacity, "opacity")
+
+
+def dequantize_logits(steps: NDArray[np.integer], sf_opacity: float) -> F32:
+    """Steps to logits (format version 2)."""
+    logits: F32 = steps.astype(np.float32) / np.float32(sf_opacity) + np.float32(LEAST_LOGIT)
     return logits
 
 
@@ -194,16 +254,27 @@ def canonical_rotations(quaternions: F32, log_scales: F32) -> tuple[F64, F32]:
     return product, np.take_along_axis(log_scales, _PERMUTATIONS[best], axis=1)
 
 
-def quantize_rotations(imaginary: F64, sf_rotation: float) -> Integers:
-    """One imaginary part of unit quaternions to steps of 1 / SF."""
-    return _to_steps(imaginary, sf_rotation, "quaternion component")
+def rotation_factors(scale_steps: Sequence[NDArray[np.integer]], sf_rotation: float) -> F32:
+    """(N,) scale factor of each splat's rotation in format version 2: SF times the root of its largest scale in steps.
+
+    Long splats need their direction more exactly; the root is the best power by measurement (docs/benchmarks.md).
+    """
+    largest = np.maximum(np.maximum(scale_steps[0], scale_steps[1]), scale_steps[2])
+    factors: F32 = np.sqrt(np.maximum(largest, 1).astype(np.float32)) * np.float32(sf_rotation)
+    return factors
 
 
-def dequantize_rotations(steps: list[NDArray[np.integer]], sf_rotation: float, out: F32) -> None:
+def quantize_rotations(imaginary: F64, factor: float | F32) -> Integers:
+    """One imaginary part of unit quaternions to steps of 1 / factor, which may be one a splat."""
+    return _to_steps(imaginary, factor, "quaternion component")
+
+
+def dequantize_rotations(steps: list[NDArray[np.integer]], factor: float | F32, out: F32) -> None:
     """Steps of x, y, z to unit quaternions w, x, y, z in ``out`` (N, 4); w ≥ 0 is computed from the rest."""
     rest = np.ones(len(out), np.float32)
+    factor = np.asarray(factor, np.float32)
     for axis, step in enumerate(steps, start=1):
-        part = step.astype(np.float32) / np.float32(sf_rotation)
+        part = step.astype(np.float32) / factor
         out[:, axis] = part
         rest -= part * part
     out[:, 0] = np.sqrt(np.maximum(rest, 0))

@@ -392,7 +392,7 @@ class _Search:
 def _with_steps(options: EncodeOptions, q: float) -> EncodeOptions:
     """The options with the quantiser's parameters of another q, as far as they are not given on their own."""
     parameters = dataclasses.replace(options, q=q).parameters
-    names = {field.name for field in dataclasses.fields(parameters)} - {"lam", "alpha", "delta_mse_max"}
+    names = {field.name for field in dataclasses.fields(parameters)} - {"version", "lam", "alpha", "delta_mse_max"}
     return dataclasses.replace(options, **{name: getattr(parameters, name) for name in names})
 
 

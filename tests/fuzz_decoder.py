@@ -36,6 +36,8 @@ def seeds() -> list[bytes]:
         encode(coincident, None, dataclasses.replace(KEEP, q=0.3, entropy=EntropyCoder("npz"))),
         encode(random_scene(400, 0, seed=3), None, dataclasses.replace(KEEP, q=1.0, entropy=EntropyCoder("zstd", 1))),
         encode(random_scene(1, 0, seed=4), None, KEEP),
+        encode(random_scene(1200, 2, seed=5), None, dataclasses.replace(KEEP, preset="best")),
+        encode(random_scene(200, 1, seed=6), ring_of_cameras(6), dataclasses.replace(KEEP, preset="fast")),
     ]
     return [b"".join(e.pieces) for e in encoded]
 
@@ -75,7 +77,8 @@ def mutate(data: bytes, rng: np.random.Generator) -> bytes:
                 (40, 8),
                 (64, 8),
                 (72, 8),
-            ][rng.integers(11)]
+                (104, 8),
+            ][rng.integers(12)]
             out[at : at + size] = interesting(rng, size).to_bytes(size, "little")
         elif kind == 4 and len(out) > HEADER + ENTRY:  # a field of a table entry
             sections = max(1, struct.unpack_from("<H", out, 34)[0])

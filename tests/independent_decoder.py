@@ -36,12 +36,14 @@ ONE_INTEGER_A_SPLAT = (SCALE, ROTATION, OPACITY, SH)
 STORED = 0
 ZSTANDARD = 1
 ZLIB = 2
-LARGEST_EXPANSION = {STORED: 1, ZSTANDARD: 2**15, ZLIB: 1032}
+CONTEXT = 3
+LARGEST_EXPANSION = {STORED: 1, ZSTANDARD: 2**15, ZLIB: 1032, CONTEXT: 2**15}
 
 
 class Header(NamedTuple):
     """The numbers of the fixed part of the header that decoding needs."""
 
+    version: int
     size: int
     splats: int
     coefficients: int
@@ -50,13 +52,15 @@ class Header(NamedTuple):
     origin: tuple[float, float, float]
     edge: float
     scale_factors: dict[int, float]
+    sh_factors: tuple[float, float]
 
 
 class Section(NamedTuple):
-    """One section after undoing its coder."""
+    """One section after undoing its coder: its bytes, or with the context coder the integers of its streams."""
 
     planes: int
     raw: bytes
+    streams: list[list[int]] | None = None
 
 
 @dataclass
@@ -77,6 +81,17 @@ class Cell:
 
 
 Sections = dict[tuple[int, int], Section]
+
+#: Property, first index and number of streams of the sections that the context coder can have.
+CONTEXT_SECTIONS = (
+    (SCALE, 0, 3),
+    (ROTATION, 0, 3),
+    (OPACITY, 0, 1),
+    (SH, 0, 3),
+    (SH, 3, 9),
+    (SH, 12, 15),
+    (SH, 27, 21),
+)
 
 
 def decode(data: bytes) -> dict[str, Any]:
@@ -110,7 +125,7 @@ def read_header(data: bytes) -> Header:
     (edge,) = struct.unpack_from("<d", data, 64)
     scale_factors = struct.unpack_from("<4d", data, 72)
 
-    check(version == 1, f"version {version} is not supported, only 1")
+    check(version in (1, 2), f"version {version} is not supported, only 1 and 2")
     check(file_size == len(data), f"the file has {len(data)} bytes, but its header says {file_size}")
     check(header_size == 124 + ENTRY_SIZE * section_count, "the header's size does not fit the number of sections")
     check(header_size <= len(data), "the file ends within the header")
@@ -119,16 +134,22 @@ def read_header(data: bytes) -> Header:
 
     check(flags == 0, f"unknown flags {flags}")
     check(data[36:40] == bytes(4), "bytes 36 to 39 are not zero")
-    check(data[104:120] == bytes(16), "the reserved bytes 104 to 119 are not zero")
+    ac_factor = scale_factors[3]
+    if version == 1:
+        check(data[104:112] == bytes(8), "the reserved bytes 104 to 111 are not zero")
+    else:
+        (ac_factor,) = struct.unpack_from("<d", data, 104)
+    check(data[112:120] == bytes(8), "the reserved bytes 112 to 119 are not zero")
     check(splats >= 1, "the file holds no splats")
     check(degree <= 3, f"SH degree {degree} is above 3")
     check(deepest <= 52, f"deepest octree level {deepest} is above 52")
     check(all(math.isfinite(value) for value in origin), "the origin of the root cube is not finite")
     check(math.isfinite(edge) and edge >= 0, "the edge of the root cube is negative or not finite")
-    for factor in scale_factors:
+    for factor in (*scale_factors, ac_factor):
         check(0.001 <= factor <= 1e9, f"scale factor {factor} is not within 0.001 to 10^9")
 
     return Header(
+        version=version,
         size=header_size,
         splats=splats,
         coefficients=(degree + 1) ** 2,
@@ -136,7 +157,8 @@ def read_header(data: bytes) -> Header:
         sections=section_count,
         origin=origin,
         edge=edge,
-        scale_factors=dict(zip((SCALE, ROTATION, OPACITY, SH), scale_factors, strict=True)),
+        scale_factors=dict(zip((SCALE, ROTATION, OPACITY), scale_factors[:3], strict=True)),
+        sh_factors=(scale_factors[3], ac_factor),
     )
 
 
@@ -155,6 +177,7 @@ def read_sections(data: bytes, header: Header) -> Sections:
         SH: 3 * header.coefficients,
     }
     sections: Sections = {}
+    coded: dict[tuple[int, int], bytes] = {}
     start = header.size
     for number in range(header.sections):
         entry = struct.unpack_from("<BBBBIQQ", data, FIXED_HEADER + ENTRY_SIZE * number)
@@ -164,8 +187,13 @@ def read_sections(data: bytes, header: Header) -> Sections:
         check(prop in number_of_indices, f"{name}: unknown property")
         check(index < number_of_indices[prop], f"{name}: unknown index")
         check((prop, index) not in sections, f"{name} stands twice")
-        check(coder in LARGEST_EXPANSION, f"{name}: unknown coder {coder}")
-        check(1 <= planes <= 8, f"{name}: {planes} planes")
+        check(coder in LARGEST_EXPANSION and (coder != CONTEXT or header.version == 2), f"{name}: coder {coder}")
+        if coder == CONTEXT:
+            check((prop, index, planes) in CONTEXT_SECTIONS, f"{name}: the context coder has no such section")
+            check(index + planes <= number_of_indices[prop], f"{name}: more streams than the property has")
+            check(not any((prop, index + k) in sections for k in range(planes)), f"{name} stands twice")
+        else:
+            check(1 <= planes <= 8, f"{name}: {planes} planes")
         if prop in BYTE_STREAMS:
             check(planes == 1, f"{name}: {planes} planes instead of 1")
         if prop in ONE_INTEGER_A_SPLAT:
@@ -178,12 +206,35 @@ def read_sections(data: bytes, header: Header) -> Sections:
         stored = data[start : start + stored_size]
         start += stored_size
         check(zlib.crc32(stored) == checksum, f"{name}: wrong checksum")
-        sections[prop, index] = Section(planes, undo_coder(coder, stored, raw_size, name))
+        if coder == CONTEXT:
+            for k in range(planes):
+                sections[prop, index + k] = Section(planes, b"", [])
+            coded[prop, index] = stored
+        else:
+            sections[prop, index] = Section(planes, undo_coder(coder, stored, raw_size, name))
 
     check(start == len(data), "the sections do not fill the file")
     # It also bounds the number of splats by the size of the file, before anything is made for each splat.
     check((OPACITY, 0) in sections, "the opacity section is absent")
+    undo_context_coder(coded, sections, header.splats)
     return sections
+
+
+def undo_context_coder(coded: dict[tuple[int, int], bytes], sections: Sections, splats: int) -> None:
+    """Decode the sections of the context coder; AC coefficients in the order of their indices."""
+    ac_history = History(splats)
+    for prop, index in sorted(coded):
+        history = ac_history if prop == SH and index > 0 else History(splats)
+        streams = decode_context_section(
+            coded[prop, index],
+            splats,
+            count=sections[prop, index].planes,
+            signed=prop in (ROTATION, SH),
+            predicted=prop == SH and index == 0,
+            history=history,
+        )
+        for k, stream in enumerate(streams):
+            sections[prop, index + k] = Section(0, b"", [stream])
 
 
 def undo_coder(coder: int, stored: bytes, raw_size: int, name: str) -> bytes:
@@ -268,11 +319,16 @@ def unsigned_stream(sections: Sections, prop: int, index: int, splats: int) -> l
     """Return one unsigned integer a splat."""
     if (prop, index) not in sections:
         return [0] * splats
+    streams = sections[prop, index].streams
+    if streams is not None:
+        return streams[0]
     return unsigned_integers(sections[prop, index])
 
 
 def signed_stream(sections: Sections, prop: int, index: int, splats: int) -> list[int]:
     """Return one signed integer a splat."""
+    if (prop, index) in sections and sections[prop, index].streams is not None:
+        return unsigned_stream(sections, prop, index, splats)
     values = []
     for u in unsigned_stream(sections, prop, index, splats):
         if u % 2 == 0:
@@ -296,6 +352,163 @@ def check_padding(data: bytes, bits: int, name: str) -> None:
     """Check that the bits of the last byte after so many bits are zero."""
     for position in range(bits, 8 * len(data)):
         check(get_bit(data, position) == 0, f"{name}: a padding bit is not zero")
+
+
+# Context coder
+
+
+class History:
+    """The sizes of earlier streams: sums by channel, and of the channels before of the same coefficient."""
+
+    def __init__(self, splats: int) -> None:
+        self.sums = [[0] * splats for _ in range(3)]
+        self.same: list[list[int]] = []
+
+    def add(self, sizes: list[int]) -> None:
+        """Take in the sizes of the next stream."""
+        self.same.append(sizes)
+        if len(self.same) == 3:
+            for channel in range(3):
+                self.sums[channel] = [a + b for a, b in zip(self.sums[channel], self.same[channel], strict=True)]
+            self.same = []
+
+
+class Model(NamedTuple):
+    """The contexts of one channel: thresholds of the expected size, and a row of frequencies for each context."""
+
+    thresholds: list[int]
+    frequencies: list[list[int]]
+
+
+def decode_context_section(
+    stored: bytes, splats: int, count: int, signed: bool, predicted: bool, history: History
+) -> list[list[int]]:
+    """Return the integers of the streams of one section."""
+    check(len(stored) >= 8, "a context section is shorter than its two sizes")
+    description_size, bits_size = struct.unpack_from("<II", stored, 0)
+    lanes = min(-(-splats // 256), 8192)
+    steps = -(-splats // lanes)
+    bits_start = 8 + description_size
+    states_start = bits_start + bits_size
+    words_start = states_start + 4 * lanes
+    check(words_start <= len(stored), "a context section is shorter than its parts")
+    check((len(stored) - words_start) % 2 == 0, "a context section ends within a word")
+
+    description = stored[8:bits_start]
+    size = zstandard.frame_content_size(description)
+    check(0 <= size <= 2**20, "impossible size of a description")
+    weights, models = read_models(undo_zstandard(description, size, "description of contexts"), count)
+    extra = stored[bits_start:states_start]
+    states = list(struct.unpack_from(f"<{lanes}I", stored, states_start))
+    check(all(state >= 65536 for state in states), "a state is below 65536")
+    words = struct.unpack(f"<{(len(stored) - words_start) // 2}H", stored[words_start:])
+    words_read = 0
+    extra_read = 0
+
+    streams = []
+    for number in range(count):
+        model = models[number % 3]
+        w = weights[number]
+        tokens = [0] * splats
+        recent = [0] * lanes
+        for step in range(steps):
+            for lane in range(lanes):
+                n = lane * steps + step
+                if n >= splats:
+                    continue
+                total = w[6] + w[5] * recent[lane]
+                for channel in range(3):
+                    total += w[channel] * history.sums[channel][n]
+                for channel in range(len(history.same)):
+                    total += w[3 + channel] * history.same[channel][n]
+                expected = min(max(total >> 8, 0), 255)
+                row = model.frequencies[sum(threshold <= expected for threshold in model.thresholds)]
+
+                residue = states[lane] % 4096
+                token = 0
+                below = 0
+                while below + row[token] <= residue:
+                    below += row[token]
+                    token += 1
+                states[lane] = row[token] * (states[lane] // 4096) + residue - below
+                if states[lane] < 65536:
+                    check(words_read < len(words), "a context section has too few words")
+                    states[lane] = states[lane] * 65536 + words[words_read]
+                    words_read += 1
+                tokens[n] = token
+                recent[lane] += 2 * token_size(token, signed) - recent[lane] // 4
+
+        values = [least_of_token(token) for token in tokens]
+        for b in range(max(extra_bits(token) for token in tokens)):
+            for step in range(steps):
+                for lane in range(lanes):
+                    n = lane * steps + step
+                    if n < splats and extra_bits(tokens[n]) > b:
+                        check(extra_read < 8 * len(extra), "a context section has too few extra bits")
+                        values[n] += get_bit(extra, extra_read) << b
+                        extra_read += 1
+        if signed:
+            values = [u // 2 if u % 2 == 0 else -(u + 1) // 2 for u in values]
+        if predicted:
+            for n in range(splats):
+                place = n % steps
+                before = [values[n - k] for k in range(1, 5) if place - k >= 0]
+                values[n] += (sum(before) + 2) // 4
+        history.add([token_size(token, signed) for token in tokens])
+        streams.append(values)
+    check(words_read == len(words), "a context section has too many words")
+    check(all(state == 65536 for state in states), "a lane does not end where it began")
+    check(bytes_for_bits(extra_read) == len(extra), "a context section has too many extra bits")
+    check_padding(extra, extra_read, "extra bits")
+    return streams
+
+
+def read_models(raw: bytes, count: int) -> tuple[list[list[int]], list[Model]]:
+    """Return the seven weights of each stream, and the models of the channels."""
+    check(len(raw) >= 14 * count, "a description is too short")
+    weights = [list(struct.unpack_from("<7h", raw, 14 * number)) for number in range(count)]
+    at = 14 * count
+    models = []
+    for _ in range(min(3, count)):
+        check(len(raw) >= at + 2, "a description is too short")
+        contexts, alphabet = raw[at], raw[at + 1]
+        at += 2
+        check(1 <= contexts <= 32 and 1 <= alphabet <= 252, "impossible contexts")
+        check(len(raw) >= at + contexts - 1 + 2 * contexts * alphabet, "a description is too short")
+        thresholds = list(raw[at : at + contexts - 1])
+        at += contexts - 1
+        check(all(a < b for a, b in zip([0, *thresholds], thresholds, strict=False)), "thresholds do not rise")
+        rows = []
+        for context in range(contexts):
+            row = []
+            for token in range(alphabet):
+                low = raw[at + token * contexts + context]
+                high = raw[at + contexts * alphabet + token * contexts + context]
+                row.append(low + 256 * high)
+            check(sum(row) == 4096, "frequencies do not add up")
+            rows.append(row)
+        at += 2 * contexts * alphabet
+        models.append(Model(thresholds, rows))
+    check(at == len(raw), "a description is too long")
+    return weights, models
+
+
+def extra_bits(token: int) -> int:
+    """Return how many bits are stored beside a token."""
+    return 0 if token < 128 else 5 + (token - 128) // 4
+
+
+def least_of_token(token: int) -> int:
+    """Return the least integer of a token."""
+    return token if token < 128 else (4 + token % 4) << extra_bits(token)
+
+
+def token_size(token: int, signed: bool) -> int:
+    """Return the size of a token's integers."""
+    magnitude = least_of_token(token)
+    if signed:
+        magnitude = (magnitude + 1) // 2
+    return math.floor(16 * math.log2(1 + magnitude) + 0.5)
 
 
 # Positions
@@ -373,9 +586,12 @@ def collect_leaves(cell: Cell, leaves: list[Cell]) -> None:
 
 def follow_tails(sections: Sections, header: Header, lone: list[Cell]) -> None:
     """Move each lone splat's leaf down to the cell where its tail ends."""
-    lengths = raw_bytes(sections, TAIL_LENGTH)
+    lengths = list(raw_bytes(sections, TAIL_LENGTH))
     tail = raw_bytes(sections, TAIL)
     check(len(lengths) == len(lone), f"tail length has {len(lengths)} bytes for {len(lone)} lone splats")
+    if header.version == 2:
+        check(max(lengths, default=0) <= header.deepest, "a leaf's level is below the deepest one")
+        lengths = [max(level - leaf.level, 0) for level, leaf in zip(lengths, lone, strict=True)]
     for leaf, length in zip(lone, lengths, strict=True):
         check(leaf.level + length <= header.deepest, "a tail goes below the deepest level")
 
@@ -424,9 +640,13 @@ def decode_quaternions(sections: Sections, header: Header) -> np.ndarray:
     """Return the rotations as w x y z."""
     factor = header.scale_factors[ROTATION]
     streams = [signed_stream(sections, ROTATION, axis, header.splats) for axis in range(3)]
+    scales = [unsigned_stream(sections, SCALE, axis, header.splats) for axis in range(3)]
     quaternions = np.zeros((header.splats, 4), dtype=np.float64)
     for n in range(header.splats):
-        x, y, z = (stream[n] / factor for stream in streams)
+        own_factor = factor
+        if header.version == 2:
+            own_factor = factor * math.sqrt(max(1, *(scale[n] for scale in scales)))
+        x, y, z = (stream[n] / own_factor for stream in streams)
         w = math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
         quaternions[n] = (w, x, y, z)
     return quaternions
@@ -437,17 +657,21 @@ def decode_opacities(sections: Sections, header: Header) -> np.ndarray:
     factor = header.scale_factors[OPACITY]
     opacities = np.zeros(header.splats, dtype=np.float64)
     for n, value in enumerate(unsigned_stream(sections, OPACITY, 0, header.splats)):
-        opacities[n] = min(1.0, (value + 0.25) / factor)
+        if header.version == 1:
+            opacities[n] = min(1.0, (value + 0.25) / factor)
+        else:
+            opacities[n] = 1 / (1 + math.exp(-(value / factor - 8)))
     return opacities
 
 
 def decode_sh(sections: Sections, header: Header) -> np.ndarray:
     """Return the spherical harmonics coefficients as RGB."""
-    factor = header.scale_factors[SH]
     sh = np.zeros((header.splats, header.coefficients, 3), dtype=np.float64)
     for coefficient in range(header.coefficients):
+        factor = header.sh_factors[0 if coefficient == 0 else 1]
         streams = [signed_stream(sections, SH, 3 * coefficient + channel, header.splats) for channel in range(3)]
-        if coefficient == 0:
+        context_coded = (SH, 0) in sections and sections[SH, 0].streams is not None
+        if coefficient == 0 and not context_coded:
             streams = [running_sums(stream) for stream in streams]
         for n in range(header.splats):
             luma, orange, green = (stream[n] for stream in streams)

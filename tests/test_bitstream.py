@@ -63,8 +63,8 @@ def test_unknown_coder(bad):
         EntropyCoder(**bad)
 
 
-def small_file(splats=4):
-    header = Header(splats, 0, (0.0, 0.0, 0.0), 1.0, 3, 10.0, 10.0, 10.0, 10.0)
+def small_file(splats=4, version=1):
+    header = Header(version, splats, 0, (0.0, 0.0, 0.0), 1.0, 3, 10.0, 10.0, 10.0, 10.0, 11.0)
     coder = EntropyCoder("zstd", 3)
     coded = [
         coder.section(Property.OPACITY, 0, bytes(range(splats)), 1),
@@ -93,6 +93,39 @@ def test_header_roundtrip():
     assert (header.splats, header.sh_degree, header.depth, header.side) == (4, 0, 3, 1.0)
     assert [s.kind for s in header.sections] == [Property.OPACITY, Property.METADATA]
     assert header.find(Property.SCALE) is None
+    assert (header.sf_dc, header.sf_ac) == (10.0, 10.0)  # version 1 has one factor for both
+
+
+def test_header_roundtrip_of_version_2():
+    data = small_file(version=2)
+    header = bitstream.read_header(data, len(data))
+    assert (header.version, header.sf_dc, header.sf_ac) == (2, 10.0, 11.0)
+
+
+@pytest.mark.parametrize(
+    ("offset", "form", "value"),
+    [
+        (122, "<B", 3),  # opacity of coder 3, which has one stream of four integers: possible, so the raw size lies
+        (104, "<d", 0.0),
+        (104, "<d", float("nan")),
+        (112, "<B", 1),
+    ],
+)
+def test_lies_in_the_header_of_version_2(offset, form, value):
+    data = changed(small_file(version=2), offset, form, value)
+    if offset == 122:
+        data = changed(data, 128, "<Q", 5)
+    with pytest.raises(DataError):
+        bitstream.read_header(data, len(data))
+
+
+@pytest.mark.parametrize(("prop", "index", "streams"), [(18, 0, 2), (16, 0, 2), (19, 3, 9), (5, 0, 1), (0, 0, 1)])
+def test_sections_that_the_context_coder_has_not(prop, index, streams):
+    data = small_file(version=2)
+    for offset, value in [(144, prop), (145, index), (146, Coder.CONTEXT), (147, streams)]:
+        data = changed(data, offset, "<B", value)
+    with pytest.raises(DataError):
+        bitstream.read_header(changed(data, 152, "<Q", 4 * streams), len(data))
 
 
 LIES = {
@@ -103,7 +136,9 @@ LIES = {
     "half a header": (lambda d: d[:130], "truncated"),
     "cut": (lambda d: d[:-1], "truncated"),
     "longer": (lambda d: d + b"x", "followed by"),
-    "future version": (lambda d: changed(d, 8, "<H", 2), "update potr_cl"),
+    "future version": (lambda d: changed(d, 8, "<H", 3), "update potr_cl"),
+    "version 2 with version 1's reserved bytes": (lambda d: changed(d, 8, "<H", 2), "scale factor"),
+    "coder of version 2": (lambda d: changed(d, 122, "<B", 3), "coder 3"),
     "version 0": (lambda d: changed(d, 8, "<H", 0), "unknown"),
     "flags": (lambda d: changed(d, 10, "<H", 1), "unknown"),
     "header size": (lambda d: changed(d, 12, "<I", 4000), "damaged"),
@@ -123,7 +158,7 @@ LIES = {
     "unknown coder": (lambda d: changed(d, 122, "<B", 9), "unknown kind"),
     "index": (lambda d: changed(d, 121, "<B", 1), "impossible index"),
     "twice": (lambda d: changed(d, 144, "<B", 18), "impossible index"),
-    "planes": (lambda d: changed(d, 123, "<B", 9), "4 splats of 9 bytes"),
+    "planes": (lambda d: changed(d, 123, "<B", 9), "integers of 9 bytes"),
     "raw size of a stream": (lambda d: changed(d, 128, "<Q", 2**50), "4 splats of 1 bytes"),
     "raw size of metadata": (lambda d: changed(d, 152, "<Q", 2**50), "more than its"),
     "stored size": (lambda d: changed(d, 136, "<Q", 2**50), "beyond the end"),

@@ -13,7 +13,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from potr_cl import quantize
-from potr_cl.bitstream import EntropyCoder, Property
+from potr_cl.bitstream import Coder, EntropyCoder, Property
 from potr_cl.cameras import camera_centres, train_views
 from potr_cl.decoder import PotrFile, decode
 from potr_cl.encoder import encode
@@ -61,6 +61,70 @@ def check_within_steps(source: Scene, decoded: Scene, order, parameters, toleran
             assert (np.abs(w - g) <= 0.5 / parameters.sf_sh + 1e-6 * size).all()
 
 
+def check_within_balanced_steps(source: Scene, data: bytes, order, tolerance):
+    """The same for version 2: steps as the header and the decoded scales say."""
+    header, decoded, original = PotrFile.from_bytes(data).header, decode(data), source.subset(order)
+    assert header.version == 2
+
+    rounding = np.abs(original.means.astype(np.float64)).max(axis=1) * 2.0**-23
+    distance = np.linalg.norm(decoded.means.astype(np.float64) - original.means, axis=1)
+    assert (distance <= np.maximum(tolerance, rounding) + rounding).all()
+
+    imaginary, log_scales = quantize.canonical_rotations(original.quaternions, original.log_scales)
+    scales, scales_back = np.exp(log_scales.astype(np.float64)), np.exp(decoded.log_scales.astype(np.float64))
+    assert (np.abs(scales_back - scales) <= 0.5 / header.sf_scale + 1e-5 * scales).all()
+    steps = np.round(scales_back * header.sf_scale)
+    factor = header.sf_rotation * np.sqrt(np.maximum(steps.max(axis=1, keepdims=True), 1))
+    ball = (steps.max(axis=1) == steps.min(axis=1))[:, None]
+    assert ((np.abs(decoded.quaternions[:, 1:] - imaginary) <= 0.5 / factor + 1e-5) | ball).all()
+
+    logits = np.clip(original.opacity_logits, -8, 12)
+    assert (np.abs(decoded.opacity_logits - logits) <= 0.5 / header.sf_opacity + 1e-5).all()
+    for m in range(source.sh.shape[1]):
+        factor = header.sf_dc if m == 0 else header.sf_ac
+        wanted = quantize.to_ycocg(original.sh[:, m].astype(np.float64))
+        got = quantize.to_ycocg(decoded.sh[:, m].astype(np.float64))
+        size = np.abs(original.sh[:, m].astype(np.float64)).max(axis=1) + 1
+        for w, g in zip(wanted, got, strict=True):
+            assert (np.abs(w - g) <= 0.5 / factor + 1e-6 * size).all()
+
+
+def typical_size(scene: Scene) -> float:
+    return float(np.median(np.exp(scene.log_scales.max(axis=1).astype(np.float64))))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("entropy", [FAST, EntropyCoder("npz"), EntropyCoder("context")])
+@pytest.mark.parametrize("q", [0.0, 0.5, 1.0])
+def test_within_balanced_steps(degree, entropy, q):
+    scene = random_scene(1500, degree, seed=degree)
+    options = dataclasses.replace(KEEP, preset="best", q=q, entropy=entropy)
+    encoded = encode(scene, options=options)
+    data = joined(encoded)
+    context = any(s.coder == Coder.CONTEXT for s in PotrFile.from_bytes(data).header.sections)
+    assert context == (entropy.name == "context")
+    check_within_balanced_steps(scene, data, encoded.order, options.parameters.beta * typical_size(scene))
+
+
+def test_balanced_steps_do_not_depend_on_the_unit_of_length():
+    scene = random_scene(1500, 1)
+    millimetres = dataclasses.replace(
+        scene, means=scene.means * np.float32(1024), log_scales=scene.log_scales + np.float32(np.log(1024))
+    )
+    options = dataclasses.replace(KEEP, preset="best")
+    sizes = [encode(s, options=options).nbytes for s in (scene, millimetres)]
+    assert abs(sizes[0] - sizes[1]) < 0.002 * sizes[0]
+    again = decode(joined(encode(millimetres, options=options)))
+    assert np.abs(again.log_scales.max() - millimetres.log_scales.max()) < 0.1
+
+
+def test_version_1_has_no_context_coder():
+    data = joined(encode(random_scene(200), options=dataclasses.replace(KEEP, entropy=EntropyCoder("context"))))
+    file = PotrFile.from_bytes(data)
+    assert file.header.version == 1
+    assert all(s.coder != Coder.CONTEXT for s in file.header.sections)
+
+
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
 @pytest.mark.parametrize("entropy", [FAST, EntropyCoder("npz")])
 @pytest.mark.parametrize("q", [0.0, 0.5, 1.0])
@@ -104,8 +168,8 @@ EXTREME = st.one_of(st.floats(-80, 14, width=32), st.sampled_from([0.0, -80.0, 1
 
 
 @settings(max_examples=150, deadline=None)
-@given(st.data(), st.integers(0, 3), st.integers(1, 30), st.floats(0, 1))
-def test_any_scene(data, degree, splats, q):
+@given(st.data(), st.integers(0, 3), st.integers(1, 30), st.floats(0, 1), st.booleans())
+def test_any_scene(data, degree, splats, q, balanced):
     def array(shape, elements):
         return data.draw(hnp.arrays(np.float32, shape, elements=elements))
 
@@ -121,15 +185,22 @@ def test_any_scene(data, degree, splats, q):
         array((splats, SH_COEFFICIENTS[degree], 3), st.floats(-1000, 1000, width=32)),
     )
     options = dataclasses.replace(KEEP, q=q, entropy=FAST)
+    if balanced:
+        # Both coders; the steps themselves are checked on scenes that have a typical size.
+        for entropy in (FAST, EntropyCoder("context")):
+            encoded = encode(scene, options=dataclasses.replace(options, preset="best", entropy=entropy))
+            assert len(decode(joined(encoded))) == splats
+        return
     encoded = encode(scene, options=options)
     check_within_steps(scene, decode(joined(encoded)), encoded.order, options.parameters, options.parameters.gamma)
 
 
-def test_same_input_same_bytes_whatever_the_threads():
+@pytest.mark.parametrize("preset", ["paper", "best"])
+def test_same_input_same_bytes_whatever_the_threads(preset):
     scene = random_scene(3000)
-    first = joined(encode(scene, options=dataclasses.replace(KEEP, threads=1)))
+    first = joined(encode(scene, options=dataclasses.replace(KEEP, preset=preset, threads=1)))
     for threads in (1, 2, 5):
-        assert joined(encode(scene, options=dataclasses.replace(KEEP, threads=threads))) == first
+        assert joined(encode(scene, options=dataclasses.replace(KEEP, preset=preset, threads=threads))) == first
     a, b = decode(first), PotrFile.from_bytes(first).scene(threads=1)
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
         assert np.array_equal(getattr(a, name), getattr(b, name))
@@ -159,9 +230,10 @@ def test_decoding_again_loses_nothing_more():
     assert np.abs(np.sort(twice.scales, axis=1) - np.sort(expected.scales, axis=1)).max() < 1e-5
 
 
-def test_sections_decode_alone():
-    scene = random_scene(300)
-    data = joined(encode(scene, options=KEEP))
+@pytest.mark.parametrize("preset", ["paper", "best"])
+def test_sections_decode_alone(preset):
+    scene = random_scene(2000)
+    data = joined(encode(scene, options=dataclasses.replace(KEEP, preset=preset)))
     whole = decode(data)
     assert np.array_equal(PotrFile.from_bytes(data).means(), whole.means)
     assert np.array_equal(PotrFile.from_bytes(data).log_scales(), whole.log_scales)
@@ -169,12 +241,12 @@ def test_sections_decode_alone():
     assert np.array_equal(PotrFile.from_bytes(data).opacity_logits(), whole.opacity_logits)
     assert np.array_equal(PotrFile.from_bytes(data).sh(), whole.sh)
     # A damaged colour does not keep the positions from decoding.
-    section = PotrFile.from_bytes(data).header.find(Property.SH, 7)
+    section = next(s for s in PotrFile.from_bytes(data).header.sections if s.kind == Property.SH and s.index >= 3)
     damaged = bytearray(data)
     damaged[section.offset] ^= 1
     file = PotrFile.from_bytes(bytes(damaged))
     assert np.array_equal(file.means(), whole.means)
-    with pytest.raises(DataError, match="'sh 7' is damaged"):
+    with pytest.raises(DataError, match=f"'{section.name}' is damaged"):
         file.scene()
 
 
@@ -206,11 +278,12 @@ def agree(decoded: Scene, expected: dict[str, np.ndarray]) -> None:
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])
-def test_independent_decoder_agrees(degree):
-    scene = random_scene(300, degree)
-    scene = scene.subset(np.r_[np.arange(300), [0, 0, 7]])
+@pytest.mark.parametrize("preset", ["paper", "fast", "best"])
+def test_independent_decoder_agrees(degree, preset):
+    scene = random_scene(600, degree)
+    scene = scene.subset(np.r_[np.arange(600), [0, 0, 7]])
     for cameras in (None, ring_of_cameras(8)):
-        data = joined(encode(scene, cameras, KEEP))
+        data = joined(encode(scene, cameras, EncodeOptions.for_preset(preset, prune=False, compact=False)))
         agree(decode(data), decode_independently(data))
 
 

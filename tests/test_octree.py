@@ -14,10 +14,10 @@ from potr_cl import octree
 from potr_cl.errors import DataError
 
 
-def roundtrip(means, tolerance):
+def roundtrip(means, tolerance, absolute=False):
     """Build, parse, and check what must hold for every scene."""
     means = np.asarray(means, np.float32)
-    streams, order = octree.build(means, tolerance)
+    streams, order = octree.build(means, tolerance, absolute)
     parsed = octree.parse(streams, len(means))
     assert sorted(order) == list(range(len(means)))
     source = means[order].astype(np.float64)
@@ -66,6 +66,7 @@ def test_adversarial(name):
         assert np.abs(parsed - means[order]).max() <= 1e12 * 2.0**-23
         return
     roundtrip(*ADVERSARIAL[name])
+    roundtrip(*ADVERSARIAL[name], absolute=True)
 
 
 def test_tolerance_for_each_splat():

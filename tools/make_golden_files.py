@@ -1,6 +1,6 @@
-"""Make the golden files of the format's current version: python -m tools.make_golden_files
+"""Make the golden files of both versions of the format: python -m tools.make_golden_files
 
-Writes tests/data/golden_v1_NAME.potr and, with the independent decoder of the tests, the values that they must yield
+Writes tests/data/golden_vN_NAME.potr and, with the independent decoder of the tests, the values that they must yield
 for ever. Refuses to touch a golden file that exists: those are never made again.
 """
 
@@ -11,7 +11,8 @@ from pathlib import Path
 
 import numpy as np
 
-from potr_cl.bitstream import VERSION, EntropyCoder
+from potr_cl.bitstream import EntropyCoder
+from potr_cl.decoder import PotrFile
 from potr_cl.encoder import encode
 from potr_cl.options import EncodeOptions
 from potr_cl.scene import Scene
@@ -49,8 +50,20 @@ def main() -> None:
             random_scene(30, 0, seed=9, extent=1e3), None, replace(KEEP, sf_scale=1e8, sf_sh=1e6)
         ),
     }
+    best, fast = (EncodeOptions.for_preset(preset, prune=False, compact=False) for preset in ("best", "fast"))
+    many = random_scene(1500, 3, seed=11)
+    many.sh[:, 1:] *= np.random.default_rng(2).random((1500, 15, 1)) < 0.3
+    scenes |= {
+        "degree3_context": encode(many, cameras, best),
+        "degree1_context": encode(random_scene(1000, 1, seed=12), None, replace(best, q=1.0)),
+        "degree3_zstd": encode(random_scene(200, 3, seed=13), cameras, fast),
+        "degree2_coincident_balanced": encode(coincident, None, best),
+        "degree0_one_splat_balanced": encode(random_scene(1, 0, seed=14), None, best),
+        "degree0_deep_balanced": encode(_with_means(random_scene(40, 0, seed=15), deep), None, best),
+    }
     for name, encoded in scenes.items():
-        path = DATA / f"golden_v{VERSION}_{name}.potr"
+        version = PotrFile.from_bytes(b"".join(encoded.pieces)).header.version
+        path = DATA / f"golden_v{version}_{name}.potr"
         if path.exists():
             print(f"{path.name} exists: kept")
             continue

@@ -11,7 +11,7 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.atomic_write import replacing
-from potr_cl.bitstream import EntropyCoder
+from potr_cl.bitstream import ENTROPY_CODERS, EntropyCoder
 from potr_cl.cli.options import (
     Commands,
     add_compaction_options,
@@ -32,6 +32,7 @@ from potr_cl.html_report import PicturePair, html_report, views_to_show
 from potr_cl.images import parse_colour
 from potr_cl.judging import Judge, JudgingViews
 from potr_cl.options import EncodeOptions
+from potr_cl.quantize import PRESETS
 from potr_cl.scene import Scene
 from potr_cl.search import Target, encode_to_target
 from potr_cl.summary import encode_report, format_encode_report, quality_report, search_report
@@ -40,25 +41,31 @@ from potr_cl.summary import encode_report, format_encode_report, quality_report,
 def _options(args: argparse.Namespace) -> EncodeOptions:
     if args.threads < 0:
         raise UsageError(f"--threads is {args.threads}, it must be 0 or more")
-    options = EncodeOptions(
+    changes: dict[str, Any] = {} if args.iterations is None else {"iterations": args.iterations}
+    if args.entropy is not None or args.zstd_level is not None:
+        changes["entropy"] = EntropyCoder(
+            args.entropy or "zstd", EntropyCoder.level if args.zstd_level is None else args.zstd_level
+        )
+    options = EncodeOptions.for_preset(
+        args.preset,
         q=args.quality,
         delta_mse_max=args.delta_mse_max,
         **compaction_choices(args),
         prune=not args.no_prune,
-        iterations=args.iterations,
         compact=not args.no_compact,
         compact_at=args.compact_at,
         sweep=sweep_options(args),
         background=parse_colour(args.background),
         beta=args.beta,
         gamma=args.gamma,
+        sf_dc=args.sf_dc,
         sf_sh=args.sf_sh,
         sf_opacity=args.sf_opacity,
         sf_rotation=args.sf_rotation,
         sf_scale=args.sf_scale,
-        entropy=EntropyCoder(args.entropy, args.zstd_level),
         threads=args.threads,
         source_bytes=args.scene.stat().st_size if args.scene.is_file() else None,
+        **changes,
     )
     _ = options.parameters  # a wrong option is told before a gigabyte is read
     return options
@@ -161,6 +168,13 @@ def add_encode(commands: Commands) -> None:
         help="find the quality that just reaches this mean PSNR against the uncompressed scene, on the views that the "
         "result is judged by",
     )
+    p.add_argument(
+        "--preset",
+        choices=PRESETS,
+        default=EncodeOptions.preset,
+        help="paper: the paper's steps; best: steps of equal worth and the context coder, the smallest file; fast: "
+        f"best's steps, 12 pruning iterations and zstd 9; default {EncodeOptions.preset}",
+    )
     add_cameras_options(p)
     p.add_argument("--no-quality", action="store_true", help="do not judge the result; saves time")
     p.add_argument("--json", action="store_true", help="the summary for programs")
@@ -173,6 +187,7 @@ def add_encode(commands: Commands) -> None:
     p.add_argument("--report-view", metavar="NAME", help="a judging view to show besides the worst and the median one")
     p.add_argument("--no-prune", action="store_true", help="keep every splat")
     add_pruning_options(p)
+    p.set_defaults(iterations=None)  # the preset's
     p.add_argument("--no-compact", action="store_true", help="keep the colours' coefficients as they are")
     p.add_argument(
         "--compact-at",
@@ -182,21 +197,28 @@ def add_encode(commands: Commands) -> None:
         help=f"of the pruning iterations after which colours are compacted; default {EncodeOptions.compact_at:g}",
     )
     p.add_argument(
-        "--entropy", choices=("zstd", "npz"), default="zstd", help="npz: deflate, as NumPy's compressed files use"
+        "--entropy",
+        choices=ENTROPY_CODERS,
+        help="context: smallest, not for preset paper; zstd: decodes fastest; npz: deflate, as NumPy's compressed "
+        "files use; default: the preset's",
     )
-    p.add_argument("--zstd-level", type=int, default=19, metavar="L", help="1 (fast) to 22 (small); default 19")
+    p.add_argument("--zstd-level", type=int, metavar="L", help="1 (fast) to 22 (small); default: the preset's")
     p.add_argument("--threads", type=int, default=0, metavar="T", help="default: one a processor")
     single = p.add_argument_group("single parameters (each is set by -q otherwise)")
     single.add_argument("--gamma", type=float, metavar="UNITS", help="least distance a centre may move, world units")
     single.add_argument(
-        "--beta", type=float, metavar="PART", help="the same as a part of the nearest camera's distance"
+        "--beta",
+        type=float,
+        metavar="PART",
+        help="the same as a part of the nearest camera's distance; best, fast: of a typical splat's size there",
     )
     for name, what in (
-        ("sh", "SH coefficients"),
-        ("opacity", "opacities"),
-        ("rotation", "quaternions"),
-        ("scale", "standard deviations"),
+        ("dc", "a unit for constant SH coefficients"),
+        ("sh", "a unit for the other SH coefficients"),
+        ("opacity", "a unit for opacities; best, fast: for their logits"),
+        ("rotation", "a unit for quaternions; best, fast: times the root of the largest scale in steps"),
+        ("scale", "a unit for standard deviations; best, fast: in a typical splat's size"),
     ):
-        single.add_argument(f"--sf-{name}", type=float, metavar="SF", help=f"steps a unit for {what}")
+        single.add_argument(f"--sf-{name}", type=float, metavar="SF", help=f"steps {what}")
     add_compaction_options(single)
     p.set_defaults(run=_encode)
