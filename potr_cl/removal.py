@@ -31,6 +31,8 @@ Indices = NDArray[np.int64]
 _QUEUES = 16
 #: Where the removal kernel's argument stands that has it store the target.
 _FIRST_TIME = 12
+#: Below it transmittances lose digits in float32, and the sweep divides by them.
+_LEAST_STOP = 1e-30
 #: Part of the device's memory that the views may take unless the caller sets a budget: on CPUs it is everybody's.
 _SHARE = 0.5
 
@@ -45,6 +47,12 @@ class SweepOptions:
         turns: a view is swept in every so many-th measurement only (all of them in the first). Views that do not fit
             the memory budget are swept in each.
         memory: bytes of device memory that the views may take; None: half of the device's.
+        tighten: drop a tile's entries that reach alpha 1/255 in none of its pixels. Changes no result.
+        stop: a pixel ends before its transmittance falls below this; None: where the rasterizer's rules end it. When a
+            removal lets a pixel go on one splat longer, its colour jumps by up to the hundredfold of this.
+        sample: part of the tiles to be swept that are, drawn at random; the others keep their sums until another time.
+        sampled: measurements, after the first, in which only a sample is swept.
+        seed: of the sample.
 
     Raises:
         UsageError: a value is out of range.
@@ -53,6 +61,11 @@ class SweepOptions:
     tolerance: float = 0.002
     turns: int = 1
     memory: int | None = None
+    tighten: bool = False
+    stop: float | None = 1e-8
+    sample: float = 1.0
+    sampled: int = 24
+    seed: int = 0
 
     def __post_init__(self) -> None:
         if not self.tolerance < np.inf:
@@ -61,6 +74,14 @@ class SweepOptions:
             raise UsageError(f"views cannot be swept every {self.turns} measurements: at least 1 is needed")
         if self.memory is not None and self.memory < 0:
             raise UsageError(f"a memory budget of {self.memory} bytes is less than nothing")
+        if self.stop is not None and not _LEAST_STOP <= self.stop < 1:
+            raise UsageError(
+                f"a pixel cannot end at a transmittance of {self.stop:g}: at least {_LEAST_STOP:g}, below 1"
+            )
+        if not 0 < self.sample <= 1:
+            raise UsageError(f"a sample of {self.sample:g} of the tiles: it must be above 0 and at most 1")
+        if self.sampled < 0:
+            raise UsageError(f"{self.sampled} sampled measurements are less than none")
 
 
 @dataclass
@@ -115,6 +136,7 @@ class RemovalSweep:
         self._rasterizer = rasterizer
         self._device = device = rasterizer.device
         self._options = options or SweepOptions()
+        self._random = np.random.default_rng(self._options.seed)
         self._measured = 0
         self._original_sh: cl.Buffer | None = None
         self.sweeps = 0.0
@@ -164,7 +186,12 @@ class RemovalSweep:
 
     def _build(self) -> None:
         device, rules = self._device, self._rasterizer.rules
-        limits: dict[str, float | int] = {"ALPHA_CAP": float(rules.alpha_cap), "STOP": rules.stop}
+        stop = rules.stop if self._options.stop is None else self._options.stop
+        limits: dict[str, float | int] = {
+            "ALPHA_CAP": float(rules.alpha_cap),
+            "STOP": stop,
+            "TIGHTEN": int(self._options.tighten),
+        }
         if device.family == "gpu":
             limits["NATIVE_EXP2"] = int(device.native_exp2)
         else:
@@ -251,13 +278,16 @@ class RemovalSweep:
         if len(tiles):
             cl.enqueue_copy(self._device.queue, self._tiles, tiles.astype(np.uint32), is_blocking=True)
 
-    def _sweep_stale(self, tolerance: float, turns: int = 1) -> None:
-        """Sweep the kept views' tiles that have lost more than ``tolerance``, of every so many-th view only."""
+    def _sweep_stale(self, tolerance: float, turns: int = 1, sample: float = 1) -> None:
+        """Sweep the kept views' tiles that have lost more than ``tolerance``, of every so many-th view only, and of
+        those only a random part."""
         wanted = self._stale > tolerance
         firsts = np.array([swept.first_tile for swept in self._kept.values()] + [len(wanted)], np.int64)
         for number, (start, stop) in zip(self._kept, itertools.pairwise(firsts), strict=True):
             if (self._measured + number) % turns:
                 wanted[start:stop] = False
+        if sample < 1:
+            wanted &= self._random.random(len(wanted)) < sample
         numbers = np.flatnonzero(wanted)
         bounds = np.searchsorted(numbers, firsts)
         self._list_tiles(numbers - np.repeat(firsts[:-1], np.diff(bounds)))
@@ -276,7 +306,9 @@ class RemovalSweep:
         ΔMSE is the change of the mean squared error over all views, pixels and channels against the uncompressed
         scene's renders if that splat alone went; I the mean over views and pixels of T α.
         """
-        self._sweep_stale(self._options.tolerance, self._options.turns if self._measured else 1)
+        options = self._options
+        sampled = 0 < self._measured <= options.sampled
+        self._sweep_stale(options.tolerance, options.turns if self._measured else 1, options.sample if sampled else 1)
         if self._measured == 0:
             for swept in self._kept.values():
                 swept.sweep.set_arg(_FIRST_TIME, np.int32(0))
@@ -368,7 +400,8 @@ class RemovalSweep:
             if kept is None:
                 self._device.free(unused)
                 swept.free(self._device)
-            total = np.bincount(entries, weights=sums[:, 1], minlength=self.splats)[: self.splats]
+            weights = np.maximum(sums[:, 1], 0)  # negative: touches no pixel
+            total = np.bincount(entries, weights=weights, minlength=self.splats)[: self.splats]
             splats = np.flatnonzero((total > 0) & (self._alive[: self.splats] == 1))
             yield number, splats, total[splats] / (camera.width * camera.height)
 

@@ -16,6 +16,7 @@ from potr_cl.removal import RemovalSweep, SweepOptions
 from potr_cl.scene import Scene
 from tests import reference
 from tests.scenes import random_scene, ring_of_cameras
+from tools.removal_exactness import BruteForce
 
 
 @pytest.fixture(scope="module", params=["cpu", "gpu"])
@@ -196,7 +197,113 @@ def test_tolerance_saves_sweeps(device, lego_excerpt, lego_excerpt_cameras):
     assert sweeps[0] > sweeps[1] > sweeps[2] >= 1
 
 
-@pytest.mark.parametrize("bad", [{"tolerance": np.nan}, {"tolerance": np.inf}, {"turns": 0}, {"memory": -1}])
+def entries_in_lists(removal: RemovalSweep) -> int:
+    lengths = [removal._device.download(s.lengths, (s.view.tiles,), np.uint32) for s in removal._kept.values()]
+    return int(np.concatenate(lengths).sum())
+
+
+def test_tightened_lists_change_no_result(device, lego_excerpt, lego_excerpt_cameras):
+    results, entries = {}, {}
+    for tighten in (False, True):
+        rasterizer = Rasterizer(device, lego_excerpt)
+        removal = RemovalSweep(rasterizer, lego_excerpt_cameras[:3], SweepOptions(-1, tighten=tighten))
+        measured = [removal.measure()]
+        for start in (0, 3, 5):
+            removal.remove(np.arange(start, 1500, 7))
+            measured.append(removal.measure())
+        entries[tighten] = entries_in_lists(removal)
+        views = [np.concatenate([splats, weights]) for _, splats, weights in removal.view_importances()]
+        results[tighten] = np.concatenate([np.ravel(measured), *views])
+        finish(rasterizer, removal)
+    if device.family == "cpu":
+        assert np.array_equal(results[False], results[True])
+    else:  # the order in which the pixels of a tile are added depends on an entry's place in the list
+        assert np.allclose(results[False], results[True], rtol=1e-6, atol=1e-6 * results[False][:1500].max())
+    assert entries[True] < entries[False]
+
+
+def test_tightened_lists_keep_what_is_hidden(device):
+    """Behind the end of all pixels, entries stay: they come back when what hides them goes."""
+    scene = visible_scene(30, seed=4).subset(np.arange(60) % 30)
+    scene.log_scales[:30], scene.opacity_logits[:30] = 3, 12  # thirty walls
+    cameras = ring_of_cameras(2, size=32)
+    effects = {}
+    for tighten in (False, True):
+        rasterizer = Rasterizer(device, scene)
+        removal = RemovalSweep(rasterizer, cameras, SweepOptions(-1, tighten=tighten, stop=None))
+        hidden = removal.measure()[1][30:] == 0
+        removal.measure()
+        removal.remove(np.arange(30))
+        effects[tighten] = removal.measure()
+        finish(rasterizer, removal)
+    assert hidden.any()
+    assert np.array_equal(np.stack(effects[False])[:, 30:], np.stack(effects[True])[:, 30:])
+    assert (effects[True][1][30:][hidden] > 0).any()
+
+
+def test_a_removal_lets_pixels_go_on(device):
+    """Where pixels end early, effects are those of the same limit on transmittance; small limits leave no jump."""
+    scene = visible_scene(300, seed=2).subset(np.repeat(np.arange(300), 3))
+    scene.opacity_logits[:] = 2
+    cameras = ring_of_cameras(1, size=40)
+    some = np.arange(0, 900, 10)
+    shares = {}
+    for stop in (None, SweepOptions.stop):
+        rasterizer = Rasterizer(device, scene)
+        removal = RemovalSweep(rasterizer, cameras, SweepOptions(stop=stop))
+        effect, _ = removal.measure()
+        finish(rasterizer, removal)
+        exact = BruteForce(reference.project(scene, cameras[0], INRIA), cameras[0], INRIA)
+        true = exact.effects(some, [INRIA.stop if stop is None else stop])[1, 0] / (3 * 40 * 40)
+        strong = true > 1e-4 * true.max()
+        shares[stop] = np.mean(np.abs(effect[some[strong]] / true[strong] - 1) < 1e-2)
+    assert shares[None] < shares[SweepOptions.stop]
+    assert shares[SweepOptions.stop] > 0.98
+
+
+def test_a_random_sample_of_tiles(device, lego_excerpt, lego_excerpt_cameras):
+    """Reproducible, fewer sweeps, every tile when sampling is over."""
+    results, sweeps = [], []
+    for options in (
+        SweepOptions(0),
+        SweepOptions(0, sample=0.3, sampled=2),
+        SweepOptions(0, sample=0.3, sampled=2),
+        SweepOptions(0, sample=0.3, sampled=2, seed=1),
+    ):
+        rasterizer = Rasterizer(device, lego_excerpt)
+        removal = RemovalSweep(rasterizer, lego_excerpt_cameras[:3], options)
+        removal.measure()
+        measured = []
+        for start in range(2):
+            removal.remove(np.arange(start, 1500, 10))
+            measured.append(np.stack(removal.measure())[:, np.arange(5, 1500, 10)])
+        sweeps.append(removal.sweeps)
+        measured.append(np.stack(removal.measure())[:, np.arange(5, 1500, 10)])
+        results.append(measured)
+        finish(rasterizer, removal)
+    everything, first, again, other = results
+    assert sweeps[1] < sweeps[0]
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first[0], other[0])
+    assert not np.array_equal(first[0], everything[0])
+    assert np.array_equal(first[2], everything[2])
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"tolerance": np.nan},
+        {"tolerance": np.inf},
+        {"turns": 0},
+        {"memory": -1},
+        {"stop": 0.0},
+        {"stop": 1.0},
+        {"stop": np.nan},
+        {"sample": 0.0},
+        {"sample": 1.5},
+        {"sampled": -1},
+    ],
+)
 def test_options_out_of_range(bad):
     with pytest.raises(UsageError):
         SweepOptions(**bad)

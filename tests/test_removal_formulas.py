@@ -26,22 +26,25 @@ def measure(device, scene, cameras, background):
     return whole, rest
 
 
-def agree(scene, cameras, background=(0.0, 0.0, 0.0)):
-    mine, theirs = (measure(device, scene, cameras, background) for device in devices())
+def agree(family, scene, cameras, background=(0.0, 0.0, 0.0)):
+    mine, theirs = (measure(device, scene, cameras, background) for device in devices(family=family))
     assert not np.array_equal(mine[0], theirs[0])  # two kernels, not one
     for a, b in zip(mine, theirs, strict=True):
         assert (np.abs(a - b).max(axis=1) < 1e-5 * np.abs(a).max(axis=1)).all()
 
 
+@pytest.mark.parametrize("family", ["cpu", "gpu"])
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 0.3, 0.0)])
-def test_prefix_sums_agree_with_back_to_front(background):
-    agree(visible_scene(60, 1), ring_of_cameras(2, size=40), background)
+def test_prefix_sums_agree_with_back_to_front(family, background):
+    agree(family, visible_scene(60, 1), ring_of_cameras(2, size=40), background)
 
 
-def test_prefix_sums_agree_where_pixels_end_early():
-    agree(visible_scene(600).subset(np.repeat(np.arange(600), 4)), ring_of_cameras(2, size=40))
+@pytest.mark.parametrize("family", ["cpu", "gpu"])
+def test_prefix_sums_agree_where_pixels_end_early(family):
+    agree(family, visible_scene(600).subset(np.repeat(np.arange(600), 4)), ring_of_cameras(2, size=40))
 
 
 def test_only_the_removal_kernel_is_replaced():
-    assert "P_{k+1}" in prefix_sums_source("removal_cpu.cl")
-    assert "P_{k+1}" not in prefix_sums_source("composite_cpu.cl")
+    for family in ("cpu", "gpu"):
+        assert "paper's second half" in prefix_sums_source(f"removal_{family}.cl")
+        assert "paper's second half" not in prefix_sums_source(f"composite_{family}.cl")

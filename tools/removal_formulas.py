@@ -2,11 +2,12 @@
 
 Back to front is what the package computes, PD = T alpha (B - c) with the colour behind B grown from the last splat on.
 Prefix sums is the paper's, PD_k = P_k - P_{k+1} / (1 - alpha) + alpha / (1 - alpha) P_K, in a second sweep from front
-to back once the final colour P_K is known (removal_prefix_sums.cl): the same first half of the kernel, lists and sums.
+to back once the final colour P_K is known (removal_prefix_sums_*.cl): the rest of the kernel, lists and sums are the
+same.
 
 Compared: the error where an opaque splat stands behind many layers, the error on real scenes, both against removals in
 float64 that leave the pixels' ends where they are, and the time of a sweep. On the scenes both formulas also share the
-errors of splats whose alpha crosses 1/255 in float32 where it does not in float64. CPU kernels. Prints Markdown.
+errors of splats whose alpha crosses 1/255 in float32 where it does not in float64. Prints Markdown.
 """
 
 from __future__ import annotations
@@ -21,18 +22,23 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.cameras import Camera, train_views
-from potr_cl.device import Device, kernel_source
+from potr_cl.device import Device, Family, kernel_source
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.rasterizer import INRIA, Rasterizer
 from potr_cl.removal import RemovalSweep, SweepOptions
 from potr_cl.scene import Scene
 from tests import reference
-from tools.removal_exactness import SCENES, BruteForce
+from tools.removal_exactness import SCENES, BruteForce, choose_splats
 
 F64 = NDArray[np.float64]
 
-_REPLACED = "removal_cpu.cl"
-_SECOND_HALF = Path(__file__).with_name("removal_prefix_sums.cl")
+#: Where a removal kernel's second half begins; it ends before the next kernel.
+_SECOND_HALVES = {
+    "removal_cpu.cl": "    /* From here on r, g, b are twice the difference",
+    "removal_gpu.cl": "    float br[PIXELS], bg[PIXELS], bb[PIXELS];",
+}
+#: Pixels end here, in the sweeps and in float64.
+STOP = 1e-8
 LAYERS_IN_FRONT = (0, 10, 100, 300)
 LAYERS_BEHIND = 19
 TIMED_VIEWS = 5
@@ -40,37 +46,38 @@ REPEATS = 7
 
 
 def prefix_sums_source(name: str) -> str:
-    """:func:`potr_cl.device.kernel_source`, but for the CPU removal kernel, whose second half is the paper's."""
+    """:func:`potr_cl.device.kernel_source`, but for the removal kernels, whose second half is the paper's."""
     source = kernel_source(name)
-    if name != _REPLACED:
+    if name not in _SECOND_HALVES:
         return source
-    first_half, begin, rest = source.partition("    /* From here on r, g, b are twice the difference")
+    first_half, begin, rest = source.partition(_SECOND_HALVES[name])
     _, end, others = rest.partition("/* How much of each tile's area")
     if not (begin and end):
-        raise RuntimeError(f"{_REPLACED} has changed: its second half is not where {Path(__file__).name} looks for it")
-    return first_half + _SECOND_HALF.read_text("utf-8") + "\n" + end + others
+        raise RuntimeError(f"{name} has changed: its second half is not where {Path(__file__).name} looks for it")
+    second_half = Path(__file__).with_name(name.replace("removal_", "removal_prefix_sums_"))
+    return first_half + second_half.read_text("utf-8") + "\n" + end + others
 
 
 class PrefixSumsDevice(Device):
-    """A device whose removal kernel for CPUs follows the paper's formula; all else is the same."""
+    """A device whose removal kernel follows the paper's formula; all else is the same."""
 
     def program(self, source: str, **defines: str | int | float) -> cl.Program:
         with mock.patch("potr_cl.device.kernel_source", prefix_sums_source):
             return super().program(source, **defines)
 
 
-def devices(spec: str | None = None) -> tuple[Device, Device]:
+def devices(spec: str | None = None, family: Family | None = None) -> tuple[Device, Device]:
     """Back to front and prefix sums, in this order, with timestamps."""
     return (
-        Device(spec, profiling=True, family="cpu"),
-        PrefixSumsDevice(spec, profiling=True, family="cpu"),
+        Device(spec, profiling=True, family=family),
+        PrefixSumsDevice(spec, profiling=True, family=family),
     )
 
 
 def measure(device: Device, scene: Scene, cameras: Sequence[Camera]) -> tuple[F64, F64]:
     """ΔMSE and importance of all splats of a whole scene, see :meth:`potr_cl.removal.RemovalSweep.measure`."""
     rasterizer = Rasterizer(device, scene)
-    removal = RemovalSweep(rasterizer, cameras)
+    removal = RemovalSweep(rasterizer, cameras, SweepOptions(stop=STOP))
     result = removal.measure()
     removal.free()
     rasterizer.free()
@@ -79,7 +86,7 @@ def measure(device: Device, scene: Scene, cameras: Sequence[Camera]) -> tuple[F6
 
 def truth(scene: Scene, camera: Camera, splats: NDArray[np.int64]) -> F64:
     """ΔMSE of single splats in float64 with the pixels' ends held."""
-    held, _ = BruteForce(reference.project(scene, camera, INRIA), camera, INRIA).effects(splats)
+    held = BruteForce(reference.project(scene, camera, INRIA), camera, INRIA).effects(splats, [STOP])[0, 0]
     return held / (3 * camera.width * camera.height)
 
 
@@ -114,15 +121,6 @@ def print_column_errors(pair: tuple[Device, Device]) -> None:
     print()
 
 
-def choose_splats(importance: F64, count: int) -> NDArray[np.int64]:
-    """About ``count`` splats that the views see, evenly over the logarithm of importance."""
-    seen = np.flatnonzero(importance > 0)
-    by_importance = seen[np.argsort(importance[seen], kind="stable")]
-    low, high = np.log(importance[by_importance[[len(seen) // 100, -1]]])
-    at = np.searchsorted(np.log(importance[by_importance]), np.linspace(low, high, count))
-    return np.unique(by_importance[at.clip(0, len(seen) - 1)])
-
-
 def print_scene_errors(name: str, scene: Scene, camera: Camera, pair: tuple[Device, Device], count: int) -> None:
     effects, importances = zip(*(measure(device, scene, [camera]) for device in pair), strict=True)
     chosen = choose_splats(importances[0], count)
@@ -138,7 +136,7 @@ def print_scene_errors(name: str, scene: Scene, camera: Camera, pair: tuple[Devi
 def time_sweeps(scene: Scene, cameras: Sequence[Camera], pair: tuple[Device, Device]) -> F64:
     """Seconds of the removal kernel over all tiles of all views, (repeats, 2), the formulas taking turns."""
     rasterizers = [Rasterizer(device, scene) for device in pair]
-    removals = [RemovalSweep(rasterizer, cameras, SweepOptions(tolerance=-1)) for rasterizer in rasterizers]
+    removals = [RemovalSweep(rasterizer, cameras, SweepOptions(-1, stop=STOP)) for rasterizer in rasterizers]
     seconds = np.zeros((REPEATS + 1, 2))
     for times in seconds:
         for i, (device, removal) in enumerate(zip(pair, removals, strict=True)):
@@ -155,17 +153,19 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--device")
     parser.add_argument("--splats", type=int, default=150)
+    parser.add_argument("--family", choices=("cpu", "gpu"), help="of kernels; default: the device's own")
+    parser.add_argument("--scenes", type=Path, default=SCENES, help="folder with lego and plush in it")
     args = parser.parse_args()
-    pair = devices(args.device)
-    print(f"{pair[0].info}\n")
+    pair = devices(args.device, args.family)
+    print(f"{pair[0].info}, {pair[0].family} kernels\n")
     print_column_errors(pair)
 
     scenes = {}
     for name in ("lego", "plush"):
-        if (SCENES / name).exists():
-            training = train_views(load_cameras(SCENES / name / "cameras.json"))
+        if (args.scenes / name).exists():
+            training = train_views(load_cameras(args.scenes / name / "cameras.json"))
             cameras = training[:: max(1, len(training) // TIMED_VIEWS)][:TIMED_VIEWS]
-            scenes[name] = load_scene(SCENES / name / "point_cloud.ply"), cameras
+            scenes[name] = load_scene(args.scenes / name / "point_cloud.ply"), cameras
     print("Relative error of ΔMSE in one view, median / 99th percentile:\n")
     print("| scene | formula | splats | all | the half with the smaller ΔMSE | the other half |")
     print("|---|---|---|---|---|---|")

@@ -9,10 +9,10 @@
 
    (paper, section "Effect of a splat's removal"), in the slot of the splat's entry.
 
-   Lists are compacted on the way: entries of splats that are not alive are dropped, in place; a tile's list begins at
-   begins[tile] and has lengths[tile] entries.
+   Lists are compacted on the way: entries of splats that are not alive, or that the last sweep marked, are dropped, in
+   place; a tile's list begins at begins[tile] and has lengths[tile] entries.
 
-   Macros: LANES, ALPHA_CAP, STOP. */
+   Macros: LANES, ALPHA_CAP, STOP, TIGHTEN (whether to mark entries that touch no pixel). */
 
 #include "lanes.clh"
 #include "splat.clh"
@@ -65,7 +65,7 @@ kernel void removal(
         const uint block_begin = kept;
         for (uint e = read; e < min(read + BLOCK, end); ++e) {
             const uint splat = entries[e];
-            if (alive[splat]) {
+            if (alive[splat] && sums[e].y >= 0.0f) {
                 entries[kept] = splat;
                 sums[kept++] = sums[e];
             }
@@ -167,6 +167,7 @@ kernel void removal(
             for (int v = 0; v < VECTORS; ++v)
                 au[v] = a * ((LANE_NUMBERS + (origin.x + v * LANES + 0.5f)) - x);
             vfloat effect = (vfloat)(0.0f), importance = (vfloat)(0.0f);
+            vint touched = (vint)(0);
             for (int row = block.first_row[k]; row < end_row; ++row) {
                 const float dy = origin.y + row + 0.5f - block.y[k];
                 const float bu = block.b[k] * dy;
@@ -177,7 +178,9 @@ kernel void removal(
                     const vfloat u = au[v] + bu;
                     const vfloat power = MAD(-u, u, (vfloat)(level));
                     vfloat alpha = min(exp2_polynomial(power), ALPHA_CAP);
-                    alpha = (power >= LOG2_ALPHA_MIN) && (number <= last[i]) ? alpha : (vfloat)(0.0f);
+                    const vint reached = power >= LOG2_ALPHA_MIN;
+                    touched |= reached;
+                    alpha = reached && (number <= last[i]) ? alpha : (vfloat)(0.0f);
                     const vfloat front = t[i] / (1.0f - alpha);
                     t[i] = front;
                     const vfloat weight = front * alpha;
@@ -200,7 +203,7 @@ kernel void removal(
                 sum += (float2)(effects[lane], importances[lane]);
             const uint e = block_begin + k;
             replace_sums(totals + TOTAL_WORDS * entries[e], sums[e], sum, scale, bound);
-            sums[e] = sum;
+            sums[e] = TIGHTEN && !VANY(touched) ? NEVER : sum;
         }
         block_end = block_begin;
     }
@@ -220,7 +223,7 @@ kernel void staleness(
     const uint begin = begins[tile], end = begin + lengths[tile];
     float gone = 0.0f;
     for (uint e = begin; e < end; ++e)
-        if (alive[entries[e]] == 2)
+        if (alive[entries[e]] == 2 && sums[e].y >= 0.0f)
             gone += fmax(sums[e].y, LEAST_STALENESS);
     stale[first + tile] = gone * (1.0f / (TILE * TILE));
 }

@@ -4,7 +4,7 @@
    The sums over a tile's pixels are made for GROUP_ENTRIES splats at a time: each work-item leaves the sum of its own
    pixels in local memory, then four work-items a splat add them up, always in the same order.
 
-   Macros: ALPHA_CAP, STOP, NATIVE_EXP2. */
+   Macros: ALPHA_CAP, STOP, TIGHTEN, NATIVE_EXP2. */
 
 #define LANES 1
 #include "lanes.clh"
@@ -45,6 +45,7 @@ void removal(
     local float4 near_s0[ITEMS], near_s1[ITEMS];
     local float near_blue[ITEMS];
     local uint near_splat[ITEMS];
+    local int near_touched[ITEMS];
     local uint ranks[2][ITEMS];
     local int unfinished[2];
     local float2 parts[GROUP_ENTRIES * ITEMS];
@@ -74,7 +75,7 @@ void removal(
         if (batch + lid < end) {
             splat = entries[batch + lid];
             old = sums[batch + lid];
-            stays = alive[splat] != 0;
+            stays = alive[splat] != 0 && old.y >= 0.0f;
         }
         ranks[0][lid] = stays;
         int from = 0;
@@ -181,6 +182,7 @@ void removal(
             near_s0[lid] = shapes[2 * splat];
             near_s1[lid] = (float4)(s1.x, s1.y, colour.x, colour.y);
             near_blue[lid] = colour.z;
+            near_touched[lid] = 0;
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int group_end = (int)size; group_end > 0; group_end -= GROUP_ENTRIES) {
@@ -194,6 +196,8 @@ void removal(
                     float u = mad(s0.w, dy, u0);
                     float v = s1.x * dy;
                     float power = s1.y - u * u - v * v;
+                    if (power >= LOG2_ALPHA_MIN && TIGHTEN)
+                        near_touched[k] = 1;
                     if (power >= LOG2_ALPHA_MIN && (int)batch + k <= last[p]) {
                         float alpha = fmin(EXP2(power), ALPHA_CAP);
                         t[p] = t[p] / (1.0f - alpha);
@@ -225,7 +229,7 @@ void removal(
                 float2 after = (parts[4 * lid] + parts[4 * lid + 1]) + (parts[4 * lid + 2] + parts[4 * lid + 3]);
                 const uint slot = begin + batch + group + lid;
                 replace_sums(totals + TOTAL_WORDS * near_splat[group + lid], sums[slot], after, scale, bound);
-                sums[slot] = after;
+                sums[slot] = TIGHTEN && !near_touched[group + lid] ? NEVER : after;
             }
             barrier(CLK_LOCAL_MEM_FENCE);
         }
@@ -249,7 +253,7 @@ void staleness(
     const uint begin = begins[tile], end = begin + lengths[tile];
     float gone = 0.0f;
     for (uint e = begin + lid; e < end; e += ITEMS)
-        if (alive[entries[e]] == 2)
+        if (alive[entries[e]] == 2 && sums[e].y >= 0.0f)
             gone += fmax(sums[e].y, LEAST_STALENESS);
     parts[lid] = gone;
     barrier(CLK_LOCAL_MEM_FENCE);
