@@ -28,7 +28,7 @@ F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 
 #: Training views that are placed, and pixels along a side of each, unless told otherwise.
-COUNT, SIZE = 100, 800
+COUNT, SIZE = 100, 1000
 #: What the names of virtual cameras begin with.
 _PREFIX = "virtual_"
 

@@ -85,7 +85,7 @@ def test_an_object_is_seen_from_all_sides(around_ball):
 def test_names_and_splits(around_ball):
     assert (len(train_views(around_ball)), len(test_views(around_ball))) == (100, 12)
     assert len({c.name for c in around_ball}) == 112
-    assert {(c.width, c.height) for c in around_ball} == {(800, 800)}
+    assert {(c.width, c.height) for c in around_ball} == {(1000, 1000)}
     assert is_virtual(around_ball)
     assert not is_virtual([])
     assert not is_virtual([dataclasses.replace(around_ball[0], name="photo")])
