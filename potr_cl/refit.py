@@ -303,7 +303,9 @@ class ColourRefit:
         """A vector on the device as (N, M, 3) R, G, B."""
         columns = self.device.download(buffer, (self._sh_count, 3, self._stride), np.float32)[:, :, : self._splats]
         y, co, cg = columns[:, 0], columns[:, 1], columns[:, 2]
-        return np.ascontiguousarray(np.stack([y + co - cg, y + cg, y - co - cg]).transpose(2, 1, 0))
+        # In this order nothing overflows that did not in R, G, B.
+        rest = y - cg
+        return np.ascontiguousarray(np.stack([rest + co, y + cg, rest - co]).transpose(2, 1, 0))
 
     # ------------------------------------------------------------------------------------------ vectors
 
