@@ -167,7 +167,7 @@ def composite(
     """Composite front to back, every splat over every pixel."""
     height, width = shape
     y, x = np.mgrid[:height, :width] + 0.5
-    image = np.zeros((height, width, 3))
+    image = np.zeros((height, width, projected.colour.shape[1]))
     transmittance = np.ones(shape)
     margin = np.full(shape, np.inf)
     alive = np.ones(shape, dtype=bool)
