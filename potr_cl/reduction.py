@@ -1,8 +1,9 @@
-"""From the scene to fewer splats with sparser colours: pruning, and compaction on the way."""
+"""From the scene to fewer splats with sparser colours: pruning; compaction and re-fits of the colours on the way."""
 
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 
 import numpy as np
 from numpy.typing import NDArray
@@ -14,6 +15,7 @@ from potr_cl.errors import UsageError
 from potr_cl.options import EncodeOptions
 from potr_cl.pruning import Pruned, PruningOptions, prune
 from potr_cl.rasterizer import Rasterizer
+from potr_cl.refit import RefitOptions, RenderedTargets, refit_colours
 from potr_cl.removal import RemovalSweep
 from potr_cl.scene import Scene
 
@@ -46,8 +48,9 @@ def reduce_scene(
     """
     report = progress or (lambda stage, done: None)
     schedule = PruningOptions(options.parameters.delta_mse_max, options.iterations, count=options.count)
-    if not 0 <= options.compact_at <= 1:
-        raise UsageError(f"compact_at is {options.compact_at:g}, it must lie between 0 and 1")
+    for part in (options.compact_at, *options.refit_at):
+        if not 0 <= part <= 1:
+            raise UsageError(f"a stage after {part:g} of the iterations: it must lie between 0 and 1")
     how = options.compaction
     views = train_views(cameras)
     report("prepare views", 0.0)
@@ -66,10 +69,38 @@ def reduce_scene(
         compacted = True
         report("compact", 1.0)
 
+    def refit() -> None:
+        nonlocal sh
+        report("refit", 0.0)
+        left = np.flatnonzero(alive)
+        source = Rasterizer(device, scene, background=options.background)
+        try:
+            refitted = refit_colours(
+                device,
+                replace(scene.subset(left), sh=sh[left]),
+                views,
+                RenderedTargets(source, views),
+                RefitOptions(steps=options.refit_at_steps, memory=options.sweep.memory),
+                background=options.background,
+                progress=lambda done, steps: report("refit", 0.99 * done / steps),
+            )
+        finally:
+            source.free()
+        sh = sh.copy()
+        sh[left] = refitted.sh
+        report("refit", 1.0)
+
+    alive = np.ones(len(scene), bool)
+    refits = {max(round(part * options.iterations), 1) for part in options.refit_at}
+
     def after_iteration(iteration: int, gone: NDArray[np.int64]) -> None:
+        assert removal is not None
+        alive[gone] = False
         if not compacted and iteration + 1 >= options.compact_at * options.iterations:
             compact()
-            assert removal is not None
+            removal.replace_sh(sh)
+        if iteration + 1 in refits:
+            refit()
             removal.replace_sh(sh)
 
     try:
