@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import re
 import shutil
 import subprocess
 import sys
@@ -707,6 +708,87 @@ def test_compare_bad_calls(tmp_path, scene_path, potr_path, cameras_path, capsys
     potr_path.write_bytes(potr_path.read_bytes()[:-20])
     fails(capsys, [*call, "-o", tmp_path / "worst.png"], 1, str(potr_path))
     assert sorted(p.name for p in tmp_path.iterdir()) == ["cameras.json", "scene.ply", "scene.potr"]
+
+
+# ------------------------------------------------------------------------------------------ refit
+
+
+@pytest.fixture
+def dimmed_path(tmp_path, scene_path):
+    """The scene with darker colours, and coefficients that are 0."""
+    scene = load_scene(scene_path)
+    scene.sh[:, 0] *= np.float32(0.8)
+    scene.sh[:, 1:] = 0
+    scene.sh[::2, 1] = 0.01
+    ply.save(tmp_path / "dimmed.ply", scene)
+    return tmp_path / "dimmed.ply"
+
+
+def test_refit(tmp_path, scene_path, dimmed_path, cameras_path, capsys):
+    out = tmp_path / "out.ply"
+    refit = ["refit", dimmed_path, "--reference", scene_path, "--cameras", cameras_path, "-o", out]
+    text = run(capsys, *refit, "--steps", "10")
+    assert "6 training views" in text
+    assert "2 held-out test views" in text
+    before, after = map(float, re.findall(r"([\d.]+) dB", text.splitlines()[-1]))
+    assert after > before + 1
+    dimmed, refitted = load_scene(dimmed_path), load_scene(out)
+    assert np.array_equal(dimmed.means, refitted.means)
+    assert not refitted.sh[1::2, 1:].any()  # what was 0 stays 0
+    assert refitted.sh[::2, 1].any()
+    judged = json.loads(run(capsys, "compare", scene_path, out, "--cameras", cameras_path, "--json"))
+    assert judged["mean"]["b_against_a"]["psnr"] == pytest.approx(after, abs=0.01)
+
+    whole = load_scene(scene_path)
+    run(capsys, *["refit", scene_path, *refit[2:]], "--drop", "1e-7")
+    assert 0 < np.count_nonzero(load_scene(out).sh) < np.count_nonzero(whole.sh)
+    run(capsys, *["refit", scene_path, *refit[2:]], "--drop", "1000")
+    assert not load_scene(out).sh[:, 1:].any()
+
+
+def test_refit_to_photographs(tmp_path, scene_path, dimmed_path, cameras_path, capsys):
+    photos, out = tmp_path / "photos", tmp_path / "out.ply"
+    run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", photos, "--background", "white")
+    refit = ["refit", dimmed_path, "--reference", scene_path, "--cameras", cameras_path, "-o", out]
+    refit += ["--background", "white", "--photos", photos]
+    # The reference is what the photographs show: nothing comes as close to them.
+    assert cli.main([str(a) for a in refit]) == 0
+    captured = capsys.readouterr()
+    assert "2 held-out photographs" in captured.out
+    assert "warning: on held-out photographs the result is " in captured.err
+    # With the parts exchanged the reference is the darker one.
+    exchanged = ["refit", scene_path, "--reference", dimmed_path, *refit[4:]]
+    assert cli.main([str(a) for a in exchanged]) == 0
+    assert "warning" not in capsys.readouterr().err
+
+    fails(capsys, [*refit[:4], *refit[6:]], 2, "--photos", "--cameras")
+    out.unlink()
+    Image.new("RGB", (32, 64)).save(photos / "view_4.png")
+    fails(capsys, refit, 2, "32 x 64", "64 x 64")
+    (photos / "view_4.png").unlink()
+    fails(capsys, refit, 2, "no photograph of view 'view_4'")
+    assert not out.exists()
+
+
+def test_refit_to_photographs_without_held_out_views(tmp_path, scene_path, dimmed_path, cameras_path, capsys):
+    views = [{**view, "split": "train"} for view in json.loads(cameras_path.read_text())]
+    cameras_path.write_text(json.dumps(views))
+    photos, out = tmp_path / "photos", tmp_path / "out.ply"
+    run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", photos)
+    refit = ["refit", dimmed_path, "--reference", scene_path, "--cameras", cameras_path, "--photos", photos, "-o", out]
+    assert cli.main([str(a) for a in refit]) == 0
+    captured = capsys.readouterr()
+    assert "8 training views" in captured.out
+    assert "no view is held out" in captured.err
+
+
+def test_refit_bad_calls(tmp_path, scene_path, cameras_path, capsys):
+    out = tmp_path / "out.ply"
+    refit = ["refit", scene_path, "--reference", scene_path, "--cameras", cameras_path, "-o", out]
+    for option, value in (("--steps", -1), ("--prior", -1), ("--lambda", "nan"), ("--drop", "inf"), ("--memory", -1)):
+        fails(capsys, [*refit, f"{option}={value}"], 2)
+    fails(capsys, ["refit", scene_path, "--reference", tmp_path / "none.ply", *refit[4:]], 2, "none.ply")
+    assert not out.exists()
 
 
 # ------------------------------------------------------------------------------------------ devices

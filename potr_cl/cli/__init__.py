@@ -21,6 +21,7 @@ def _parser() -> argparse.ArgumentParser:
     encode.add_encode(commands)
     edit.add_prune(commands)
     edit.add_compact(commands)
+    edit.add_refit(commands)
     files.add_decode(commands)
     files.add_info(commands)
     convert.add_convert(commands)

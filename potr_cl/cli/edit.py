@@ -1,15 +1,18 @@
-"""The commands that change a scene and write it as a PLY again: prune, compact."""
+"""The commands that change a scene and write it as a PLY again: prune, compact, refit."""
 
 from __future__ import annotations
 
 import argparse
 import contextlib
 import dataclasses
+import math
+import sys
 from pathlib import Path
 
 import numpy as np
 
 from potr_cl.atomic_write import replacing
+from potr_cl.cameras import Camera, test_views, train_views
 from potr_cl.cli.options import (
     Commands,
     add_compaction_options,
@@ -25,12 +28,21 @@ from potr_cl.cli.progress import Progress
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
 from potr_cl.device import Device
 from potr_cl.errors import UsageError
+from potr_cl.fallback import on_device
 from potr_cl.formats import load_scene, ply
 from potr_cl.images import parse_colour
+from potr_cl.judging import Judge, JudgingViews
 from potr_cl.options import EncodeOptions
+from potr_cl.photographs import Photographs, PhotographTargets
 from potr_cl.quantize import ac_sparsity
+from potr_cl.rasterizer import Rasterizer
 from potr_cl.reduction import reduce_scene
+from potr_cl.refit import RefitOptions, Refitted, RenderedTargets, active_coefficients, refit_colours
 from potr_cl.removal import SweepOptions
+from potr_cl.scene import Scene
+
+#: Coefficients that round to 0 at so many steps a unit are 0, but for what storing R, G and B leaves of them.
+_ZERO_SF = 1e5
 
 
 def _prune(args: argparse.Namespace) -> None:
@@ -114,3 +126,140 @@ def add_compact(commands: Commands) -> None:
     add_memory_option(p)
     add_device_options(p)
     p.set_defaults(run=_compact)
+
+
+def _refit(args: argparse.Namespace) -> None:
+    background = parse_colour(args.background)
+    options = RefitOptions(steps=args.steps, drop=args.drop, lam=args.lam, prior=args.prior)
+    memory = SweepOptions(memory=as_bytes(args.memory))
+    if args.photos is not None and args.cameras is None:
+        raise UsageError("--photos needs --cameras, the views that the photographs show")
+    cameras = given_cameras(args)
+    photographs = None
+    if args.photos is not None:
+        assert cameras is not None
+        photographs = Photographs(args.photos, cameras, background)
+    scene, reference = load_scene(args.scene), load_scene(args.reference)
+    device = Device(args.device)
+    with contextlib.closing(Progress()) as progress:
+        cameras = cameras or virtual_cameras(args, reference, progress)
+        views = train_views(cameras)
+
+        def work(device: Device, budget: EncodeOptions) -> Refitted:
+            how = dataclasses.replace(options, memory=budget.sweep.memory)
+            with contextlib.ExitStack() as stack:
+                targets: RenderedTargets | PhotographTargets
+                if photographs is None:
+                    rasterizer = Rasterizer(device, reference, background=background)
+                    stack.callback(rasterizer.free)
+                    targets = RenderedTargets(rasterizer, views)
+                else:
+                    targets = PhotographTargets(device, photographs, views)
+                    stack.callback(targets.free)
+                active = active_coefficients(scene.sh, _ZERO_SF)
+                return refit_colours(
+                    device, scene, views, targets, how, active, background,
+                    lambda done, steps: progress("refit", done / steps),
+                )  # fmt: skip
+
+        progress("refit", 0.0)
+        refitted, device = on_device(device, EncodeOptions(sweep=memory), work)
+        progress("refit", 1.0)
+        result = dataclasses.replace(scene, sh=refitted.sh)
+        ply.save(args.output, result)
+        print(f"{args.output}: {len(scene)} splats re-fitted in {refitted.steps} steps on {device.info}")
+        before, after = refitted.errors
+        print(
+            f"{len(views)} training views: mean squared error {before:.3g} before, {after:.3g} after, "
+            f"PSNR {_decibels(before)} before, {_decibels(after)} after"
+        )
+        held_out = test_views(cameras)
+        if photographs is not None:
+            _tell_of_photographs(device, (reference, scene, result), held_out, photographs, background)
+        elif held_out:
+            judge = Judge(device, reference, JudgingViews.of(held_out), background)
+            try:
+                psnrs = [judge.psnr(candidate) for candidate in (scene, result)]
+            finally:
+                judge.free()
+            print(f"{judge.views}: PSNR {psnrs[0]:.2f} dB before, {psnrs[1]:.2f} dB after, mean over views")
+
+
+def _decibels(error: float) -> str:
+    return f"{-10 * math.log10(error):.2f} dB" if error > 0 else "infinite"
+
+
+def _tell_of_photographs(
+    device: Device,
+    scenes: tuple[Scene, Scene, Scene],
+    held_out: list[Camera],
+    photographs: Photographs,
+    background: tuple[float, float, float],
+) -> None:
+    """What the reference, the scene before and the scene after come to on photographs that the re-fit did not see."""
+    if not held_out:
+        print(
+            "warning: no view is held out, so nobody knows whether the colours fit the photographs too closely",
+            file=sys.stderr,
+        )
+        return
+    psnrs = []
+    for scene in scenes:
+        rasterizer = Rasterizer(device, scene, background=background)
+        try:
+            psnrs.append(photographs.psnr(rasterizer, held_out))
+        finally:
+            rasterizer.free()
+    reference, before, after = psnrs
+    print(
+        f"{len(held_out)} held-out photographs: PSNR {before:.2f} dB before, {after:.2f} dB after, "
+        f"{reference:.2f} dB of the reference, mean over views"
+    )
+    if after < reference:
+        print(
+            f"warning: on held-out photographs the result is {reference - after:.2f} dB worse than the reference: "
+            "the training photographs are fitted too closely (more --prior, fewer --steps), or too much is gone",
+            file=sys.stderr,
+        )
+
+
+def add_refit(commands: Commands) -> None:
+    p = commands.add_parser(
+        "refit",
+        help="re-fit the colours of a reduced scene to the pictures of the uncompressed one, or to photographs",
+        description="Solve for the colours of all splats together, so that the training views look as those of the "
+        "reference (or as the photographs) do; nothing else changes. Coefficients that are 0 stay 0.",
+    )
+    p.add_argument("scene", type=Path, metavar="PRUNED", help=".ply or .potr")
+    p.add_argument("--reference", type=Path, required=True, metavar="ORIGINAL", help="the uncompressed scene")
+    add_cameras_options(p)
+    p.add_argument("--photos", type=Path, metavar="DIR", help="photographs, named after the views, to fit instead")
+    p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.ply")
+    p.add_argument(
+        "--steps", type=int, default=RefitOptions.steps, metavar="N", help=f"at the most; default {RefitOptions.steps}"
+    )
+    p.add_argument(
+        "--prior",
+        type=float,
+        default=RefitOptions.prior,
+        metavar="X",
+        help=f"how strongly coefficients are held where they were; default {RefitOptions.prior:g}",
+    )
+    p.add_argument(
+        "--lambda",
+        dest="lam",
+        type=float,
+        default=RefitOptions.lam,
+        metavar="X",
+        help=f"how strongly AC coefficients are pulled to 0; default {RefitOptions.lam:g}",
+    )
+    p.add_argument(
+        "--drop",
+        type=float,
+        default=RefitOptions.drop,
+        metavar="X",
+        help="give up an AC coefficient where the mean squared error grows by less; default: none",
+    )
+    add_memory_option(p)
+    add_device_options(p)
+    p.set_defaults(run=_refit)
