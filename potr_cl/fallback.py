@@ -10,6 +10,7 @@ from typing import TypeVar
 from potr_cl.device import Device, choose_device
 from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.options import EncodeOptions
+from potr_cl.removal import default_memory
 
 logger = logging.getLogger("potr_cl")
 
@@ -52,7 +53,7 @@ def on_device(device: Device, options: EncodeOptions, work: Callable[[Device, En
 
 def _with_less(device: Device, options: EncodeOptions, work: Callable[[Device, EncodeOptions], T]) -> T:
     given = options.sweep.memory
-    less = (device.info.memory // 2 if given is None else given) // _LESS
+    less = (default_memory(device) if given is None else given) // _LESS
     for memory, smaller in ((given, less), (less, 0), (0, None)):
         sweep = dataclasses.replace(options.sweep, memory=memory)
         try:

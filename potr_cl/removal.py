@@ -33,8 +33,15 @@ _QUEUES = 16
 _FIRST_TIME = 12
 #: Below it transmittances lose digits in float32, and the sweep divides by them.
 _LEAST_STOP = 1e-30
-#: Part of the device's memory that the views may take unless the caller sets a budget: on CPUs it is everybody's.
-_SHARE = 0.5
+#: Part of the device's memory that the views may take unless the caller sets a budget. A CPU's is that of the host: the
+#: scene, its new colours and everybody else live there too.
+_SHARE, _SHARE_OF_HOST = 0.5, 0.3
+
+
+def default_memory(device: Device) -> int:
+    """Bytes that the views may take: half of the device's memory, three tenths where that is the host's."""
+    of_host = device.info.kind == "cpu" or device.info.integrated
+    return int(device.info.memory * (_SHARE_OF_HOST if of_host else _SHARE))
 
 
 @dataclass(frozen=True)
@@ -46,7 +53,7 @@ class SweepOptions:
             0: whenever anything was removed from it; negative: always.
         turns: a view is swept in every so many-th measurement only (all of them in the first). Views that do not fit
             the memory budget are swept in each.
-        memory: bytes of device memory that the views may take; None: half of the device's.
+        memory: bytes of device memory that the views may take; None: :func:`default_memory`.
         tighten: drop a tile's entries that reach alpha 1/255 in none of its pixels. Changes no result.
         stop: a pixel ends before its transmittance falls below this; None: where the rasterizer's rules end it. When a
             removal lets a pixel go on one splat longer, its colour jumps by up to the hundredfold of this.
@@ -156,7 +163,7 @@ class RemovalSweep:
         self._totals = self._zero_totals()
 
         memory = self._options.memory
-        self._budget = device.info.memory * _SHARE if memory is None else memory
+        self._budget = default_memory(device) if memory is None else memory
         self._queues = [device.queue]
         self._kept: dict[int, _Swept] = {}  # by the number of the view
         self._shared: tuple[cl.Buffer, cl.Buffer] | None = None

@@ -13,7 +13,7 @@ from potr_cl.encoder import encode
 from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.fallback import on_device
 from potr_cl.options import EncodeOptions
-from potr_cl.removal import SweepOptions
+from potr_cl.removal import SweepOptions, default_memory
 from tests.scenes import random_scene, ring_of_cameras
 
 # Tolerance 0: views that are made anew each time are swept in full, and so are those that are kept.
@@ -124,4 +124,4 @@ def test_memory_errors_of_the_driver_count_too(caplog):
     device = Device()
     with caplog.at_level(logging.WARNING, "potr_cl"):
         assert on_device(device, OPTIONS, work) == (np.pi, device)
-    assert budgets == [None, device.info.memory // 16, 0]
+    assert budgets == [None, default_memory(device) // 8, 0]

@@ -12,7 +12,7 @@ from potr_cl.device import Device
 from potr_cl.errors import UsageError
 from potr_cl.pruning import PruningOptions, prune
 from potr_cl.rasterizer import INRIA, Rasterizer
-from potr_cl.removal import RemovalSweep, SweepOptions
+from potr_cl.removal import RemovalSweep, SweepOptions, default_memory
 from potr_cl.scene import Scene
 from tests import reference
 from tests.scenes import random_scene, ring_of_cameras
@@ -382,3 +382,13 @@ def test_no_view_is_an_error(device):
     with pytest.raises(UsageError, match="at least one view"):
         RemovalSweep(rasterizer, [])
     rasterizer.free()
+
+
+@pytest.mark.parametrize(
+    ("kind", "integrated", "share"), [("gpu", False, 0.5), ("gpu", True, 0.3), ("cpu", True, 0.3), ("cpu", False, 0.3)]
+)
+def test_views_take_less_of_memory_that_is_the_hosts(device, kind, integrated, share):
+    before = device.info
+    device.info = dataclasses.replace(before, memory=10**10, kind=kind, integrated=integrated)
+    assert default_memory(device) == share * 10**10
+    device.info = before

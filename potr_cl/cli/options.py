@@ -81,7 +81,10 @@ def add_pruning_options(p: argparse.ArgumentParser) -> None:
 
 def add_memory_option(p: argparse._ActionsContainer) -> None:
     p.add_argument(
-        "--memory", type=float, metavar="GB", help="GiB of device memory to keep views in; default: half of it"
+        "--memory",
+        type=float,
+        metavar="GB",
+        help="GiB of device memory to keep views in; default: half of it, 0.3 of a CPU's",
     )
 
 
