@@ -19,6 +19,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.bitstream import EntropyCoder
 from potr_cl.cameras import Camera, camera_centres, train_views
 from potr_cl.compaction import Compactor, ViewWeights
 from potr_cl.decoder import decode
@@ -41,10 +42,10 @@ _STAGE = 0.25
 _ITERATIONS = 3
 #: Views that an estimate of the PSNR looks at.
 _FEW_VIEWS = 24
-#: By how much the quantiser's fineness may differ from that of everything else: its steps by a third.
-_MOST_STEPS = 0.06
-#: Logarithm of the size at zstd's level 19 over that at level 1, about.
-_LEVEL_GAIN = -0.07
+#: By how much the fineness (:class:`_Axis`) of the quantiser may differ from that of everything else: steps by a third.
+_MOST_STEPS = math.log(4 / 3)
+#: The highest of zstd's levels that costs no time to speak of, and the logarithm of what is about gained beyond.
+_QUICK_LEVEL, _LEVEL_GAIN = 9, -0.08
 #: Full encodes at most.
 _ENCODES = 3
 #: Stands for the infinite PSNR of identical pictures, decibels.
@@ -92,8 +93,8 @@ class Target:
 
     @property
     def slope(self) -> float:
-        """About how much the value grows with the :func:`_fineness`, from 0 to 1."""
-        return 2.5 if self.max_bytes is not None else 30.0
+        """About how much the value grows with the fineness (:class:`_Axis`)."""
+        return 0.55 if self.max_bytes is not None else 6.5
 
     def met(self, value: float) -> bool:
         """Whether a value keeps the promise, if not by how little."""
@@ -273,6 +274,7 @@ class _Search:
         self._tell = tell
         self._tries: list[Try] = []
         self._estimates: dict[float, float] = {}
+        self._axis = _Axis(options)
         self._survey: _Survey | None = None
         self._judge: Judge | None = None
 
@@ -286,10 +288,12 @@ class _Search:
         low, high = target.window
         best: Found | None = None
         ends: dict[float, float] = {}
-        error = _LEVEL_GAIN if self._judge is None and options.entropy.name == "zstd" else 0.0  # of the estimates
+        error = (
+            _LEVEL_GAIN if self._judge is None and self._quick_coder() != options.entropy else 0.0
+        )  # of the estimates
         q = 0.5
         for left in reversed(range(_ENCODES)):
-            q, _ = _solve(self._estimate, target.aim - error, target, q)
+            q, _ = _solve(self._estimate, target.aim - error, target, self._axis, q)
             reduced, found = self._encode(q)
             error = found.value - self._estimate(q)
             if q in (0.0, 1.0):
@@ -331,9 +335,16 @@ class _Search:
 
     def _quick_value(self, scene: Scene, options: EncodeOptions, most_views: int | None = None) -> float:
         """The value without the time that the real entropy stage takes."""
-        coder = dataclasses.replace(options.entropy, level=1)
-        coded = code_scene(scene, options.parameters, self._views, b"", coder, options.threads)
+        coded = code_scene(scene, options.parameters, self._views, b"", self._quick_coder(), options.threads)
         return self._value(coded.pieces, most_views)
+
+    def _quick_coder(self) -> EntropyCoder:
+        if self._judge is not None:
+            return EntropyCoder("zstd", 1)
+        coder = self._options.entropy
+        if coder.name == "zstd" or (coder.name == "context" and self._options.parameters.version == 1):
+            return EntropyCoder("zstd", min(coder.level, _QUICK_LEVEL))
+        return coder
 
     def _value(self, pieces: list[bytes], most_views: int | None = None) -> float:
         if self._judge is None:
@@ -372,8 +383,8 @@ class _Search:
             def value(steps: float, error: float = error) -> float:
                 return self._quick_value(reduced.scene, _with_steps(found.options, steps)) + error
 
-            ends = (_quality(_fineness(q) + sign * _MOST_STEPS) for sign in (-1, 1))
-            first, expected = _solve(value, self._target.aim, self._target, first, *ends)
+            ends = (self._axis.quality(self._axis.fineness(q) + sign * _MOST_STEPS) for sign in (-1, 1))
+            first, expected = _solve(value, self._target.aim, self._target, self._axis, first, *ends)
             if not (low <= expected <= high or last):
                 break
             other = self._finish("steps", first, reduced, _with_steps(found.options, first))
@@ -392,8 +403,9 @@ class _Search:
 def _with_steps(options: EncodeOptions, q: float) -> EncodeOptions:
     """The options with the quantiser's parameters of another q, as far as they are not given on their own."""
     parameters = dataclasses.replace(options, q=q).parameters
-    names = {field.name for field in dataclasses.fields(parameters)} - {"version", "lam", "alpha", "delta_mse_max"}
-    return dataclasses.replace(options, **{name: getattr(parameters, name) for name in names})
+    names = [field.name for field in dataclasses.fields(parameters)]
+    steps = [name for name in names if name.startswith("sf_") or name in ("beta", "gamma")]
+    return dataclasses.replace(options, **{name: getattr(parameters, name) for name in steps})
 
 
 def _of_splats(weights: ViewWeights, splats: NDArray[np.int64]) -> ViewWeights:
@@ -404,18 +416,33 @@ def _of_splats(weights: ViewWeights, splats: NDArray[np.int64]) -> ViewWeights:
     return ViewWeights(offsets, weights.views[entries], weights.weights[entries])
 
 
-def _fineness(q: float) -> float:
-    """The logarithm of the quantiser's fineness, 0 to 1: sizes and PSNR grow more evenly with it than with q."""
-    return math.log1p(100 * q) / math.log(101)
+class _Axis:
+    """Qualities by the logarithm of the quantiser's fineness: sizes and PSNR grow more evenly with it than with q."""
 
+    def __init__(self, options: EncodeOptions) -> None:
+        self._options = dataclasses.replace(options, sf_sh=None)
 
-def _quality(fineness: float) -> float:
-    """The q of a :func:`_fineness`, rounded to what matters."""
-    return round(math.expm1(math.log(101) * min(max(fineness, 0), 1)) / 100, 5)
+    def fineness(self, q: float) -> float:
+        """Of a quality from 0 to 1."""
+        return math.log(dataclasses.replace(self._options, q=q).parameters.sf_sh)
+
+    def quality(self, fineness: float) -> float:
+        """The nearest q from 0 to 1, rounded to what matters."""
+        low, high = 0.0, 1.0
+        for _ in range(20):
+            middle = (low + high) / 2
+            low, high = (middle, high) if self.fineness(middle) < fineness else (low, middle)
+        return round(high if fineness > self.fineness(0) else 0.0, 5)
 
 
 def _solve(
-    value: Callable[[float], float], aim: float, target: Target, first: float, low: float = 0.0, high: float = 1.0
+    value: Callable[[float], float],
+    aim: float,
+    target: Target,
+    axis: _Axis,
+    first: float,
+    low: float = 0.0,
+    high: float = 1.0,
 ) -> tuple[float, float]:
     """The q at which a growing function meets the aim (``low`` or ``high`` if that lies beyond), and its value."""
     points: dict[float, float] = {}
@@ -434,12 +461,12 @@ def _solve(
                 break  # it does not grow everywhere: this is as near as it gets
             # Along a line, but now and then in the middle: where the curve bends, one of the two would stay for long.
             part = (aim - points[a]) / (points[b] - points[a]) if step % 3 < 2 else 0.5
-            q = _quality(_fineness(a) + (_fineness(b) - _fineness(a)) * min(max(part, 0.05), 0.95))
+            q = axis.quality(axis.fineness(a) + (axis.fineness(b) - axis.fineness(a)) * min(max(part, 0.05), 0.95))
         else:
             # Somewhat further than the slope tells, so that the aim comes to lie between two points, and ever further.
             nearest = max(below) if below else min(above)
             way = 1.1 * 2**step * (aim - points[nearest]) / target.slope
-            q = min(max(_quality(_fineness(nearest) + math.copysign(max(abs(way), 0.01), way)), low), high)
+            q = min(max(axis.quality(axis.fineness(nearest) + math.copysign(max(abs(way), 0.05), way)), low), high)
         if q in points:
             break
     best = min(points, key=lambda p: abs(points[p] - aim))

@@ -17,13 +17,14 @@ from potr_cl.device import Device
 from potr_cl.encoder import encode
 from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.options import EncodeOptions
-from potr_cl.quantize import HyperParameters
+from potr_cl.quantize import PRESETS, HyperParameters
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.removal import SweepOptions
-from potr_cl.search import Target, _fineness, _of_splats, _quality, _solve, encode_to_target
+from potr_cl.search import Target, _Axis, _of_splats, _solve, _with_steps, encode_to_target
 from tests.scenes import random_scene, ring_of_cameras
 
 FEW = EncodeOptions(iterations=6)
+AXIS = _Axis(FEW)
 
 
 @pytest.fixture(scope="module")
@@ -46,10 +47,12 @@ def psnr(device, scene, file, cameras):
     return mean_view(views).figures["b_against_a"].psnr
 
 
-@pytest.mark.parametrize("size", [8_000, 20_000, 35_000])
-def test_a_size_is_filled_and_not_passed(device, lego_excerpt, cameras, size):
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("size", [16_000, 24_000])
+def test_a_size_is_filled_and_not_passed(device, lego_excerpt, cameras, size, preset):
     lines = []
-    found = encode_to_target(lego_excerpt, cameras, Target(max_bytes=size), FEW, device=device, tell=lines.append)
+    options = EncodeOptions.for_preset(preset, iterations=6)
+    found = encode_to_target(lego_excerpt, cameras, Target(max_bytes=size), options, device=device, tell=lines.append)
     file = b"".join(found.encoded.pieces)
     assert 0.98 * size <= len(file) <= size
     assert len(file) == found.encoded.nbytes == round(math.exp(found.value))
@@ -58,9 +61,10 @@ def test_a_size_is_filled_and_not_passed(device, lego_excerpt, cameras, size):
     assert sum(step.kind == "encode" for step in found.tries) <= 3
 
 
-@pytest.mark.parametrize("wanted", [38.0, 45.0])
-def test_a_psnr_is_reached_with_little_to_spare(device, lego_excerpt, cameras, wanted):
-    found = encode_to_target(lego_excerpt, cameras, Target(min_psnr=wanted), FEW, device=device)
+@pytest.mark.parametrize(("preset", "wanted"), [("paper", 38.0), ("paper", 45.0), ("best", 46.0)])
+def test_a_psnr_is_reached_with_little_to_spare(device, lego_excerpt, cameras, preset, wanted):
+    options = EncodeOptions.for_preset(preset, iterations=6)
+    found = encode_to_target(lego_excerpt, cameras, Target(min_psnr=wanted), options, device=device)
     reached = psnr(device, lego_excerpt, b"".join(found.encoded.pieces), cameras)
     assert wanted <= reached <= wanted + 0.1
     assert found.value == pytest.approx(reached)
@@ -72,7 +76,7 @@ def test_only_the_steps_of_the_quantiser_may_be_of_another_q(device, lego_excerp
     pruned = encode(lego_excerpt, cameras, dataclasses.replace(FEW, q=found.options.q), device=device).pruned
     assert np.array_equal(pruned.survivors, found.encoded.pruned.survivors)
     header = PotrFile.from_bytes(b"".join(found.encoded.pieces)).header
-    assert header.sf_sh == found.options.sf_sh == pytest.approx(1 + 100 * found.tries[-1].q)
+    assert header.sf_ac == found.options.sf_sh == pytest.approx(1 + 100 * found.tries[-1].q)
     parameters = HyperParameters.from_quality(found.options.q)
     for name in ("lam", "alpha", "delta_mse_max"):
         assert getattr(found.options.parameters, name) == getattr(parameters, name)
@@ -140,15 +144,16 @@ def test_bad_targets(bad):
 
 @given(st.floats(0, 1), st.floats(0.5, 3), st.floats(0.5, 6), st.integers(0, 100))
 def test_growing_functions_are_solved(root, curve, steepness, first):
+    end = AXIS.fineness(1)
     target = Target(max_bytes=1_000_000)
     asked = []
 
     def value(q):
         asked.append(q)
-        return target.aim + steepness * (_fineness(q) ** curve - root**curve)
+        return target.aim + steepness * ((AXIS.fineness(q) / end) ** curve - root**curve)
 
-    q, reached = _solve(value, target.aim, target, first / 100)
-    assert reached == target.aim + steepness * (_fineness(q) ** curve - root**curve)
+    q, reached = _solve(value, target.aim, target, AXIS, first / 100)
+    assert reached == target.aim + steepness * ((AXIS.fineness(q) / end) ** curve - root**curve)
     low, high = target.window
     assert low <= reached <= high
     assert len(asked) <= 12
@@ -157,13 +162,24 @@ def test_growing_functions_are_solved(root, curve, steepness, first):
 @given(st.floats(0.01, 5), st.integers(0, 100))
 def test_a_root_beyond_an_end_gives_the_end(beyond, first):
     target = Target(min_psnr=40)
-    assert _solve(lambda q: target.aim + 20 * (q - 1 - beyond), target.aim, target, first / 100)[0] == 1
-    assert _solve(lambda q: target.aim + 20 * (q + beyond), target.aim, target, first / 100)[0] == 0
+    assert _solve(lambda q: target.aim + 20 * (q - 1 - beyond), target.aim, target, AXIS, first / 100)[0] == 1
+    assert _solve(lambda q: target.aim + 20 * (q + beyond), target.aim, target, AXIS, first / 100)[0] == 0
 
 
-def test_fineness_is_reversible():
-    for q in (0, 0.00123, 0.1, 0.5, 1):
-        assert _quality(_fineness(q)) == pytest.approx(q, abs=1e-5)
+def test_qualities_from_fineness():
+    for axis in (AXIS, _Axis(dataclasses.replace(FEW, sf_sh=7.0))):
+        for q in (0, 0.00123, 0.1, 0.5, 1):
+            assert axis.quality(axis.fineness(q)) == pytest.approx(q, abs=1e-5)
+        assert axis.quality(axis.fineness(0) - 1) == 0
+        assert axis.quality(axis.fineness(1) + 1) == 1
+
+
+def test_steps_of_another_quality():
+    given = dataclasses.replace(FEW, q=0.5, sf_scale=9.0)
+    mixed, finer = _with_steps(given, 0.7).parameters, dataclasses.replace(given, q=0.7).parameters
+    for field in dataclasses.fields(mixed):
+        source = given.parameters if field.name in ("lam", "alpha", "delta_mse_max") else finer
+        assert getattr(mixed, field.name) == getattr(source, field.name), field.name
 
 
 def test_weights_of_some_splats():
