@@ -23,6 +23,7 @@ from potr_cl.errors import UnreachableError
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.judging import Judge, JudgingViews
 from potr_cl.options import EncodeOptions
+from potr_cl.quantize import PRESETS
 from potr_cl.search import Target, encode_to_target
 
 
@@ -33,16 +34,17 @@ def main() -> None:
     parser.add_argument("--sizes", nargs="*", type=float, default=[1.2e6, 2e6, 3e6, 5e6], help="bytes")
     parser.add_argument("--psnrs", nargs="*", type=float, default=[38, 42, 45], help="dB")
     parser.add_argument("--qualities", nargs="*", type=float, default=[0.05, 0.1, 0.2, 0.35, 0.5, 0.7, 1])
+    parser.add_argument("--preset", choices=PRESETS, default=EncodeOptions.preset)
     parser.add_argument("--every", type=int, default=1, metavar="N", help="only every N-th view")
     parser.add_argument("--device")
     args = parser.parse_args()
     device = Device(args.device)
-    print(device.info)
+    print(f"{device.info}, preset {args.preset}")
     for folder in args.scenes:
         scene, cameras = load_scene(folder / "point_cloud.ply"), load_cameras(folder / "cameras.json")
         cameras = [c for split in ("train", "test") for c in [c for c in cameras if c.split == split][:: args.every]]
         judge = Judge(device, scene, JudgingViews.of(cameras), (0.0, 0.0, 0.0))
-        options = EncodeOptions()
+        options = EncodeOptions.for_preset(args.preset)
         encode(scene, cameras, replace(options, iterations=1), device=device)  # builds the kernels
 
         def measured(encoded: Encoded, judge: Judge = judge) -> float:
