@@ -4,7 +4,8 @@ python -m tools.ablation measure SCENE … --json OUT.json [--quality Q]
 python -m tools.ablation report OUT.json
 
 The steps are those of the paper's table "Ablation study": serialisation and quantisation, entropy coding, pruning,
-SH compaction, YCoCg; those before the last quantise R, G and B. A second table has the bytes a splat of each property,
+SH compaction, YCoCg; those before YCoCg quantise R, G and B. The last is ours: balanced steps and a context coder, the
+preset best. A second table has the bytes a splat of each property,
 compared with the float32 values of a PLY (normals left out). ``report`` prints Markdown.
 """
 
@@ -72,18 +73,18 @@ def _coded(judge: JudgedScene, scene: Scene, options: EncodeOptions, rgb: bool) 
 
 def measure_steps(judge: JudgedScene, device: Device, q: float) -> list[dict[str, Any]]:
     """All steps on one scene, the first without entropy coding."""
-    options = EncodeOptions(q=q)
+    options = EncodeOptions.for_preset("paper", q=q)
     plain = _coded(judge, judge.source, options, rgb=True)
     serialised = {**plain, "bytes": plain["serialised_bytes"], "bytes_a_splat": plain["serialised_bytes_a_splat"]}
     steps = [{"step": "serialisation and quantisation", **serialised}, {"step": "entropy coding", **plain}]
-    for name, changes in (
-        ("pruning", {"compact": False}),
-        ("SH compaction", {"colour_model": "rgb"}),
-        ("RGB → YCoCg", {}),
+    for name, changed, rgb in (
+        ("pruning", dataclasses.replace(options, compact=False), True),
+        ("SH compaction", dataclasses.replace(options, colour_model="rgb"), True),
+        ("RGB → YCoCg", options, False),
+        ("preset best", EncodeOptions.for_preset("best", q=q), False),
     ):
-        changed = dataclasses.replace(options, **changes)
         reduced = reduce(judge.source, train_views(judge.cameras), changed, Stopwatch(), device)
-        steps.append({"step": name, **_coded(judge, reduced.scene, changed, rgb=name != "RGB → YCoCg")})
+        steps.append({"step": name, **_coded(judge, reduced.scene, changed, rgb)})
     return steps
 
 

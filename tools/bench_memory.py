@@ -15,6 +15,7 @@ from potr_cl.device import Device
 from potr_cl.encoder import encode
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.options import EncodeOptions
+from potr_cl.quantize import PRESETS
 from potr_cl.removal import SweepOptions
 
 
@@ -52,6 +53,7 @@ def main() -> None:
     parser.add_argument("scene", type=Path)
     parser.add_argument("cameras", type=Path)
     parser.add_argument("--iterations", type=int, default=EncodeOptions.iterations)
+    parser.add_argument("--preset", choices=PRESETS, default=EncodeOptions.preset)
     parser.add_argument("--views", type=int, metavar="N", help="the first so many only")
     parser.add_argument("--memory", type=float, metavar="GB", help="as encode's")
     parser.add_argument("--device")
@@ -62,7 +64,8 @@ def main() -> None:
     scene = load_scene(args.scene)
     cameras = load_cameras(args.cameras)[: args.views]
     memory = None if args.memory is None else int(args.memory * 2**30)
-    options = EncodeOptions(iterations=args.iterations, sweep=SweepOptions(memory=memory))
+    sweep = SweepOptions(memory=memory)
+    options = EncodeOptions.for_preset(args.preset, iterations=args.iterations, sweep=sweep)
     encoded = encode(scene, cameras, options, peaks, device)
     peaks("end")
     most = max(row[1] for row in peaks.rows)

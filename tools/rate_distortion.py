@@ -4,9 +4,9 @@ python -m tools.rate_distortion measure SCENE … --json OUT.json [--qualities Q
 python -m tools.rate_distortion report OUT.json [--formats FORMATS.json] [--images DIR]
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photographs in images. A series is a curve:
-the name it gets and the fields of EncodeOptions in which it differs from the defaults. ``measure`` writes its results
-after every encode and goes on where an existing file stops. ``report`` prints Markdown and draws
-DIR/rate_distortion_SCENE.png; the points of other formats come from tools.compare_formats.
+the name it gets and the fields of EncodeOptions in which it differs from the defaults, as in best:preset=best.
+``measure`` writes its results after every encode and goes on where an existing file stops. ``report`` prints Markdown
+and draws DIR/rate_distortion_SCENE.png; the points of other formats come from tools.compare_formats.
 """
 
 from __future__ import annotations
@@ -89,7 +89,8 @@ def _measure(args: argparse.Namespace) -> None:
             for q in args.qualities:
                 if q in done:
                     continue
-                point = measure_encode(judge, EncodeOptions(q=q, **options), device)
+                changes = {"preset": EncodeOptions.preset, **options, "q": q}
+                point = measure_encode(judge, EncodeOptions.for_preset(**changes), device)
                 curve["encodes"].append(point)
                 curve["encodes"].sort(key=lambda p: p["q"])
                 write_json(args.json, results)
