@@ -444,9 +444,8 @@ class Reader:
                 self._decode_recent(tokens, expected, weights[-2], counts, classes, table, sizes_of)
             else:
                 expected >>= _WEIGHT_BITS
-                np.clip(expected, 0, _LARGEST_SIZE, out=expected)
                 for token, size, count in zip(tokens, expected, counts, strict=True):
-                    self._rans.step(table, classes.take(size[:count]), token[:count])
+                    self._rans.step(table, classes.take(size[:count], mode="clip"), token[:count])
             self._history.add(sizes_of[tokens])
             yield self._values(tokens)
         self._rans.finish()
@@ -470,8 +469,8 @@ class Reader:
             size = r * weight
             size += known[:count]
             size >>= _WEIGHT_BITS
-            np.clip(size, 0, _LARGEST_SIZE, out=size)
-            self._rans.step(table, classes.take(size), token[:count])
+            # What is below 0 or above the last size is taken as these.
+            self._rans.step(table, classes.take(size, mode="clip"), token[:count])
             r -= r >> 2
             r += 2 * sizes_of.take(token[:count])
 

@@ -100,7 +100,7 @@ class Decoder:
         states, slots, entries = self._states[:lanes], self._slots[:lanes], self._entries[:lanes]
         np.bitwise_and(states, TOTAL - 1, out=slots)
         slots += contexts
-        np.take(table, slots, out=entries, mode="clip")
+        table.take(slots, out=entries, mode="clip")
         out[:] = entries  # the token is the entry's lowest byte
         states >>= PRECISION
         np.right_shift(entries, 8 + PRECISION, out=slots)
@@ -108,7 +108,7 @@ class Decoder:
         entries >>= 8
         entries &= TOTAL - 1
         states += entries
-        low = np.flatnonzero(states < LOWEST)
+        (low,) = (states < LOWEST).nonzero()
         if len(low):
             words = self._words[self._read : self._read + len(low)]
             if len(words) < len(low):
