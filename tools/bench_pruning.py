@@ -4,8 +4,8 @@ A SCENE is a folder with point_cloud.ply, cameras.json and, for --truth, images.
 
 curves  PSNR on test views against the share of splats removed, for our schedule at several numbers of iterations (one
         schedule for each count of survivors) and for other pruners' orders.
-skips   the schedule at q = 0.5 with everything computed, and with each of the things that it may skip: time, tiles
-        swept, splats kept, and what the skipping costs, also at equal counts.
+skips   the schedule at q = 0.5 with everything computed, and with each of the things that it may skip or do otherwise:
+        time, tiles swept, splats kept, and what that costs, also at equal counts.
 frames  frames a second before pruning, and after it at an equal loss, by our order and by the best of the others.
 
 PSNR is the mean over test views, against the uncompressed scene's renders, and with --truth also what is lost against
@@ -40,6 +40,7 @@ from potr_cl.rasterizer import Rasterizer
 from potr_cl.removal import RemovalSweep, SweepOptions
 from tools.pruning_baselines import mesongs_power, removal_order, scores, transmittance_sums
 
+F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
 Image = NDArray[np.float32]
 Row = dict[str, Any]
@@ -150,15 +151,23 @@ class Bench:
         rasterizer.free()
         return decibels(statistics.mean(errors))
 
-    def pruned(self, cameras: Sequence[Camera], options: PruningOptions, sweep: SweepOptions) -> tuple[Pruned, Row]:
-        """Run a schedule; its result and its cost in seconds and full sweeps."""
+    def pruned(
+        self, cameras: Sequence[Camera], options: PruningOptions, sweep: SweepOptions, half: int = 0
+    ) -> tuple[Pruned, Row]:
+        """Run a schedule, so many of its measurements of half-size views; its result and its cost in seconds and full
+        sweeps."""
         started = time.perf_counter()
         removal = RemovalSweep(self.rasterizer, cameras, sweep)
+        small = RemovalSweep(self.rasterizer, [halved(c) for c in cameras], sweep) if half else None
         prepared = time.perf_counter()
-        result = prune(removal, len(self.scene), options)
+        effects = HalfSizeFirst(removal, small, half) if small else removal
+        result = prune(effects, len(self.scene), options)
         self.device.queue.finish()
         ended = time.perf_counter()
         sweeps = removal.sweeps
+        if small:
+            sweeps += small.sweeps / 4
+            small.free()
         removal.free()
         return result, {
             "prepare_seconds": prepared - started,
@@ -182,7 +191,7 @@ class Bench:
     def baselines(self) -> dict[str, Indices]:
         """The other pruners' orders."""
         if not self._baselines:
-            sweep = RemovalSweep(self.rasterizer, self.train)
+            sweep = RemovalSweep(self.rasterizer, self.train, SweepOptions(stop=None))
             importance = sweep.measure()[1]
             sweep.free()
             transmittance = transmittance_sums(self.rasterizer, self.train)
@@ -221,42 +230,95 @@ def curves(bench: Bench, shares: Sequence[float], iterations: Sequence[int]) -> 
     return rows
 
 
-def skip_settings(bench: Bench, iterations: Sequence[int]) -> list[tuple[str, Sequence[Camera], int, SweepOptions]]:
-    """What is skipped, views, iterations and sweep options; the full computation first.
+@dataclasses.dataclass(frozen=True)
+class Setting:
+    """One row of the skips.
 
-    The full computation with one and two iterations less says how far results scatter that ought to be the same.
+    Attributes:
+        name: what is skipped.
+        iterations: of the schedule.
+        sweep: what its measurements skip.
+        every: only each so many-th training view counts.
+        half: measurements, after the first, that look at views of half the size; -1: all.
+        pruning: other options of the schedule.
     """
+
+    name: str
+    iterations: int
+    sweep: SweepOptions = dataclasses.field(default_factory=SweepOptions)
+    every: int = 1
+    half: int = 0
+    pruning: Row = dataclasses.field(default_factory=dict)
+
+
+class HalfSizeFirst:
+    """Removal effects of which all measurements but the first and those after some number are of half-size views."""
+
+    def __init__(self, full: RemovalSweep, half: RemovalSweep, number: int) -> None:
+        self._full, self._half, self._left = full, half, number + 1
+        self._first = True
+
+    def measure(self) -> tuple[F64, F64]:
+        """As :meth:`RemovalSweep.measure`."""
+        self._left -= 1
+        if self._left < 0:
+            return self._full.measure()
+        effects = self._half.measure()
+        if self._first:
+            effects = self._full.measure()
+            self._first = False
+        return effects
+
+    def remove(self, splats: Indices) -> None:
+        """As :meth:`RemovalSweep.remove`."""
+        self._full.remove(splats)
+        self._half.remove(splats)
+
+
+def skip_settings(iterations: Sequence[int]) -> list[Setting]:
+    """The full computation first; with one and two iterations less it says how far results scatter that ought to be
+    the same."""
     most = max(iterations)
     fewer = [n for n in sorted({*iterations, 24, 32}) if 1 < n < most]
-    train, full, default = bench.train, SweepOptions(0, 1), SweepOptions()
-    settings: list[tuple[str, Sequence[Camera], int, SweepOptions]] = [("nothing", train, most, full)]
-    settings += [(f"nothing, {most - n} iterations", train, most - n, full) for n in (1, 2) if most > n]
-    settings += [(f"tolerance {t:g}", train, most, SweepOptions(t, 1)) for t in (0.002, 0.005, 0.01, 0.02, 0.05)]
-    settings += [(f"{n} iterations", train, n, default) for n in fewer]
-    settings += [(f"views in {n} turns", train, most, SweepOptions(default.tolerance, n)) for n in (1, 2, 4)]
+    full = SweepOptions(0)
+    settings = [Setting("nothing", most, full)]
+    settings += [Setting(f"nothing, {most - n} iterations", most - n, full) for n in (1, 2) if most > n]
+    settings += [Setting(f"nothing, damping {d:g}", most, full, pruning={"damping": d}) for d in (0, 0.5, 0.9, 1)]
+    settings += [Setting(f"nothing, a = {a:g}", most, full, pruning={"a": a}) for a in (1, 100)]
+    settings += [Setting(f"nothing, pixels end at {e:.0e}", most, SweepOptions(0, stop=e)) for e in (1e-6, 1e-8)]
+    settings += [Setting("what touches no pixel", most, SweepOptions(0, tighten=True))]
+    settings += [Setting(f"tolerance {t:g}", most, SweepOptions(t)) for t in (0.002, 0.005, 0.01, 0.02, 0.05)]
+    settings.append(Setting("tolerance 0.002, damping 0", most, pruning={"damping": 0}))
+    settings += [Setting(f"{n} iterations", n) for n in fewer]
+    settings += [Setting(f"views in {n} turns", most, SweepOptions(turns=n)) for n in (2, 4)]
+    settings += [Setting(f"{n} iterations, views in 4 turns", n, SweepOptions(turns=4)) for n in fewer[-3:]]
     settings += [
-        (f"{n} iterations, views in 4 turns", train, n, SweepOptions(default.tolerance, 4)) for n in fewer[-3:]
+        Setting(f"tiles but {p:.0%} at random, {when}", most, SweepOptions(sample=p, sampled=number))
+        for when, number in (("first half", most // 2), ("always", most))
+        for p in (0.5, 0.25)
     ]
-    settings += [(f"every {name} view", train[::n], most, default) for name, n in (("2nd", 2), ("4th", 4))]
-    settings.append(("half-size views", [halved(c) for c in train], most, default))
+    settings += [Setting(f"every {name} view", most, every=n) for name, n in (("2nd", 2), ("4th", 4))]
+    settings += [Setting(f"half-size views, {w}", most, half=n) for w, n in (("first half", most // 2), ("always", -1))]
     return settings
 
 
 def skips(bench: Bench, iterations: Sequence[int]) -> list[Row]:
     """One row a setting. Equal counts: each order is cut where the full computation ended."""
     rows: list[Row] = []
-    for name, views, rounds, sweep in skip_settings(bench, iterations):
-        result, cost = bench.pruned(views, PruningOptions(DELTA_MSE_MAX, rounds), sweep)
+    for setting in skip_settings(iterations):
+        options = PruningOptions(DELTA_MSE_MAX, setting.iterations, **setting.pruning)
+        views = bench.train[:: setting.every]
+        if setting.half < 0:
+            views = [halved(c) for c in views]
+        result, cost = bench.pruned(views, options, setting.sweep, max(setting.half, 0))
         cost["sweeps"] *= sum(c.width * c.height for c in views) / sum(c.width * c.height for c in bench.train)
         kept = rows[0]["kept"] if rows else result.kept
         at_equal_count = result.order[len(result.order) - kept :]
         own, equal = bench.quality(result.survivors), bench.quality(at_equal_count)
         rows.append(
             {
-                "skipped": name,
-                "iterations": rounds,
-                "tolerance": sweep.tolerance,
-                "turns": sweep.turns,
+                "skipped": setting.name,
+                "iterations": setting.iterations,
                 "views": len(views),
                 **own,
                 "psnr_at_equal_count": equal["psnr"],
@@ -264,7 +326,7 @@ def skips(bench: Bench, iterations: Sequence[int]) -> list[Row]:
                 **cost,
             }
         )
-        log(f"{bench.name}: skipping {name}: {cost['seconds']:.1f} s, {equal['psnr']:.2f} dB")
+        log(f"{bench.name}: skipping {setting.name}: {cost['seconds']:.1f} s, {equal['psnr']:.2f} dB")
     return rows
 
 

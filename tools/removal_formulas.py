@@ -86,7 +86,7 @@ def measure(device: Device, scene: Scene, cameras: Sequence[Camera]) -> tuple[F6
 
 def truth(scene: Scene, camera: Camera, splats: NDArray[np.int64]) -> F64:
     """ΔMSE of single splats in float64 with the pixels' ends held."""
-    held = BruteForce(reference.project(scene, camera, INRIA), camera, INRIA).effects(splats, [STOP])[0, 0]
+    held: F64 = BruteForce(reference.project(scene, camera, INRIA), camera, INRIA).effects(splats, [STOP])[0, 0]
     return held / (3 * camera.width * camera.height)
 
 
