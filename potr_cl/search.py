@@ -168,7 +168,7 @@ def encode_to_target(
         DataError: a value too large to quantise.
         DeviceError: no device does the work.
     """
-    options = options or EncodeOptions()
+    options = options or EncodeOptions.for_preset("best")
     watch = Stopwatch(progress)
     if cameras is None and needs_views(scene, options):
         watch("place cameras", 0.0)
@@ -330,11 +330,11 @@ class _Search:
                     how = options.compaction
                     scene = Compactor(self._device).compact(scene, camera_centres(self._views), weights, how)
             self._estimates[q] = self._note("estimate", q, self._quick_value(scene, options, _FEW_VIEWS))
-            self._watch("estimate", 1.0)
         return self._estimates[q]
 
     def _quick_value(self, scene: Scene, options: EncodeOptions, most_views: int | None = None) -> float:
         """The value without the time that the real entropy stage takes."""
+        self._watch("estimate", 0.0)
         coded = code_scene(scene, options.parameters, self._views, b"", self._quick_coder(), options.threads)
         return self._value(coded.pieces, most_views)
 
@@ -347,9 +347,13 @@ class _Search:
         return coder
 
     def _value(self, pieces: list[bytes], most_views: int | None = None) -> float:
+        self._watch("estimate", 0.0)
         if self._judge is None:
-            return math.log(sum(map(len, pieces)))
-        return min(self._judge.psnr(decode(b"".join(pieces)), most_views), _IDENTICAL)
+            value = math.log(sum(map(len, pieces)))
+        else:
+            value = min(self._judge.psnr(decode(b"".join(pieces)), most_views), _IDENTICAL)
+        self._watch("estimate", 1.0)
+        return value
 
     def _note(self, kind: str, q: float, value: float) -> float:
         self._tries.append(Try(kind, q, value))
