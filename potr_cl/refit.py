@@ -328,7 +328,8 @@ class ColourRefit:
         self._dot_parts.set_args(x, y, np.uint64(self._columns * self._stride), self._parts)
         self.device.launch(self._dot_parts, (_DOT_ITEMS,), (_GROUP,))
         parts = self.device.download(self._parts, (2, _DOT_ITEMS), np.float32)
-        return float(parts[0].sum(dtype=np.float64)), float(parts[1].max())
+        with np.errstate(invalid="ignore"):  # infinities of both signs: the callers look at the result
+            return float(parts[0].sum(dtype=np.float64)), float(parts[1].max())
 
     def _add_ridge(self, sums: cl.Buffer, coefficients: cl.Buffer, lam: float, prior: float) -> None:
         """sums += Γ coefficients + prior · coefficients, on the active coefficients; the others' sums become 0."""
@@ -537,18 +538,20 @@ class ColourRefit:
         first = state = self._linearise(targets, options.selection_lam if options.drop else options.lam, True)
         steps = 0
         if options.drop:
+            chosen_from = self._active_words()
             steps = self._descend(state, options.selection_steps, options.selection_lam, told)
-            self._select_active.set_args(
-                self._x,
-                self._gram,
-                self._active,
-                np.uint32(self._stride),
-                np.float32(options.prior),
-                np.float32(options.drop * values),
-            )
-            self._over_splats(self._select_active, self._lanes)
+            self._select(options.drop * values)
+            self._copy(self._preconditioned, self._start)
             self._copy(self._start, self._x)
             state = self._linearise(targets, options.lam, False)
+            given_up = options.drop * values * np.bitwise_count(chosen_from ^ self._active_words()).sum()
+            if not state.error <= first.error + given_up:
+                # Colours were cut at 0 on the way: choose among the coefficients as they were.
+                self._copy(self._x, self._preconditioned)
+                cl.enqueue_copy(self.device.queue, self._active, chosen_from, is_blocking=True)
+                self._select(options.drop * values)
+                self._copy(self._start, self._x)
+                state, steps = self._linearise(targets, options.lam, False), 0
         more = self._descend(state, options.steps, options.lam, lambda done: told(steps + done))
         last = self._linearise(targets, options.lam, False)
         for _ in range(_HALVINGS):
@@ -560,6 +563,23 @@ class ColourRefit:
             self._copy(self._x, self._start)
             last, more = state, 0
         return Refitted(self._coefficients(self._x), (first.error / values, last.error / values), steps + more)
+
+    def _active_words(self) -> NDArray[np.uint32]:
+        """(2, stride) a bit a coefficient: which are active."""
+        words: NDArray[np.uint32] = self.device.download(self._active, (2, self._stride), np.uint32)
+        return words
+
+    def _select(self, least: float) -> None:
+        """Give up the active coefficients that cost less."""
+        self._select_active.set_args(
+            self._x,
+            self._gram,
+            self._active,
+            np.uint32(self._stride),
+            np.float32(self.options.prior),
+            np.float32(least),
+        )
+        self._over_splats(self._select_active, self._lanes)
 
     def _descend(self, state: _State, most: int, lam: float, told: Callable[[int], None]) -> int:
         """Conjugate-gradient steps from a linearised state; returns how many paid."""

@@ -374,6 +374,16 @@ def test_a_greater_price_keeps_fewer(case):
     assert kept[0] > kept[-1] == 0
 
 
+@pytest.mark.parametrize(("seed", "steps", "dc"), [(0, 30, -3), (3, 8, -5), (7, 30, -3)])
+def test_a_selection_that_overshoots_is_taken_back(device, seed, steps, dc):
+    """Dark scenes without a prior: so many colours are cut at 0 on the way that the steps lead astray."""
+    scene = visible_scene(40, seed=seed)
+    scene.sh[:, 0] += dc
+    with Case(device, scene, visible_scene(60, 2, seed + 7), ring_of_cameras(3, size=40)) as case:
+        refitted = case.solve(RefitOptions(steps=steps, selection_steps=steps, gain=0, drop=1e-15, prior=0))
+    assert refitted.errors[1] <= refitted.errors[0] * (1 + 1e-6)
+
+
 # ------------------------------------------------------------------------------------------ stress
 
 
