@@ -4,6 +4,7 @@ The public interface in short; everything else has its module:
 
 - :func:`load_scene`, :func:`load_cameras`: from the files of :mod:`potr_cl.formats`;
 - :func:`encode` with :class:`EncodeOptions`, or :func:`encode_to_target` with a :class:`Target`, a size or a PSNR;
+- :func:`place_cameras`: views for a scene that comes without any; the two above place them themselves;
 - :func:`decode`: back from a .potr file;
 - :func:`render`: a picture of a scene;
 - :class:`Scene`, :class:`Camera`: what they work on;
@@ -25,6 +26,7 @@ if TYPE_CHECKING:
     from potr_cl.rasterizer import render
     from potr_cl.scene import Scene
     from potr_cl.search import Target, encode_to_target
+    from potr_cl.virtual_cameras import place_cameras
 
 __version__ = "0.1.0"
 
@@ -46,6 +48,7 @@ __all__ = [
     "encode_to_target",
     "load_cameras",
     "load_scene",
+    "place_cameras",
     "render",
 ]
 
@@ -67,6 +70,7 @@ _HOMES = {
     "encode_to_target": "search",
     "load_cameras": "formats",
     "load_scene": "formats",
+    "place_cameras": "virtual_cameras",
     "render": "rasterizer",
 }
 

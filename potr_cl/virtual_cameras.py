@@ -92,7 +92,7 @@ class _Matter:
         reach: (K,) distance up to which each shows all its detail.
         colours: (K, M - 1, 3) their AC coefficients, of unit norm; zero if there are none to speak of.
         occluders: (3, P) points on all opaque splats.
-        areas: (P,) of the surface that each point stands for.
+        areas: (P,) of the surface that each point stands for; 0 if it is too wide to be in the way.
     """
 
     targets: F64
@@ -252,6 +252,8 @@ def _matter(scene: Scene, frame: _Frame) -> _Matter:
     sums = np.cumsum(odds)
     rows = np.searchsorted(sums, (np.arange(_OCCLUDERS) + 0.5) / _OCCLUDERS * sums[-1]).clip(0, len(solid) - 1)
     areas = area[rows] * sums[-1] / (odds[rows] * _OCCLUDERS)
+    # Haze and backdrops: of so wide a splat it means nothing that one of its few points is near.
+    areas[areas > _ELBOW_ROOM**2] = 0
     q = scene.quaternions[solid[rows]].astype(np.float64)
     q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-30)
     local = (2 * _low_discrepancy(_OCCLUDERS, 3) - 1) * scales[rows]
@@ -318,8 +320,9 @@ def _candidates(frame: _Frame, matter: _Matter) -> _Candidates:
     free = np.flatnonzero(crowd <= max(_CROWDED, float(np.quantile(crowd, 0.1))))
     views = [_views_from(places[place], tangents[place], horizons[place], frame, matter) for place in free]
     worths = [worth for _, worth, _ in views]
-    plausible = _plausibility(places[free], [np.maximum.reduce(worth) for worth in worths], matter)
-    if plausible is not None:
+    remembered = _remembered(places[free], [np.maximum.reduce(worth) for worth in worths], matter)
+    if remembered is not None:
+        plausible = np.clip((remembered - _UNTRAINED) / (_TRAINED - _UNTRAINED), 0, 1)
         worths = [worth * part for worth, part in zip(worths, plausible.astype(np.float32), strict=True)]
     each = [len(aims) for aims, _, _ in views]
     return _Candidates(
@@ -329,7 +332,7 @@ def _candidates(frame: _Frame, matter: _Matter) -> _Candidates:
         worth=np.concatenate(worths),
         bins=np.repeat([bins for _, _, bins in views], each, axis=0),
         enclosed=np.repeat([np.mean(np.isfinite(horizons[place])) > _ENCLOSED for place in free], each),
-        trained=plausible is not None,
+        trained=remembered is not None,
     )
 
 
@@ -370,11 +373,11 @@ def _energy(eye: F64, matter: _Matter) -> F32:
     return energy
 
 
-def _plausibility(places: F64, shown: list[F32], matter: _Matter) -> F64 | None:
-    """(places,) 0 where what one sees was never trained to be seen from there, 1 where it was; None: nobody knows.
+def _remembered(places: F64, shown: list[F32], matter: _Matter) -> F64 | None:
+    """(places,) how well the colours of what one sees from a place remember a view from there; None: they cannot tell.
 
-    The energy of the visible splats' colours towards the place is compared with what the same splats have towards the
-    best places. (Training moves coefficients along the basis functions of its views' directions, so their squared
+    It is the energy of the visible splats' colours towards the place, as a part of what the same splats have towards
+    the best places. (Training moves coefficients along the basis functions of its views' directions, so their squared
     deviation, averaged over many splats, follows the density of the views.)
     """
     informative = matter.colours.any(axis=(1, 2))
@@ -386,9 +389,8 @@ def _plausibility(places: F64, shown: list[F32], matter: _Matter) -> F64 | None:
     total = np.maximum(weights.sum(axis=1), 1e-6)
     own = (weights * energy).sum(axis=1) / total
     best = np.quantile(weights @ energy.T / total[:, None], 0.95, axis=1)
-    ratio = own / np.maximum(best, 1e-12)
-    plausible: F64 = np.clip((ratio - _UNTRAINED) / (_TRAINED - _UNTRAINED), 0, 1)
-    return plausible
+    remembered: F64 = own / np.maximum(best, 1e-12)
+    return remembered
 
 
 def _ac_basis(d: F64) -> F64:

@@ -231,6 +231,28 @@ def test_encode_places_them_itself(monkeypatch):
     assert given.pruned is not None
 
 
+@pytest.mark.parametrize("name", ["lego", "plush"])
+def test_trained_colours_remember_their_views(name, request):
+    folder = request.getfixturevalue(name)
+    scene, cameras = load_scene(folder / "point_cloud.ply"), load_cameras(folder / "cameras.json")
+    frame = virtual_cameras._frame(scene)
+    matter = virtual_cameras._matter(scene, frame)
+    places, _ = virtual_cameras._places(frame)
+    true = (camera_centres(cameras) - frame.centre) / frame.unit
+    shown, kept = [], []
+    for number, eye in enumerate(np.concatenate([true, places[::2]])):
+        horizon, blocked = virtual_cameras._surroundings(eye, matter)
+        if number < len(true) or blocked <= virtual_cameras._CROWDED:
+            kept.append(eye)
+            view = virtual_cameras._views_from(eye, virtual_cameras._HALF_VIEW, horizon, frame, matter)
+            shown.append(view[1].max(axis=0))
+    remembered = virtual_cameras._remembered(np.array(kept), shown, matter)
+    of_true, of_others = remembered[: len(true)], remembered[len(true) :]
+    assert of_true.min() > 0.65
+    assert np.quantile(of_true, 0.1) > 0.78
+    assert np.mean(of_others < 0.6) > 0.35
+
+
 def test_lego_is_looked_at_from_above(lego):
     scene = load_scene(lego / "point_cloud.ply")
     eyes = camera_centres(place_cameras(scene))
