@@ -49,6 +49,9 @@ _DOT_ITEMS = 16384
 _SHARE = 0.25
 #: Pixel values beyond this are cut in the kernels (LARGEST_VALUE).
 _LARGEST_VALUE = 64.0
+#: Steps end where the residual's square, as the preconditioner measures it, has shrunk by this: single precision has no
+#: more digits, and what is left of them leads astray.
+_CONVERGED = 1e-14
 #: Half steps tried when a solution is worse than its start because colours were cut at 0 on the way.
 _HALVINGS = 4
 
@@ -583,11 +586,12 @@ class ColourRefit:
 
     def _descend(self, state: _State, most: int, lam: float, told: Callable[[int], None]) -> int:
         """Conjugate-gradient steps from a linearised state; returns how many paid."""
-        remaining, slope = state.objective, 0.0
+        remaining, slope, least = state.objective, 0.0, 0.0
         for step in range(most):
             self._apply_preconditioner(lam)
             new_slope = self._dot(self._preconditioned, self._residual)[0]
-            if not (new_slope > 0 and np.isfinite(new_slope)):
+            least = _CONVERGED * new_slope if step == 0 else least
+            if not (new_slope > least and np.isfinite(new_slope)):
                 return step
             self._linear(new_slope / slope if step else 0.0, self._direction, 1.0, self._preconditioned)
             slope = new_slope

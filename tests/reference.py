@@ -162,9 +162,9 @@ def composite(
     projected: Projected,
     shape: tuple[int, int],
     rules: RasterRules,
-    background: tuple[float, float, float] = (0, 0, 0),
+    background: tuple[float, ...] = (0, 0, 0),
 ) -> Composite:
-    """Composite front to back, every splat over every pixel."""
+    """Composite front to back, every splat over every pixel; colours may have any number of channels."""
     height, width = shape
     y, x = np.mgrid[:height, :width] + 0.5
     image = np.zeros((height, width, projected.colour.shape[1]))

@@ -9,6 +9,7 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -26,14 +27,16 @@ Array = NDArray[np.float64]
 TO_RGB = np.array([[1.0, 1, -1], [1, 0, 1], [1, -1, -1]])
 
 
-def to_ycocg(sh: NDArray[np.floating]) -> Array:
+def to_ycocg(sh: NDArray[np.floating[Any]]) -> Array:
     """(N, M, 3) R, G, B as Y, Co, Cg."""
-    return sh.astype(np.float64) @ np.linalg.inv(TO_RGB).T
+    x: Array = sh.astype(np.float64) @ np.linalg.inv(TO_RGB).T
+    return x
 
 
 def to_rgb(x: Array) -> Array:
     """The inverse of :func:`to_ycocg`."""
-    return x @ TO_RGB.T
+    rgb: Array = x @ TO_RGB.T
+    return rgb
 
 
 @dataclass
@@ -47,7 +50,8 @@ class LinearView:
 
     def colours(self, x: Array) -> Array:
         """(N, 3) R, G, B of the splats, not cut."""
-        return 0.5 + np.einsum("nm,nmc->nc", self.basis, to_rgb(x))
+        rgb: Array = 0.5 + np.einsum("nm,nmc->nc", self.basis, to_rgb(x))
+        return rgb
 
 
 def linear_view(scene: Scene, camera: Camera) -> LinearView:
@@ -85,7 +89,7 @@ class Reference:
         self,
         scene: Scene,
         cameras: Sequence[Camera],
-        targets: Sequence[NDArray[np.floating]],
+        targets: Sequence[NDArray[np.floating[Any]]],
         lam: float = 0.0,
         prior: float = 0.1,
         chroma_factor: float = 3.0,
@@ -180,7 +184,7 @@ class Reference:
         operator = LinearOperator((rows, columns), matvec=apply, rmatvec=apply_transposed, dtype=np.float64)
         data = [(root * r).ravel() for root, r in zip(roots, self.residuals(), strict=True)]
         wanted = np.concatenate([*data, -ridge * self.start[active], np.zeros(columns)])
-        change = lsmr(operator, wanted, atol=1e-12, btol=1e-12, conlim=0, maxiter=20000)[0]
+        change: Array = lsmr(operator, wanted, atol=1e-12, btol=1e-12, conlim=0, maxiter=20000)[0]
         x = self.start.copy()
         x[active] += change
         return x

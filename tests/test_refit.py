@@ -5,21 +5,19 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
-import pyopencl as cl
 import pytest
 
 from potr_cl.cameras import Camera
 from potr_cl.compaction import REFERENCE_PIXELS
 from potr_cl.device import Device
 from potr_cl.errors import UsageError
-from potr_cl.rasterizer import Rasterizer
-from potr_cl.refit import ColourRefit, RefitOptions, RenderedTargets, active_coefficients, refit_colours
-from potr_cl.scene import Scene
+from potr_cl.refit import ColourRefit, RefitOptions, active_coefficients
 from tests.raster_scenes import camera as straight_camera
 from tests.raster_scenes import splats as plain_splats
 from tests.raster_scenes import tilted_camera
-from tests.refit_reference import LENGTHS, Reference, selection, to_rgb, to_ycocg
-from tests.scenes import random_scene, ring_of_cameras
+from tests.refit_cases import Case, Linearised, Pictures, visible_scene
+from tests.refit_reference import LENGTHS, selection, to_rgb, to_ycocg
+from tests.scenes import ring_of_cameras
 
 
 @pytest.fixture(scope="module", params=["cpu", "gpu"])
@@ -29,17 +27,6 @@ def device(request):
     assert device.allocated == 0, "a re-fit did not give all its memory back"
 
 
-def visible_scene(splats: int, degree: int = 3, seed: int = 0) -> Scene:
-    """Splats of several pixels; one colour in fifteen is cut at 0."""
-    scene = random_scene(splats, degree, seed)
-    rng = np.random.default_rng(seed + 100)
-    return dataclasses.replace(
-        scene,
-        log_scales=rng.normal(-2, 0.5, size=(splats, 3)).astype(np.float32),
-        opacity_logits=rng.normal(-1, 1.5, size=splats).astype(np.float32),
-    )
-
-
 def of_size(camera: Camera, width: int, height: int) -> Camera:
     factor = width / camera.width
     return dataclasses.replace(
@@ -47,100 +34,10 @@ def of_size(camera: Camera, width: int, height: int) -> Camera:
     )
 
 
-class Case:
-    """A scene to re-fit to the pictures of another."""
-
-    def __init__(self, device, scene, other, cameras, background=(0.0, 0.0, 0.0)):
-        self.device, self.scene, self.cameras, self.background = device, scene, cameras, background
-        self.rasterizer = Rasterizer(device, other, background=background)
-        self.pictures = [self.rasterizer.render(c)[0] for c in cameras]
-        self.targets = RenderedTargets(self.rasterizer, cameras)
-
-    def reference(self, **changes) -> Reference:
-        return Reference(self.scene, self.cameras, self.pictures, background=self.background, **changes)
-
-    def solve(self, options: RefitOptions, active=None):
-        return refit_colours(
-            self.device, self.scene, self.cameras, self.targets, options, active, background=self.background
-        )
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.rasterizer.free()
-
-
 @pytest.fixture
 def case(device):
     with Case(device, visible_scene(40), visible_scene(60, 2, seed=7), ring_of_cameras(4, size=40)) as case:
         yield case
-
-
-class Linearised:
-    """A solver at its start, with its vectors to be looked at and set."""
-
-    def __init__(self, case: Case, targets=None, options: RefitOptions | None = None):
-        refit = self.refit = ColourRefit(case.device, case.scene, case.cameras, options, background=case.background)
-        refit._zero(refit._gram)
-        refit._copy(refit._start, refit._x)
-        self.state = refit._linearise(targets or case.targets, refit.options.lam, True)
-
-    def vector(self, buffer) -> np.ndarray:
-        """(N, M, 3) in Y, Co, Cg."""
-        refit = self.refit
-        columns = refit.device.download(buffer, (refit._sh_count, 3, refit._stride), np.float32)
-        return columns[:, :, : refit._splats].transpose(2, 0, 1).astype(np.float64)
-
-    def normal(self, direction) -> np.ndarray:
-        """A transposed W A times a direction."""
-        refit = self.refit
-        columns = np.zeros((refit._sh_count, 3, refit._stride), np.float32)
-        columns[:, :, : refit._splats] = direction.transpose(1, 2, 0)
-        cl.enqueue_copy(refit.device.queue, refit._direction, columns)
-        refit._zero(refit._product)
-        refit._sweep_views(refit._direction, refit._product, None, unit=1 / np.abs(direction).max())
-        return self.vector(refit._product)
-
-    def gram(self) -> np.ndarray:
-        """(N, M, M), upper triangles."""
-        refit, count = self.refit, self.refit._sh_count
-        packed = refit.device.download(refit._gram, (refit._triangle, refit._stride), np.float32)
-        blocks = np.zeros((refit._splats, count, count))
-        rows, columns = np.triu_indices(count)
-        blocks[:, rows, columns] = packed[:, : refit._splats].T
-        return blocks
-
-    def active(self) -> np.ndarray:
-        """(N, M, 3)."""
-        refit = self.refit
-        words = refit.device.download(refit._active, (2, refit._stride), np.uint32)[:, : refit._splats]
-        bits = [words[c // 24] >> (c % 24) & 1 for c in range(refit._columns)]
-        return np.array(bits, bool).T.reshape(refit._splats, -1, 3)
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        self.refit.free()
-
-
-class Pictures:
-    """Targets that are given as arrays."""
-
-    def __init__(self, device, pictures):
-        self.device, self.pictures = device, pictures
-        self.buffers = [device.upload(np.ascontiguousarray(p, np.float32), "a picture") for p in pictures]
-
-    def __call__(self, number):
-        return self.buffers[number]
-
-    def __enter__(self):
-        return self
-
-    def __exit__(self, *_):
-        for buffer in self.buffers:
-            self.device.free(buffer)
 
 
 def relative(a, b) -> float:
@@ -282,6 +179,17 @@ def test_each_step_takes_the_objective_down(device):
 def test_it_stops_when_a_step_gains_too_little(case):
     assert case.solve(RefitOptions(steps=50, gain=0.05)).steps < 20
     assert case.solve(RefitOptions(steps=0)).steps == 0
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_it_stops_where_single_precision_ends(device, degree):
+    other = visible_scene(60, 2, seed=7)
+    with Case(device, visible_scene(40, degree), other, ring_of_cameras(3, size=40)) as case:
+        refitted = case.solve(RefitOptions(steps=300, gain=0, lam=30, prior=10))
+        reference = case.reference(lam=30, prior=10)
+    assert refitted.steps < 100
+    solution = reference.solution()
+    assert np.linalg.norm(to_ycocg(refitted.sh) - solution) < 1e-4 * np.linalg.norm(solution - reference.start)
 
 
 def test_progress(case):
