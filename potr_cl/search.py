@@ -50,8 +50,8 @@ _QUICK_LEVEL, _LEVEL_GAIN = 9, -0.08
 _ENCODES = 3
 #: Stands for the infinite PSNR of identical pictures, decibels.
 _IDENTICAL = 200.0
-#: Values that one solution for q may ask for.
-_STEPS = 12
+#: Values that one solution for q may ask for, and the fineness between two that is too little to tell them apart.
+_STEPS, _SAME = 12, 0.001
 
 
 @dataclass(frozen=True)
@@ -451,7 +451,7 @@ def _solve(
     """The q at which a growing function meets the aim (``low`` or ``high`` if that lies beyond), and its value."""
     points: dict[float, float] = {}
     window = target.window
-    tolerance = (window[1] - window[0]) / 5
+    tolerance = (window[1] - window[0]) / 4
     q = first
     for step in range(_STEPS):
         points[q] = value(q)
@@ -461,8 +461,8 @@ def _solve(
         above = [p for p in points if points[p] >= aim]
         if below and above:
             a, b = max(below), min(above)
-            if a > b:
-                break  # it does not grow everywhere: this is as near as it gets
+            if axis.fineness(b) - axis.fineness(a) < _SAME:
+                break  # or it does not grow everywhere: this is as near as it gets
             # Along a line, but now and then in the middle: where the curve bends, one of the two would stay for long.
             part = (aim - points[a]) / (points[b] - points[a]) if step % 3 < 2 else 0.5
             q = axis.quality(axis.fineness(a) + (axis.fineness(b) - axis.fineness(a)) * min(max(part, 0.05), 0.95))
