@@ -102,7 +102,7 @@ class Reference:
         self.background = np.asarray(background, np.float64)
         self.active = np.ones(scene.sh.shape, bool) if active is None else active
         # The solver keeps its start in float32.
-        self.start = to_ycocg(scene.sh).astype(np.float32).astype(np.float64) * (self.active | hold)
+        self.start: Array = to_ycocg(scene.sh).astype(np.float32).astype(np.float64) * (self.active | hold)
         self.free = [view.colours(self.start) > 0 for view in self.views]
         self.pull = np.zeros(scene.sh.shape)
         self.pull[:, 1:] = lam * np.array([1, chroma_factor, chroma_factor])

@@ -2,7 +2,8 @@
 
 Each device and kernel family runs in a process of its own, so that a runtime that crashes is one row of the table. What
 is checked: the device's self-check; small random scenes of every SH degree and both rules against the float64
-definition; the same bytes twice; and, where FOLDER holds scenes with reference renders, PSNR against them.
+definition; the same bytes twice; the re-fit's maps and its solution against float64; and, where FOLDER holds scenes
+with reference renders, PSNR against them.
 
 Oclgrind, where installed, simulates small scenes under its race, bounds and initialisation checks. pip's PoCL, Debian's
 PoCL (pocl-opencl-icd), Intel's (intel-opencl-rt) and Mesa's rusticl (mesa-opencl-icd) are found if they are there.
@@ -29,9 +30,13 @@ from potr_cl.compaction import Compactor, ViewWeights
 from potr_cl.device import Device, DeviceInfo, list_devices
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.refit import ColourRefit, RefitOptions, RenderedTargets
 from potr_cl.removal import RemovalSweep, SweepOptions
 from tests import reference
 from tests.raster_scenes import camera, random_splats, splats, tilted_camera
+from tests.refit_cases import Case, Linearised, Pictures, visible_scene
+from tests.refit_reference import Array, to_ycocg
+from tests.scenes import ring_of_cameras
 
 #: As in the tests: pixels that come no nearer, relatively, to 1/255 and 1e-4 cannot flip.
 CLEAR = 1e-4
@@ -58,6 +63,54 @@ def check_definition(device: Device, sizes: tuple[int, ...] = (30, 400)) -> dict
     return {"error": worst, "flips": flips, "pixels": pixels, "same_bytes": same}
 
 
+def check_refit(device: Device) -> dict[str, Any]:
+    """The re-fit's float32 against float64, relative errors: the worst of SH degrees 0 to 3.
+
+    Returns:
+        ``transposed``, of random pictures; ``normal``, of random coefficients through the map and back; ``blocks``,
+        the preconditioner's; ``adjoint``, <A d, r> - <d, Aᵀ r>; ``solution``, of the coefficients' change; and
+        whether two solves gave the same bytes.
+    """
+    worst = dict.fromkeys(("transposed", "normal", "blocks", "adjoint", "solution"), 0.0)
+    same = True
+    for degree in range(4):
+        rng = np.random.default_rng(degree)
+        with Case(device, visible_scene(40, degree), visible_scene(60, 2, seed=7), ring_of_cameras(3, size=40)) as case:
+            lam, prior = 30.0, 10.0
+            wanted = case.reference(lam=lam, prior=prior)
+            rendered = [p.reshape(*t.shape) for p, t in zip(wanted.pictures(wanted.start), case.pictures, strict=True)]
+            targets = [(p - rng.uniform(-1, 1, size=p.shape)).astype(np.float32) for p in rendered]
+            images = [(p - t).reshape(-1, 3) for p, t in zip(rendered, targets, strict=True)]
+            direction = rng.normal(size=case.scene.sh.shape)
+            with Pictures(device, targets) as pictures, Linearised(case, pictures, RefitOptions(lam=0)) as linear:
+                transposed = -linear.vector(linear.refit._residual)
+                normal, blocks = linear.normal(direction), linear.gram()
+            forward, back, gram = wanted.forward(direction), wanted.transposed(images), np.triu(wanted.gram())
+            weights = [view.weight for view in wanted.views]
+            product = sum(w * float(np.sum(a * b)) for w, a, b in zip(weights, forward, images, strict=True))
+            lengths = [
+                np.sqrt(sum(w * float(np.sum(a * a)) for w, a in zip(weights, vectors, strict=True)))
+                for vectors in (forward, images)
+            ]
+            options = RefitOptions(steps=300, gain=0, lam=lam, prior=prior)
+            solved = case.solve(options).sh
+            same &= solved.tobytes() == case.solve(options).sh.tobytes()
+            solution = wanted.solution()
+            errors = {
+                "transposed": _relative(transposed, back),
+                "normal": _relative(normal, wanted.transposed(forward)),
+                "blocks": float(np.abs(blocks - gram).max() / gram.max()),
+                "adjoint": abs(float(np.sum(direction * transposed)) - product) / (lengths[0] * lengths[1]),
+                "solution": _relative(to_ycocg(solved) - wanted.start, solution - wanted.start),
+            }
+            worst = {name: max(worst[name], error) for name, error in errors.items()}
+    return {**worst, "same_bytes": same}
+
+
+def _relative(value: Array, wanted: Array) -> float:
+    return float(np.linalg.norm(value - wanted) / np.linalg.norm(wanted))
+
+
 def check_scene(device: Device, folder: Path) -> dict[str, float]:
     """Lowest PSNR against the reference renders, largest difference, and seconds a frame."""
     rasterizer = Rasterizer(device, load_scene(folder / "point_cloud.ply"), GSPLAT)
@@ -81,7 +134,7 @@ def check_device(index: int, family: str, scenes: Path | None) -> dict[str, Any]
     """Everything about one device and family."""
     device = Device(list_devices()[index], family=family)  # type: ignore[arg-type]
     device.self_check()
-    result = {"vector_width": device.vector_width, **check_definition(device)}
+    result = {"vector_width": device.vector_width, **check_definition(device), "refit": check_refit(device)}
     for name in ("lego", "plush"):
         if scenes and (scenes / name / "reference").exists():
             result[name] = check_scene(device, scenes / name)
@@ -112,6 +165,8 @@ def simulate() -> None:
         removal.measure()
         removal.remove(np.arange(0, 60, 5))
         removal.measure()
+        refit = ColourRefit(device, scene, views, RefitOptions(steps=2, gain=0, drop=1e-9))
+        refit.solve(RenderedTargets(kept[-1], views))
         weights = ViewWeights.from_importances(len(scene), removal.view_importances())
         for degree in (1, 2, 3):
             Compactor(device).compact(random_splats(60, degree, seed=2), camera_centres(views), weights)
@@ -154,15 +209,17 @@ def row(info: DeviceInfo, family: str, scenes: Path | None) -> str:
     head = f"| {info.name} | {info.platform}, {info.version} | {family}"
     if run.returncode:
         message = run.stderr.strip().splitlines()[-1] if run.stderr.strip() else f"exit code {run.returncode}"
-        return f"{head} | failed: {message} | | | | |"
+        return f"{head} | failed: {message}" + " |" * 11
     r = json.loads(run.stdout.splitlines()[-1])
     real = [
         f"{r[n]['psnr']:.1f} dB, {r[n]['largest']:.1e}, {1e3 * r[n]['seconds']:.1f} ms" if n in r else ""
         for n in ("lego", "plush")
     ]
+    same = r["same_bytes"] and r["refit"]["same_bytes"]
+    refit = " | ".join(f"{r['refit'][n]:.0e}" for n in ("adjoint", "transposed", "normal", "blocks", "solution"))
     return (
         f"{head} | {r['vector_width'] if family == 'cpu' else ''} | {r['error']:.1e} | "
-        f"{r['flips']} of {r['pixels']:,} | {'yes' if r['same_bytes'] else 'NO'} | {real[0]} | {real[1]} |"
+        f"{r['flips']} of {r['pixels']:,} | {'yes' if same else 'NO'} | {refit} | {real[0]} | {real[1]} |"
     )
 
 
@@ -182,8 +239,8 @@ def main() -> None:
         print(json.dumps(check_device(arguments.device, arguments.family, arguments.scenes)))
         return
     print(
-        "| device | runtime | family | vector | largest error | flipped pixels | same bytes twice | lego | plush |\n"
-        "|---|---|---|---|---|---|---|---|---|"
+        "| device | runtime | family | vector | largest error | flipped pixels | same bytes twice | re-fit: "
+        "<A d, r> − <d, Aᵀ r> | Aᵀ r | Aᵀ A d | blocks | solution | lego | plush |\n" + "|---" * 14 + "|"
     )
     for info in list_devices():
         for family in ("gpu", "cpu") if info.family == "cpu" else ("gpu",):
