@@ -185,7 +185,7 @@ class Reference:
         data = [(root * r).ravel() for root, r in zip(roots, self.residuals(), strict=True)]
         wanted = np.concatenate([*data, -ridge * self.start[active], np.zeros(columns)])
         change: Array = lsmr(operator, wanted, atol=1e-12, btol=1e-12, conlim=0, maxiter=20000)[0]
-        x = self.start.copy()
+        x: Array = self.start.copy()
         x[active] += change
         return x
 
