@@ -464,6 +464,7 @@ class Reader:
         sizes_of: I32,
     ) -> None:
         recent = np.zeros(tokens.shape[1], np.int32)
+        twice = 2 * sizes_of
         for token, known, count in zip(tokens, expected, counts, strict=True):
             r = recent[:count]
             size = r * weight
@@ -472,7 +473,7 @@ class Reader:
             # What is below 0 or above the last size is taken as these.
             self._rans.step(table, classes.take(size, mode="clip"), token[:count])
             r -= r >> 2
-            r += 2 * sizes_of.take(token[:count])
+            r += twice.take(token[:count], mode="clip")
 
     def _values(self, tokens: U8) -> NDArray[np.integer]:
         top = int(tokens.max())
