@@ -46,6 +46,38 @@ def test_single_values_replace():
     assert p.beta == pytest.approx(7e-5)
 
 
+def test_one_factor_for_all_of_sh_in_the_paper():
+    assert HyperParameters.from_quality(0.5, sf_sh=20).sf_dc == 20
+    assert HyperParameters.from_quality(0.5, sf_sh=20, sf_dc=30).sf_dc == 30
+    best = HyperParameters.from_quality(0.5, "best")
+    assert HyperParameters.from_quality(0.5, "best", sf_sh=20).sf_dc == best.sf_dc
+
+
+def test_presets():
+    assert HyperParameters.from_quality(0.5).version == 1
+    assert HyperParameters.from_quality(0.3, "best") == HyperParameters.from_quality(0.3, "fast")
+    coarse, fine = (HyperParameters.from_quality(q, "best") for q in (0.2, 0.7))
+    assert coarse.version == fine.version == 2
+    for name in ("sf_dc", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale"):
+        assert getattr(coarse, name) < getattr(fine, name)
+    assert coarse.beta > fine.beta
+    with pytest.raises(UsageError, match="preset"):
+        HyperParameters.from_quality(0.5, "smallest")
+
+
+def test_logits_come_back_within_half_a_step():
+    logits = np.linspace(-8, 12, 1001)
+    back = quantize.dequantize_logits(quantize.quantize_logits(logits, 5.5), 5.5)
+    assert np.abs(back - logits).max() <= HALF / 5.5
+    extremes = quantize.dequantize_logits(quantize.quantize_logits(np.array([-50.0, 50.0]), 5.5), 5.5)
+    assert np.allclose(extremes, (-8, 12), atol=HALF / 5.5)
+
+
+def test_long_splats_have_finer_rotations():
+    factors = quantize.rotation_factors([np.array([0, 1, 16]), np.array([0, 0, 3]), np.array([0, 1, 100])], 9.5)
+    assert np.allclose(factors, [9.5, 9.5, 95])
+
+
 @pytest.mark.parametrize("bad", [{"q": -0.1}, {"q": 1.1}, {"q": float("nan")}, {"gamma": 0}, {"sf_sh": 0},
                                  {"sf_scale": float("inf")}, {"beta": -1}])  # fmt: skip
 def test_out_of_range(bad):
