@@ -9,7 +9,7 @@ import os
 import re
 import tempfile
 import warnings
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
@@ -253,6 +253,7 @@ class Device:
         info: the device, or what :func:`choose_device` understands.
         profiling: record a pair of device timestamps for every launch, see :attr:`timings`.
         family: run the kernels of this family instead of the device's own (for tests and benchmarks).
+        build_options: compiler flags for every program; the kernels' accuracy is known without any.
 
     Attributes:
         info, context, queue.
@@ -271,6 +272,7 @@ class Device:
         *,
         profiling: bool = False,
         family: Family | None = None,
+        build_options: Sequence[str] = (),
     ) -> None:
         self.info = info if isinstance(info, DeviceInfo) else choose_device(info)
         self.family: Family = family or self.info.family
@@ -278,6 +280,7 @@ class Device:
         self.timings: list[tuple[str, cl.Event]] = []
         self._unfinished: list[list[cl.Buffer]] = []
         self._profiling = profiling
+        self._build_options = tuple(build_options)
         self._programs: dict[tuple[str, tuple[tuple[str, str], ...]], cl.Program] = {}
         with self.errors("cannot be opened"):
             self.context = cl.Context([self.info.handle])
@@ -316,7 +319,7 @@ class Device:
         macros = tuple(sorted((name, _literal(value)) for name, value in defines.items()))
         key = (source, macros)
         if key not in self._programs:
-            options = ["-cl-std=CL1.2", *(f"-D{name}={value}" for name, value in macros)]
+            options = ["-cl-std=CL1.2", *self._build_options, *(f"-D{name}={value}" for name, value in macros)]
             with self.errors(f"failed to build {source}"), warnings.catch_warnings():
                 warnings.simplefilter("ignore", cl.CompilerWarning)  # some drivers chat without being asked
                 self._programs[key] = cl.Program(self.context, kernel_source(source)).build(options)
