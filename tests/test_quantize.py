@@ -68,7 +68,7 @@ def test_presets():
 def test_logits_come_back_within_half_a_step():
     logits = np.linspace(-8, 12, 1001)
     back = quantize.dequantize_logits(quantize.quantize_logits(logits, 5.5), 5.5)
-    assert np.abs(back - logits).max() <= HALF / 5.5
+    assert np.abs(back - logits).max() <= 0.5 / 5.5 + 2e-6  # float32 rounds numbers up to 20
     extremes = quantize.dequantize_logits(quantize.quantize_logits(np.array([-50.0, 50.0]), 5.5), 5.5)
     assert np.allclose(extremes, (-8, 12), atol=HALF / 5.5)
 
