@@ -178,7 +178,8 @@ class Reference:
                 images.append(values[at : at + size].reshape(-1, 3) / root)
                 at += size
             first = self.transposed(images)[active]
-            return first + ridge * values[at : at + columns] + prior * values[at + columns :]
+            change: Array = first + ridge * values[at : at + columns] + prior * values[at + columns :]
+            return change
 
         rows = sum(3 * len(view.blend) for view in self.views) + 2 * columns
         operator = LinearOperator((rows, columns), matvec=apply, rmatvec=apply_transposed, dtype=np.float64)
