@@ -8,6 +8,7 @@ from typing import Any
 from potr_cl import quantize
 from potr_cl.bitstream import EntropyCoder
 from potr_cl.compaction import ColourModel, CompactionOptions, Weighting
+from potr_cl.pruning import PruningOptions
 from potr_cl.removal import SweepOptions
 
 
@@ -22,7 +23,7 @@ class EncodeOptions:
         lam, alpha, delta_mse_max, beta, gamma, sf_dc, sf_sh, sf_opacity, sf_rotation, sf_scale: replace single
             hyper-parameters (:class:`potr_cl.quantize.HyperParameters`).
         prune: remove splats; looks at views.
-        iterations: of the pruning schedule.
+        iterations, mapping_a, damping: of the pruning schedule (:class:`potr_cl.pruning.PruningOptions`).
         compact: make the SH coefficients sparse; looks at views.
         compact_at: the part of the pruning iterations after which that is done: later ones see its effect.
         colour_model, weighting, two_pass: of the compaction (:class:`potr_cl.compaction.CompactionOptions`).
@@ -52,6 +53,8 @@ class EncodeOptions:
     sf_scale: float | None = None
     prune: bool = True
     iterations: int = 48
+    mapping_a: float = PruningOptions.a
+    damping: float = PruningOptions.damping
     compact: bool = True
     compact_at: float = 0.75
     colour_model: ColourModel = CompactionOptions.colour_model

@@ -47,7 +47,13 @@ def reduce_scene(
         DeviceError: the scene does not fit the device.
     """
     report = progress or (lambda stage, done: None)
-    schedule = PruningOptions(options.parameters.delta_mse_max, options.iterations, count=options.count)
+    schedule = PruningOptions(
+        options.parameters.delta_mse_max,
+        options.iterations,
+        a=options.mapping_a,
+        count=options.count,
+        damping=options.damping,
+    )
     for part in (options.compact_at, *options.refit_at):
         if not 0 <= part <= 1:
             raise UsageError(f"a stage after {part:g} of the iterations: it must lie between 0 and 1")

@@ -22,6 +22,7 @@ from potr_cl.cli.options import (
     as_bytes,
     compaction_choices,
     count,
+    pruning_choices,
     sweep_options,
 )
 from potr_cl.cli.progress import Progress
@@ -52,6 +53,7 @@ def _prune(args: argparse.Namespace) -> None:
         q=args.quality,
         delta_mse_max=args.delta_mse_max,
         iterations=args.iterations,
+        **pruning_choices(args),
         compact=False,
         sweep=sweep_options(args),
         background=parse_colour(args.background),

@@ -18,6 +18,7 @@ from potr_cl.cli.options import (
     add_pruning_options,
     compaction_choices,
     count,
+    pruning_choices,
     size_in_bytes,
     sweep_options,
 )
@@ -50,6 +51,7 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
         args.preset,
         q=args.quality,
         delta_mse_max=args.delta_mse_max,
+        **pruning_choices(args),
         **compaction_choices(args),
         prune=not args.no_prune,
         compact=not args.no_compact,

@@ -10,6 +10,7 @@ from typing import Any, TypeAlias, get_args
 from potr_cl.compaction import ColourModel, CompactionOptions, Weighting
 from potr_cl.device import DEVICE_VARIABLE
 from potr_cl.errors import UsageError
+from potr_cl.pruning import PruningOptions
 from potr_cl.rasterizer import GSPLAT, INRIA
 from potr_cl.removal import SweepOptions
 
@@ -30,6 +31,11 @@ def count(args: argparse.Namespace, splats: int) -> int | None:
 
 def sweep_options(args: argparse.Namespace) -> SweepOptions:
     return SweepOptions(args.tolerance, args.turns, as_bytes(args.memory))
+
+
+def pruning_choices(args: argparse.Namespace) -> dict[str, Any]:
+    """What :func:`add_pruning_options` added of the schedule, as keywords of EncodeOptions."""
+    return {"mapping_a": args.mapping_a, "damping": args.damping}
 
 
 def as_bytes(gigabytes: float | None) -> int | None:
@@ -74,6 +80,21 @@ def add_pruning_options(p: argparse.ArgumentParser) -> None:
         default=SweepOptions.turns,
         metavar="N",
         help=f"look at a view again in every N-th iteration only; default {SweepOptions.turns}",
+    )
+    group.add_argument(
+        "--damping",
+        type=float,
+        default=PruningOptions.damping,
+        metavar="X",
+        help="what a splat's effect in one iteration counts against the next iteration's; 0: only the newest counts, as "
+        f"in the paper; default {PruningOptions.damping:g}",
+    )
+    group.add_argument(
+        "--mapping-a",
+        type=float,
+        default=PruningOptions.a,
+        metavar="X",
+        help=f"how late splats go whose removal improves the match: the smaller, the later; default {PruningOptions.a:g}",
     )
     add_memory_option(group)
     add_device_options(group)
