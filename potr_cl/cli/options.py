@@ -86,15 +86,16 @@ def add_pruning_options(p: argparse.ArgumentParser) -> None:
         type=float,
         default=PruningOptions.damping,
         metavar="X",
-        help="what a splat's effect in one iteration counts against the next iteration's; 0: only the newest counts, as "
-        f"in the paper; default {PruningOptions.damping:g}",
+        help="what a splat's effect in one iteration counts against the next iteration's; 0: only the newest "
+        f"counts, as in the paper; default {PruningOptions.damping:g}",
     )
     group.add_argument(
         "--mapping-a",
         type=float,
         default=PruningOptions.a,
         metavar="X",
-        help=f"how late splats go whose removal improves the match: the smaller, the later; default {PruningOptions.a:g}",
+        help="the smaller, the later go splats whose removal improves the match; default "
+        f"{PruningOptions.a:g}, the paper's",
     )
     add_memory_option(group)
     add_device_options(group)
