@@ -7,6 +7,7 @@ concerns memory runs in a process of its own.
 from __future__ import annotations
 
 import argparse
+import dataclasses
 import json
 import os
 import platform
@@ -136,16 +137,23 @@ def _like() -> tuple[Path, Path | None]:
 
 
 def bench_decode(splats: int, folder: Path) -> None:
+    plain = EncodeOptions(entropy=EntropyCoder("zstd", 9), prune=False, compact=False)
+    _bench_decode("paper's steps, zstd 9", plain, splats, folder)
+    context = EncodeOptions.for_preset("best", refit=0, prune=False, compact=False)
+    _bench_decode("preset best, context coder", context, splats, folder)
+
+
+def _bench_decode(name: str, options: EncodeOptions, splats: int, folder: Path) -> None:
     scene_path, cameras = _like()
     scene = large_scene(load_scene(scene_path), splats)
     views = load_cameras(cameras) if cameras else None
     path = folder / "scene.potr"
-    encoded = encode(scene, views, EncodeOptions(entropy=EntropyCoder("zstd", 9), prune=False, compact=False))
+    encoded = encode(scene, views, options)
     path.write_bytes(b"".join(encoded.pieces))
     del scene
     result = _child("decode", path)
     best, middle = min(result["all"]), statistics.median(result["all"])
-    print(f"\n### Decode, {splats} splats of SH degree 3, {encoded.nbytes / 1e6:.1f} MB\n")
+    print(f"\n### Decode, {splats} splats of SH degree 3, {name}, {encoded.nbytes / 1e6:.1f} MB\n")
     print("| | median | best |\n|---|---|---|")
     print(f"| all threads | {middle * 1e3:.0f} ms | {best * 1e3:.0f} ms |")
     print(f"| million splats/s | {splats / middle / 1e6:.2f} | {splats / best / 1e6:.2f} |")
@@ -218,8 +226,12 @@ def bench_sizes(_: int, __: Path) -> None:
             ("zstd 19", EntropyCoder("zstd", 19)),
             ("zstd 22", EntropyCoder("zstd", 22)),
             ("npz", EntropyCoder("npz")),
+            ("best", None),
         ):
-            encoded = encode(scene, cameras, EncodeOptions(entropy=coder, prune=False, compact=False))
+            options = EncodeOptions.for_preset(
+                "best" if coder is None else "paper", prune=False, compact=False, refit=0
+            )
+            encoded = encode(scene, cameras, dataclasses.replace(options, entropy=coder or options.entropy))
             columns[label] = file_report(PotrFile.from_bytes(b"".join(encoded.pieces)))
         first = columns["zstd 9"]
         print("| | serialised | " + " | ".join(columns) + " |\n|---|---|" + "---|" * len(columns))
