@@ -112,7 +112,7 @@ def encode(
         scene: clean (:meth:`potr_cl.scene.Scene.cleaned`), at least one splat.
         cameras: the training views among them decide which splats may go, and how coarse centres may be. None: virtual
             ones are placed if the options ask for anything that looks at views; if not, γ alone decides about centres.
-        options: defaults to quality 0.5.
+        options: defaults to quality 0.5 of preset best.
         progress: told how far each stage is.
         device: to prune on; the best one there is by default. Where its memory is too small, less is kept in it, and
             if that is not enough a CPU does the work; either is said by a warning.
@@ -122,7 +122,7 @@ def encode(
         DataError: a value too large to quantise.
         DeviceError: no device does the work.
     """
-    options = options or EncodeOptions()
+    options = options or EncodeOptions.for_preset("best")
     watch = Stopwatch(progress)
     if cameras is None and needs_views(scene, options):
         watch("place cameras", 0.0)
@@ -175,7 +175,7 @@ def refit(
     place[bare.order] = np.arange(len(reduced))
     decoded = decode(b"".join(bare.pieces)).subset(place)
     active = active_coefficients(reduced.sh, parameters.sf_sh) if options.compact else None
-    how = RefitOptions(steps=options.refit, drop=options.drop, memory=options.sweep.memory)
+    how = RefitOptions(steps=options.refit, drop=parameters.drop, memory=options.sweep.memory)
     rasterizer = Rasterizer(device, scene, background=options.background)
     try:
         return refit_colours(

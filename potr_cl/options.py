@@ -20,7 +20,7 @@ class EncodeOptions:
         q: quality, 0 to 1; sets every hyper-parameter that is not given on its own.
         preset: how q sets them, and the file's version: :meth:`potr_cl.quantize.HyperParameters.from_quality`. What
             else belongs to a preset comes with :meth:`for_preset`.
-        lam, alpha, delta_mse_max, beta, gamma, sf_dc, sf_sh, sf_opacity, sf_rotation, sf_scale: replace single
+        lam, alpha, delta_mse_max, drop, beta, gamma, sf_dc, sf_sh, sf_opacity, sf_rotation, sf_scale: replace single
             hyper-parameters (:class:`potr_cl.quantize.HyperParameters`).
         prune: remove splats; looks at views.
         iterations, mapping_a, damping: of the pruning schedule (:class:`potr_cl.pruning.PruningOptions`).
@@ -28,7 +28,6 @@ class EncodeOptions:
         compact_at: the part of the pruning iterations after which that is done: later ones see its effect.
         colour_model, weighting, two_pass: of the compaction (:class:`potr_cl.compaction.CompactionOptions`).
         refit: conjugate-gradient steps of the joint re-fit of the colours; 0 leaves it out. Looks at views.
-        drop: mean squared error for which the re-fit gives up a coefficient; 0: none is.
         refit_at, refit_at_steps: the parts of the pruning iterations after which colours are re-fitted too, so that
             later ones judge by colours that have made up for what went, and the steps of each.
         count: number of splats to keep, instead of ΔMSE_MAX.
@@ -44,6 +43,7 @@ class EncodeOptions:
     lam: float | None = None
     alpha: float | None = None
     delta_mse_max: float | None = None
+    drop: float | None = None
     beta: float | None = None
     gamma: float | None = None
     sf_dc: float | None = None
@@ -61,7 +61,6 @@ class EncodeOptions:
     weighting: Weighting = CompactionOptions.weighting
     two_pass: bool = CompactionOptions.two_pass
     refit: int = 0
-    drop: float = 0.0
     refit_at: tuple[float, ...] = ()
     refit_at_steps: int = 3
     count: int | None = None
@@ -73,14 +72,22 @@ class EncodeOptions:
 
     @staticmethod
     def for_preset(preset: quantize.Preset, **changes: Any) -> EncodeOptions:
-        """All that a preset means, with changes: keywords are attributes."""
-        quick: dict[str, Any] = {"iterations": 12, "entropy": EntropyCoder("zstd", 9)}
-        return EncodeOptions(**{"preset": preset, **(quick if preset == "fast" else {}), **changes})
+        """All that a preset means, with changes: keywords are attributes.
+
+        Without a re-fit the colours are compacted, unless the changes say otherwise.
+        """
+        given: dict[str, Any] = {"preset": preset}
+        if preset != "paper":
+            given["refit"] = 8 if preset == "best" else 4
+        if preset == "fast":
+            given |= {"iterations": 16, "entropy": EntropyCoder("zstd", 9)}
+        given |= changes
+        return EncodeOptions(**{"compact": not given.get("refit"), **given})
 
     @property
     def parameters(self) -> quantize.HyperParameters:
         """The hyper-parameters that result."""
-        names = ("lam", "alpha", "delta_mse_max", "beta", "gamma")
+        names = ("lam", "alpha", "delta_mse_max", "drop", "beta", "gamma")
         factors = ("sf_dc", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale")
         return quantize.HyperParameters.from_quality(
             self.q, self.preset, **{name: getattr(self, name) for name in (*names, *factors)}

@@ -44,6 +44,7 @@ class HyperParameters:
         lam: λ, how strongly SH compaction pulls AC coefficients to zero, pixels squared.
         alpha: two SH columns whose cosine exceeds it count as parallel.
         delta_mse_max: ΔMSE_MAX: a splat may go if its removal changes the mean squared error by less.
+        drop: the same for an AC coefficient, given up by the re-fit of the colours.
         beta: allowed distance of a centre to its leaf's centre: version 1: as a part of the distance to the nearest
             camera; version 2: as a part of a typical splat's size at that distance.
         gamma: the least such distance, world units.
@@ -57,6 +58,7 @@ class HyperParameters:
     lam: float
     alpha: float
     delta_mse_max: float
+    drop: float
     beta: float
     gamma: float
     sf_sh: float
@@ -104,6 +106,7 @@ def _paper(q: float) -> HyperParameters:
         lam=10**-q,
         alpha=1 / (1 + math.exp(-3 * q)),
         delta_mse_max=10 ** (-8.8 - 2 * q),
+        drop=0.0,
         beta=1.4e-4 * q,
         gamma=5.0 * 10 ** (-3 - 5 * q),
         sf_dc=1 + 100 * q,
@@ -115,19 +118,24 @@ def _paper(q: float) -> HyperParameters:
 
 
 def _balanced(q: float) -> HyperParameters:
-    """Steps at which a bit more buys the same everywhere; all errors grow with ΔMSE_MAX, so steps with its root."""
-    paper = _paper(q)
+    """Where a bit more buys the same everywhere; all errors grow with ΔMSE_MAX, so steps with its root.
+
+    A coefficient is worth the part of a splat's bits that it takes, about a fourteenth.
+    """
     finer = 10 ** (q - 0.5)
+    delta_mse_max = 10 ** (-8.3 - 2 * q)
     return replace(
-        paper,
+        _paper(q),
         version=2,
-        beta=0.04 / finer,
+        delta_mse_max=delta_mse_max,
+        drop=delta_mse_max / 14,
+        beta=0.056 / finer,
         gamma=1e-30,
         sf_dc=31 * finer,
-        sf_sh=24 * finer,
+        sf_sh=48 * finer,
         sf_opacity=5.5 * finer,
-        sf_rotation=9.5 * finer,
-        sf_scale=11 * finer,
+        sf_rotation=7.6 * finer,
+        sf_scale=8.8 * finer,
     )
 
 

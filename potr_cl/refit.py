@@ -77,7 +77,7 @@ class RefitOptions:
 
     steps: int = 8
     drop: float = 0.0
-    selection_steps: int = 4
+    selection_steps: int = 2
     selection_lam: float = 0.0
     gain: float = 0.01
     lam: float = 0.0

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
@@ -14,6 +15,9 @@ FloatArray = NDArray[np.float32]
 #: Splats looked at at a time where values are checked.
 _BLOCK = 1 << 14
 
+#: The logit of an opacity that single precision cannot tell from 1.
+_OPAQUE = np.float32(20)
+
 #: Number of SH coefficients a colour channel for each degree.
 SH_COEFFICIENTS = (1, 4, 9, 16)
 
@@ -25,10 +29,13 @@ class CleanReport:
     Attributes:
         non_finite: splats dropped because one of their values was NaN or infinite.
         zero_quaternions: splats whose quaternion had length zero and became the identity.
+        infinite_opacities: splats whose logit was infinite, as decoders of 8-bit opacities write 0 and 1; it became
+            a finite one of the same opacity.
     """
 
     non_finite: int
     zero_quaternions: int
+    infinite_opacities: int
 
 
 @dataclass(frozen=True)
@@ -113,7 +120,7 @@ class Scene:
         )
 
     def cleaned(self) -> tuple[Scene, CleanReport]:
-        """Drop splats with non-finite values, turn zero quaternions into the identity.
+        """Drop splats with non-finite values, turn zero quaternions into the identity, infinite opacity logits finite.
 
         Returns:
             The clean scene (``self`` if nothing had to be mended) and what was mended.
@@ -121,6 +128,12 @@ class Scene:
         Raises:
             DataError: no splat is left.
         """
+        infinite = np.isinf(self.opacity_logits)
+        infinite_opacities = int(np.count_nonzero(infinite))
+        if infinite_opacities:
+            logits = np.where(infinite, np.copysign(_OPAQUE, self.opacity_logits), self.opacity_logits)
+            scene, report = dataclasses.replace(self, opacity_logits=logits).cleaned()
+            return scene, dataclasses.replace(report, infinite_opacities=infinite_opacities)
         finite = np.ones(len(self), bool)
         # Block by block: the temporaries stay in the cache, and a block without fault is done at the first look.
         for start in range(0, len(self), _BLOCK):
@@ -141,4 +154,4 @@ class Scene:
             quaternions = scene.quaternions.copy()
             quaternions[zero] = (1, 0, 0, 0)
             scene = Scene(scene.means, scene.log_scales, quaternions, scene.opacity_logits, scene.sh)
-        return scene, CleanReport(dropped, zeros)
+        return scene, CleanReport(dropped, zeros, 0)

@@ -53,7 +53,7 @@ def test_non_finite_splats_are_dropped_and_counted(splats, value):
     scene.means[bad[0], 1] = value
     scene.log_scales[bad[1], 2] = value
     scene.quaternions[bad[2], 3] = value
-    scene.opacity_logits[bad[3]] = value
+    scene.opacity_logits[bad[3]] = np.nan
     scene.sh[bad[4], 8, 2] = value
     for strided in (scene, dataclasses.replace(scene, sh=np.asfortranarray(scene.sh))):
         clean, report = strided.cleaned()
@@ -61,6 +61,19 @@ def test_non_finite_splats_are_dropped_and_counted(splats, value):
         kept = np.setdiff1d(np.arange(splats + 5), bad)
         assert np.array_equal(clean.sh, scene.sh[kept])
         assert np.array_equal(clean.means, scene.means[kept])
+
+
+def test_infinite_opacity_logits_become_finite():
+    scene = random_scene(4)
+    scene.opacity_logits[:3] = np.inf, -np.inf, 1
+    scene.means[3] = np.nan
+    clean, report = scene.cleaned()
+    assert (len(clean), report.non_finite, report.infinite_opacities) == (3, 1, 2)
+    assert np.isfinite(clean.opacity_logits).all()
+    assert clean.opacities[0] == 1
+    assert 0 <= clean.opacities[1] < 1e-8
+    assert clean.opacity_logits[2] == 1
+    assert np.isinf(scene.opacity_logits[:2]).all()
 
 
 def test_zero_quaternions_become_the_identity():

@@ -124,7 +124,7 @@ def main() -> None:
         began = time.perf_counter()
         placed = place_cameras(scene, args.count, args.size)
         placing = time.perf_counter() - began
-        options = EncodeOptions()
+        options = EncodeOptions.for_preset("best")
         if args.quick:
             options = dataclasses.replace(options, iterations=8)
             judges = [scaled(c, 0.5) for c in judges[::3]]

@@ -42,7 +42,8 @@ from potr_cl.summary import encode_report, format_encode_report, quality_report,
 def _options(args: argparse.Namespace) -> EncodeOptions:
     if args.threads < 0:
         raise UsageError(f"--threads is {args.threads}, it must be 0 or more")
-    changes: dict[str, Any] = {} if args.iterations is None else {"iterations": args.iterations}
+    asked = {"iterations": args.iterations, "compact": args.compact, "refit": _refit_steps(args.refit)}
+    changes: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
     if args.entropy is not None or args.zstd_level is not None:
         changes["entropy"] = EntropyCoder(
             args.entropy or "zstd", EntropyCoder.level if args.zstd_level is None else args.zstd_level
@@ -54,8 +55,9 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
         **pruning_choices(args),
         **compaction_choices(args),
         prune=not args.no_prune,
-        compact=not args.no_compact,
         compact_at=args.compact_at,
+        drop=args.drop,
+        refit_at=tuple(args.refit_at),
         sweep=sweep_options(args),
         background=parse_colour(args.background),
         beta=args.beta,
@@ -71,6 +73,15 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
     )
     _ = options.parameters  # a wrong option is told before a gigabyte is read
     return options
+
+
+def _refit_steps(wanted: str) -> int | None:
+    """The number of steps; None for the preset's."""
+    if wanted in ("auto", "off"):
+        return None if wanted == "auto" else 0
+    if not wanted.isdecimal():
+        raise UsageError(f"--refit is '{wanted}': give a number of steps, auto, or off")
+    return int(wanted)
 
 
 def _target(args: argparse.Namespace) -> Target | None:
@@ -173,9 +184,9 @@ def add_encode(commands: Commands) -> None:
     p.add_argument(
         "--preset",
         choices=PRESETS,
-        default=EncodeOptions.preset,
-        help="paper: the paper's steps; best: steps of equal worth and the context coder, the smallest file; fast: "
-        f"best's steps, 12 pruning iterations and zstd 9; default {EncodeOptions.preset}",
+        default="best",
+        help="paper: what the paper does; best: colours re-fitted, steps of equal worth, the context coder: the "
+        "smallest file; fast: the same in fewer iterations and steps, zstd 9; default best",
     )
     add_cameras_options(p)
     p.add_argument("--no-quality", action="store_true", help="do not judge the result; saves time")
@@ -190,7 +201,26 @@ def add_encode(commands: Commands) -> None:
     p.add_argument("--no-prune", action="store_true", help="keep every splat")
     add_pruning_options(p)
     p.set_defaults(iterations=None)  # the preset's
-    p.add_argument("--no-compact", action="store_true", help="keep the colours' coefficients as they are")
+    p.add_argument(
+        "--refit",
+        default="auto",
+        metavar="N",
+        help="steps in which the colours are re-fitted to the uncompressed scene's pictures, all splats together; off: "
+        "none; default auto, the preset's",
+    )
+    p.add_argument(
+        "--refit-at",
+        type=float,
+        nargs="+",
+        default=(),
+        metavar="PART",
+        help="of the pruning iterations after which they are re-fitted too: a few percent smaller, and slower",
+    )
+    p.add_argument(
+        "--compact",
+        action=argparse.BooleanOptionalAction,
+        help="make the colours' coefficients sparse splat by splat; default: where there is no re-fit",
+    )
     p.add_argument(
         "--compact-at",
         type=float,
@@ -207,6 +237,12 @@ def add_encode(commands: Commands) -> None:
     p.add_argument("--zstd-level", type=int, metavar="L", help="1 (fast) to 22 (small); default: the preset's")
     p.add_argument("--threads", type=int, default=0, metavar="T", help="default: one a processor")
     single = p.add_argument_group("single parameters (each is set by -q otherwise)")
+    single.add_argument(
+        "--drop",
+        type=float,
+        metavar="X",
+        help="give up a coefficient if the mean squared error grows by less; re-fit only",
+    )
     single.add_argument("--gamma", type=float, metavar="UNITS", help="least distance a centre may move, world units")
     single.add_argument(
         "--beta",

@@ -82,6 +82,8 @@ def load(path: str | os.PathLike[str]) -> Scene:
         raise DataError(f"'{path}': {error}") from error
     if report.non_finite:
         _log.warning("'%s': dropped %d splats with non-finite values", path, report.non_finite)
+    if report.infinite_opacities:
+        _log.warning("'%s': made %d infinite opacity logits finite", path, report.infinite_opacities)
     if report.zero_quaternions:
         _log.warning("'%s': turned %d quaternions of length zero into no rotation", path, report.zero_quaternions)
     return scene
