@@ -19,12 +19,17 @@ from potr_cl.quantize import PRESETS
 from potr_cl.removal import SweepOptions
 
 
-def _resident(field: str) -> float:
+def resident(field: str) -> float:
     """Gigabytes of this process: "VmHWM", the peak since the last reset, or "VmRSS", now."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(field + ":"):
             return int(line.split()[1]) * 1024 / 1e9
     raise OSError(f"/proc/self/status has no {field}")
+
+
+def reset_peak() -> None:
+    """Let "VmHWM" begin again at what is resident now."""
+    Path("/proc/self/clear_refs").write_text("5")
 
 
 class StagePeaks:
@@ -37,15 +42,15 @@ class StagePeaks:
     def __init__(self, first: str) -> None:
         self.rows: list[tuple[str, float, float, float]] = []
         self._stage, self._began = first, time.perf_counter()
-        Path("/proc/self/clear_refs").write_text("5")
+        reset_peak()
 
     def __call__(self, stage: str, done: float = 0.0) -> None:
         if stage != self._stage:
             now = time.perf_counter()
-            self.rows.append((self._stage, _resident("VmHWM"), _resident("VmRSS"), now - self._began))
+            self.rows.append((self._stage, resident("VmHWM"), resident("VmRSS"), now - self._began))
             print("| {} | {:.2f} | {:.2f} | {:.0f} s |".format(*self.rows[-1]), flush=True)
             self._stage, self._began = stage, now
-            Path("/proc/self/clear_refs").write_text("5")
+            reset_peak()
 
 
 def main() -> None:
