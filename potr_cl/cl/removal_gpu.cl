@@ -197,7 +197,7 @@ void removal(
                     float v = s1.x * dy;
                     float power = s1.y - u * u - v * v;
                     if (power >= LOG2_ALPHA_MIN && TIGHTEN)
-                        near_touched[k] = 1;
+                        atomic_or(&near_touched[k], 1);
                     if (power >= LOG2_ALPHA_MIN && (int)batch + k <= last[p]) {
                         float alpha = fmin(EXP2(power), ALPHA_CAP);
                         t[p] = t[p] / (1.0f - alpha);
