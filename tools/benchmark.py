@@ -52,7 +52,6 @@ from potr_cl.removal import RemovalSweep, SweepOptions
 from potr_cl.scene import Scene
 from potr_cl.streams import code_scene
 from tests import reference
-from tests.ridge_reference import YCOCG, Ridges, triangles
 from tools.bench_pruning import Bench, halved, skips
 from tools.compaction_curves import measured_weights
 from tools.removal_exactness import SCENES, BruteForce, choose_splats
@@ -338,6 +337,8 @@ def ridge_errors(scene: Scene, compacted: Scene, centres: F64, weights: Any, opt
 
     Relative to the largest coefficient or 1.
     """
+    from tests.ridge_reference import YCOCG, Ridges, triangles  # needs scipy
+
     before, after = scene.sh @ YCOCG.T, compacted.sh @ YCOCG.T
     largest = np.maximum(np.abs(before).max(axis=1), 1)
     squares = np.add.reduceat(np.append(weights.weights.astype(np.float64) ** 2, 0), weights.offsets[:-1])
@@ -546,7 +547,7 @@ def print_report(result: dict[str, Any]) -> None:
 
 
 def plot(result: dict[str, Any], folder: Path) -> list[Path]:
-    """One picture a stage: time on one axis, error on the other, the front joined."""
+    """One picture a stage: time on one axis, error on the other, the front blue and joined, the default red."""
     import matplotlib
 
     matplotlib.use("Agg")
@@ -558,17 +559,22 @@ def plot(result: dict[str, Any], folder: Path) -> list[Path]:
         own = [Row(**row) for row in result["rows"] if row["stage"] == stage]
         if not own:
             continue
-        figure, axes = plt.subplots(figsize=(7, 5), layout="constrained")
+        figure, axes = plt.subplots(figsize=(10, 5), layout="constrained")
         front = sorted((row for row in own if on_front(row, own)), key=lambda r: r.seconds)
         # An error of 0 has no place on a logarithmic axis: it stands at the bottom.
         least = min((row.error for row in own if row.error > 0), default=1.0) / 3
-        heights = {row.variant: max(row.error, least) for row in own}
-        axes.plot([r.seconds for r in front], [heights[r.variant] for r in front], "-", color="0.7", zorder=0)
-        for row in own:
+        height = {row.variant: max(row.error, least) for row in own}
+        axes.plot([r.seconds for r in front], [height[r.variant] for r in front], "-", color="0.7", zorder=0)
+        listed = []
+        for place, row in enumerate(sorted(own, key=lambda r: r.seconds), 1):
             colour = "C3" if row.default else ("C0" if row in front else "0.6")
-            axes.scatter(row.seconds, heights[row.variant], s=30, color=colour)
-            label = row.variant + (f", {row.nbytes / 1e6:.2f} MB" if row.nbytes is not None else "")
-            axes.annotate(label, (row.seconds, heights[row.variant]), (4, 3), textcoords="offset points", fontsize=7)
+            axes.scatter(row.seconds, height[row.variant], s=30, color=colour)
+            axes.annotate(
+                str(place), (row.seconds, height[row.variant]), (4, 3), textcoords="offset points", fontsize=7
+            )
+            size = f", {row.nbytes / 1e6:.2f} MB" if row.nbytes is not None else ""
+            listed.append(f"{place}  {row.variant}{size}{' (default)' if row.default else ''}")
+        axes.annotate("\n".join(listed), (1.02, 1), xycoords="axes fraction", va="top", fontsize=7)
         axes.set(xscale="log", yscale="log", xlabel=f"seconds of {what}", ylabel=error)
         axes.set_title(f"{stage}: {result['scene']}, {result['device'].split(',')[0]}", fontsize=9)
         slug = "".join(c if c.isalnum() else "_" for c in f"{result['scene']}_{result['device'].split(',')[0]}_{stage}")
