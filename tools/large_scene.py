@@ -72,6 +72,11 @@ def more_views(like: Sequence[Camera], views: int, width: int, height: int, seed
     return entries
 
 
+def cameras_beside(scene: Path) -> Path:
+    """The cameras of a scene's file."""
+    return scene.with_name("lego_cameras.json" if scene.resolve() == EXCERPT.resolve() else "cameras.json")
+
+
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("splats", type=int)
@@ -83,9 +88,10 @@ def main() -> None:
     parser.add_argument("--size", default="1600x1064", metavar="WxH")
     args = parser.parse_args()
     if args.cameras is not None:
-        beside = args.like.with_name("cameras.json" if args.like != EXCERPT else "lego_cameras.json")
         width, height = map(int, args.size.split("x"))
-        args.cameras.write_text(json.dumps(more_views(load_cameras(beside), args.views, width, height)))
+        args.cameras.write_text(
+            json.dumps(more_views(load_cameras(cameras_beside(args.like)), args.views, width, height))
+        )
     ply.save(args.output, large_scene(load_scene(args.like), args.splats, split=args.split))
 
 

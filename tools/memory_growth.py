@@ -33,7 +33,7 @@ from potr_cl.options import EncodeOptions
 from potr_cl.quantize import PRESETS, Preset
 from potr_cl.removal import SweepOptions
 from tools.bench_memory import reset_peak, resident
-from tools.large_scene import DEFAULT_SCENE, EXCERPT, large_scene, more_views
+from tools.large_scene import DEFAULT_SCENE, EXCERPT, cameras_beside, large_scene, more_views
 
 #: Parts of what the views would take that --memory is tried with.
 SHARES = (0.0, 0.1, 0.3, 0.6, 0.9)
@@ -65,8 +65,7 @@ class Point:
 def measure(point: Point, like: Path, size: tuple[int, int], preset: Preset, rounds: int, spec: str | None) -> Point:
     """The encode, in this process."""
     scene = large_scene(load_scene(like), point.splats, split=True)
-    beside = like.with_name("lego_cameras.json" if like.resolve() == EXCERPT.resolve() else "cameras.json")
-    entries = more_views(load_cameras(beside), point.views, *size)
+    entries = more_views(load_cameras(cameras_beside(like)), point.views, *size)
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "cameras.json"
         path.write_text(json.dumps(entries))
