@@ -355,7 +355,8 @@ def _plot(name: str, entry: dict[str, Any], keys: list[str], path: Path) -> None
         axis.set_ylabel(titles[key])
         axis.grid(alpha=0.3)
     axes[0][-1].legend(loc="lower right", fontsize="small")
-    figure.suptitle(f"{name}: 30 to 90 % of {entry['splats']:,} splats removed")
+    parts = [p["removed"] for p in entry["curves"][PAPER]]
+    figure.suptitle(f"{name}: {min(parts):.0%} to {max(parts):.0%} of {entry['splats']:,} splats removed")
     figure.tight_layout()
     path.parent.mkdir(parents=True, exist_ok=True)
     figure.savefig(path, dpi=110)
