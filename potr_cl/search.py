@@ -46,12 +46,14 @@ _FEW_VIEWS = 24
 _MOST_STEPS = math.log(4 / 3)
 #: The highest of zstd's levels that costs no time to speak of, and the logarithm of what is about gained beyond.
 _QUICK_LEVEL, _LEVEL_GAIN = 9, -0.08
-#: Full encodes at most.
-_ENCODES = 3
+#: Full encodes at most; one or two are the rule.
+_ENCODES = 4
 #: Stands for the infinite PSNR of identical pictures, decibels.
 _IDENTICAL = 200.0
-#: Values that one solution for q may ask for, and the fineness between two that is too little to tell them apart.
-_STEPS, _SAME = 12, 0.001
+#: Values that one solution for q may ask for.
+_STEPS = 12
+#: The fineness between two qualities that is too little to tell them apart, by estimates and by real values.
+_SAME_BY_ESTIMATE, _SAME = 0.015, 0.001
 
 
 @dataclass(frozen=True)
@@ -207,7 +209,7 @@ class _Survey:
         )
         self._effects = self._removal.measure()
         self.weights: ViewWeights | None = None
-        if options.compact and scene.sh_degree > 0:
+        if (options.compact or options.refit) and scene.sh_degree > 0:
             self.weights = ViewWeights.from_importances(len(scene), self._removal.view_importances())
 
     def survivors(self, q: float) -> NDArray[np.int64]:
@@ -274,47 +276,63 @@ class _Search:
         self._tell = tell
         self._tries: list[Try] = []
         self._estimates: dict[float, float] = {}
+        self._encoded: dict[float, float] = {}  # values of full encodes
         self._axis = _Axis(options)
         self._survey: _Survey | None = None
         self._judge: Judge | None = None
 
     def run(self) -> Found:
         target, options = self._target, self._options
-        if self._views and (options.prune or (options.compact and self._scene.sh_degree > 0)):
+        if self._views and needs_views(self._scene, options):
             self._watch("prepare views", 0.0)
             self._survey = _Survey(self._scene, self._views, options, self._watch, self._device)
         if target.min_psnr is not None:
             self._judge = Judge(self._device, self._scene, JudgingViews.of(self._cameras), options.background)
         low, high = target.window
         best: Found | None = None
-        ends: dict[float, float] = {}
-        error = (
-            _LEVEL_GAIN if self._judge is None and self._quick_coder() != options.entropy else 0.0
-        )  # of the estimates
+        encoded = self._encoded
         q = 0.5
         for left in reversed(range(_ENCODES)):
-            q, _ = _solve(self._estimate, target.aim - error, target, self._axis, q)
+            # Between what is known to be too little and too much.
+            bounds = (
+                max((p for p in encoded if encoded[p] < target.aim), default=0.0),
+                min((p for p in encoded if encoded[p] >= target.aim), default=1.0),
+            )
+            first = min(max(q, bounds[0]), bounds[1])
+            q, _ = _solve(self._expected, target.aim, target, self._axis, first, *bounds, same=_SAME_BY_ESTIMATE)
+            if q in encoded and best is None:  # the last hope
+                q = 0.0 if target.max_bytes is not None else 1.0
+            if q in encoded:
+                break
             reduced, found = self._encode(q)
-            error = found.value - self._estimate(q)
-            if q in (0.0, 1.0):
-                ends[q] = found.value
+            encoded[q] = found.value
             found = self._adjust(reduced, found, left == 0)
             if target.met(found.value) and (best is None or self._rank(found) < self._rank(best)):
                 best = found
             if low <= found.value <= high or (q == 0 and found.value > high) or (q == 1 and found.value < low):
                 break
         if best is None:
-            raise UnreachableError(f"{target} cannot be reached: {self._extremes(ends, error)}")
+            raise UnreachableError(f"{target} cannot be reached: {self._extremes()}")
         return dataclasses.replace(best, tries=self._tries)
 
     def _rank(self, found: Found) -> tuple[bool, float]:
         return not self._target.met(found.value), abs(found.value - self._target.aim)
 
-    def _extremes(self, ends: dict[float, float], error: float) -> str:
+    def _expected(self, q: float) -> float:
+        """The estimate for a q, put right by what those were wrong by that were encoded in full."""
+        estimate = self._estimate(q)
+        if not self._encoded:
+            slow = self._judge is None and self._quick_coder() != self._options.entropy
+            return estimate + (_LEVEL_GAIN if slow else 0.0)
+        known = sorted(self._encoded)
+        errors = [self._encoded[p] - self._estimate(p) for p in known]
+        return estimate + float(np.interp(self._axis.fineness(q), [self._axis.fineness(p) for p in known], errors))
+
+    def _extremes(self) -> str:
         said = []
         for q in (0.0, 1.0):
-            about = "" if q in ends else "about "
-            value = ends[q] if q in ends else self._estimate(q) + error
+            about = "" if q in self._encoded else "about "
+            value = self._encoded[q] if q in self._encoded else self._expected(q)
             said.append(f"quality {q:g} gives {about}{self._target.describe(value)}")
         return ", ".join(said)
 
@@ -325,7 +343,8 @@ class _Search:
             if self._survey is not None:
                 survivors = self._survey.survivors(q)
                 scene = scene.subset(survivors)
-                if self._survey.weights is not None:
+                # A re-fit gives up coefficients too, and is as small as a compaction, but loses much less.
+                if self._survey.weights is not None and (options.compact or self._judge is None):
                     weights = _of_splats(self._survey.weights, survivors)
                     how = options.compaction
                     scene = Compactor(self._device).compact(scene, camera_centres(self._views), weights, how)
@@ -447,6 +466,7 @@ def _solve(
     first: float,
     low: float = 0.0,
     high: float = 1.0,
+    same: float = _SAME,
 ) -> tuple[float, float]:
     """The q at which a growing function meets the aim (``low`` or ``high`` if that lies beyond), and its value."""
     points: dict[float, float] = {}
@@ -461,7 +481,7 @@ def _solve(
         above = [p for p in points if points[p] >= aim]
         if below and above:
             a, b = max(below), min(above)
-            if axis.fineness(b) - axis.fineness(a) < _SAME:
+            if axis.fineness(b) - axis.fineness(a) < same:
                 break  # or it does not grow everywhere: this is as near as it gets
             # Along a line, but now and then in the middle: where the curve bends, one of the two would stay for long.
             part = (aim - points[a]) / (points[b] - points[a]) if step % 3 < 2 else 0.5

@@ -58,7 +58,17 @@ def test_a_size_is_filled_and_not_passed(device, lego_excerpt, cameras, size, pr
     assert len(file) == found.encoded.nbytes == round(math.exp(found.value))
     assert len(decode(file)) == len(found.encoded.order) == found.encoded.pruned.kept
     assert len(lines) == len(found.tries)
-    assert sum(step.kind == "encode" for step in found.tries) <= 3
+    assert sum(step.kind == "encode" for step in found.tries) <= 4
+
+
+@pytest.mark.parametrize("target", [Target(max_bytes=24_000), Target(min_psnr=46)])
+def test_colours_may_be_refitted(device, lego_excerpt, cameras, target):
+    """The estimates leave that out."""
+    options = dataclasses.replace(FEW, compact=False, refit=3, drop=1e-10)
+    found = encode_to_target(lego_excerpt, cameras, target, options, device=device)
+    low, high = target.window
+    assert low <= found.value <= high
+    assert found.encoded.refitted is not None
 
 
 @pytest.mark.parametrize(("preset", "wanted"), [("paper", 38.0), ("paper", 45.0), ("best", 46.0)])
