@@ -145,14 +145,14 @@ def check_device(index: int, family: str, scenes: Path | None) -> dict[str, Any]
 def simulate() -> None:
     """Inside Oclgrind: every kernel, both families, every vector width, on scenes as small as it is slow.
 
-    Nothing is freed: Oclgrind mistakes a new buffer in an old one's place for memory that no one has written. Nor does it
-    know that a filled buffer has been written.
+    Nothing is freed: Oclgrind mistakes a new buffer in an old one's place for memory that no one has written. Nor does
+    it know that a filled buffer has been written.
     """
 
     def zero(refit: ColourRefit, buffer: cl.Buffer) -> None:
         cl.enqueue_copy(refit.device.queue, buffer, np.zeros(buffer.size // 4, np.float32))
 
-    ColourRefit._zero = zero  # type: ignore[method-assign]
+    ColourRefit._zero = zero  # type: ignore[method-assign, assignment]
     info = next(d for d in list_devices() if "oclgrind" in d.platform.lower())
     kept: list[Rasterizer] = []
     for family, width in (("gpu", 1), ("cpu", 4), ("cpu", 8), ("cpu", 16)):
