@@ -105,6 +105,35 @@ class Pruned:
         return np.sort(self.order[len(self.order) - self.kept :])
 
 
+class DampedEffects:
+    """Effects of which each splat's is the weighted mean of all its measurements.
+
+    Args:
+        effects: measures and removes.
+        damping: how much a measurement counts against the next one, see :class:`PruningOptions`.
+
+    Attributes:
+        newest: (N,) ΔMSE_k as last measured.
+    """
+
+    def __init__(self, effects: RemovalEffects, damping: float) -> None:
+        self._effects, self._damping = effects, damping
+        self._weight = 0.0
+        self._mean: F64 = np.zeros(0)
+        self.newest = self._mean
+
+    def measure(self) -> tuple[F64, F64]:
+        """The mean ΔMSE_k, and I_k as it is now."""
+        self.newest, importance = self._effects.measure()
+        self._weight = self._damping * self._weight + 1
+        self._mean = self._mean + (self.newest - self._mean) / self._weight if len(self._mean) else self.newest
+        return self._mean, importance
+
+    def remove(self, splats: Indices) -> None:
+        """Take splats out for good."""
+        self._effects.remove(splats)
+
+
 def mapping(x: F64, a: float) -> F64:
     """m(x) = x for x >= 0, (sqrt(1 - 2 a x) - 1) / a for x < 0 (paper, "The mapping function")."""
     return np.where(x >= 0, x, (np.sqrt(1 - 2 * a * np.minimum(x, 0)) - 1) / a)
@@ -177,11 +206,10 @@ def prune(
     removed: list[Indices] = []
     history: list[Iteration] = []
     done = 0
-    delta_mse, measurements = np.zeros(splats), 0.0
+    delta_mse = np.zeros(splats)
+    damped = DampedEffects(effects, options.damping)
     for iteration in range(options.iterations):
-        newest, importance = effects.measure()
-        measurements = options.damping * measurements + 1
-        delta_mse += (newest - delta_mse) / measurements
+        delta_mse, importance = damped.measure()
         gone = choose(delta_mse, importance, alive, options.iterations - iteration, options)
         if len(gone) >= len(alive) and options.count is None:
             gone = gone[: len(alive) - 1]  # an empty scene is no scene
@@ -191,9 +219,9 @@ def prune(
         iteration_of[gone] = iteration
         removed.append(gone)
         alive = alive[iteration_of[alive] < 0]
-        effect = newest[gone]
+        effect = damped.newest[gone]
         history.append(Iteration(len(alive), float(importance[gone].sum()), float(effect.sum()), float(effect.max())))
-        effects.remove(gone)
+        damped.remove(gone)
         if progress is not None:
             progress(done, len(alive))
         if after_iteration is not None:
