@@ -97,6 +97,7 @@ def test_encode_decode_info(tmp_path, scene_path, capsys):
 def test_encode_tells_what_it_did(tmp_path, scene_path, capsys):
     potr, cameras = tmp_path / "a.potr", cameras_json(tmp_path / "cameras.json")
     encode = ["encode", scene_path, "-o", potr, "--cameras", cameras, "--iterations", "3", "--count", "90"]
+    encode += ["--preset", "paper"]
     report = json.loads(run(capsys, *encode, "--json"))
     assert (report["bytes"], report["source"]["bytes"]) == (potr.stat().st_size, scene_path.stat().st_size)
     assert report["ratio"] == report["source"]["bytes"] / report["bytes"]
