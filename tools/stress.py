@@ -11,7 +11,8 @@ problem's condition; an error of more than LIMIT times that is the kernel's own,
 made as small as it goes. Pixels within rounding of a threshold (alpha 1/255, the end of a pixel) or of a tie in depth
 are left out where a flip would say nothing; what may not happen anywhere is a value that is not finite.
 
-Every device and kernel family runs in a process of its own. Prints Markdown; --json writes the inputs too.
+Every device and kernel family runs in a process of its own. Prints Markdown; --json writes the inputs too, and
+--from reads it again.
 """
 
 from __future__ import annotations
@@ -294,11 +295,13 @@ def rasterized(rasterizer: Rasterizer, view: Camera) -> Lists:
     device = rasterizer.device
     prepared = rasterizer.prepare(view)
     image, transmittance = rasterizer.composite(prepared)
+    shapes = device.download(prepared.shapes, (rasterizer.stride, 8), np.float32)[: rasterizer.splats]
+    colours = device.download(prepared.colours, (rasterizer.stride, 4), np.float32)[: rasterizer.splats, :3]
+    with np.errstate(invalid="ignore"):  # colours of splats that are not drawn are never set
+        wide = colours.astype(np.float64)
     lists = Lists(
-        device.download(prepared.shapes, (rasterizer.stride, 8), np.float32)[: rasterizer.splats].astype(np.float64),
-        device.download(prepared.colours, (rasterizer.stride, 4), np.float32)[: rasterizer.splats, :3].astype(
-            np.float64
-        ),
+        shapes.astype(np.float64),
+        wide,
         device.download(prepared.offsets, (prepared.tiles + 1,), np.uint32),
         device.download(prepared.entries, (prepared.entry_count,), np.uint32),
         image.reshape(-1, 3).astype(np.float64),
@@ -701,7 +704,7 @@ def in_process(info: DeviceInfo, family: str, examples: int) -> dict[str, Any]:
 
 def shortened(name: str) -> str:
     """For a table's cell."""
-    return name if len(name) <= 120 else "found: " + name[:110] + " …"
+    return name if len(name) <= 120 else "found: " + name[:60] + " …"
 
 
 def print_report(results: list[dict[str, Any]]) -> None:
@@ -745,7 +748,11 @@ def main() -> None:
     parser.add_argument("--family", choices=("cpu", "gpu"), help="one family of kernels; default: all that run")
     parser.add_argument("--examples", type=int, default=100, help="attempts of the search at every measure")
     parser.add_argument("--json", type=Path)
+    parser.add_argument("--from", dest="kept", type=Path, nargs="+", help="results of earlier runs, instead of a run")
     args = parser.parse_args()
+    if args.kept:
+        print_report([result for path in args.kept for result in json.loads(path.read_text())])
+        return
     results = []
     chosen = [info for info in list_devices() if args.device in (None, info.index)]
     for info in chosen:
@@ -758,8 +765,8 @@ def main() -> None:
                 result = run_device(Device(info, family=family), args.examples)  # type: ignore[arg-type]
             results.append({"device": str(info), "family": family, **result})
             print(f"{info}, {family} kernels: done", file=sys.stderr, flush=True)
-    if args.json is not None:
-        args.json.write_text(json.dumps(results, indent=1))
+            if args.json is not None:
+                args.json.write_text(json.dumps(results, indent=1))
     print_report(results)
 
 
