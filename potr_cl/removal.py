@@ -185,7 +185,9 @@ class RemovalSweep:
             self._bind(swept, True, self._totals)
         if device.family == "gpu" and not self._shared:
             # A view's longest tile list keeps one work-group busy when all others are done: other views fill the gap.
-            self._queues = [cl.CommandQueue(device.context, device.info.handle) for _ in range(_QUEUES)]
+            self._queues = [
+                cl.CommandQueue(device.context, device.info.handle, device.queue.properties) for _ in range(_QUEUES)
+            ]
 
     @property
     def kept_views(self) -> int:
