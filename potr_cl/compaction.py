@@ -270,7 +270,8 @@ class Compactor:
         times max(1, norm of the channel's coefficients) keeps its original coefficients.
 
         Args:
-            camera_centres: (S, 3) positions of the views that ``weights`` counts.
+            camera_centres: (S, 3) positions of the views that ``weights`` counts; or (S, J, 3) where each view stands
+                for J positions, which share its weight.
             weights: for the N splats of the scene.
 
         Raises:
@@ -284,7 +285,9 @@ class Compactor:
             return scene
         kernel, lanes = self._kernel(count, options)
 
-        offsets = weights.offsets
+        share = camera_centres.shape[1] if camera_centres.ndim == 3 else 1
+        camera_centres = camera_centres.reshape(-1, 3)
+        offsets = share * weights.offsets
         result = np.empty(scene.sh.shape, np.float32)
         batches = self._batches(offsets, count)
         most = max((stop - start for start, stop in batches), default=0)
@@ -310,7 +313,7 @@ class Compactor:
             for number, (start, stop) in enumerate(batches):
                 slot = slots[number % len(slots)]
                 slot.collect(pool)
-                slot.upload(_arrays(scene, weights, options, slice(start, stop)), pool)
+                slot.upload(_arrays(scene, weights, options, slice(start, stop), share), pool)
                 seen = int(np.count_nonzero(offsets[start + 1 : stop + 1] > offsets[start:stop]))
                 if seen:
                     self._launch(kernel, lanes, slot, device_eyes, seen, options)
@@ -375,8 +378,10 @@ class Compactor:
         self.device.launch(kernel, (-(-items // group) * group,), (group,), slot.queue)
 
 
-def _arrays(scene: Scene, weights: ViewWeights, options: CompactionOptions, batch: slice) -> tuple[NDArray[Any], ...]:
-    """What the kernel takes of a batch of splats, in the order of its arguments."""
+def _arrays(
+    scene: Scene, weights: ViewWeights, options: CompactionOptions, batch: slice, share: int
+) -> tuple[NDArray[Any], ...]:
+    """What the kernel takes of a batch of splats, in the order of its arguments; ``share`` positions to a view."""
     offsets = weights.offsets[batch.start : batch.stop + 1]
     entries = slice(int(offsets[0]), int(offsets[-1]))
     counts = np.diff(offsets)
@@ -387,12 +392,16 @@ def _arrays(scene: Scene, weights: ViewWeights, options: CompactionOptions, batc
     values = weights.weights[entries]
     if options.weighting == "visibility":
         values = (values > 0).astype(np.float32)
+    views: NDArray[Any] = weights.views[entries]
+    if share > 1:
+        views = (share * views[:, None] + np.arange(share, dtype=np.int32)).ravel()
+        values = np.repeat(values * np.float32(1 / share), share)
     return (
         scene.sh[batch],
         means,
         order[np.count_nonzero(counts == 0) :],
-        (offsets - offsets[0]).astype(np.uint32),
-        weights.views[entries],
+        (share * (offsets - offsets[0])).astype(np.uint32),
+        views,
         values,
     )
 
@@ -400,7 +409,7 @@ def _arrays(scene: Scene, weights: ViewWeights, options: CompactionOptions, batc
 def _check(splats: int, camera_centres: NDArray[np.floating[Any]], weights: ViewWeights) -> None:
     if len(weights.offsets) != splats + 1:
         raise UsageError(f"the view weights are of {len(weights.offsets) - 1} splats, the scene has {splats}")
-    if camera_centres.ndim != 2 or camera_centres.shape[1] != 3 or not np.isfinite(camera_centres).all():
-        raise UsageError(f"camera centres of shape {camera_centres.shape} are not finite positions (S, 3)")
+    if camera_centres.ndim not in (2, 3) or camera_centres.shape[-1] != 3 or not np.isfinite(camera_centres).all():
+        raise UsageError(f"camera centres of shape {camera_centres.shape} are not finite positions (S, 3) or (S, J, 3)")
     if len(weights.views) and not 0 <= weights.views.min() <= weights.views.max() < len(camera_centres):
         raise UsageError(f"the view weights name a view outside the {len(camera_centres)} given")

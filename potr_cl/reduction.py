@@ -8,7 +8,7 @@ from dataclasses import replace
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.cameras import Camera, camera_centres, train_views
+from potr_cl.cameras import Camera, train_views
 from potr_cl.compaction import Compactor, ViewWeights
 from potr_cl.device import Device
 from potr_cl.errors import UsageError
@@ -18,6 +18,7 @@ from potr_cl.rasterizer import Rasterizer
 from potr_cl.refit import RefitOptions, RenderedTargets, refit_colours
 from potr_cl.removal import RemovalSweep
 from potr_cl.scene import Scene
+from potr_cl.virtual_cameras import standpoints
 
 #: Called with the stage's name and the part of it that is done, 0 to 1.
 Progress = Callable[[str, float], None]
@@ -71,7 +72,7 @@ def reduce_scene(
         assert removal is not None
         report("compact", 0.0)
         weights = ViewWeights.from_importances(len(scene), removal.view_importances())
-        sh = Compactor(device).compact(scene, camera_centres(views), weights, how).sh
+        sh = Compactor(device).compact(scene, standpoints(views, scene.means), weights, how).sh
         compacted = True
         report("compact", 1.0)
 

@@ -20,7 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.bitstream import EntropyCoder
-from potr_cl.cameras import Camera, camera_centres, train_views
+from potr_cl.cameras import Camera, train_views
 from potr_cl.compaction import Compactor, ViewWeights
 from potr_cl.decoder import decode
 from potr_cl.device import Device
@@ -35,7 +35,7 @@ from potr_cl.reduction import Progress
 from potr_cl.removal import RemovalSweep
 from potr_cl.scene import Scene
 from potr_cl.streams import code_scene
-from potr_cl.virtual_cameras import place_cameras
+from potr_cl.virtual_cameras import place_cameras, standpoints
 
 #: The survey's stages, in steps of q, and the pruning iterations of each.
 _STAGE = 0.25
@@ -346,8 +346,8 @@ class _Search:
                 # A re-fit gives up coefficients too, and is as small as a compaction, but loses much less.
                 if self._survey.weights is not None and (options.compact or self._judge is None):
                     weights = _of_splats(self._survey.weights, survivors)
-                    how = options.compaction
-                    scene = Compactor(self._device).compact(scene, camera_centres(self._views), weights, how)
+                    eyes = standpoints(self._views, self._scene.means)
+                    scene = Compactor(self._device).compact(scene, eyes, weights, options.compaction)
             self._estimates[q] = self._note("estimate", q, self._quick_value(scene, options, _FEW_VIEWS))
         return self._estimates[q]
 

@@ -62,6 +62,8 @@ _UNTRAINED, _TRAINED = 0.65, 0.85
 #: Part of all directions that is blocked where a place counts as enclosed, and part of the views that must be for the
 #: scene to count as having an inside.
 _ENCLOSED, _FEW = 0.8, 0.05
+#: How far the standpoints around a virtual view are from it, as a part of its distance from the scene.
+_AROUND = 0.35
 #: Targets with coefficients to speak of, below which that is not asked.
 _INFORMATIVE = 100
 
@@ -162,6 +164,27 @@ def place_cameras(scene: Scene, count: int = COUNT, size: int = SIZE) -> list[Ca
 def is_virtual(cameras: Sequence[Camera]) -> bool:
     """Whether they were placed by :func:`place_cameras`, by their names."""
     return bool(cameras) and all(camera.name.startswith(_PREFIX) for camera in cameras)
+
+
+def standpoints(cameras: Sequence[Camera], means: F32) -> F64:
+    """Where to look from when colours are fitted: what the compaction takes as camera centres.
+
+    Someone will look from between virtual views, where a fit to them alone runs wild. So each shares its weight with
+    four places around it.
+
+    Args:
+        means: (N, 3) centres of the scene.
+
+    Returns:
+        (S, 3) the eyes of given cameras, (S, 4, 3) the places around those of virtual ones.
+    """
+    eyes = camera_centres(cameras)
+    if not is_virtual(cameras):
+        return eyes
+    some = means[:: max(len(means) // _TARGETS, 1)].astype(np.float64)
+    away = np.array([np.median(np.linalg.norm(some - eye, axis=1)) for eye in eyes])
+    corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
+    return eyes[:, None] + _AROUND * away[:, None, None] * corners
 
 
 def describe(cameras: Sequence[Camera]) -> str:

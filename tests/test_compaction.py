@@ -12,7 +12,7 @@ from hypothesis import strategies as st
 from numpy.typing import NDArray
 
 from potr_cl.cameras import Camera, camera_centres, train_views
-from potr_cl.compaction import REFERENCE_PIXELS, CompactionOptions, Compactor, ViewWeights
+from potr_cl.compaction import REFERENCE_PIXELS, CompactionOptions, Compactor, ViewWeights, Weighting
 from potr_cl.device import Device, Family
 from potr_cl.errors import DeviceError, UsageError
 from potr_cl.quantize import quantize_sh, to_ycocg
@@ -482,6 +482,20 @@ def test_weights_from_importances() -> None:
     np.testing.assert_allclose(weights.weights, REFERENCE_PIXELS * expected.weights, rtol=1e-6)
 
 
+@pytest.mark.parametrize("weighting", ["importance", "visibility"])
+def test_a_view_that_stands_for_several_positions(device: Device, weighting: Weighting) -> None:
+    rng = np.random.default_rng(16)
+    scene, centres = random_scene(40, seed=7), on_a_sphere(24)
+    dense = rng.random((40, 8)) * (rng.random((40, 8)) < 0.6)
+    apart = dense_weights(np.repeat(dense / 3, 3, axis=1))
+    if weighting == "visibility":
+        apart = dense_weights(np.repeat((dense > 0) / 3, 3, axis=1))
+    options = CompactionOptions(weighting=weighting)
+    shared = Compactor(device, 6000).compact(scene, centres.reshape(8, 3, 3), dense_weights(dense), options)
+    expected = Compactor(device).compact(scene, centres, apart, CompactionOptions())
+    np.testing.assert_allclose(shared.sh, expected.sh, atol=2e-5)
+
+
 # ------------------------------------------------------------------------------------------------ bad calls
 
 
@@ -494,6 +508,8 @@ def test_views_that_do_not_belong_to_the_scene(device: Device) -> None:
         compactor.compact(scene, on_a_sphere(3), weights)
     with pytest.raises(UsageError, match="not finite positions"):
         compactor.compact(scene, np.full((4, 3), np.nan), weights)
+    with pytest.raises(UsageError, match="outside the 2 given"):
+        compactor.compact(scene, on_a_sphere(8).reshape(2, 4, 3), weights)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,7 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.options import EncodeOptions
 from potr_cl.rasterizer import INRIA
 from potr_cl.scene import Scene
-from potr_cl.virtual_cameras import describe, is_virtual, place_cameras
+from potr_cl.virtual_cameras import describe, is_virtual, place_cameras, standpoints
 from tests.reference import sh_basis
 from tests.scenes import random_scene
 from tests.surfaces import box, flat_splats, sphere, together
@@ -94,6 +94,21 @@ def test_names_and_splits(around_ball):
     assert [c.split for c in few] == ["train"] * 5
     assert few[0].width == 64
     assert "judge" not in describe(few)
+
+
+def test_standpoints(around_ball):
+    given = [dataclasses.replace(c, name="photo") for c in around_ball]
+    assert np.array_equal(standpoints(given, BALL.means), camera_centres(given))
+    places = standpoints(around_ball, BALL.means)
+    assert places.shape == (112, 4, 3)
+    assert np.allclose(places.mean(axis=1), camera_centres(around_ball))
+    away = np.linalg.norm(places - camera_centres(around_ball)[:, None], axis=2)
+    # About the distance of the ball's surface on either side, near and far.
+    assert np.allclose(away, away[:, :1])
+    ratio = away[:, 0] / np.linalg.norm(camera_centres(around_ball), axis=1)
+    assert np.allclose(
+        ratio[np.linalg.norm(camera_centres(around_ball), axis=1) > 2], virtual_cameras._AROUND, rtol=0.15
+    )
 
 
 def test_the_same_every_time(around_ball):
