@@ -6,6 +6,7 @@ import json
 import os
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -18,6 +19,7 @@ from potr_cl.decoder import decode
 from potr_cl.device import Device
 from potr_cl.fallback import on_device
 from potr_cl.options import EncodeOptions
+from potr_cl.photographs import Photographs, PhotographTargets
 from potr_cl.pruning import Pruned
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.reduction import Progress, reduce_scene
@@ -176,21 +178,27 @@ def refit(
     decoded = decode(b"".join(bare.pieces)).subset(place)
     active = active_coefficients(reduced.sh, parameters.sf_sh) if options.compact else None
     how = RefitOptions(steps=options.refit, drop=parameters.drop, memory=options.sweep.memory)
-    rasterizer = Rasterizer(device, scene, background=options.background)
-    try:
+    targets: RenderedTargets | PhotographTargets
+    with ExitStack() as stack:
+        stack.callback(watch, "refit", 1.0)
+        if options.photographs is None:
+            rasterizer = Rasterizer(device, scene, background=options.background)
+            stack.callback(rasterizer.free)
+            targets = RenderedTargets(rasterizer, views)
+        else:
+            photographs = Photographs(options.photographs, views, options.background)
+            targets = PhotographTargets(device, photographs, views)
+            stack.callback(targets.free)
         return refit_colours(
             device,
             replace(decoded, sh=reduced.sh),
             views,
-            RenderedTargets(rasterizer, views),
+            targets,
             how,
             active,
             options.background,
             lambda done, steps: watch("refit", done / steps),
         )
-    finally:
-        rasterizer.free()
-        watch("refit", 1.0)
 
 
 def code(scene: Scene, reduced: Reduced, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch) -> Encoded:

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any
 
 from potr_cl import quantize
@@ -30,6 +31,8 @@ class EncodeOptions:
         refit: conjugate-gradient steps of the joint re-fit of the colours; 0 leaves it out. Looks at views.
         refit_at, refit_at_steps: the parts of the pruning iterations after which colours are re-fitted too, so that
             later ones judge by colours that have made up for what went, and the steps of each.
+        photographs: folder of the views' photographs, named after them: what the last re-fit comes near to, instead of
+            the uncompressed scene's pictures.
         count: number of splats to keep, instead of ΔMSE_MAX.
         sweep: what measuring removal effects may skip.
         background: R, G, B behind the scene in the views that pruning looks at.
@@ -63,6 +66,7 @@ class EncodeOptions:
     refit: int = 0
     refit_at: tuple[float, ...] = ()
     refit_at_steps: int = 3
+    photographs: Path | None = None
     count: int | None = None
     sweep: SweepOptions = field(default_factory=SweepOptions)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -820,3 +820,22 @@ def test_devices_check(capsys, monkeypatch):
 def test_no_device(capsys, monkeypatch):
     monkeypatch.setattr("potr_cl.device.list_devices", list)
     fails(capsys, ["devices"], 1, "no OpenCL device found")
+
+
+def test_encode_to_photographs(tmp_path, scene_path, capsys):
+    """Photographs that are darker than the scene: the file comes nearer to them than the scene is."""
+    cameras_path, photos, out = cameras_json(tmp_path / "cameras.json"), tmp_path / "photos", tmp_path / "out.potr"
+    run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", photos)
+    for photo in photos.iterdir():
+        with Image.open(photo) as image:
+            darker = image.point(lambda value: value * 0.8)
+        darker.save(photo)
+    encode = ["encode", scene_path, "-o", out, "--cameras", cameras_path, "--iterations", "2", "--no-quality"]
+    assert cli.main([str(word) for word in [*encode, "--photos", photos]]) == 0
+    said = capsys.readouterr().err
+    before, after = (float(value) for value in re.findall(r"([\d.]+) dB", said.split("held-out photographs")[1])[:2])
+    assert after > before + 3
+    assert "warning" not in said
+    fails(capsys, [*encode, "--photos", photos, "--refit", "off"], 2, "--photos", "re-fit")
+    fails(capsys, ["encode", scene_path, "-o", out, "--photos", photos], 2, "--photos", "--cameras")
+    fails(capsys, [*encode, "--photos", tmp_path / "nowhere"], 2, "nowhere")

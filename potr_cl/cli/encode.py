@@ -6,12 +6,14 @@ import argparse
 import contextlib
 import dataclasses
 import json
+import sys
 import time
 from pathlib import Path
 from typing import Any
 
 from potr_cl.atomic_write import replacing
 from potr_cl.bitstream import ENTROPY_CODERS, EntropyCoder
+from potr_cl.cameras import Camera, test_views
 from potr_cl.cli.options import (
     Commands,
     add_compaction_options,
@@ -30,10 +32,12 @@ from potr_cl.encoder import Stopwatch, encode, needs_views
 from potr_cl.errors import DeviceError, UsageError
 from potr_cl.formats import load_scene
 from potr_cl.html_report import PicturePair, html_report, views_to_show
-from potr_cl.images import parse_colour
+from potr_cl.images import Colour, parse_colour
 from potr_cl.judging import Judge, JudgingViews
 from potr_cl.options import EncodeOptions
+from potr_cl.photographs import Photographs
 from potr_cl.quantize import PRESETS
+from potr_cl.rasterizer import Rasterizer
 from potr_cl.scene import Scene
 from potr_cl.search import Target, encode_to_target
 from potr_cl.summary import encode_report, format_encode_report, quality_report, search_report
@@ -58,6 +62,7 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
         compact_at=args.compact_at,
         drop=args.drop,
         refit_at=tuple(args.refit_at),
+        photographs=args.photos,
         sweep=sweep_options(args),
         background=parse_colour(args.background),
         beta=args.beta,
@@ -93,11 +98,16 @@ def _target(args: argparse.Namespace) -> Target | None:
 def _encode(args: argparse.Namespace) -> None:
     began = time.perf_counter()
     options, target = _options(args), _target(args)
+    if options.photographs is not None and not (args.cameras and options.refit):
+        raise UsageError("--photos needs --cameras, the views that the photographs show, and a re-fit")
     if args.report is None and args.report_view is not None:
         raise UsageError("--report-view needs --report, the page that shows it")
     if args.report is not None and args.report.resolve() == args.output.resolve():
         raise UsageError("--report and --output name the same file")
     cameras = given_cameras(args)
+    photographs = None
+    if options.photographs is not None and cameras is not None:
+        photographs = Photographs(options.photographs, cameras, options.background)
     scene = load_scene(args.scene)
     options = dataclasses.replace(options, count=count(args, len(scene)))
     device = Device(args.device) if needs_views(scene, options) else None
@@ -129,6 +139,9 @@ def _encode(args: argparse.Namespace) -> None:
             quality = "not judged: there are no cameras to look from"
         seconds = placing.seconds | encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
         report = encode_report(args.scene, scene, args.output, written, encoded, options, search, quality, seconds)
+        if photographs is not None and cameras is not None:
+            used = encoded.device or Device(args.device)
+            _judge_by_photographs(photographs, cameras, scene, decode(written.data), used, options.background)
         if page is not None:
             page.write(html_report(report, pictures).encode())
     print(json.dumps(report, indent=1, allow_nan=False) if args.json else format_encode_report(report))
@@ -161,6 +174,32 @@ def _judge(
     return quality, [
         PicturePair(title, view["name"], view["psnr"], *pair) for (title, view), pair in zip(shown, pairs, strict=True)
     ]
+
+
+def _judge_by_photographs(
+    photographs: Photographs,
+    cameras: list[Camera],
+    scene: Scene,
+    candidate: Scene,
+    device: Device,
+    background: Colour,
+) -> None:
+    """Say what the file gained or lost on photographs that the re-fit has not seen."""
+    views = test_views(cameras)
+    if not views:
+        print("no view is held out: what the photographs gain elsewhere is not known", file=sys.stderr)
+        return
+    before, after = 0.0, 0.0
+    for each in (scene, candidate):
+        rasterizer = Rasterizer(device, each, background=background)
+        before, after = after, photographs.psnr(rasterizer, views)
+        rasterizer.free()
+    print(f"{len(views)} held-out photographs: uncompressed {before:.2f} dB, file {after:.2f} dB", file=sys.stderr)
+    if after < before:
+        print(
+            f"warning: on held-out photographs the file is {before - after:.2f} dB worse than the uncompressed scene",
+            file=sys.stderr,
+        )
 
 
 def add_encode(commands: Commands) -> None:
@@ -207,6 +246,12 @@ def add_encode(commands: Commands) -> None:
         metavar="N",
         help="steps in which the colours are re-fitted to the uncompressed scene's pictures, all splats together; off: "
         "none; default auto, the preset's",
+    )
+    p.add_argument(
+        "--photos",
+        type=Path,
+        metavar="DIR",
+        help="photographs, named after the views: re-fit to them instead, for truth rather than fidelity",
     )
     p.add_argument(
         "--refit-at",
