@@ -55,9 +55,10 @@ def reduce_scene(
         count=options.count,
         damping=options.damping,
     )
-    for part in (options.compact_at, *options.refit_at):
-        if not 0 <= part <= 1:
-            raise UsageError(f"a stage after {part:g} of the iterations: it must lie between 0 and 1")
+    for name, parts in (("compact_at", (options.compact_at,)), ("refit_at", options.refit_at)):
+        for part in parts:
+            if not 0 <= part <= 1:
+                raise UsageError(f"{name} is {part:g}, it must lie between 0 and 1")
     how = options.compaction
     views = train_views(cameras)
     report("prepare views", 0.0)

@@ -24,7 +24,7 @@ from potr_cl.rasterizer import GSPLAT, Rasterizer
 from tests.scenes import random_scene, ring_of_cameras
 
 #: Options of an encode that keeps everything, and so looks at no views.
-KEEP = ("--no-prune", "--no-compact")
+KEEP = ["--no-prune", "--no-compact", "--refit", "off"]
 
 
 @pytest.fixture
@@ -230,7 +230,8 @@ def test_every_parameter_can_be_set(tmp_path, scene_path, capsys):
     }
     flat = [str(x) for pair in options.items() for x in pair]
     cameras = cameras_json(tmp_path / "cameras.json")
-    assert cli.main(["encode", str(scene_path), "-o", str(potr), "--cameras", str(cameras), *flat]) == 0
+    paper = ["--preset", "paper"]
+    assert cli.main(["encode", str(scene_path), "-o", str(potr), "--cameras", str(cameras), *paper, *flat]) == 0
     capsys.readouterr()
     assert cli.main(["info", str(potr), "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
@@ -323,11 +324,12 @@ def test_compact(tmp_path, scene_path, capsys):
 def test_each_part_of_compaction_can_be_left_out(tmp_path, scene_path):
     cameras = cameras_json(tmp_path / "cameras.json")
     choices = ([], ["--colour-model", "rgb"], ["--weighting", "visibility"], ["--one-pass"], ["--alpha", "1"])
-    for command, suffix in (("compact", ".ply"), ("encode", ".potr")):
+    for command, suffix, preset in (("compact", ".ply", []), ("encode", ".potr", ["--preset", "paper"])):
         files = set()
         for number, options in enumerate(choices):
             out = tmp_path / f"{command}{number}{suffix}"
-            assert cli.main([command, str(scene_path), "--cameras", str(cameras), "-o", str(out), *options]) == 0
+            arguments = [command, str(scene_path), "--cameras", str(cameras), "-o", str(out), *preset, *options]
+            assert cli.main(arguments) == 0
             files.add(out.read_bytes())
         assert len(files) == len(choices)
 
@@ -357,7 +359,9 @@ def test_compaction_of_bad_files(tmp_path, scene_path, capsys):
     fails(capsys, ["compact", tmp_path / "none.ply", "--cameras", cameras, "-o", out], 2, "none.ply")
     fails(capsys, ["compact", scene_path, "--cameras", tmp_path / "none.json", "-o", out], 2, "none.json")
     fails(capsys, ["compact", scene_path, "--cameras", scene_path, "-o", out], 2, "scene.ply")
-    fails(capsys, ["encode", scene_path, "--cameras", cameras, "-o", out, "--compact-at", "2"], 2, "compact_at")
+    for option in ("compact", "refit"):
+        late = [f"--{option}-at", "2"]
+        fails(capsys, ["encode", scene_path, "--cameras", cameras, "-o", out, *late], 2, f"{option}_at")
     assert not out.exists()
 
 
