@@ -62,7 +62,7 @@ def test_transmittance_sums(device, rules):
     rasterizer = Rasterizer(device, scene, rules)
     found = transmittance_sums(rasterizer, cameras)
     again = transmittance_sums(rasterizer, cameras)
-    sweep = RemovalSweep(rasterizer, cameras, SweepOptions(0, 1))
+    sweep = RemovalSweep(rasterizer, cameras, SweepOptions(0, 1, stop=None))
     importance = sweep.measure()[1] * sum(c.width * c.height for c in cameras)
     sweep.free()
     rasterizer.free()
