@@ -7,6 +7,7 @@ import importlib.metadata
 import logging
 import os
 import re
+import sys
 import tempfile
 import warnings
 from collections.abc import Iterator, Sequence
@@ -14,11 +15,13 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
+from platform import machine
 from typing import Any, Literal
 
 import numpy as np
 import pyopencl as cl
 
+from potr_cl import compiler
 from potr_cl.errors import DeviceError, DeviceMemoryError
 
 Family = Literal["cpu", "gpu"]
@@ -29,8 +32,10 @@ logger = logging.getLogger("potr_cl")
 DEVICE_VARIABLE = "POTR_CL_DEVICE"
 
 _ICD_VARIABLE = "OCL_ICD_VENDORS"
+_WINDOWS_ICD_VARIABLE = "OCL_ICD_FILENAMES"
 _INTEL_PACKAGE = "intel-opencl-rt"
 _INTEL_LIBRARY = "libintelocl.so"
+_INTEL_WINDOWS_LIBRARY = "intelocl64.dll"
 
 
 @dataclass(frozen=True)
@@ -70,18 +75,32 @@ class DeviceInfo:
         return f"'{self.name}' ({self.platform})"
 
 
+def _installed_by_pip(library: str) -> Path | None:
+    """Where pip put this library of Intel's CPU runtime; None if it did not."""
+    try:
+        paths = importlib.metadata.files(_INTEL_PACKAGE) or []
+    except importlib.metadata.PackageNotFoundError:
+        return None
+    path = next((Path(str(p.locate())).resolve() for p in paths if p.name == library), None)
+    return path if path is not None and path.exists() else None
+
+
+def _register_intel_runtime_on_windows() -> None:
+    """As :func:`_register_intel_runtime`, for Windows' loader: it reads a list of libraries beside the registry."""
+    library = _installed_by_pip(_INTEL_WINDOWS_LIBRARY)
+    known = os.environ.get(_WINDOWS_ICD_VARIABLE, "")
+    if library is not None and _INTEL_WINDOWS_LIBRARY not in known:
+        os.environ[_WINDOWS_ICD_VARIABLE] = f"{known}{os.pathsep}{library}" if known else str(library)
+
+
 def _register_intel_runtime() -> None:
     """Make the loader see Intel's CPU runtime where pip installed it.
 
     Its wheel brings an ``.icd`` file that holds a placeholder path, so a folder is made with an ``.icd`` of the real
     path beside links to all those that the loader would have read. Must run before the first platform query.
     """
-    try:
-        paths = importlib.metadata.files(_INTEL_PACKAGE) or []
-    except importlib.metadata.PackageNotFoundError:
-        return
-    library = next((Path(str(p.locate())).resolve() for p in paths if p.name == _INTEL_LIBRARY), None)
-    if library is None or not library.exists():
+    library = _installed_by_pip(_INTEL_LIBRARY)
+    if library is None:
         return
     known = os.environ.get(_ICD_VARIABLE) or os.environ.get("OPENCL_VENDOR_PATH") or "/etc/OpenCL/vendors"
     vendors = Path(known)
@@ -128,6 +147,8 @@ def list_devices() -> list[DeviceInfo]:
 def _find_devices() -> Iterator[DeviceInfo]:
     if hasattr(os, "getuid"):
         _register_intel_runtime()
+    else:
+        _register_intel_runtime_on_windows()
     try:
         platforms = cl.get_platforms()
     except cl.Error as error:  # the loader's way of saying that there is none
@@ -190,20 +211,74 @@ def _preference(info: DeviceInfo) -> tuple[float, ...]:
         return (2, 0, info.index)
     if "intel" in platform:
         return (3, 0, info.index)
-    if "portable computing language" in platform:
+    if _is_pocl(info):
         release = re.search(r"pocl (\d+)\.(\d+)", info.version.lower())
         newness = int(release[1]) + int(release[2]) / 100 if release else 0.0
         return (4, -newness, info.index)
     return (5, 0, info.index)
 
 
+def _is_pocl(info: DeviceInfo) -> bool:
+    return "portable computing language" in info.platform.lower()
+
+
+def compiler_fault(info: DeviceInfo) -> str | None:
+    """Why a device can compile nothing, not even an empty program; None if it can.
+
+    Only PoCL's CPU devices are asked, the others are believed: a PoCL that is older than the CPU offers it all the same
+    and then refuses every program. Being asked costs a few hundredths of a second, the first time.
+    """
+    return compiler.fault(info.handle) if info.kind == "cpu" and _is_pocl(info) else None
+
+
+def _cpu_runtime_advice() -> str:
+    """How to get a CPU runtime that works on this machine."""
+    pocl = "a newer PoCL from your system's packages (Debian, Ubuntu: pocl-opencl-icd)"
+    if sys.platform in ("linux", "win32") and machine().lower() in ("x86_64", "amd64"):
+        return f"`pip install intel-opencl-rt intel-cmplr-lib-rt` (for AMD's CPUs too) or {pocl}"
+    return pocl
+
+
+def _compiles_nothing(infos: Sequence[DeviceInfo]) -> str:
+    """One line that says so of these devices, and how to mend it."""
+    names = ", ".join(map(str, infos))
+    return (
+        f"device {names} cannot compile even an empty program ({compiler_fault(infos[0])}): mend it by "
+        f"{_cpu_runtime_advice()}"
+    )
+
+
+_passed_over: set[DeviceInfo] = set()
+
+
 def choose_device(spec: str | None = None) -> DeviceInfo:
-    """The device that ``spec`` names, or the best one.
+    """The best of the devices that ``spec`` fits and that can compile (see :func:`compiler_fault`).
+
+    Better ones that cannot are passed over with a warning, one a process.
+
+    Args:
+        spec: as for :func:`fitting_devices`.
+
+    Raises:
+        DeviceError: there is no device, none that ``spec`` fits, or none of those can compile.
+    """
+    unable: list[DeviceInfo] = []
+    for info in fitting_devices(spec):
+        if compiler_fault(info) is None:
+            if not _passed_over.issuperset(unable):
+                _passed_over.update(unable)
+                logger.warning("%s; going on with %s", _compiles_nothing(unable), info)
+            return info
+        unable.append(info)
+    raise DeviceError(_compiles_nothing(unable))
+
+
+def fitting_devices(spec: str | None = None) -> list[DeviceInfo]:
+    """The devices that ``spec`` fits, best first: discrete GPUs, integrated ones, then CPU runtimes by speed.
 
     Args:
         spec: an index of :func:`list_devices`, "cpu", "gpu", or part of a device's or platform's name in any case;
-            None takes the environment variable ``POTR_CL_DEVICE``, and without that the best device: a discrete GPU,
-            then an integrated one, then the fastest CPU runtime.
+            None takes the environment variable ``POTR_CL_DEVICE``; without that every device fits.
 
     Raises:
         DeviceError: there is no device, or none that ``spec`` fits.
@@ -211,11 +286,11 @@ def choose_device(spec: str | None = None) -> DeviceInfo:
     devices = sorted(list_devices(), key=_preference)
     if not devices:
         raise DeviceError(
-            "no OpenCL device found: install your GPU's OpenCL driver, or a CPU runtime by `pip install pyopencl[pocl]`"
+            f"no OpenCL device found: install your GPU's OpenCL driver, or a CPU runtime by {_cpu_runtime_advice()}"
         )
     spec = spec or os.environ.get(DEVICE_VARIABLE)
     if not spec:
-        return devices[0]
+        return devices
     wanted = spec.strip().lower()
     if wanted.isdigit():
         matches = [d for d in devices if d.index == int(wanted)]
@@ -226,7 +301,7 @@ def choose_device(spec: str | None = None) -> DeviceInfo:
     if not matches:
         listed = ", ".join(f"{d.index}: {d.name}" for d in sorted(devices, key=lambda d: d.index))
         raise DeviceError(f"no OpenCL device fits '{spec}'; there are {listed}")
-    return matches[0]
+    return matches
 
 
 def kernel_source(name: str) -> str:
@@ -275,6 +350,8 @@ class Device:
         build_options: Sequence[str] = (),
     ) -> None:
         self.info = info if isinstance(info, DeviceInfo) else choose_device(info)
+        if compiler_fault(self.info) is not None:
+            raise DeviceError(_compiles_nothing([self.info]))
         self.family: Family = family or self.info.family
         self.allocated = 0
         self.timings: list[tuple[str, cl.Event]] = []
@@ -304,8 +381,8 @@ class Device:
                 f"device {self.info} ran out of memory ({error}): {self._memory_advice()}"
             ) from None
         except cl.Error as error:
-            first = str(error).strip().splitlines()[0]
-            raise DeviceError(f"device {self.info} {what} ({first}): choose another with --device") from None
+            said = compiler.complaint(error)
+            raise DeviceError(f"device {self.info} {what} ({said}): choose another with --device") from None
 
     def _memory_advice(self) -> str:
         return "render fewer pixels or splats at a time, or choose a device with more memory with --device"

@@ -5,12 +5,12 @@ from __future__ import annotations
 from collections.abc import Sequence
 from typing import Any
 
-from potr_cl.device import Device, DeviceInfo, choose_device, list_devices
+from potr_cl.device import Device, DeviceInfo, compiler_fault, fitting_devices, list_devices
 from potr_cl.errors import DeviceError
 
 
 def device_report(check: bool) -> list[dict[str, Any]]:
-    """One entry a device, in the order of their indices.
+    """One entry a device, in the order of their indices; "fault" says why a device can compile nothing, or is None.
 
     Args:
         check: run each device's self-check; the entry's "check" is then "passed" or says what failed.
@@ -18,8 +18,8 @@ def device_report(check: bool) -> list[dict[str, Any]]:
     Raises:
         DeviceError: there is no device at all, or the environment variable names one that there is not.
     """
-    chosen = choose_device()
-    return [_entry(info, info.index == chosen.index, check) for info in list_devices()]
+    chosen = next((info.index for info in fitting_devices() if compiler_fault(info) is None), None)
+    return [_entry(info, info.index == chosen, check) for info in list_devices()]
 
 
 def _entry(info: DeviceInfo, chosen: bool, check: bool) -> dict[str, Any]:
@@ -37,6 +37,7 @@ def _entry(info: DeviceInfo, chosen: bool, check: bool) -> dict[str, Any]:
         "compute_units": info.compute_units,
         "vector_width": info.vector_width,
         "kernels": info.family,
+        "fault": compiler_fault(info),
     }
     if check:
         try:
@@ -60,6 +61,8 @@ def format_devices(report: Sequence[dict[str, Any]]) -> str:
             f"{entry['local_memory_bytes'] / 1024:>5.0f} KB{entry['compute_units']:>7}{entry['vector_width']:>8}"
             f"  {entry['name']} ({entry['platform']})"
         )
+        if entry["fault"] is not None:
+            lines.append(f"  cannot compile anything: {entry['fault']}")
         if "check" in entry:
             lines.append(f"  self-check: {entry['check']}")
     return "\n".join(lines)

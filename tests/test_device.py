@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import logging
 import os
 import subprocess
 import sys
@@ -12,7 +13,8 @@ import pyopencl as cl
 import pytest
 
 from potr_cl import device as device_module
-from potr_cl.device import Device, DeviceInfo, Scratch, choose_device, kernel_source, list_devices
+from potr_cl.device import Device, DeviceInfo, Scratch, choose_device, compiler_fault, kernel_source, list_devices
+from potr_cl.device_report import device_report, format_devices
 from potr_cl.errors import DeviceError
 
 
@@ -30,7 +32,17 @@ def invented(
 
 
 @pytest.fixture
-def machine(monkeypatch: pytest.MonkeyPatch) -> list[DeviceInfo]:
+def faults(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """What is wrong with the compilers of devices, by name: those of this test's choice, whatever the machine has."""
+    faults: dict[str, str] = {}
+    monkeypatch.setattr(device_module, "compiler_fault", lambda info: faults.get(info.name))
+    monkeypatch.setattr("potr_cl.device_report.compiler_fault", lambda info: faults.get(info.name))
+    monkeypatch.setattr(device_module, "_passed_over", set())
+    return faults
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch, faults: dict[str, str]) -> list[DeviceInfo]:
     """A machine with one of everything, worst first."""
     pocl = "Portable Computing Language"
     devices = [
@@ -75,10 +87,136 @@ def test_specification_that_fits_nothing(machine: list[DeviceInfo], spec: str) -
         choose_device(spec)
 
 
-def test_no_device_at_all(monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize(
+    ("architecture", "advice"), [("x86_64", "`pip install intel"), ("AMD64", "`pip install intel"), ("aarch64", "PoCL")]
+)
+def test_no_device_at_all(monkeypatch: pytest.MonkeyPatch, architecture: str, advice: str) -> None:
     monkeypatch.setattr(device_module, "_devices", [])
-    with pytest.raises(DeviceError, match="pip install"):
+    monkeypatch.setattr(device_module, "machine", lambda: architecture)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(DeviceError, match=f"or a CPU runtime by .*{advice}"):
         choose_device()
+
+
+REFUSED = "error: unknown target CPU 'generic'"
+
+
+@pytest.mark.parametrize("spec", [None, "cpu", "pthread"])
+def test_what_cannot_compile_is_passed_over(
+    machine: list[DeviceInfo], faults: dict[str, str], caplog: pytest.LogCaptureFixture, spec: str | None
+) -> None:
+    """The next best that fits is taken; one line a process says so."""
+    del machine[4:]
+    faults["pthread-new"] = REFUSED
+    with caplog.at_level(logging.WARNING, "potr_cl"):
+        assert [choose_device(spec).name for _ in range(3)] == ["pthread-old"] * 3
+        assert len(caplog.records) == 1
+        said = caplog.records[0].getMessage()
+        assert said.startswith(
+            f"device 'pthread-new' (Portable Computing Language) cannot compile even an empty program ({REFUSED})"
+        )
+        assert said.endswith("going on with 'pthread-old' (Portable Computing Language)")
+        assert "\n" not in said
+        faults["pthread-old"] = REFUSED
+        if spec != "pthread":
+            assert choose_device(spec).name == "llvmpipe"
+            said = caplog.records[1].getMessage()
+            assert "'pthread-new'" in said
+            assert "'pthread-old'" in said
+            assert "'llvmpipe'" in said
+            faults["llvmpipe"] = faults["Oclgrind Simulator"] = REFUSED
+        with pytest.raises(DeviceError, match=r"'pthread-new'.*'pthread-old'.*cannot compile"):
+            choose_device(spec)
+
+
+def test_nothing_is_said_of_what_is_not_wanted(
+    machine: list[DeviceInfo], faults: dict[str, str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """A device that cannot compile does not matter where a better one is taken, or another is asked for."""
+    faults["pthread-new"] = REFUSED
+    with caplog.at_level(logging.WARNING, "potr_cl"):
+        assert choose_device().index == 6
+        assert choose_device("cpu").index == 4
+        assert choose_device("pthread-old").index == 2
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("spec", ["3", "pthread-new"])
+def test_what_cannot_compile_is_refused_where_asked_for(
+    machine: list[DeviceInfo], faults: dict[str, str], caplog: pytest.LogCaptureFixture, spec: str
+) -> None:
+    faults["pthread-new"] = REFUSED
+    with caplog.at_level(logging.WARNING, "potr_cl"), pytest.raises(DeviceError) as error:
+        choose_device(spec)
+    said = str(error.value)
+    assert said.startswith("device 'pthread-new' (Portable Computing Language) cannot compile even an empty program")
+    assert REFUSED in said
+    assert "newer PoCL" in said
+    assert "\n" not in said
+    assert not caplog.records
+    with pytest.raises(DeviceError) as again:
+        Device(machine[3])
+    assert str(again.value) == said
+
+
+def test_listing_asks_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    def asked(handle: cl.Device) -> None:
+        raise AssertionError("a compiler was asked")
+
+    monkeypatch.setattr(device_module.compiler, "fault", asked)
+    monkeypatch.setattr(device_module, "_devices", None)
+    assert list_devices()
+
+
+def test_only_cpus_of_pocl_are_asked(machine: list[DeviceInfo], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(device_module.compiler, "fault", lambda handle: REFUSED)
+    pocl_gpu = invented(8, "Some GPU", "gpu", "Portable Computing Language")
+    assert [info.name for info in [*machine, pocl_gpu] if compiler_fault(info)] == ["pthread-old", "pthread-new"]
+
+
+def test_the_report_shows_what_cannot_compile(machine: list[DeviceInfo], faults: dict[str, str]) -> None:
+    del machine[4:]
+    faults["pthread-new"] = REFUSED
+    report = device_report(check=False)
+    assert [entry["fault"] for entry in report] == [None, None, None, REFUSED]
+    assert [entry["chosen"] for entry in report] == [False, False, True, False]
+    assert format_devices(report).splitlines()[-1].strip() == f"cannot compile anything: {REFUSED}"
+    faults.update({info.name: REFUSED for info in machine})
+    assert not any(entry["chosen"] for entry in device_report(check=False))  # nothing to take is no reason to fail
+
+
+def test_compilers_of_this_machine() -> None:
+    """A device that is said to compile does, one that is said not to refuses what the others take."""
+    for info in list_devices():
+        fault = compiler_fault(info)
+        if fault is None:
+            Device(info).program("probe.cl", LANES=1)
+        else:
+            with pytest.raises(cl.RuntimeError):
+                cl.Program(cl.Context([info.handle]), kernel_source("probe.cl")).build(["-DLANES=1"])
+
+
+@pytest.mark.parametrize(
+    ("message", "said"),
+    [
+        (
+            "clBuildProgram failed: BUILD_PROGRAM_FAILURE - clBuildProgram failed: BUILD_PROGRAM_FAILURE\n\n"
+            "Build on <pyopencl.Device 'A' on 'B' at 0x1>:\n\n\n"
+            "a.cl:1:2: warning: tedious\n  a.cl:3:4: error: use of undeclared identifier 'x'\n1 error generated.\n\n"
+            "(options: -DX -I /errors/error)\n(source saved as /tmp/a.cl)",
+            "a.cl:3:4: error: use of undeclared identifier 'x'",
+        ),
+        ("clBuildProgram failed: X\n\nBuild on <A>:\n\nToo hard.\nSorry.\n\n(options: )", "Too hard."),
+        (
+            "clBuildProgram failed: X - clBuildProgram failed: X\n\nBuild on <A>:\n\n\n\n(options: -DX)",
+            "clBuildProgram failed: X",
+        ),
+        ("clWaitForEvents failed: OUT_OF_RESOURCES", "clWaitForEvents failed: OUT_OF_RESOURCES"),
+        ("", "RuntimeError"),
+    ],
+)
+def test_the_line_that_tells_most(message: str, said: str) -> None:
+    assert device_module.compiler.complaint(cl.RuntimeError(message)) == said
 
 
 def test_this_machine() -> None:
@@ -149,6 +287,26 @@ def test_registering_a_runtime_keeps_the_others(tmp_path: Path, monkeypatch: pyt
     assert os.environ["OCL_ICD_VENDORS"] == str(vendors)
 
 
+@pytest.mark.parametrize("known", ["", "other.dll"])
+def test_registering_a_runtime_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known: str) -> None:
+    library = tmp_path / "intelocl64.dll"
+
+    class Installed:
+        name = library.name
+
+        def locate(self) -> Path:
+            return library
+
+    monkeypatch.setattr(device_module.importlib.metadata, "files", lambda package: [Installed()])
+    monkeypatch.setenv("OCL_ICD_FILENAMES", known)
+    device_module._register_intel_runtime_on_windows()
+    assert os.environ["OCL_ICD_FILENAMES"] == known  # it is not there
+    library.touch()
+    for _ in range(2):  # the second time it is known
+        device_module._register_intel_runtime_on_windows()
+        assert os.environ["OCL_ICD_FILENAMES"].split(os.pathsep) == [*filter(None, [known]), str(library)]
+
+
 def test_self_check_passes(device: Device) -> None:
     before = device.allocated
     device.self_check()
@@ -167,9 +325,11 @@ def test_headers_are_included_once() -> None:
 
 
 def test_failing_build_names_the_device(device: Device) -> None:
-    with pytest.raises(DeviceError, match=r"failed to build probe.cl .*--device") as error:
+    """And the compiler's reason, in one line."""
+    with pytest.raises(DeviceError, match=r"failed to build probe.cl \(.*error.*--device") as error:
         device.program("probe.cl", LANES="nonsense")
     assert device.info.name in str(error.value)
+    assert "clBuildProgram" not in str(error.value)
     assert "\n" not in str(error.value)
 
 
