@@ -10,9 +10,10 @@ the normative description.
 from __future__ import annotations
 
 import struct
-from collections.abc import Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from dataclasses import dataclass, field
 from itertools import pairwise
+from typing import Any
 
 import numpy as np
 import zstandard
@@ -40,6 +41,14 @@ _MOST_CONTEXTS = 32
 _WEIGHT_BITS = 8
 #: Splats to which an encoder fits the weights.
 _FITTED = 1 << 16
+#: Sizes worked on at a time: few enough for temporaries to stay in a cache.
+_BLOCK = 1 << 14
+#: Of these, those whose products are added at a time.
+_COLUMNS = 1 << 11
+#: Memory for sizes that are worked on at the same time, bytes.
+_WORKING_BYTES = 1 << 28
+#: From this many lanes on sections are coded one by one.
+_MANY_LANES = 1 << 11
 #: Bits that storing one frequency costs, about.
 _FREQUENCY_BITS = 7
 
@@ -51,6 +60,9 @@ _TERMS = 7
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
+#: Calls a function with each of some arguments and gives the results in their order, as :func:`map` does.
+Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 def _size_table(signed: bool) -> I32:
@@ -85,7 +97,7 @@ class Lanes:
         """(steps,) lanes that have a splat in each step."""
         return (self.splats - 1 - np.arange(self.steps)) // self.steps + 1
 
-    def split(self, values: I64) -> I64:
+    def split(self, values: NDArray[np.integer]) -> NDArray[np.integer]:
         """(n,) to (steps, lanes), missing ones 0."""
         padded = np.zeros(self.number * self.steps, values.dtype)
         padded[: len(values)] = values
@@ -121,16 +133,6 @@ class Sizes:
             self.same = []
 
 
-def _recent(sizes: I32) -> I32:
-    """(steps, lanes) about 8 times the mean size of a lane's last splats, before each."""
-    recent = np.empty_like(sizes)
-    r = np.zeros(sizes.shape[1], np.int32)
-    for now, size in zip(recent, sizes, strict=True):
-        now[:] = r
-        r += 2 * size - (r >> 2)
-    return recent
-
-
 def _expected(known: Sequence[I32], weights: I32) -> I32:
     """The weighted sum of what is known without the recent ones, not yet shifted and cut."""
     total = np.full(known[0].shape, weights[-1], np.int32)
@@ -156,118 +158,283 @@ def _mean(last: I64) -> I64:
 # ------------------------------------------------------------------------------------------------ tokens
 
 
-def _tokenise(mapped: NDArray[np.uint64]) -> tuple[U8, NDArray[np.uint8]]:
-    """Tokens of mapped integers, and how many low bits of each are stored beside."""
-    exponent = np.frexp(np.maximum(mapped, 1).astype(np.float64))[1] - 1  # exact below 2^53
-    extra = np.where(mapped < _DIRECT, 0, exponent - 2)
-    leading = (mapped >> extra.astype(np.uint64)).astype(np.int64)  # 4 to 7
-    token = np.where(mapped < _DIRECT, mapped.astype(np.int64), _DIRECT + 4 * (exponent - _DIRECT_BITS) + leading - 4)
-    return token.astype(np.uint8), extra.astype(np.uint8)
+def _map(values: NDArray[np.integer], signed: bool) -> NDArray[np.unsignedinteger]:
+    """Integers to unsigned ones of as many bits: 0, −1, 1, −2, … to 0, 1, 2, 3, … if signed."""
+    mapped = (values << 1) ^ (values >> (8 * values.itemsize - 1)) if signed else values
+    return mapped.view(f"u{values.itemsize}")
+
+
+def _tokenise(mapped: NDArray[np.unsignedinteger]) -> tuple[U8, NDArray[np.bool_]]:
+    """Tokens of mapped integers, and the bits beside: the lowest of all that have one, then the next."""
+    tokens = mapped.astype(np.uint8)
+    if int(mapped.max()) < _DIRECT:
+        return tokens, np.zeros(0, bool)
+    large = np.flatnonzero(mapped >= _DIRECT)
+    u = mapped.ravel()[large].astype(np.int64)
+    exponent = np.frexp(u.astype(np.float64))[1] - 1  # exact below 2^53
+    extra = exponent - 2
+    leading = u >> extra  # 4 to 7
+    tokens.ravel()[large] = _DIRECT + 4 * (exponent - _DIRECT_BITS) + leading - 4
+    return tokens, np.concatenate([(u[extra > b] >> b) & 1 for b in range(int(extra.max()))]).astype(bool)
 
 
 def _extra_bits(tokens: U8) -> NDArray[np.int64]:
     return np.where(tokens < _DIRECT, 0, _DIRECT_BITS - 2 + (tokens.astype(np.int64) - _DIRECT) // 4)
 
 
-def _zigzag(values: I64) -> NDArray[np.uint64]:
-    return ((values << 1) ^ (values >> 63)).view(np.uint64)
-
-
 # ------------------------------------------------------------------------------------------------ encode
 
 
-def encode(
-    streams: Sequence[NDArray[np.integer]], signed: bool, predicted: bool, history: Sizes | None
-) -> bytes | None:
-    """Code some streams.
+@dataclass(frozen=True)
+class Streams:
+    """What one section holds.
 
-    Args:
-        streams: (n,) integers each, n >= 1; not negative if not ``signed``.
+    Attributes:
+        values: (n,) integers each, n >= 1; not negative if not ``signed``.
         signed: whether they may be negative.
         predicted: store differences from the mean of the splats before.
-        history: streams of earlier sections that may tell sizes; these are added.
+    """
+
+    values: Sequence[NDArray[np.integer]]
+    signed: bool
+    predicted: bool = False
+
+
+def encode(
+    chains: Sequence[Sequence[Streams]], run: Run = map, progress: Callable[[float], None] | None = None
+) -> list[list[bytes] | None]:
+    """Code some sections of a scene.
+
+    Args:
+        chains: sections one after another; the sizes of those before tell those of the next. All hold as many splats.
+        run: in place of :func:`map`, to make several calls at a time: none of them needs another one's result.
+        progress: told which part is done.
 
     Returns:
-        The stored bytes; None if an integer is too large.
+        The stored bytes of each chain's sections; None for a chain that holds an integer too large.
     """
-    lanes = Lanes(len(streams[0]))
-    history = history or Sizes(lanes)
-    table = _SIZES[signed]
-    tokens: list[U8] = []
-    expectations: list[U8] = []
-    weights = np.zeros((len(streams), _TERMS), _WEIGHTS)
-    extra = []
-    active = np.arange(lanes.number) < lanes.counts[:, None]
-    for s, stream in enumerate(streams):
-        values = lanes.split(stream.astype(np.int64))
-        if predicted:
-            before = np.concatenate([np.zeros((4, lanes.number), np.int64), values])
-            values = values - ((before[:-4] + before[1:-3] + before[2:-2] + before[3:-1] + 2) >> 2)
-            values *= active
-        mapped = _zigzag(values) if signed else values.view(np.uint64)
-        if int(mapped.max()) >> _MOST_BITS:
-            return None
-        token, bits = _tokenise(mapped)
-        extra.append(_pack_extra(mapped, bits))
-        sizes = table[token]
-        recent = _recent(sizes)
-        known = history.known()
-        weights[s] = _fit([*known, recent], sizes, active, s % _CHANNELS)
-        w = weights[s].astype(np.int32)
-        expected = (_expected(known, w) + w[-2] * recent) >> _WEIGHT_BITS
-        expectations.append(np.clip(expected, 0, _LARGEST_SIZE).astype(np.uint8))
-        tokens.append(token)
-        history.add(sizes)
+    report = progress or (lambda done: None)
+    drafts = [[_Draft(section) for section in chain] for chain in chains]
+    streams = [(draft, s) for chain in drafts for draft in chain for s in range(len(draft.section.values))]
+    if not streams:
+        return [[] for _ in chains]
+    layout = _Layout.of(len(streams[0][0].section.values[0]))
+    made = run(lambda job: _tokens_of(job[0].section, job[1], layout), streams)
+    for (draft, _), tokens in zip(streams, made, strict=True):
+        draft.tokens.append(tokens)
+    coded = [chain for chain in drafts if all(tokens for draft in chain for tokens in draft.tokens)]
+    report(0.2)
+    for draft, weights, cells in _contexts(coded, layout, run):
+        draft.weights.append(weights)
+        draft.cells.extend(cells)
+    report(0.5)
+    sections = [draft for chain in coded for draft in chain]
+    finished = list(run(lambda draft: _finish(draft, layout), sections))
+    # With few lanes a step's calls take longer than its work; with many, what they work on must fit a cache.
+    few = layout.lanes.number < _MANY_LANES
+    parts = [finished] if few and finished else [[each] for each in finished]
+    words = [pair for part in run(rans.encode, [[tokens for tokens, _ in part] for part in parts]) for pair in part]
+    for draft, (_, head), (states, rest) in zip(sections, finished, words, strict=True):
+        draft.stored = b"".join([head, states.astype("<u4").tobytes(), rest])
+    report(1.0)
+    return [[draft.stored for draft in chain] if chain in coded else None for chain in drafts]
 
-    models = [
-        _fit_model(tokens[c::_CHANNELS], expectations[c::_CHANNELS], active)
-        for c in range(min(_CHANNELS, len(streams)))
-    ]
-    encoder = rans.Encoder(lanes.number)
-    for s in range(len(streams) - 1, -1, -1):
-        model = models[s % _CHANNELS]
-        index = model.classes[expectations[s]].astype(np.int64) * ALPHABET + tokens[s]
-        frequencies = model.frequencies.ravel()
-        starts = (np.cumsum(model.frequencies, axis=1) - model.frequencies).ravel()
-        for t in range(lanes.steps - 1, -1, -1):
-            row = index[t, : lanes.counts[t]]
-            encoder.step(frequencies[row], starts[row])
-    description = zstandard.ZstdCompressor(level=19, write_checksum=False).compress(
-        weights.tobytes() + b"".join(model.to_bytes() for model in models)
-    )
-    bits_beside = np.packbits(np.concatenate(extra), bitorder="little").tobytes()
-    return b"".join(
-        [
-            _HEAD.pack(len(description), len(bits_beside)),
-            description,
-            bits_beside,
-            encoder.states.astype("<u4").tobytes(),
-            encoder.words(),
+
+@dataclass(frozen=True)
+class _Layout:
+    """Where splats are among steps and lanes.
+
+    Attributes:
+        idle: flat indices of the lanes in the steps in which they have no splat.
+        fitted: of the splats to which weights are fitted.
+    """
+
+    lanes: Lanes
+    idle: I64
+    fitted: I64
+
+    @staticmethod
+    def of(splats: int) -> _Layout:
+        lanes = Lanes(splats)
+        active = (np.arange(lanes.number) < lanes.counts[:, None]).ravel()
+        return _Layout(lanes, np.flatnonzero(~active), np.flatnonzero(active)[:: max(1, splats // _FITTED)])
+
+
+@dataclass(eq=False)
+class _Draft:
+    """A section on its way to bytes.
+
+    Attributes:
+        tokens: of each stream, (steps, lanes), and the bits beside; None for one with an integer too large.
+        weights: of each coefficient, (channels, terms).
+        cells: of each stream, (steps, lanes): expected size · alphabet + token.
+    """
+
+    section: Streams
+    tokens: list[tuple[U8, NDArray[np.bool_]] | None] = field(default_factory=list)
+    weights: list[NDArray[np.int16]] = field(default_factory=list)
+    cells: list[U16] = field(default_factory=list)
+    stored: bytes = b""
+
+    @property
+    def alphabet(self) -> int:
+        """One more than the largest token."""
+        return max(int(tokens[0].max()) for tokens in self.tokens if tokens) + 1
+
+
+def _tokens_of(section: Streams, stream: int, layout: _Layout) -> tuple[U8, NDArray[np.bool_]] | None:
+    values = layout.lanes.split(section.values[stream])
+    if section.predicted:
+        values = _differences(values)
+        values.ravel()[layout.idle] = 0
+    mapped = _map(values, section.signed)
+    return None if int(mapped.max()) >> _MOST_BITS else _tokenise(mapped)
+
+
+def _contexts(
+    chains: list[list[_Draft]], layout: _Layout, run: Run
+) -> Iterator[tuple[_Draft, NDArray[np.int16], list[U16]]]:
+    """Weights and cells of every coefficient of some chains, in order."""
+    alphabets = {id(draft): draft.alphabet for chain in chains for draft in chain}
+    jobs = [(chain, draft, s) for chain in chains for draft in chain for s in range(0, len(draft.tokens), _CHANNELS)]
+    shape = (layout.lanes.steps, layout.lanes.number)
+    sums = {id(chain): [np.zeros(shape, np.int32)] * _CHANNELS for chain in chains}
+
+    def measure(part: list[tuple[list[_Draft], _Draft, int]]) -> tuple[list[list[U8]], I32, I32]:
+        """Sizes and recent ones of some coefficients; of several at once, as it takes a call a step."""
+        tokens = [[pair[0] for pair in draft.tokens[s : s + _CHANNELS] if pair] for _, draft, s in part]
+        sizes = np.empty((sum(map(len, tokens)), *shape), np.int32)
+        of_all = [(token, draft) for (_, draft, _), own in zip(part, tokens, strict=True) for token in own]
+        for size, (token, draft) in zip(sizes, of_all, strict=True):
+            _SIZES[draft.section.signed].take(token, out=size, mode="clip")
+        return tokens, sizes, _recent(sizes)
+
+    def weigh(job: tuple[_Draft, list[I32], list[U8], I32, I32]) -> tuple[_Draft, NDArray[np.int16], list[U16]]:
+        draft, before, tokens, sizes, recent = job
+        weights = _fit(before, sizes, recent, layout.fitted)
+        cells = [
+            _cells([*before, *sizes[:c], recent[c]], weights[c], token, alphabets[id(draft)])
+            for c, token in enumerate(tokens)
         ]
+        return draft, weights, cells
+
+    at_once = max(_BLOCK // (_CHANNELS * shape[1]), 1)
+    at_a_time = max(_WORKING_BYTES // (40 * layout.lanes.splats * at_once), 4) * at_once
+    for start in range(0, len(jobs), at_a_time):
+        window = jobs[start : start + at_a_time]
+        parts = [window[k : k + at_once] for k in range(0, len(window), at_once)]
+        work = []
+        for part, (tokens, all_sizes, all_recent) in zip(parts, run(measure, parts), strict=True):
+            at = 0
+            for (chain, draft, _), own in zip(part, tokens, strict=True):
+                sizes, recent = (array[at : at + len(own)] for array in (all_sizes, all_recent))
+                at += len(own)
+                before = sums[id(chain)]
+                work.append((draft, before, own, sizes, recent))
+                if len(own) == _CHANNELS:
+                    sums[id(chain)] = [total + size for total, size in zip(before, sizes, strict=True)]
+        yield from run(weigh, work)
+
+
+def _finish(draft: _Draft, layout: _Layout) -> tuple[rans.Tokens, bytes]:
+    """What the range coder takes of a section, and the stored bytes before its own."""
+    alphabet = draft.alphabet
+    channels = range(min(_CHANNELS, len(draft.cells)))
+    models = [_fit_model(draft.cells[c::_CHANNELS], layout.idle, alphabet) for c in channels]
+    for cells in draft.cells:
+        cells.ravel()[layout.idle] = (_LARGEST_SIZE + 1) * alphabet
+    description = zstandard.ZstdCompressor(level=19, write_checksum=False).compress(
+        np.concatenate(draft.weights).astype(_WEIGHTS).tobytes() + b"".join(model.to_bytes() for model in models)
     )
+    beside = np.packbits(np.concatenate([bits for _, bits in filter(None, draft.tokens)]), bitorder="little").tobytes()
+    tokens = rans.Tokens(
+        draft.cells,
+        [s % _CHANNELS for s in range(len(draft.cells))],
+        [model.frequencies[model.classes] for model in models],
+    )
+    draft.tokens.clear()
+    return tokens, b"".join([_HEAD.pack(len(description), len(beside)), description, beside])
 
 
-def _pack_extra(mapped: NDArray[np.uint64], bits: U8) -> NDArray[np.bool_]:
-    """The low bits stored beside the tokens: lowest bit of all that have one, then the next."""
-    planes = [((mapped[bits > b] >> np.uint64(b)) & np.uint64(1)).astype(bool) for b in range(int(bits.max(initial=0)))]
-    return np.concatenate([np.zeros(0, bool), *planes])
+def _differences(values: NDArray[np.integer]) -> NDArray[np.integer]:
+    """Of (steps, lanes) integers, each less the rounded mean of the four before."""
+    wide: NDArray[Any] = values.astype(np.int32 if values.itemsize < 4 else np.int64)
+    before = np.concatenate([np.zeros((4, values.shape[1]), wide.dtype), wide])
+    before = (before[:-4] + before[1:-3] + before[2:-2] + before[3:-1] + 2) >> 2
+    wide -= before
+    return wide
 
 
-def _fit(terms: list[I32], sizes: I32, active: NDArray[np.bool_], channel: int) -> NDArray[np.int16]:
-    """Least-squares weights of the terms (the last: recent ones) for the size, in the order of the format."""
-    where = np.flatnonzero(active)
-    where = where[:: max(1, len(where) // _FITTED)]
-    columns = np.stack([term.ravel()[where] for term in terms] + [np.ones(len(where), np.int32)]).astype(np.float64)
-    target = sizes.ravel()[where].astype(np.float64)
-    gram = columns @ columns.T
-    gram[np.diag_indices_from(gram)] *= 1 + 1e-6
-    gram[np.diag_indices_from(gram)] += 1e-6 * len(where)
-    solution = np.round(np.linalg.solve(gram, columns @ target) * (1 << _WEIGHT_BITS))
-    weights = np.zeros(_TERMS, np.int16)
-    fitted = np.clip(solution, -32768, 32767).astype(np.int16)
-    weights[: _CHANNELS + channel] = fitted[: _CHANNELS + channel]
-    weights[-2:] = fitted[-2:]
+def _recent(sizes: I32) -> I32:
+    """About 8 times the mean size of a lane's last splats, before each; all are (streams, steps, lanes)."""
+    recent = np.empty_like(sizes)
+    recent[:, 0] = 0
+    twice = sizes << 1
+    part = np.empty((len(sizes), sizes.shape[2]), np.int32)
+    for t in range(1, sizes.shape[1]):
+        r, after = recent[:, t - 1], recent[:, t]
+        np.right_shift(r, 2, part)
+        np.subtract(r, part, after)
+        np.add(after, twice[:, t - 1], after)
+    return recent
+
+
+def _fit(sums: list[I32], sizes: I32, recents: I32, fitted: I64) -> NDArray[np.int16]:
+    """Least-squares weights for the sizes of a coefficient's channels.
+
+    Args:
+        sums: what is known from the coefficients before, (steps, lanes) each.
+        sizes, recents: (channels, steps, lanes) sizes and recent ones.
+        fitted: flat indices of what to fit to.
+
+    Returns:
+        (channels, terms) in the order of the format.
+    """
+    channels = len(sizes)
+    columns = np.empty((_CHANNELS + 2 * channels + 1, len(fitted)))
+    for column, term in zip(columns, [*sums, *sizes, *recents], strict=False):
+        column[:] = term.ravel().take(fitted)
+    columns[-1] = 1
+    # Sums of products of integers, below 2^53: exact, in whatever order they are added. Few columns at a time stay in a
+    # cache and do not wake the threads of a BLAS, which would stand in the way of those here.
+    products = np.zeros((len(columns), len(columns)))
+    for start in range(0, len(fitted), _COLUMNS):
+        part = columns[:, start : start + _COLUMNS]
+        products += part @ part.T
+    weights = np.zeros((channels, _TERMS), np.int16)
+    for c in range(channels):
+        terms = [*range(_CHANNELS + c), _CHANNELS + channels + c, -1]
+        gram = products[np.ix_(terms, terms)]
+        gram[np.diag_indices_from(gram)] *= 1 + 1e-6
+        gram[np.diag_indices_from(gram)] += 1e-6 * len(fitted)
+        solution = np.round(np.linalg.solve(gram, products[terms, _CHANNELS + c]) * (1 << _WEIGHT_BITS))
+        cut = np.clip(solution, -32768, 32767)
+        weights[c, : _CHANNELS + c] = cut[:-2]
+        weights[c, -2:] = cut[-2:]
     return weights
+
+
+def _cells(terms: list[I32], weights: NDArray[np.int16], tokens: U8, alphabet: int) -> U16:
+    """(steps, lanes) expected size · alphabet + token.
+
+    Args:
+        terms: known sizes and recent ones.
+        weights: of the terms, in the order of the format.
+    """
+    used = [(term, np.int32(w)) for term, w in zip(terms, [*weights[: len(terms) - 1], weights[-2]], strict=True) if w]
+    cells = np.empty(tokens.shape, np.uint16)
+    rows = max(_BLOCK // tokens.shape[1], 1)
+    for start in range(0, len(tokens), rows):
+        block = slice(start, start + rows)
+        expected = np.full(cells[block].shape, weights[-1], np.int32)
+        for term, weight in used:
+            expected += weight * term[block]
+        expected >>= _WEIGHT_BITS
+        np.clip(expected, 0, _LARGEST_SIZE, out=expected)
+        expected *= alphabet
+        expected += tokens[block]
+        cells[block] = expected
+    return cells
 
 
 @dataclass(frozen=True)
@@ -276,7 +443,7 @@ class _Model:
 
     Attributes:
         classes: (256,) uint8 context of each expected size, never falling.
-        frequencies: (contexts, ALPHABET).
+        frequencies: (contexts, alphabet).
     """
 
     classes: U8
@@ -295,28 +462,37 @@ class _Model:
         )
 
 
-def _fit_model(tokens: list[U8], expectations: list[U8], active: NDArray[np.bool_]) -> _Model:
-    """Classes of expected sizes and their frequencies: fine ones first, merged while that saves bytes."""
-    counts = np.zeros((_LARGEST_SIZE + 1) * ALPHABET, np.int64)
-    for token, expected in zip(tokens, expectations, strict=True):
-        index = expected[active].astype(np.int64) * ALPHABET + token[active]
-        counts += np.bincount(index, minlength=len(counts))
-    by_size = counts.reshape(-1, ALPHABET)
+def _fit_model(streams: list[U16], idle: I64, alphabet: int) -> _Model:
+    """Classes of expected sizes and their frequencies: fine ones first, merged while that saves bytes.
+
+    Args:
+        streams: cells.
+        idle: flat indices of those that stand for no splat.
+        alphabet: of the cells.
+    """
+    cells = (_LARGEST_SIZE + 1) * alphabet
+    counts = np.zeros(cells, np.int64)
+    for stream in streams:
+        counts += np.bincount(stream.ravel(), minlength=cells)
+        counts -= np.bincount(stream.ravel()[idle], minlength=cells)
+    by_size = counts.reshape(-1, alphabet)
     used = np.flatnonzero(by_size.any(axis=1))
     ranks = np.cumsum(by_size[used].sum(axis=1))
     edges = used[np.flatnonzero(np.diff((ranks - 1) * 2 * _MOST_CONTEXTS // ranks[-1], prepend=-1))]
     starts: list[int] = [0, *edges[1:].tolist()]
-    groups = [by_size[a:b].sum(axis=0) for a, b in pairwise([*starts, len(by_size)])]
+    groups = list(np.add.reduceat(by_size, starts))
     costs = [_cost(g) for g in groups]
+    merged = [_cost(a + b) for a, b in pairwise(groups)]
     while len(groups) > 1:
-        merged = [_cost(a + b) for a, b in pairwise(groups)]
         growth = [m - a - b for m, a, b in zip(merged, costs, costs[1:], strict=False)]
-        k = int(np.argmin(growth))
+        k = growth.index(min(growth))
         if growth[k] >= 0 and len(groups) <= _MOST_CONTEXTS:
             break
         groups[k : k + 2] = [groups[k] + groups[k + 1]]
-        costs[k : k + 2] = [merged[k]]
+        costs[k : k + 2] = [merged.pop(k)]
         del starts[k + 1]
+        for pair in range(max(k - 1, 0), min(k + 1, len(merged))):
+            merged[pair] = _cost(groups[pair] + groups[pair + 1])
     classes = np.zeros(_LARGEST_SIZE + 1, np.uint8)
     for start in starts[1:]:
         classes[start:] += 1
@@ -326,7 +502,7 @@ def _fit_model(tokens: list[U8], expectations: list[U8], active: NDArray[np.bool
 def _cost(counts: I64) -> float:
     """Bits of the tokens of a context and of its frequencies."""
     present = counts[counts > 0].astype(np.float64)
-    return float(np.sum(present * np.log2(present.sum() / present))) + _FREQUENCY_BITS * len(present)
+    return float(np.add.reduce(present * np.log2(np.add.reduce(present) / present))) + _FREQUENCY_BITS * len(present)
 
 
 # ------------------------------------------------------------------------------------------------ decode

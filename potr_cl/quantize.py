@@ -31,6 +31,8 @@ OPACITY_SHIFT = 0.25
 LEAST_LOGIT, _LARGEST_LOGIT = -8.0, 12.0
 #: A standard deviation that rounds to 0 comes back as this part of a step: its logarithm must stay finite.
 ZERO_SCALE = 0.25
+#: Quaternions turned at a time: few enough that a BLAS does not wake its threads, which takes longer than the work.
+_ROWS = 1 << 11
 #: Integers beyond this are not exact in float64; no sane scene comes near.
 _LARGEST = 2.0**53
 
@@ -141,8 +143,10 @@ def _balanced(q: float) -> HyperParameters:
 
 def _to_steps(values: F64, scale_factor: float | F32, what: str) -> Integers:
     """⌊½ + x · SF⌋ in the smallest of the signed integer types that holds it."""
-    steps = np.floor(0.5 + values * scale_factor)
-    largest = float(np.abs(steps).max(initial=0))
+    steps = values * scale_factor
+    steps += 0.5
+    np.floor(steps, out=steps)
+    largest = max(float(steps.max(initial=0)), -float(steps.min(initial=0)))
     if not largest < _LARGEST:
         raise DataError(
             f"a {what} of {np.abs(values).max():.3g} is too large to quantise: remove that splat or lower SF"
@@ -245,8 +249,13 @@ def canonical_rotations(quaternions: F32, log_scales: F32) -> tuple[F64, F32]:
     """
     q = quaternions.astype(np.float64)
     q /= np.linalg.norm(q, axis=1, keepdims=True)
+    real = np.empty((len(q), len(_GROUP)))
+    conjugates = (_GROUP * (1, -1, -1, -1)).T
+    for start in range(0, len(q), _ROWS):
+        np.matmul(q[start : start + _ROWS], conjugates, out=real[start : start + _ROWS])
     # Rounded, so that ties between equivalent forms fall the same way on every processor.
-    real = np.round(q @ (_GROUP * (1, -1, -1, -1)).T, 9)
+    real *= 1e9
+    np.rint(real, out=real)
     best = np.abs(real).argmax(axis=1)
     gw, gx, gy, gz = _GROUP[best].T
     w, x, y, z = q.T

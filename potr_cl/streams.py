@@ -7,7 +7,6 @@ from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass, replace
 from functools import partial
-from itertools import pairwise
 
 import numpy as np
 from numpy.typing import NDArray
@@ -15,12 +14,15 @@ from numpy.typing import NDArray
 from potr_cl import bitstream, context_coder, octree, quantize
 from potr_cl.bitstream import EntropyCoder, Header, Property, Section
 from potr_cl.cameras import Camera, camera_centres
+from potr_cl.context_coder import Run
 from potr_cl.scene import Scene
 
 #: Splats worked on at a time where a stage needs large temporaries.
-_BLOCK = 1 << 16
+_BLOCK = 1 << 14
 #: Splats whose distances to every camera are taken at a time: a few arrays of them fit a second-level cache.
 _NEAR_BLOCK = 1 << 14
+#: Splats whose SH coefficients are quantised at a time, for the same reason.
+_SH_BLOCK = 1 << 12
 #: Of fewer splats the models of the context coder may weigh more than they save.
 _FEW = 1 << 15
 #: Streams of bytes, whose length means something.
@@ -69,29 +71,24 @@ def code_scene(
     """
     report = progress or (lambda stage, done: None)
     coder = entropy or EntropyCoder()
-    report("octree", 0.0)
-    nearest = _nearest(scene.means, views)
-    parameters = _in_world_units(parameters, scene, nearest)
-    tolerance = np.maximum(parameters.gamma, parameters.beta * nearest)
-    tree, order = octree.build(scene.means, tolerance, absolute=parameters.version > 1)
-    report("octree", 1.0)
-
-    attributes = _attribute_jobs if parameters.version == 1 else _balanced_attribute_jobs
-    jobs = [*attributes(scene, order, parameters), *_octree_jobs(tree)]
-    jobs.append(lambda: [_Group(Property.METADATA, 0, [np.frombuffer(metadata, np.uint8)])])
-    context = coder.name == "context" and parameters.version > 1
-    coded: list[tuple[Section, bytes]] = []
-
-    def run(job: _Job) -> list[tuple[Section, bytes]]:
-        groups = job()
-        sections = _context_sections(groups, coder) if context and groups[0].contextual else None
-        return sections or [section for group in groups for section in _plain_sections(group, coder)]
-
     pool = ThreadPoolExecutor(threads or os.cpu_count() or 1)
     try:
-        for done, sections in enumerate(pool.map(run, jobs), start=1):
-            coded.extend(sections)
-            report("quantise and code", done / len(jobs))
+        report("octree", 0.0)
+        nearest = _nearest(scene.means, views, pool.map)
+        parameters = _in_world_units(parameters, scene, nearest)
+        tolerance = np.maximum(parameters.gamma, parameters.beta * nearest)
+        tree, order = octree.build(scene.means, tolerance, absolute=parameters.version > 1)
+        report("octree", 1.0)
+        stage = "quantise and code"
+        report(stage, 0.0)
+        groups = [*_octree_groups(tree), _Group(Property.METADATA, 0, [np.frombuffer(metadata, np.uint8)])]
+        plain = pool.map(partial(_plain_sections, coder=coder), groups)
+        attributes = _attribute_groups if parameters.version == 1 else _balanced_attribute_groups
+        chains = attributes(scene, order, parameters, pool.map)
+        report(stage, 0.2)
+        coded = _code_chains(chains, coder, parameters.version, pool, lambda done: report(stage, 0.2 + 0.7 * done))
+        coded += [section for sections in plain for section in sections]
+        report(stage, 1.0)
     finally:
         # After Ctrl-C nothing that has not begun should begin.
         pool.shutdown(cancel_futures=True)
@@ -115,20 +112,30 @@ def code_scene(
     return Coded(pieces, order)
 
 
-def _nearest(means: NDArray[np.float32], views: Sequence[Camera]) -> NDArray[np.float64]:
+def _nearest(means: NDArray[np.float32], views: Sequence[Camera], run: Run) -> NDArray[np.float64]:
     """(N,) distance to the nearest view; without views 0, which leaves the tolerance to γ."""
     nearest = np.zeros(len(means))
-    eyes = camera_centres(views) if views else ()
-    for start in range(0, len(means) if views else 0, _NEAR_BLOCK):
-        x, y, z = means[start : start + _NEAR_BLOCK].T.astype(np.float64)
+    if not views:
+        return nearest
+    eyes = camera_centres(views)
+
+    def find(start: int) -> None:
+        axes = means[start : start + _NEAR_BLOCK].T.astype(np.float64)
         least = nearest[start : start + _NEAR_BLOCK]
+        squared, part = np.empty_like(least), np.empty_like(least)
         least[:] = np.inf
         for eye in eyes:
-            squared = np.square(x - eye[0])
-            squared += np.square(y - eye[1])
-            squared += np.square(z - eye[2])
+            for axis, (coordinates, at) in enumerate(zip(axes, eye, strict=True)):
+                to = part if axis else squared
+                np.subtract(coordinates, at, out=to)
+                np.square(to, out=to)
+                if axis:
+                    np.add(squared, part, out=squared)
             np.minimum(least, squared, out=least)
-    return np.sqrt(nearest)
+        np.sqrt(least, out=least)
+
+    list(run(find, range(0, len(means), _NEAR_BLOCK)))
+    return nearest
 
 
 def _in_world_units(
@@ -164,10 +171,6 @@ class _Group:
         return bool(bitstream.context_groups(self.prop, 0))
 
 
-#: Makes streams when a thread is free for it: those of one job have contexts in common.
-_Job = Callable[[], list[_Group]]
-
-
 def _plain_sections(group: _Group, coder: EntropyCoder) -> list[tuple[Section, bytes]]:
     """A section a stream; none where all integers are 0, but for opacity, whose length vouches for that of others."""
     signed = bitstream.is_signed(group.prop)
@@ -187,29 +190,61 @@ def _plain_sections(group: _Group, coder: EntropyCoder) -> list[tuple[Section, b
     return sections
 
 
-def _context_sections(groups: list[_Group], coder: EntropyCoder) -> list[tuple[Section, bytes]] | None:
-    """A section a group; None where plain ones are smaller or the integers too large."""
-    history = context_coder.Sizes(context_coder.Lanes(max(len(groups[0].streams[0]), 1)))
+def _code_chains(
+    chains: list[list[_Group]],
+    coder: EntropyCoder,
+    version: int,
+    pool: ThreadPoolExecutor,
+    progress: Callable[[float], None],
+) -> list[tuple[Section, bytes]]:
+    """Sections of some groups: those of a chain tell each other's contexts, where there are contexts."""
+    plain = partial(_plain_sections, coder=coder)
+    if coder.name != "context" or version == 1:
+        groups = [group for chain in chains for group in chain]
+        coded = []
+        for done, sections in enumerate(pool.map(plain, groups), start=1):
+            coded.extend(sections)
+            progress(done / len(groups))
+        return coded
+    kept = [[g for g in chain if g.prop == Property.OPACITY or any(s.any() for s in g.streams)] for chain in chains]
+    # For few splats one has to try.
+    few = len(chains[-1][0].streams[0]) < _FEW
+    alternatives = [[pool.submit(plain, group) for group in chain] if few else [] for chain in kept]
+    stored = context_coder.encode(
+        [
+            [
+                context_coder.Streams(g.streams, bitstream.is_signed(g.prop), bitstream.is_predicted(g.prop, g.index))
+                for g in chain
+            ]
+            for chain in kept
+        ],
+        pool.map,
+        progress,
+    )
+    coded = []
+    for chain, groups, data, others in zip(chains, kept, stored, alternatives, strict=True):
+        made = None if data is None else _context_sections(groups, data, [other.result() for other in others])
+        coded += [section for group in chain for section in plain(group)] if made is None else made
+    return coded
+
+
+def _context_sections(
+    groups: list[_Group], stored: list[bytes], others: list[list[tuple[Section, bytes]]]
+) -> list[tuple[Section, bytes]] | None:
+    """A section a group; None where one of the others, which are plain, is smaller, or the format does not allow it."""
     sections = []
-    for group in groups:
-        if group.prop != Property.OPACITY and not any(stream.any() for stream in group.streams):
-            continue
-        n = len(group.streams[0])
-        signed = bitstream.is_signed(group.prop)
-        predicted = bitstream.is_predicted(group.prop, group.index)
-        stored = context_coder.encode(group.streams, signed, predicted, history)
-        integers = n * len(group.streams)
-        if stored is None or integers > len(stored) << 15:
+    for group, data in zip(groups, stored, strict=True):
+        integers = len(group.streams) * len(group.streams[0])
+        if integers > len(data) << 15:
             return None
-        sections.append(bitstream.context_section(group.prop, group.index, len(group.streams), integers, stored))
-        if n < _FEW:
-            plain = _plain_sections(group, coder)
-            if sum(len(data) for _, data in plain) + 24 * (len(plain) - 1) < len(stored):
-                return None
+        sections.append(bitstream.context_section(group.prop, group.index, len(group.streams), integers, data))
+    for (_, data), plain in zip(sections, others, strict=False):
+        if sum(len(p) for _, p in plain) + 24 * (len(plain) - 1) < len(data):
+            return None
     return sections
 
 
-def _octree_jobs(tree: octree.OctreeStreams) -> list[_Job]:
+def _octree_groups(tree: octree.OctreeStreams) -> list[_Group]:
     streams: list[tuple[Property, NDArray[np.unsignedinteger]]] = [
         (Property.TAIL, tree.tails),
         (Property.OCCUPANCY, tree.occupancy),
@@ -217,77 +252,94 @@ def _octree_jobs(tree: octree.OctreeStreams) -> list[_Job]:
         (Property.TAIL_LENGTH, tree.tail_lengths),
         (Property.MULTIPLICITY, tree.multiplicities),
     ]
-    return [partial(lambda prop, stream: [_Group(prop, 0, [stream])], *stream) for stream in streams if len(stream[1])]
+    return [_Group(prop, 0, [stream]) for prop, stream in streams if len(stream)]
 
 
-def _canonical(scene: Scene, order: NDArray[np.int64]) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+def _canonical(scene: Scene, order: NDArray[np.int64], run: Run) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
     """:func:`potr_cl.quantize.canonical_rotations` in the order of the file."""
     imaginary = np.empty((len(scene), 3))
     log_scales = np.empty((len(scene), 3), np.float32)
-    for start in range(0, len(scene), _BLOCK):
+
+    def turn(start: int) -> None:
         rows = order[start : start + _BLOCK]
         block = slice(start, start + len(rows))
         imaginary[block], log_scales[block] = quantize.canonical_rotations(
             scene.quaternions[rows], scene.log_scales[rows]
         )
+
+    list(run(turn, range(0, len(scene), _BLOCK)))
     return imaginary, log_scales
 
 
-def _coefficient(
-    scene: Scene, order: NDArray[np.int64], m: int, parameters: quantize.HyperParameters
-) -> list[quantize.Integers]:
-    factor = parameters.sf_dc if m == 0 else parameters.sf_sh
-    return [quantize.quantize_sh(v, factor) for v in quantize.to_ycocg(scene.sh[order, m].astype(np.float64))]
+def _coefficients(
+    scene: Scene, order: NDArray[np.int64], parameters: quantize.HyperParameters, run: Run
+) -> NDArray[np.signedinteger]:
+    """(M, 3, N) integers of the SH coefficients' Y, Co, Cg."""
+    count = scene.sh.shape[1]
+    steps: NDArray[np.signedinteger] = np.empty((count, 3, len(scene)), np.int16)
+    wide: list[tuple[tuple[int, int, slice], quantize.Integers]] = []
+
+    def take(start: int) -> None:
+        rows = order[start : start + _SH_BLOCK]
+        block = slice(start, start + len(rows))
+        planar = np.ascontiguousarray(scene.sh[rows].transpose(1, 2, 0))
+        for m, rgb in enumerate(planar.astype(np.float64)):
+            factor = parameters.sf_dc if m == 0 else parameters.sf_sh
+            for c, values in enumerate(quantize.to_ycocg(rgb.T)):
+                made = quantize.quantize_sh(values, factor)
+                if made.dtype == steps.dtype:
+                    steps[m, c, block] = made
+                else:
+                    wide.append(((m, c, block), made))
+
+    list(run(take, range(0, len(scene), _SH_BLOCK)))
+    if wide:
+        steps = steps.astype(np.result_type(*{made.dtype for _, made in wide}))
+        for where, made in wide:
+            steps[where] = made
+    return steps
 
 
-def _attribute_jobs(scene: Scene, order: NDArray[np.int64], parameters: quantize.HyperParameters) -> list[_Job]:
+def _attribute_groups(
+    scene: Scene, order: NDArray[np.int64], parameters: quantize.HyperParameters, run: Run
+) -> list[list[_Group]]:
     """Format version 1."""
-
-    def shapes() -> list[_Group]:
-        imaginary, log_scales = _canonical(scene, order)
-        rotations = [quantize.quantize_rotations(part, parameters.sf_rotation) for part in imaginary.T]
-        scales = [quantize.quantize_scales(part, parameters.sf_scale) for part in log_scales.T.astype(np.float64)]
-        return [_Group(Property.ROTATION, 0, list(rotations)), _Group(Property.SCALE, 0, list(scales))]
-
-    def opacities() -> list[_Group]:
-        logits = scene.opacity_logits[order].astype(np.float64)
-        return [_Group(Property.OPACITY, 0, [quantize.quantize_opacities(logits, parameters.sf_opacity)])]
-
-    def coefficient(m: int) -> list[_Group]:
-        return [_Group(Property.SH, 3 * m, list(_coefficient(scene, order, m, parameters)))]
-
-    # The longest jobs first: a pool that ends with a long one ends late.
-    return [shapes, *(partial(coefficient, m) for m in range(scene.sh.shape[1])), opacities]
+    imaginary, log_scales = _canonical(scene, order, run)
+    rotations = run(lambda part: quantize.quantize_rotations(part, parameters.sf_rotation), imaginary.T)
+    scales = run(lambda part: quantize.quantize_scales(part.astype(np.float64), parameters.sf_scale), log_scales.T)
+    coefficients = _coefficients(scene, order, parameters, run)
+    logits = scene.opacity_logits[order].astype(np.float64)
+    return [
+        [_Group(Property.ROTATION, 0, list(rotations))],
+        [_Group(Property.SCALE, 0, list(scales))],
+        *([_Group(Property.SH, 3 * m, list(channels))] for m, channels in enumerate(coefficients)),
+        [_Group(Property.OPACITY, 0, [quantize.quantize_opacities(logits, parameters.sf_opacity)])],
+    ]
 
 
-def _balanced_attribute_jobs(
-    scene: Scene, order: NDArray[np.int64], parameters: quantize.HyperParameters
-) -> list[_Job]:
+def _balanced_attribute_groups(
+    scene: Scene, order: NDArray[np.int64], parameters: quantize.HyperParameters, run: Run
+) -> list[list[_Group]]:
     """Format version 2."""
-    imaginary, log_scales = _canonical(scene, order)
-    scales = [quantize.quantize_scales(part, parameters.sf_scale) for part in log_scales.T.astype(np.float64)]
-
-    def rotations() -> list[_Group]:
-        factors = quantize.rotation_factors(scales, parameters.sf_rotation)
-        streams = [quantize.quantize_rotations(part, factors) for part in imaginary.T]
-        # A splat that is decoded as a ball has no direction.
-        ball = (scales[0] == scales[1]) & (scales[1] == scales[2])
-        return [_Group(Property.ROTATION, 0, [np.where(ball, 0, stream) for stream in streams])]
-
-    def opacities() -> list[_Group]:
-        logits = scene.opacity_logits[order].astype(np.float64)
-        return [_Group(Property.OPACITY, 0, [quantize.quantize_logits(logits, parameters.sf_opacity)])]
-
-    def coefficients(first: int, last: int) -> list[_Group]:
-        made = [_coefficient(scene, order, m, parameters) for m in range(first, last)]
-        edges = [band**2 for band in range(5) if first <= band**2 <= last]
-        return [
-            _Group(Property.SH, 3 * a, [s for channels in made[a - first : b - first] for s in channels])
-            for a, b in pairwise(edges)
-        ]
-
-    jobs: list[_Job] = [rotations, lambda: [_Group(Property.SCALE, 0, list(scales))], opacities]
-    jobs.append(partial(coefficients, 0, 1))
-    if scene.sh.shape[1] > 1:
-        jobs.insert(0, partial(coefficients, 1, scene.sh.shape[1]))
-    return jobs
+    imaginary, log_scales = _canonical(scene, order, run)
+    scales = list(
+        run(lambda part: quantize.quantize_scales(part.astype(np.float64), parameters.sf_scale), log_scales.T)
+    )
+    factors = quantize.rotation_factors(scales, parameters.sf_rotation)
+    # A splat that is decoded as a ball has no direction.
+    ball = (scales[0] == scales[1]) & (scales[1] == scales[2])
+    rotations = run(lambda part: np.where(ball, 0, quantize.quantize_rotations(part, factors)), imaginary.T)
+    logits = scene.opacity_logits[order].astype(np.float64)
+    coefficients = _coefficients(scene, order, parameters, run)
+    bands = [
+        _Group(Property.SH, 3 * first, list(coefficients[first : (band + 1) ** 2].reshape(-1, len(scene))))
+        for band in range(scene.sh_degree + 1)
+        for first in [band**2]
+    ]
+    return [
+        bands[1:],
+        [_Group(Property.ROTATION, 0, list(rotations))],
+        [_Group(Property.SCALE, 0, scales)],
+        bands[:1],
+        [_Group(Property.OPACITY, 0, [quantize.quantize_logits(logits, parameters.sf_opacity)])],
+    ]

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from concurrent.futures import ThreadPoolExecutor
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -9,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from potr_cl import context_coder
-from potr_cl.context_coder import Lanes, Reader, Sizes
+from potr_cl.context_coder import Lanes, Reader, Sizes, Streams
 from potr_cl.errors import DataError
 
 
@@ -17,8 +19,13 @@ def read(stored, splats, streams, signed, predicted, history=None):
     return list(Reader(memoryview(stored), splats, streams, signed, predicted, history, "test"))
 
 
+def encode(streams, signed, predicted):
+    (stored,) = context_coder.encode([[Streams(streams, signed, predicted)]])
+    return stored and stored[0]
+
+
 def check(streams, signed, predicted):
-    stored = context_coder.encode(streams, signed, predicted, None)
+    stored = encode(streams, signed, predicted)
     back = read(stored, len(streams[0]), len(streams), signed, predicted)
     for before, after in zip(streams, back, strict=True):
         assert (before == after).all()
@@ -53,8 +60,8 @@ def test_lanes_hold_every_splat_once():
 
 
 def test_what_is_too_large_is_refused():
-    assert context_coder.encode([np.array([2**38])], False, False, None) is None
-    assert context_coder.encode([np.array([2**37])], True, False, None) is None
+    assert encode([np.array([2**38])], False, False) is None
+    assert encode([np.array([2**37])], True, False) is None
     check([np.array([2**38 - 1])], False, False)
 
 
@@ -91,12 +98,41 @@ def test_history_of_earlier_sections():
     rng = np.random.default_rng(3)
     activity = rng.exponential(size=30000)
     first, second = ([np.round(rng.laplace(size=30000) * activity).astype(int) for _ in range(3)] for _ in range(2))
-    history = Sizes(Lanes(30000))
-    stored = [context_coder.encode(streams, True, False, history) for streams in (first, second)]
+    (stored,) = context_coder.encode([[Streams(first, signed=True), Streams(second, signed=True)]])
     history = Sizes(Lanes(30000))
     for streams, data in zip((first, second), stored, strict=True):
         assert all((a == b).all() for a, b in zip(streams, read(data, 30000, 3, True, False, history), strict=True))
-    assert len(stored[1]) < len(context_coder.encode(second, True, False, None))
+    assert len(stored[1]) < len(encode(second, True, False))
+
+
+def test_sections_side_by_side_are_those_alone():
+    """Whatever else is coded at the same time, in however many threads and however many lanes at once."""
+    rng = np.random.default_rng(6)
+
+    def some(count, splats, top=12):
+        return Streams(
+            [np.round(rng.laplace(size=splats) * rng.integers(1, top)).astype(int) for _ in range(count)], True
+        )
+
+    for splats in (1, 700, 3000):
+        chains = [[some(9, splats), some(3, splats)], [some(1, splats)], [some(3, splats, 300)], []]
+        alone = [context_coder.encode([chain])[0] for chain in chains]
+        assert context_coder.encode(chains) == alone
+        with ThreadPoolExecutor(3) as pool:
+            assert context_coder.encode(chains, pool.map) == alone
+        # One that cannot be coded does not keep the others from it.
+        broken = [[some(3, splats), Streams([np.full(splats, 2**40)], True)], *chains]
+        assert context_coder.encode(broken) == [None, *alone]
+
+
+def test_many_lanes_are_coded_as_few_are(monkeypatch):
+    rng = np.random.default_rng(7)
+    chains = [[Streams([rng.geometric(0.1 + 0.2 * k, 5000) for k in range(3)], False)] for _ in range(2)]
+    together = context_coder.encode(chains)
+    monkeypatch.setattr(context_coder, "_MANY_LANES", 1)
+    monkeypatch.setattr(context_coder, "_WORKING_BYTES", 0)
+    monkeypatch.setattr(context_coder, "_BLOCK", 64)
+    assert context_coder.encode(chains) == together
 
 
 def test_same_bytes_every_time():

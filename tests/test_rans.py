@@ -11,17 +11,19 @@ from potr_cl import rans
 from potr_cl.errors import DataError
 
 
+def as_tokens(tokens, contexts, frequencies):
+    """Of one stream, (steps, lanes)."""
+    cells = (contexts * frequencies.shape[1] + tokens).astype(np.uint16)
+    return rans.Tokens([cells], [0], [frequencies])
+
+
 def coded(tokens, contexts, frequencies):
     """(steps, lanes) tokens to states and words."""
-    encoder = rans.Encoder(tokens.shape[1])
-    starts = np.cumsum(frequencies, axis=1) - frequencies
-    for t in range(len(tokens) - 1, -1, -1):
-        encoder.step(frequencies[contexts[t], tokens[t]], starts[contexts[t], tokens[t]])
-    return encoder.states, encoder.words()
+    return rans.encode([as_tokens(tokens, contexts, frequencies)])[0]
 
 
 def decoded(states, words, contexts, frequencies):
-    decoder = rans.Decoder(states.copy(), words, "test")
+    decoder = rans.Decoder(states.astype(np.int64), words, "test")
     table = rans.decoding_table(frequencies)
     out = np.zeros(contexts.shape, np.uint8)
     for t in range(len(out)):
@@ -62,6 +64,59 @@ def test_frequencies_add_up_and_keep_every_token(counts):
     frequencies = rans.normalise(counts)
     assert frequencies.sum() == rans.TOTAL
     assert ((frequencies > 0) == (counts > 0)).all()
+
+
+def one_by_one(streams):
+    """The textbook's coder, integer by integer: (tokens, contexts, frequencies) of each stream."""
+    states, words = [rans.LOWEST] * streams[0][0].shape[1], []
+    for tokens, contexts, frequencies in reversed(streams):
+        starts = np.cumsum(frequencies, axis=1) - frequencies
+        for step in reversed(range(len(tokens))):
+            for lane in reversed(range(len(states))):
+                cell = contexts[step, lane], tokens[step, lane]
+                f, state = int(frequencies[cell]), states[lane]
+                if state >= f << 20:
+                    words.append(state & 0xFFFF)
+                    state >>= 16
+                states[lane] = state // f * rans.TOTAL + state % f + int(starts[cell])
+    return states, np.array(words[::-1], "<u2").tobytes()
+
+
+@pytest.mark.parametrize("lanes", [1, 3, 20])
+def test_as_the_textbook_does(lanes):
+    """Bit for bit, several sections of several streams at once, with frequencies from 1 to all."""
+    sections = []
+    for seed, count in ((1, 3), (2, 1), (3, 2)):
+        streams = [sample(25, lanes, 12, 3, seed=10 * seed + k) for k in range(count)]
+        sections.append(streams)
+    certain = np.array([[rans.TOTAL, 0]]), np.zeros((25, lanes), int)
+    sections.append([(certain[1], certain[1], certain[0])])
+    rare = np.array([[1, rans.TOTAL - 1]])
+    sections.append([((np.arange(25 * lanes).reshape(25, lanes) % 7 > 2).astype(int), certain[1], rare)])
+    joined = [
+        rans.Tokens(
+            [as_tokens(*stream).cells[0] for stream in streams],
+            list(range(len(streams))),
+            [frequencies for _, _, frequencies in streams],
+        )
+        for streams in sections
+    ]
+    for streams, (states, words) in zip(sections, rans.encode(joined), strict=True):
+        wanted, wanted_words = one_by_one(streams)
+        assert states.tolist() == wanted
+        assert words == wanted_words
+
+
+def test_lanes_without_a_token_rest():
+    tokens, contexts, frequencies = sample(30, 4, 9, 2, seed=5)
+    idle = as_tokens(tokens, contexts, frequencies)
+    idle.cells[0][:, 2] = frequencies.size
+    states, words = rans.encode([idle])[0]
+    left = [0, 1, 3]
+    wanted, wanted_words = coded(tokens[:, left], contexts[:, left], frequencies)
+    assert states[left].tolist() == wanted.tolist()
+    assert states[2] == rans.LOWEST
+    assert words == wanted_words
 
 
 def test_damage_is_found():
