@@ -5,7 +5,8 @@ more than once keeps the view and repeats only the last stage:
 
 1. ``project``: each splat's ellipse and colour on screen (cl/project.cl);
 2. ``count_tiles``, ``scan_tiles``, ``fill_tiles``: which splats touch which 16 x 16 tile (cl/tile_lists_*.cl);
-3. ``sort_tiles``: each tile's list front to back (cl/sort_*.cl);
+3. ``sort_tiles``: each tile's list front to back (cl/sort_*.cl); on CPUs ``entry_patches``: which parts of its tile
+   each entry touches (cl/entry_patches_cpu.cl);
 4. ``composite``: the picture (cl/composite_*.cl).
 
 Semantics: the original 3DGS rasterizer (Kerbl et al. 2023); where renderers differ, :class:`RasterRules` says how.
@@ -142,6 +143,9 @@ class View:
             self.offsets = device.allocate(4 * (self.tiles + 1), "the tile offsets")
             self._lists = Scratch(device, "the tile lists")
             self._lists.reserve(4 * capacity)
+            self._patches = Scratch(device, "the entries' patches") if device.family == "cpu" else None
+            if self._patches is not None:
+                self._patches.reserve(4 * capacity)
         self.entry_count = 0
 
     @property
@@ -155,6 +159,12 @@ class View:
         return self._lists.buffer
 
     @property
+    def lists(self) -> tuple[cl.Buffer, ...]:
+        """The entries and, for CPU kernels, their patches: (capacity,) uint32 a bit for each patch of its tile that an
+        entry touches (cl/patches.clh)."""
+        return (self.entries,) if self._patches is None else (self.entries, self._patches.buffer)
+
+    @property
     def capacity(self) -> int:
         """Entries that there is room for."""
         return self._lists.nbytes // 4
@@ -162,15 +172,22 @@ class View:
     def grow(self, capacity: int) -> None:
         """Make room for more entries; those there are get lost."""
         self._lists.reserve(4 * capacity)
+        if self._patches is not None:
+            self._patches.reserve(4 * capacity)
 
     def trim(self) -> None:
         """Give back the room that the entries do not need."""
-        trimmed = Scratch(self._device, "the tile lists")
+        self._lists = self._trimmed(self._lists, "the tile lists")
+        if self._patches is not None:
+            self._patches = self._trimmed(self._patches, "the entries' patches")
+
+    def _trimmed(self, scratch: Scratch, what: str) -> Scratch:
+        trimmed = Scratch(self._device, what)
         trimmed.reserve(4 * self.entry_count)
         if self.entry_count:
-            cl.enqueue_copy(self._device.queue, trimmed.buffer, self.entries, byte_count=4 * self.entry_count)
-        self._lists.free()
-        self._lists = trimmed
+            cl.enqueue_copy(self._device.queue, trimmed.buffer, scratch.buffer, byte_count=4 * self.entry_count)
+        scratch.free()
+        return trimmed
 
     def free_geometry(self) -> None:
         """Give shapes and colours back, for those who keep the lists and project again (:meth:`Rasterizer.project`)."""
@@ -184,6 +201,8 @@ class View:
         self.free_geometry()
         self._device.free(self.offsets)
         self._lists.free()
+        if self._patches is not None:
+            self._patches.free()
 
 
 class Rasterizer:
@@ -254,7 +273,7 @@ class Rasterizer:
     def _build(self, sh_count: int) -> None:
         device, rules = self.device, self.rules
         self._lanes = 1 if device.family == "gpu" else device.vector_width
-        row_lanes = max(self._lanes, 4)
+        row_lanes = max(self._lanes, 8)
         self._project = device.kernel(
             "project.cl",
             "project",
@@ -278,6 +297,7 @@ class Rasterizer:
             )
         else:
             self._sort = device.kernel("sort_cpu.cl", "sort_tiles")
+            self._entry_patches = device.kernel("entry_patches_cpu.cl", "entry_patches", LANES=row_lanes)
             self._composite = device.kernel("composite_cpu.cl", "composite", LANES=row_lanes, **limits)
 
     def _bind(self, view: View) -> None:
@@ -305,11 +325,13 @@ class Rasterizer:
         self._scan.set_args(counts, view.offsets, np.uint32(view.tiles), self._total)
         self._fill.set_args(self._bounds, view.shapes, stride, camera, counts, keys, capacity)
         self._sort.set_args(keys, view.offsets, view.entries, counts, capacity)
+        if device.family == "cpu":
+            self._entry_patches.set_args(view.shapes, view.offsets, *view.lists, capacity, camera)
         self._composite.set_args(
             view.shapes,
             view.colours,
             view.offsets,
-            view.entries,
+            *view.lists,
             capacity,
             camera,
             *(np.float32(channel) for channel in self.background),
@@ -354,9 +376,12 @@ class Rasterizer:
         self._fill.set_arg(3, camera)
         launch(self._fill, (self.stride,), (_SPLAT_GROUP,))
         launch(self._sort, (view.tiles * self._tile_group,), (self._tile_group,))
+        if self.device.family == "cpu":
+            self._entry_patches.set_arg(5, camera)
+            launch(self._entry_patches, (view.tiles,), (1,))
 
     def _enqueue_composite(self, view: View) -> None:
-        self._composite.set_arg(5, camera_struct(view.camera))
+        self._composite.set_arg(4 + len(view.lists), camera_struct(view.camera))
         self.device.launch(self._composite, (view.tiles * self._tile_group,), (self._tile_group,))
 
     def _settle(self, view: View) -> bool:

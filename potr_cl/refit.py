@@ -242,7 +242,7 @@ class ColourRefit:
         if device.family == "gpu":
             limits["NATIVE_EXP2"] = int(device.native_exp2)
         else:
-            limits["LANES"] = max(device.vector_width, 4)
+            limits["LANES"] = max(device.vector_width, 8)
         source = f"refit_{device.family}.cl"
         self._tile_group = 64 if device.family == "gpu" else 1
         self._sweeps = [device.kernel(source, "refit_sweep", WEIGHTS=weights, **limits) for weights in (0, 1)]
@@ -273,7 +273,7 @@ class ColourRefit:
         self._budget: float = free * _SHARE if memory is None else memory
         for number, camera in enumerate(self._cameras):
             view = self._rasterizer.prepare(camera)
-            nbytes = 48 * self._stride + 4 * (view.entry_count + view.tiles)
+            nbytes = 48 * self._stride + 4 * (len(view.lists) * view.entry_count + view.tiles)
             if nbytes > self._budget:
                 view.free()
             else:
@@ -415,7 +415,7 @@ class ColourRefit:
             view.shapes,
             view.colours if targets is not None else slot.colours,
             view.offsets,
-            view.entries,
+            *view.lists,
             camera_struct(view.camera),
             *(np.float32(channel if targets is not None else 0) for channel in self._background),
             slot.target if targets is None else self._target(slot, number, targets),

@@ -29,8 +29,8 @@ Indices = NDArray[np.int64]
 
 #: Views that a GPU sweeps at a time.
 _QUEUES = 16
-#: Where the removal kernel's argument stands that has it store the target.
-_FIRST_TIME = 12
+#: Where the removal kernel's argument stands that has it store the target, behind the buffers of the lists.
+_FIRST_TIME = 9
 #: Below it transmittances lose digits in float32, and the sweep divides by them.
 _LEAST_STOP = 1e-30
 #: Part of the device's memory that the views may take unless the caller sets a budget. A CPU's is that of the host: the
@@ -204,7 +204,7 @@ class RemovalSweep:
         if device.family == "gpu":
             limits["NATIVE_EXP2"] = int(device.native_exp2)
         else:
-            limits["LANES"] = max(device.vector_width, 4)
+            limits["LANES"] = max(device.vector_width, 8)
         self._limits = limits
         self._source = f"removal_{device.family}.cl"
         self._group = 64 if device.family == "gpu" else 1
@@ -229,7 +229,7 @@ class RemovalSweep:
         """Keep a prepared view as far as the budget allows; whether it does."""
         view = swept.view
         geometry = 48 * self._rasterizer.stride
-        lists = 12 * view.entry_count + 12 * view.tiles + 12 * view.camera.width * view.camera.height
+        lists = (8 + 4 * len(view.lists)) * view.entry_count + 12 * view.tiles + 12 * view.camera.width * view.camera.height
         # The first view stands for the others: geometry is kept for all of them or for none.
         if number == 0 and self._views * (lists + geometry) > self._budget:
             self._shared = (
@@ -251,7 +251,7 @@ class RemovalSweep:
         device, view = self._device, swept.view
         shapes, colours = self._shared if view.shapes is None and self._shared else (view.shapes, view.colours)
         weight = self._pixels / (view.camera.width * view.camera.height)
-        lists = (swept.begins, swept.lengths, view.entries)
+        lists = (swept.begins, swept.lengths, *view.lists)
         swept.sweep = device.kernel(self._source, "removal", **self._limits)
         swept.sweep.set_args(
             np.uint32(0),
@@ -271,7 +271,7 @@ class RemovalSweep:
         )
         swept.staleness = device.kernel(self._source, "staleness", **self._limits)
         swept.staleness.set_args(
-            self._alive_buffer, *lists, swept.sums, np.uint32(swept.first_tile), self._stale_buffer
+            self._alive_buffer, *lists[:3], swept.sums, np.uint32(swept.first_tile), self._stale_buffer
         )
 
     def _sweep(self, swept: _Swept, start: int, count: int, queue: cl.CommandQueue | None = None) -> None:
@@ -320,7 +320,7 @@ class RemovalSweep:
         self._sweep_stale(options.tolerance, options.turns if self._measured else 1, options.sample if sampled else 1)
         if self._measured == 0:
             for swept in self._kept.values():
-                swept.sweep.set_arg(_FIRST_TIME, np.int32(0))
+                swept.sweep.set_arg(_FIRST_TIME + 2 + len(swept.view.lists), np.int32(0))
         words = self._device.download(self._totals, (self.splats, 2), np.int64)
         if len(self._kept) < self._views:
             words += self._measure_transient()

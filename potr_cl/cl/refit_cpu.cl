@@ -8,10 +8,8 @@
 
 #include "lanes.clh"
 #include "splat.clh"
-#include "splat_block.clh"
+#include "patch_vectors.clh"
 #include "refit.clh"
-
-#define VECTORS (TILE / LANES)
 
 /* T alpha of one splat in LANES pixels, whose transmittances t move on; negative ones belong to pixels that have ended. */
 #define BLEND(weight, power, t)                                     \
@@ -29,6 +27,7 @@ kernel void refit_sweep(
     global const float4 *colours,
     global const uint *offsets,
     global const uint *entries,
+    global const uint *patches,
     View view,
     float red,
     float green,
@@ -41,113 +40,78 @@ kernel void refit_sweep(
 {
     const int tile = get_global_id(0);
     const int2 origin = (int2)(tile % view.columns, tile / view.columns) * TILE;
-    const int pixel_rows = min(TILE, view.height - origin.y);
-    const int pixel_columns = min(TILE, view.width - origin.x);
     const uint begin = offsets[tile], end = offsets[tile + 1];
 
-    vfloat t[TILE * VECTORS], r[TILE * VECTORS], g[TILE * VECTORS], b[TILE * VECTORS];
-    uint swept = begin;
+    vfloat t[PATCHES], r[PATCHES], g[PATCHES], b[PATCHES];
     for (int pass = 0; pass < 2; ++pass) {
-        for (int i = 0; i < TILE * VECTORS; ++i) {
-            vfloat column = LANE_NUMBERS + (float)(origin.x + i % VECTORS * LANES);
-            t[i] = column < (float)view.width ? (vfloat)(1.0f) : (vfloat)(-1.0f);
+        for (int i = 0; i < PATCHES; ++i) {
+            t[i] = patch_transmittance(i, origin, view.width, view.height);
             if (pass == 0)
                 r[i] = g[i] = b[i] = (vfloat)(0.0f);
         }
-        int first_alive = 0, end_alive = pixel_rows;
-        SplatBlock block;
-        for (uint from = begin; from < end && first_alive < end_alive; from += BLOCK) {
-            fetch_block(&block, shapes, colours, entries, from, end, origin);
-            swept = min(from + BLOCK, end);
-            for (int k = 0; k < BLOCK; ++k) {
-                const int first_row = GREATER(block.first_row[k], first_alive);
-                const int end_row = LESSER(block.end_row[k], end_alive);
-                if (first_row >= end_row)
-                    continue;
-                const float x = block.x[k], a = block.a[k];
-                vfloat au[VECTORS];
-                for (int v = 0; v < VECTORS; ++v)
-                    au[v] = a * ((LANE_NUMBERS + (origin.x + v * LANES + 0.5f)) - x);
+        uint living = ALL_PATCHES;
+        for (uint e = begin; e < end && living; ++e) {
+            if (e + AHEAD < end)
+                prefetch_splat(shapes, colours, entries[e + AHEAD]);
+            uint todo = patches[e] & living;
+            if (todo) {
+                const Splat splat = load_splat(shapes, colours, entries[e]);
                 vfloat sum_r = (vfloat)(0.0f), sum_g = (vfloat)(0.0f), sum_b = (vfloat)(0.0f);
                 vfloat squares = (vfloat)(0.0f);
-                for (int row = first_row; row < end_row; ++row) {
-                    const float dy = origin.y + row + 0.5f - block.y[k];
-                    const float bu = block.b[k] * dy;
-                    const float cv = block.c[k] * dy;
-                    const float level = MAD(-cv, cv, block.log2_opacity[k]);
-                    for (int v = 0; v < VECTORS; ++v) {
-                        const int i = row * VECTORS + v;
-                        const vfloat u = au[v] + bu;
-                        const vfloat power = MAD(-u, u, (vfloat)(level));
-                        BLEND(weight, power, t[i]);
-                        if (pass == 0) {
-                            r[i] = MAD(weight, (vfloat)(block.red[k]), r[i]);
-                            g[i] = MAD(weight, (vfloat)(block.green[k]), g[i]);
-                            b[i] = MAD(weight, (vfloat)(block.blue[k]), b[i]);
-                        } else {
-                            sum_r = MAD(weight, r[i], sum_r);
-                            sum_g = MAD(weight, g[i], sum_g);
-                            sum_b = MAD(weight, b[i], sum_b);
+                for (; todo; todo &= todo - 1) {
+                    const int i = LOWEST_PATCH(todo);
+                    const vfloat power = patch_power(&splat, i, origin);
+                    BLEND(weight, power, t[i]);
+                    if (pass == 0) {
+                        r[i] = MAD(weight, (vfloat)(splat.red), r[i]);
+                        g[i] = MAD(weight, (vfloat)(splat.green), g[i]);
+                        b[i] = MAD(weight, (vfloat)(splat.blue), b[i]);
+                    } else {
+                        sum_r = MAD(weight, r[i], sum_r);
+                        sum_g = MAD(weight, g[i], sum_g);
+                        sum_b = MAD(weight, b[i], sum_b);
 #if WEIGHTS
-                            squares = MAD(weight, weight, squares);
+                        squares = MAD(weight, weight, squares);
 #endif
-                        }
                     }
                 }
                 if (pass == 1) {
-                    float parts[4][LANES];
-                    VSTORE(sum_r, 0, parts[0]);
-                    VSTORE(sum_g, 0, parts[1]);
-                    VSTORE(sum_b, 0, parts[2]);
-                    VSTORE(squares, 0, parts[3]);
-                    float4 sum = (float4)(0.0f);
-                    for (int lane = 0; lane < LANES; ++lane)
-                        sum += (float4)(parts[0][lane], parts[1][lane], parts[2][lane], parts[3][lane]);
-                    add_sums(totals, entries[from + k], sum, scale);
+                    const float4 sum =
+                        (float4)(sum_lanes(sum_r), sum_lanes(sum_g), sum_lanes(sum_b), sum_lanes(squares));
+                    add_sums(totals, entries[e], sum, scale);
                 }
             }
-            int first = pixel_rows, last = -1;
-            for (int row = first_alive; row < end_alive; ++row) {
-                vfloat most = t[row * VECTORS];
-                for (int v = 1; v < VECTORS; ++v)
-                    most = fmax(most, t[row * VECTORS + v]);
-                if (VANY(most > 0.0f)) {
-                    first = min(first, row);
-                    last = row;
-                }
-            }
-            first_alive = first;
-            end_alive = last + 1;
+            if ((e - begin) % AHEAD == AHEAD - 1)
+                living = living_patches(t);
         }
         if (pass == 1)
             break;
 
         float error = 0.0f;
-        for (int row = 0; row < pixel_rows; ++row) {
-            float values[3][TILE];
-            for (int v = 0; v < VECTORS; ++v) {
-                const int i = row * VECTORS + v;
-                const vfloat through = fabs(t[i]);
-                VSTORE(MAD(through, (vfloat)(red), r[i]), v, values[0]);
-                VSTORE(MAD(through, (vfloat)(green), g[i]), v, values[1]);
-                VSTORE(MAD(through, (vfloat)(blue), b[i]), v, values[2]);
-            }
-            const size_t pixel = 3 * ((size_t)(origin.y + row) * view.width + origin.x);
-            for (int column = 0; column < TILE; ++column)
+        float values[3][TILE * TILE];
+        for (int i = 0; i < PATCHES; ++i) {
+            const vfloat through = fabs(t[i]);
+            store_patch(MAD(through, (vfloat)(red), r[i]), i, values[0]);
+            store_patch(MAD(through, (vfloat)(green), g[i]), i, values[1]);
+            store_patch(MAD(through, (vfloat)(blue), b[i]), i, values[2]);
+        }
+        for (int row = 0; row < TILE; ++row)
+            for (int column = 0; column < TILE; ++column) {
+                const int inside = origin.x + column < view.width && origin.y + row < view.height;
+                const size_t pixel = 3 * ((size_t)(origin.y + row) * view.width + origin.x + column);
                 for (int channel = 0; channel < 3; ++channel) {
-                    float value = column < pixel_columns ? values[channel][column] : 0.0f;
-                    if (has_target && column < pixel_columns)
-                        value -= target[pixel + 3 * column + channel];
+                    float value = inside ? values[channel][row * TILE + column] : 0.0f;
+                    if (has_target && inside)
+                        value -= target[pixel + channel];
                     value = clamp(value, -LARGEST_VALUE, LARGEST_VALUE);
                     error += value * value;
-                    values[channel][column] = value;
+                    values[channel][row * TILE + column] = value;
                 }
-            for (int v = 0; v < VECTORS; ++v) {
-                const int i = row * VECTORS + v;
-                r[i] = VLOAD(v, values[0]);
-                g[i] = VLOAD(v, values[1]);
-                b[i] = VLOAD(v, values[2]);
             }
+        for (int i = 0; i < PATCHES; ++i) {
+            r[i] = load_patch(i, values[0]);
+            g[i] = load_patch(i, values[1]);
+            b[i] = load_patch(i, values[2]);
         }
         errors[tile] = error;
     }
