@@ -88,6 +88,20 @@ def test_a_sound_device_is_not_accused(device):
         assert error <= 20 * expected, measure
 
 
+def test_the_cap_that_a_device_gets_is_no_fault(device):
+    """1 - 0.999 is another number in float32, and what lies behind a capped splat is seen through just that."""
+    veil = dataclasses.replace(
+        CASE.scene.subset(np.arange(2)),
+        means=np.array([CASE.view.centre / 2, [0, 0, 0]], np.float32),
+        log_scales=np.array([[6] * 3, [0] * 3], np.float32),
+        opacity_logits=np.array([50, 0], np.float32),
+    )
+    found = stress.check(device, dataclasses.replace(CASE, scene=veil, rules=GSPLAT))
+    for measure in ("removal: effect", "removal: importance"):
+        error, expected = found[measure]
+        assert error <= 20 * expected, measure
+
+
 @pytest.mark.parametrize(
     ("measure", "change"),
     [
