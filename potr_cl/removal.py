@@ -65,7 +65,7 @@ class SweepOptions:
         UsageError: a value is out of range.
     """
 
-    tolerance: float = 0.002
+    tolerance: float = 0.01
     turns: int = 1
     memory: int | None = None
     tighten: bool = False
@@ -229,7 +229,8 @@ class RemovalSweep:
         """Keep a prepared view as far as the budget allows; whether it does."""
         view = swept.view
         geometry = 48 * self._rasterizer.stride
-        lists = (8 + 4 * len(view.lists)) * view.entry_count + 12 * view.tiles + 12 * view.camera.width * view.camera.height
+        an_entry = 8 + 4 * len(view.lists)
+        lists = an_entry * view.entry_count + 12 * view.tiles + 12 * view.camera.width * view.camera.height
         # The first view stands for the others: geometry is kept for all of them or for none.
         if number == 0 and self._views * (lists + geometry) > self._budget:
             self._shared = (

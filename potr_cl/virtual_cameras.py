@@ -27,8 +27,13 @@ from potr_cl.scene import Scene
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
 
-#: Training views that are placed, and pixels along a side of each, unless told otherwise.
-COUNT, SIZE = 100, 1000
+#: Training views that are placed unless told otherwise. Many small ones leave fewer gaps than few large ones of as many
+#: pixels; but each costs time and memory for every splat, so that large scenes get fewer.
+FEWEST, MOST = 100, 300
+_SPLATS_TIMES_VIEWS = 150_000_000
+#: Pixels of all of them together, and along a side of each.
+_PIXELS = 108_000_000
+_SMALLEST, _LARGEST = 500, 1000
 #: What the names of virtual cameras begin with.
 _PREFIX = "virtual_"
 
@@ -127,13 +132,14 @@ class _Candidates:
     trained: bool
 
 
-def place_cameras(scene: Scene, count: int = COUNT, size: int = SIZE) -> list[Camera]:
+def place_cameras(scene: Scene, count: int | None = None, size: int | None = None) -> list[Camera]:
     """Views that cover what someone would look at.
 
     Args:
         scene: clean, at least one splat.
-        count: training views. An eighth as many test views, which lie among them, come on top.
-        size: of their square images, in pixels.
+        count: training views; by default 100 to 300, the fewer the more splats there are. An eighth as many test views,
+            which lie among them, come on top.
+        size: of their square images, in pixels; by default 500 to 1000, the smaller the more views there are.
 
     Returns:
         Cameras "virtual_000" and so on, in the order in which they were picked.
@@ -141,6 +147,10 @@ def place_cameras(scene: Scene, count: int = COUNT, size: int = SIZE) -> list[Ca
     Raises:
         UsageError: ``count`` or ``size`` below 1.
     """
+    if count is None:
+        count = min(max(_SPLATS_TIMES_VIEWS // len(scene), FEWEST), MOST)
+    if size is None:
+        size = min(max(round(math.sqrt(_PIXELS / max(count, 1))), _SMALLEST), _LARGEST)
     if count < 1 or size < 1:
         raise UsageError(f"{count} virtual views of {size} x {size} pixels: both must be at least 1")
     frame = _frame(scene)

@@ -31,7 +31,7 @@ from potr_cl.metrics import psnr
 from potr_cl.options import EncodeOptions
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.scene import FloatArray, Scene
-from potr_cl.virtual_cameras import COUNT, SIZE, place_cameras
+from potr_cl.virtual_cameras import place_cameras
 
 QUALITIES = (0.1, 0.3, 0.5, 0.7, 0.9)
 #: Bytes are compared at the PSNR that the true cameras reach at these.
@@ -109,8 +109,8 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", nargs="+", type=Path)
     parser.add_argument("--qualities", nargs="+", type=float, default=QUALITIES)
-    parser.add_argument("--count", type=int, default=COUNT, help="virtual views; default as encode places")
-    parser.add_argument("--size", type=int, default=SIZE, help="of their images, in pixels; default as encode's")
+    parser.add_argument("--count", type=int, help="virtual views; default as encode places")
+    parser.add_argument("--size", type=int, help="of their images, in pixels; default as encode's")
     parser.add_argument("--quick", action="store_true", help="few iterations, few and small views")
     parser.add_argument("--json", type=Path, help="also write the raw results here")
     parser.add_argument("--device")

@@ -11,14 +11,17 @@ from potr_cl.cli.options import CAMERAS_HELP
 from potr_cl.formats import load_cameras
 from potr_cl.reduction import Progress
 from potr_cl.scene import Scene
-from potr_cl.virtual_cameras import COUNT, describe, place_cameras
+from potr_cl.virtual_cameras import FEWEST, MOST, describe, place_cameras
 
 
 def add_cameras_options(p: argparse.ArgumentParser) -> None:
     """``--cameras``, and what to do without."""
     p.add_argument("--cameras", type=Path, metavar="PATH", help=f"{CAMERAS_HELP}; without, virtual cameras are placed")
     p.add_argument(
-        "--virtual-views", type=int, default=COUNT, metavar="N", help=f"to place without --cameras; default {COUNT}"
+        "--virtual-views",
+        type=int,
+        metavar="N",
+        help=f"to place without --cameras; default {FEWEST} to {MOST}, the fewer the more splats",
     )
 
 
