@@ -13,12 +13,13 @@ from numpy.typing import NDArray
 
 from potr_cl.cameras import Camera, camera_centres, train_views
 from potr_cl.compaction import REFERENCE_PIXELS, CompactionOptions, Compactor, ViewWeights, Weighting
-from potr_cl.device import Device, Family
+from potr_cl.device import Device
 from potr_cl.errors import DeviceError, UsageError
 from potr_cl.quantize import quantize_sh, to_ycocg
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.removal import RemovalSweep
 from potr_cl.scene import Scene
+from tests.devices import KERNELS, open_device
 from tests.ridge_reference import (
     YCOCG,
     Ridges,
@@ -36,10 +37,9 @@ from tests.scenes import random_scene
 ROUNDING = 2e-6
 
 
-@pytest.fixture(scope="module", params=["cpu", "gpu"])
+@pytest.fixture(scope="module", params=KERNELS)
 def device(request: pytest.FixtureRequest) -> Iterator[Device]:
-    family: Family = request.param
-    device = Device(family=family)
+    device = open_device(request.param)
     yield device
     assert device.allocated == 0, "a compactor did not give all its memory back"
 

@@ -229,6 +229,14 @@ def test_this_machine() -> None:
         assert info.vector_width in (1, 4, 8, 16)
 
 
+@pytest.mark.parametrize("index", range(len(list_devices())))
+def test_each_device_of_this_machine(index: int) -> None:
+    info = list_devices()[index]
+    if (fault := compiler_fault(info)) is not None:
+        pytest.skip(f"{info}, {info.version} cannot compile: {fault}")
+    Device(info).self_check()
+
+
 def list_names(vendors: Path, **environment: str) -> list[str]:
     """The devices that a fresh process finds with this folder of ICDs."""
     run = subprocess.run(

@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl.device import Device
 from potr_cl.encoder import Stopwatch, encode
 from potr_cl.errors import UsageError
 from potr_cl.options import EncodeOptions
@@ -15,14 +14,15 @@ from potr_cl.quantize import ac_sparsity
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.reduction import reduce_scene
 from potr_cl.removal import SweepOptions
+from tests.devices import KERNELS, open_device
 from tests.scenes import random_scene, ring_of_cameras
 
 FEW = EncodeOptions(iterations=6)
 
 
-@pytest.fixture(scope="module", params=["cpu", "gpu"])
+@pytest.fixture(scope="module", params=KERNELS)
 def device(request):
-    device = Device(family=request.param)
+    device = open_device(request.param)
     yield device
     assert device.allocated == 0, "the encoder did not give all its memory back"
 

@@ -7,18 +7,18 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl.device import Device
 from potr_cl.rasterizer import GSPLAT, INRIA, Rasterizer
 from potr_cl.removal import RemovalSweep, SweepOptions
 from tests import reference
+from tests.devices import KERNELS, open_device
 from tests.scenes import random_scene, ring_of_cameras
 from tools.bench_pruning import halved, pareto
 from tools.pruning_baselines import mesongs_power, removal_order, scores, transmittance_sums
 
 
-@pytest.fixture(scope="module", params=["cpu", "gpu"])
+@pytest.fixture(scope="module", params=KERNELS)
 def device(request):
-    device = Device(family=request.param)
+    device = open_device(request.param)
     yield device
     assert device.allocated == 0, "not all memory was given back"
 

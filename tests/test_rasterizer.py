@@ -10,25 +10,22 @@ import pytest
 from numpy.typing import NDArray
 
 from potr_cl.cameras import Camera
-from potr_cl.device import Device, Family, choose_device
+from potr_cl.device import Device
 from potr_cl.errors import DataError, DeviceError, UsageError
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.rasterizer import GSPLAT, INRIA, TILE, Rasterizer, RasterRules, View, render
 from potr_cl.scene import Scene
 from tests import reference
+from tests.devices import KERNELS, open_device
 from tests.raster_scenes import camera, random_splats, splats, tilted_camera
 
 #: A pixel whose every alpha and transmittance stays this far, relatively, from 1/255 and 1e-4 cannot flip.
 CLEAR = 1e-4
 
 
-@pytest.fixture(scope="module", params=["cpu", "gpu"])
+@pytest.fixture(scope="module", params=KERNELS)
 def device(request: pytest.FixtureRequest) -> Iterator[Device]:
-    family: Family = request.param
-    info = choose_device()
-    if family == "cpu" and info.family == "gpu" and info.kind == "cpu":
-        pytest.skip(f"{info} does not run the row kernels: it ends long loops early")
-    device = Device(info, family=family)
+    device = open_device(request.param)
     yield device
     assert device.allocated == 0, "a rasterizer did not give all its memory back"
 

@@ -9,9 +9,9 @@ import pytest
 
 from potr_cl.cameras import Camera
 from potr_cl.compaction import REFERENCE_PIXELS
-from potr_cl.device import Device
 from potr_cl.errors import UsageError
 from potr_cl.refit import ColourRefit, RefitOptions, active_coefficients
+from tests.devices import KERNELS, open_device
 from tests.raster_scenes import camera as straight_camera
 from tests.raster_scenes import splats as plain_splats
 from tests.raster_scenes import tilted_camera
@@ -20,9 +20,9 @@ from tests.refit_reference import LENGTHS, selection, to_rgb, to_ycocg
 from tests.scenes import ring_of_cameras
 
 
-@pytest.fixture(scope="module", params=["cpu", "gpu"])
+@pytest.fixture(scope="module", params=KERNELS)
 def device(request):
-    device = Device(family=request.param)
+    device = open_device(request.param)
     yield device
     assert device.allocated == 0, "a re-fit did not give all its memory back"
 

@@ -8,20 +8,20 @@ import numpy as np
 import pytest
 
 from potr_cl.cameras import Camera
-from potr_cl.device import Device
 from potr_cl.errors import UsageError
 from potr_cl.pruning import PruningOptions, prune
 from potr_cl.rasterizer import INRIA, Rasterizer
 from potr_cl.removal import RemovalSweep, SweepOptions, default_memory
 from potr_cl.scene import Scene
 from tests import reference
+from tests.devices import KERNELS, open_device
 from tests.scenes import random_scene, ring_of_cameras
 from tools.removal_exactness import BruteForce
 
 
-@pytest.fixture(scope="module", params=["cpu", "gpu"])
+@pytest.fixture(scope="module", params=KERNELS)
 def device(request):
-    device = Device(family=request.param)
+    device = open_device(request.param)
     yield device
     assert device.allocated == 0, "a sweep did not give all its memory back"
 

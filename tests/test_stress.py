@@ -10,13 +10,14 @@ import pytest
 from potr_cl.device import Device
 from potr_cl.rasterizer import GSPLAT, INRIA
 from tests import reference
+from tests.devices import KERNELS, open_device
 from tests.raster_scenes import random_splats, tilted_camera
 from tools import stress, stress_cases
 
 
-@pytest.fixture(scope="module", params=["cpu", "gpu"])
+@pytest.fixture(scope="module", params=KERNELS)
 def device(request):
-    device = Device(family=request.param)
+    device = open_device(request.param)
     yield device
     assert device.allocated == 0
 

@@ -1,0 +1,46 @@
+"""The devices and kernel families that the kernels are tested on."""
+
+from __future__ import annotations
+
+import importlib.metadata
+from typing import Any, cast
+
+import pytest
+
+from potr_cl.device import Device, DeviceInfo, Family, choose_device, compiler_fault, list_devices
+from potr_cl.errors import DeviceError
+
+
+def _is_of_pip(info: DeviceInfo) -> bool:
+    try:
+        return f"pocl {importlib.metadata.version('pocl-binary-distribution')}" in info.version.lower()
+    except importlib.metadata.PackageNotFoundError:
+        return False
+
+
+def _pocl() -> DeviceInfo | None:
+    """PoCL where another device goes before it: pip's, or if that does not know this CPU, any other that does."""
+    found = [info for info in list_devices() if info.kind == "cpu" and "portable computing" in info.platform.lower()]
+    able = sorted((info for info in found if compiler_fault(info) is None), key=lambda info: not _is_of_pip(info))
+    try:
+        return able[0] if able and able[0] != choose_device() else None
+    except DeviceError:
+        return None
+
+
+_POCL = _pocl()
+
+#: Parameters of fixtures, for :func:`open_device`: both families on the device that is taken by default, and again on
+#: PoCL, which every installation on Linux brings. What cannot compile is skipped in tests/test_device.py, visibly.
+KERNELS: list[Any] = ["cpu", "gpu"]
+if _POCL is not None:
+    KERNELS += [pytest.param(f"{family}-pocl", marks=pytest.mark.slow) for family in ("cpu", "gpu")]
+
+
+def open_device(kernels: str) -> Device:
+    """The device of one of :data:`KERNELS`; skips the test if it cannot run that family."""
+    family, _, runtime = kernels.partition("-")
+    info = _POCL if runtime and _POCL is not None else choose_device()
+    if family == "cpu" and info.family == "gpu" and info.kind == "cpu":
+        pytest.skip(f"{info} does not run the row kernels: it ends long loops early")
+    return Device(info, family=cast(Family, family))
