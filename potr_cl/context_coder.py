@@ -12,6 +12,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
+from functools import cached_property, partial
 from itertools import pairwise
 from typing import Any
 
@@ -34,6 +35,8 @@ _CHANNELS = 3
 #: Splats of a lane, unless there are too many for :data:`_MOST_LANES`.
 _LANE = 256
 _MOST_LANES = 8192
+#: Lanes that are split or joined at a time: whole lines of a cache.
+_TURNED = 64
 #: Expected sizes are from 0 to this.
 _LARGEST_SIZE = 255
 _MOST_CONTEXTS = 32
@@ -76,6 +79,9 @@ def _size_table(signed: bool) -> I32:
 
 
 _SIZES = {signed: _size_table(signed) for signed in (False, True)}
+#: What a decoder's trail is while there are no recent sizes, and what a token adds to it.
+_NO_TRAIL = rans.TRAIL_FACTOR
+_WORTH = {signed: rans.TRAIL_FACTOR * (2 * sizes.astype(np.int64) + 1) for signed, sizes in _SIZES.items()}
 
 
 @dataclass(frozen=True)
@@ -101,11 +107,19 @@ class Lanes:
         """(n,) to (steps, lanes), missing ones 0."""
         padded = np.zeros(self.number * self.steps, values.dtype)
         padded[: len(values)] = values
-        return np.ascontiguousarray(padded.reshape(self.number, self.steps).T)
+        lanes = padded.reshape(self.number, self.steps)
+        laid = np.empty((self.steps, self.number), values.dtype)
+        for start in range(0, self.number, _TURNED):
+            laid[:, start : start + _TURNED] = lanes[start : start + _TURNED].T
+        return laid
 
     def join(self, laid: NDArray[np.integer]) -> NDArray[np.integer]:
         """(steps, lanes) to (n,)."""
-        return np.ascontiguousarray(laid.T).reshape(-1)[: self.splats]
+        lanes = np.empty((self.number, self.steps), laid.dtype)
+        for start in range(0, self.number, _TURNED):
+            # The steps of thousands of lanes lie where they drive each other out of a cache: so first close together.
+            lanes[start : start + _TURNED] = np.ascontiguousarray(laid[:, start : start + _TURNED]).T
+        return lanes.reshape(-1)[: self.splats]
 
 
 class Sizes:
@@ -133,26 +147,18 @@ class Sizes:
             self.same = []
 
 
-def _expected(known: Sequence[I32], weights: I32) -> I32:
-    """The weighted sum of what is known without the recent ones, not yet shifted and cut."""
-    total = np.full(known[0].shape, weights[-1], np.int32)
-    for weight, term in zip(weights, known, strict=False):
-        if weight:
-            total += weight * term
-    return total
-
-
 def _predict(residuals: I64) -> I64:
     """Undo the prediction: (steps, lanes) integers, each the residual plus the rounded mean of the four before."""
     values = np.zeros((len(residuals) + 4, residuals.shape[1]), np.int64)
-    for t, residual in enumerate(residuals):
-        values[t + 4] = residual + _mean(values[t : t + 4])
+    # Sums of the last four, and 2 to round.
+    total = np.full(residuals.shape[1], 2, np.int64)
+    mean = np.empty_like(total)
+    for residual, value, leaving in zip(residuals, values[4:], values, strict=False):
+        np.right_shift(total, 2, mean)
+        np.add(residual, mean, value)
+        np.add(total, value, total)
+        np.subtract(total, leaving, total)
     return values[4:]
-
-
-def _mean(last: I64) -> I64:
-    total: I64 = last.sum(axis=0)
-    return (total + 2) >> 2
 
 
 # ------------------------------------------------------------------------------------------------ tokens
@@ -178,8 +184,9 @@ def _tokenise(mapped: NDArray[np.unsignedinteger]) -> tuple[U8, NDArray[np.bool_
     return tokens, np.concatenate([(u[extra > b] >> b) & 1 for b in range(int(extra.max()))]).astype(bool)
 
 
-def _extra_bits(tokens: U8) -> NDArray[np.int64]:
-    return np.where(tokens < _DIRECT, 0, _DIRECT_BITS - 2 + (tokens.astype(np.int64) - _DIRECT) // 4)
+def _extra_bits(large: U8) -> NDArray[np.int64]:
+    """Of tokens that have some."""
+    return _DIRECT_BITS - 2 + (large.astype(np.int64) - _DIRECT) // 4
 
 
 # ------------------------------------------------------------------------------------------------ encode
@@ -577,7 +584,7 @@ class Reader:
         if len(raw) < size:
             raise impossible
         self._weights = np.frombuffer(raw[:size], _WEIGHTS).reshape(-1, _TERMS).astype(np.int32)
-        self._models: list[tuple[I64, I64]] = []  # class of an expected size times TOTAL, decoding table
+        self._models: list[tuple[I64, rans.Table]] = []  # class of a third of an expected size times TOTAL
         for _ in range(min(_CHANNELS, self._streams)):
             if len(raw) < size + 2:
                 raise impossible
@@ -596,80 +603,99 @@ class Reader:
             if (np.diff(thresholds, prepend=0) < 1).any() or (frequencies.sum(axis=1) != rans.TOTAL).any():
                 raise impossible
             classes = np.searchsorted(thresholds, np.arange(_LARGEST_SIZE + 1), side="right").astype(np.int64)
-            self._models.append((classes * rans.TOTAL, rans.decoding_table(frequencies)))
+            table = rans.Table.of(frequencies, _WORTH[self._signed])
+            self._models.append((np.repeat(classes * rans.TOTAL, rans.TRAIL_FACTOR), table))
         if len(raw) != size:
             raise impossible
 
-    def __iter__(self) -> Iterator[NDArray[np.integer]]:
-        """Yield each stream's (n,) integers.
+    def __iter__(self) -> Iterator[Stream]:
+        """Yield each stream.
 
         Raises:
             DataError: damaged.
         """
-        lanes = self._lanes
-        counts = lanes.counts.tolist()
-        sizes_of = _SIZES[self._signed]
+        lanes = self._lanes.counts
         for s in range(self._streams):
             classes, table = self._models[s % _CHANNELS]
-            weights = self._weights[s]
             known = self._history.known()
+            weights = self._weights[s]
             # Channels of the same coefficient that come later are not known yet: their weights do not count.
-            expected = _expected(known, np.r_[weights[: len(known)], weights[-1:]])
-            tokens = np.zeros(expected.shape, np.uint8)
-            if weights[-2]:
-                self._decode_recent(tokens, expected, weights[-2], counts, classes, table, sizes_of)
-            else:
-                expected >>= _WEIGHT_BITS
-                for token, size, count in zip(tokens, expected, counts, strict=True):
-                    self._rans.step(table, classes.take(size[:count], mode="clip"), token[:count])
-            self._history.add(sizes_of[tokens])
-            yield self._values(tokens)
+            expected = partial(_expected, known, weights[: len(known)], int(weights[-2]), int(weights[-1]))
+            tokens = self._rans.stream(table, classes, expected, int(weights[-2]), _NO_TRAIL, lanes)
+            self._history.add(_SIZES[self._signed].take(tokens))
+            end = self._bits_read
+            if int(tokens.max()) >= _DIRECT:
+                end += int(_extra_bits(tokens[tokens >= _DIRECT]).sum())
+            bits = self._bits[self._bits_read : end]
+            if end > len(self._bits):
+                raise self._damaged("ends too early")
+            self._bits_read = end
+            yield Stream(self._lanes, tokens, bits, self._signed, self._predicted)
         self._rans.finish()
         rest = self._bits[self._bits_read :]
         if len(rest) >= 8 or rest.any():
             raise self._damaged("holds more bits than its integers ask for")
 
-    def _decode_recent(
-        self,
-        tokens: U8,
-        expected: I32,
-        weight: np.int32,
-        counts: list[int],
-        classes: I64,
-        table: I64,
-        sizes_of: I32,
-    ) -> None:
-        recent = np.zeros(tokens.shape[1], np.int32)
-        twice = 2 * sizes_of
-        for token, known, count in zip(tokens, expected, counts, strict=True):
-            r = recent[:count]
-            size = r * weight
-            size += known[:count]
-            size >>= _WEIGHT_BITS
-            # What is below 0 or above the last size is taken as these.
-            self._rans.step(table, classes.take(size, mode="clip"), token[:count])
-            r -= r >> 2
-            r += twice.take(token[:count], mode="clip")
 
-    def _values(self, tokens: U8) -> NDArray[np.integer]:
-        top = int(tokens.max())
-        values: NDArray[np.integer]
-        if top < _DIRECT and not self._predicted:
-            small = tokens
-            values = ((small >> 1) ^ (0 - (small & 1)).astype(np.uint8)).view(np.int8) if self._signed else small
-            return self._lanes.join(values)
-        above = np.maximum(tokens.astype(np.int64) - _DIRECT, 0)
-        extra = _extra_bits(tokens)
-        mapped = np.where(tokens < _DIRECT, tokens, (4 + above % 4) << extra)
-        for b in range(int(extra.max())):
+def _expected(known: Sequence[I32], weights: I32, recent: int, constant: int, steps: slice) -> I64:
+    """What :meth:`potr_cl.rans.Decoder.stream` adds to the recent sizes' part of a context.
+
+    With ρ the recent sizes, its trail is 3 ρ + 3 (⌊trail / 4⌋ is ρ − ⌊ρ / 4⌋), and so all is three times as much: 3 ·
+    (the weighted sum of what is known − the weight of ρ).
+    """
+    total = np.full(known[0][steps].shape, constant - recent, np.int32)
+    product = np.empty_like(total)
+    for term, weight in zip(known, weights, strict=True):
+        if weight:
+            np.multiply(term[steps], weight, product)
+            np.add(total, product, total)
+    return np.multiply(total, rans.TRAIL_FACTOR, dtype=np.int64)
+
+
+@dataclass(frozen=True)
+class Stream:
+    """A stream whose integers need no other's any more: that can be left to another thread.
+
+    Attributes:
+        tokens: (steps, lanes).
+        bits: beside the tokens.
+    """
+
+    lanes: Lanes
+    tokens: U8
+    bits: NDArray[np.bool_]
+    signed: bool
+    predicted: bool
+
+    @property
+    def values(self) -> NDArray[np.integer]:
+        """(n,) integers of any type."""
+        return self.part(0, self.lanes.splats)
+
+    def part(self, start: int, stop: int) -> NDArray[np.integer]:
+        """Those from one splat to another."""
+        values = self._joined[start:stop]
+        if self.signed and values.dtype == np.uint8:
+            return ((values >> 1) ^ (0 - (values & 1)).astype(np.uint8)).view(np.int8)
+        return values
+
+    @cached_property
+    def _joined(self) -> NDArray[np.integer]:
+        """(n,) integers, mapped to unsigned ones as long as they are bytes."""
+        tokens = self.tokens
+        if not (len(self.bits) or self.predicted):
+            return self.lanes.join(tokens)
+        mapped = tokens.astype(np.int64)
+        where = np.flatnonzero(tokens >= _DIRECT)
+        large = tokens.ravel()[where]
+        extra = _extra_bits(large)
+        u = (4 + (large - _DIRECT) % np.int64(4)) << extra
+        read = 0
+        for b in range(int(extra.max(initial=0))):
             has = extra > b
             need = int(np.count_nonzero(has))
-            bits = self._bits[self._bits_read : self._bits_read + need]
-            if len(bits) < need:
-                raise self._damaged("ends too early")
-            self._bits_read += need
-            mapped[has] |= bits.astype(np.int64) << b
-        values = (mapped >> 1) ^ -(mapped & 1) if self._signed else mapped
-        if self._predicted:
-            values = _predict(values.astype(np.int64))
-        return self._lanes.join(values)
+            u[has] |= self.bits[read : read + need].astype(np.int64) << b
+            read += need
+        mapped.ravel()[where] = u
+        values = (mapped >> 1) ^ -(mapped & 1) if self.signed else mapped
+        return self.lanes.join(_predict(values) if self.predicted else values)

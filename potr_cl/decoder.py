@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_EXCEPTION, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -19,8 +19,10 @@ from potr_cl.bitstream import Coder, Header, Property, Section
 from potr_cl.errors import DataError, UsageError
 from potr_cl.scene import SH_COEFFICIENTS, Scene
 
-#: Splats dequantised at a time: few enough for bounded temporaries, enough that threads seldom wait for each other.
-_BLOCK = 1 << 17
+#: Splats dequantised at a time: few enough that temporaries stay in a cache, many enough that threads seldom wait.
+_BLOCK = 1 << 15
+#: More threads would find nothing to do.
+_MOST_THREADS = 16
 
 _EMPTY = np.empty(0, np.uint8)
 
@@ -110,25 +112,28 @@ class PotrFile:
 
     def log_scales(self) -> NDArray[np.float32]:
         """(N, 3) float32 natural logarithms of standard deviations. Raises DataError if damaged."""
-        return self._dequantized_scales(self._streams(Property.SCALE))
+        out = np.empty((self.header.splats, 3), np.float32)
+        self._dequantize_scales(self._streams(Property.SCALE), out)
+        return out
 
     def quaternions(self) -> NDArray[np.float32]:
         """(N, 4) float32 unit quaternions w, x, y, z. Raises DataError if damaged."""
-        return self._dequantized_rotations(self._streams(Property.SCALE) if self.header.version > 1 else [])
+        out = np.empty((self.header.splats, 4), np.float32)
+        scales = self._streams(Property.SCALE) if self.header.version > 1 else []
+        self._dequantize_rotations(self._streams(Property.ROTATION), scales, out)
+        return out
 
     def opacity_logits(self) -> NDArray[np.float32]:
         """(N,) float32 logits. Raises DataError if damaged."""
         out = np.empty(self.header.splats, np.float32)
-        dequantize = quantize.dequantize_opacities if self.header.version == 1 else quantize.dequantize_logits
-        for block, steps in self._blocks(self._streams(Property.OPACITY)):
-            out[block] = dequantize(steps[0], self.header.sf_opacity)
+        self._decode_opacities(out, _now)
         return out
 
     def sh(self) -> NDArray[np.float32]:
         """(N, M, 3) float32 SH coefficients, each contiguous in memory. Raises DataError if damaged."""
         planar = self._empty_sh()
-        for job in self._sh_jobs(planar):
-            job()
+        for _, job in self._sh_jobs(planar):
+            job(_now)
         return planar.transpose(2, 0, 1)
 
     def scene(self, threads: int = 0) -> Scene:
@@ -141,24 +146,55 @@ class PotrFile:
             DataError: damaged.
         """
         header = self.header
-        planar = self._empty_sh()
-        # The longest first: a pool that ends with a long one ends late.
-        colours = self._sh_jobs(planar)
-        jobs: list[Callable[[], Any]] = [*colours, self.means, self._shapes, self.opacity_logits]
-        pool = ThreadPoolExecutor(threads or min(os.cpu_count() or 1, len(jobs)))
         try:
-            futures = [pool.submit(job) for job in jobs]
-            wait(futures, return_when=FIRST_EXCEPTION)
-            for future in futures:
-                if future.done() and (error := future.exception()) is not None:
-                    raise error
-            means, (log_scales, quaternions), opacity_logits = (f.result() for f in futures[len(colours) :])
+            planar = self._empty_sh()
+            log_scales = np.empty((header.splats, 3), np.float32)
+            quaternions = np.empty((header.splats, 4), np.float32)
+            opacity_logits = np.empty(header.splats, np.float32)
+            shapes: _Job = partial(self._decode_shapes, log_scales, quaternions)
+            opacities: _Job = partial(self._decode_opacities, opacity_logits)
+            # The longest first: a pool that ends with a long one ends late.
+            jobs = [
+                *self._sh_jobs(planar),
+                (self._contextual(Property.SCALE) or self._contextual(Property.ROTATION), shapes),
+                (self._contextual(Property.OPACITY), opacities),
+            ]
+            means = self._run(jobs, threads or min(os.cpu_count() or 1, _MOST_THREADS))
         except MemoryError:
             needed = header.splats * (11 + 3 * SH_COEFFICIENTS[header.sh_degree]) * 4
             raise DataError(f"the scene needs {needed / 1e9:.1f} GB of memory, more than there is") from None
+        return Scene(means, log_scales, quaternions, opacity_logits, planar.transpose(2, 0, 1))
+
+    def _run(self, jobs: list[tuple[bool, _Job]], threads: int) -> NDArray[np.float32]:
+        """Do some jobs, each with whether it takes the context coder, and decode the centres.
+
+        The context coder makes many short calls, in which threads would only wait for each other: one makes them all,
+        and leaves what else is to be done with the integers to others.
+        """
+        left: list[Future[None]] = []
+
+        def leave(work: Callable[[], None]) -> None:
+            left.append(pool.submit(work))
+
+        def one_by_one() -> None:
+            for contextual, job in jobs:
+                if contextual:
+                    job(_now if threads == 1 else leave)
+
+        pool = ThreadPoolExecutor(threads)
+        try:
+            coded = pool.submit(one_by_one)
+            means = pool.submit(self.means)
+            others = [pool.submit(job, _now) for contextual, job in jobs if not contextual]
+            first: list[Future[Any]] = [coded, means, *others]
+            for futures in (first, left):
+                wait(futures, return_when=FIRST_EXCEPTION)
+                for future in futures:
+                    if future.done() and (error := future.exception()) is not None:
+                        raise error
+            return means.result()
         finally:
             pool.shutdown(cancel_futures=True)
-        return Scene(means, log_scales, quaternions, opacity_logits, planar.transpose(2, 0, 1))
 
     # ------------------------------------------------------------------------------------------ inside
 
@@ -170,9 +206,13 @@ class PotrFile:
         section = self.header.find(prop, index)
         return 0 if section is None else section.planes
 
+    def _contextual(self, prop: Property, index: int = 0) -> bool:
+        section = self.header.find(prop, index)
+        return section is not None and section.coder == Coder.CONTEXT
+
     def _context_streams(
         self, section: Section, history: context_coder.Sizes | None = None
-    ) -> Iterator[NDArray[np.integer]]:
+    ) -> Iterator[context_coder.Stream]:
         """The streams of a section of coder CONTEXT, one after another."""
         yield from context_coder.Reader(
             bitstream.stored_bytes(self.data, section),
@@ -189,7 +229,7 @@ class PotrFile:
         indices = range(bitstream.indices(prop)) if indices is None else indices
         section = self.header.find(prop, indices[0])
         if section is not None and section.coder == Coder.CONTEXT:
-            return [partial(_part, values) for values in self._context_streams(section)]
+            return [stream.part for stream in self._context_streams(section)]
         signed = bitstream.is_signed(prop)
         return [
             partial(bitstream.unpack_integers, self._raw(prop, index), self._planes(prop, index), signed)
@@ -202,55 +242,65 @@ class PotrFile:
             stop = min(start + _BLOCK, self.header.splats)
             yield slice(start, stop), [stream(start, stop) for stream in streams]
 
-    def _shapes(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """Log scales and quaternions."""
+    def _decode_shapes(
+        self, log_scales: NDArray[np.float32], quaternions: NDArray[np.float32], submit: _Submit
+    ) -> None:
         scales = self._streams(Property.SCALE)
-        return self._dequantized_scales(scales), self._dequantized_rotations(scales)
+        submit(partial(self._dequantize_scales, scales, log_scales))
+        submit(partial(self._dequantize_rotations, self._streams(Property.ROTATION), scales, quaternions))
 
-    def _dequantized_scales(self, streams: list[_Stream]) -> NDArray[np.float32]:
-        out = np.empty((self.header.splats, 3), np.float32)
+    def _decode_opacities(self, out: NDArray[np.float32], submit: _Submit) -> None:
+        dequantize = quantize.dequantize_opacities if self.header.version == 1 else quantize.dequantize_logits
+
+        def finish(streams: list[_Stream]) -> None:
+            for block, steps in self._blocks(streams):
+                out[block] = dequantize(steps[0], self.header.sf_opacity)
+
+        submit(partial(finish, self._streams(Property.OPACITY)))
+
+    def _dequantize_scales(self, streams: list[_Stream], out: NDArray[np.float32]) -> None:
         for axis, stream in enumerate(streams):
             for block, steps in self._blocks([stream]):
                 out[block, axis] = quantize.dequantize_scales(steps[0], self.header.sf_scale)
-        return out
 
-    def _dequantized_rotations(self, scales: list[_Stream]) -> NDArray[np.float32]:
+    def _dequantize_rotations(self, streams: list[_Stream], scales: list[_Stream], out: NDArray[np.float32]) -> None:
         """Quaternions; ``scales`` matter in format version 2 only."""
-        out = np.empty((self.header.splats, 4), np.float32)
         if self.header.version == 1:
-            for block, steps in self._blocks(self._streams(Property.ROTATION)):
+            for block, steps in self._blocks(streams):
                 quantize.dequantize_rotations(steps, self.header.sf_rotation, out[block])
         else:
-            for block, steps in self._blocks([*self._streams(Property.ROTATION), *scales]):
+            for block, steps in self._blocks([*streams, *scales]):
                 factors = quantize.rotation_factors(steps[3:], self.header.sf_rotation)
                 quantize.dequantize_rotations(steps[:3], factors, out[block])
-        return out
 
     def _empty_sh(self) -> NDArray[np.float32]:
         return np.empty((SH_COEFFICIENTS[self.header.sh_degree], 3, self.header.splats), np.float32)
 
-    def _sh_jobs(self, planar: NDArray[np.float32]) -> list[Callable[[], None]]:
-        """What decodes all SH coefficients into ``planar`` (M, 3, N); the jobs may run at the same time."""
+    def _sh_jobs(self, planar: NDArray[np.float32]) -> list[tuple[bool, _Job]]:
+        """What decodes all SH coefficients into ``planar`` (M, 3, N), and whether it takes the context coder."""
         chained = [s for s in self.header.sections if s.kind == Property.SH and s.coder == Coder.CONTEXT and s.index]
         in_chain = {s.index // 3 + m for s in chained for m in range(s.planes // 3)}
         alone = [m for m in range(len(planar)) if m not in in_chain]
-        jobs: list[Callable[[], None]] = [partial(self._decode_chain, chained, planar)] if chained else []
-        return jobs + [partial(self._decode_coefficient, m, planar[m]) for m in alone]
+        jobs: list[tuple[bool, _Job]] = [(True, partial(self._decode_chain, chained, planar))] if chained else []
+        return jobs + [
+            (self._contextual(Property.SH, 3 * m), partial(self._decode_coefficient, m, planar[m])) for m in alone
+        ]
 
-    def _decode_chain(self, sections: list[Section], planar: NDArray[np.float32]) -> None:
+    def _decode_chain(self, sections: list[Section], planar: NDArray[np.float32], submit: _Submit) -> None:
         """AC coefficients whose contexts are made of those before."""
         history = context_coder.Sizes(context_coder.Lanes(self.header.splats))
         for section in sorted(sections, key=lambda s: s.index):
             streams = self._context_streams(section, history)
             for m, channels in enumerate(zip(streams, streams, streams, strict=True), start=section.index // 3):
-                for block, steps in self._blocks([partial(_part, values) for values in channels]):
-                    _to_rgb(_wider(steps), self.header.sf_ac, planar[m, :, block])
+                submit(partial(self._finish_coefficient, [s.part for s in channels], m, False, planar[m]))
 
-    def _decode_coefficient(self, m: int, out: NDArray[np.float32]) -> None:
+    def _decode_coefficient(self, m: int, out: NDArray[np.float32], submit: _Submit) -> None:
         """One SH coefficient into ``out`` (3, N): R, G, B."""
         streams = self._streams(Property.SH, range(3 * m, 3 * m + 3))
-        section = self.header.find(Property.SH, 3 * m)
-        differences = m == 0 and not (section is not None and section.coder == Coder.CONTEXT)
+        differences = m == 0 and not self._contextual(Property.SH)
+        submit(partial(self._finish_coefficient, streams, m, differences, out))
+
+    def _finish_coefficient(self, streams: list[_Stream], m: int, differences: bool, out: NDArray[np.float32]) -> None:
         last = [0, 0, 0]
         for block, steps in self._blocks(streams):
             if differences:
@@ -266,10 +316,14 @@ class PotrFile:
 
 #: Gives the integers from one splat to another of a stream.
 _Stream = Callable[[int, int], NDArray[np.integer]]
+#: Takes what needs no more than what is at hand, to be done now or by another thread.
+_Submit = Callable[[Callable[[], None]], None]
+#: Decodes some of a file.
+_Job = Callable[[_Submit], None]
 
 
-def _part(values: NDArray[np.integer], start: int, stop: int) -> NDArray[np.integer]:
-    return values[start:stop]
+def _now(work: Callable[[], None]) -> None:
+    work()
 
 
 def _wider(steps: list[NDArray[np.integer]]) -> list[NDArray[Any]]:

@@ -15,6 +15,7 @@ attribute streams is the depth-first (Morton) order of the leaves.
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -367,6 +368,7 @@ class _Level:
     """The nodes of one level that descend from a crowded node: their parents among the level above, octants, kinds."""
 
     parent: NDArray[np.int32]
+    first: NDArray[np.int64]  # child of each crowded node above
     octant: U8
     several: NDArray[np.bool_]
     nodes: int  # that hold several splats
@@ -379,10 +381,11 @@ def _parse_tree(streams: OctreeStreams) -> list[_Level]:
     root_several = len(streams.occupancy) > 0 or len(streams.multiplicities) > 0
     if not 0 <= depth <= DEEPEST_LEVEL:
         raise DataError(f"positions: an octree of {depth} levels, the format allows {DEEPEST_LEVEL}")
-    root = _Level(
-        np.zeros(1, np.int32), np.zeros(1, np.uint8), np.array([root_several]), int(root_several), int(not root_several)
-    )
-    levels = [root]
+    several = np.array([root_several])
+    nothing = np.zeros(1, np.int64)
+    levels = [
+        _Level(np.zeros(1, np.int32), nothing, np.zeros(1, np.uint8), several, int(root_several), int(not root_several))
+    ]
     read = 0
     children_before = 0
     counts = np.bitwise_count(streams.occupancy)
@@ -392,7 +395,9 @@ def _parse_tree(streams: OctreeStreams) -> list[_Level]:
         occupancy = streams.occupancy[read : read + nodes]
         if len(occupancy) < nodes or not occupancy.all():
             raise damaged
-        parent = np.repeat(np.arange(nodes, dtype=np.int32), counts[read : read + nodes])
+        children = counts[read : read + nodes]
+        parent = np.repeat(np.arange(nodes, dtype=np.int32), children)
+        first = np.cumsum(children, dtype=np.int64) - children
         read += nodes
         octant = (np.flatnonzero(np.unpackbits(occupancy, bitorder="little").view(bool)) & 7).astype(np.uint8)
         several = bits[children_before : children_before + len(octant)]
@@ -400,7 +405,7 @@ def _parse_tree(streams: OctreeStreams) -> list[_Level]:
             raise damaged
         children_before += len(octant)
         crowded = int(np.count_nonzero(several))
-        levels.append(_Level(parent, octant, several, crowded, len(several) - crowded))
+        levels.append(_Level(parent, first, octant, several, crowded, len(several) - crowded))
     if (
         read != len(streams.occupancy)
         or len(streams.several) != (children_before + 7) // 8
@@ -411,25 +416,27 @@ def _parse_tree(streams: OctreeStreams) -> list[_Level]:
     return levels
 
 
-def _morton_ranks(levels: list[_Level]) -> list[NDArray[np.int64]]:
+def _morton_ranks(levels: list[_Level]) -> list[NDArray[Any]]:
     """For every node of each level the number of leaves before it in Morton order, from leaf counts of subtrees."""
-    counts: list[NDArray[np.int64]] = []
-    below: NDArray[np.int64] | None = None
+    nodes = sum(len(level.several) for level in levels)
+    word: type[np.signedinteger] = np.int32 if nodes < 1 << 31 else np.int64
+    counts: list[NDArray[Any]] = []
+    below: NDArray[Any] | None = None
     for level in reversed(levels):
-        count = np.ones(len(level.several), np.int64)
+        count = np.ones(len(level.several), word)
         if below is not None:
             count[level.several] = below
         counts.append(count)
         if level is not levels[0]:
-            first_children = np.flatnonzero(np.diff(level.parent, prepend=-1))
-            below = np.add.reduceat(count, first_children)
+            below = np.add.reduceat(count, level.first)
     counts.reverse()
-    ranks = [np.zeros(1, np.int64)]
+    ranks: list[NDArray[Any]] = [np.zeros(1, word)]
     for above, level, count in zip(levels, levels[1:], counts[1:], strict=False):
-        before = np.cumsum(count) - count
-        first_children = np.flatnonzero(np.diff(level.parent, prepend=-1))
-        offset = ranks[-1][above.several] - before[first_children]
-        ranks.append(before + offset[level.parent])
+        before = np.cumsum(count, dtype=word)
+        before -= count
+        offset = ranks[-1][above.several] - before[level.first]
+        before += offset[level.parent]
+        ranks.append(before)
     return ranks
 
 

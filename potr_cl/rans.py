@@ -8,7 +8,7 @@ docs/format.md, "Context coder", is the normative description.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,8 +21,12 @@ PRECISION = 12
 TOTAL = 1 << PRECISION
 #: A state is at or above this between steps, and below it times 2^16; coding starts and decoding ends with it.
 LOWEST = 1 << 16
-#: Tokens that an encoder prepares at a time: few enough for their frequencies to stay in a cache.
+#: How a decoder's trails fade, and what divides the sums that tell contexts.
+TRAIL_SHIFT, TRAIL_FACTOR = 2, 3
+CONTEXT_SHIFT = 8
+#: Tokens that an encoder and a decoder prepare at a time: few enough for what there is to each to stay in a cache.
 _BLOCK = 1 << 15
+_DECODED = 1 << 16
 
 I64 = NDArray[np.int64]
 F64 = NDArray[np.float64]
@@ -144,8 +148,44 @@ def _tables(sections: Sequence[Tokens]) -> tuple[list[list[int]], F64, F64]:
     return bases, np.concatenate(frequencies), np.concatenate(starts)
 
 
+#: Where an entry of a table has its parts: the token's frequency, the trail's factor; from the 13th bit on the slot's
+#: place within the token and what the token adds to the trail: where a pair of state and trail needs them.
+_FACTORS = 2 * TOTAL - 1 | TRAIL_FACTOR << 32
+_ADDENDS_AT = 13
+_ADDENDS = TOTAL - 1 | 0x7FFFF << 32
+
+
+@dataclass(frozen=True)
+class Table:
+    """A model, for decoding: what a slot (context · :data:`TOTAL` + the lowest bits of a state) stands for.
+
+    Attributes:
+        entries: (contexts · TOTAL,) what it does to a pair of state and trail.
+        tokens: its token.
+    """
+
+    entries: I64
+    tokens: U8
+
+    @staticmethod
+    def of(frequencies: I64, worth: I64) -> Table:
+        """From frequencies (contexts, A), every row adding up to :data:`TOTAL`, and the tokens' worth, below 2^19."""
+        contexts, alphabet = frequencies.shape
+        flat = frequencies.ravel()
+        tokens = np.tile(np.arange(alphabet, dtype=np.uint8), contexts)
+        starts = np.cumsum(flat) - flat
+        places = np.arange(contexts * TOTAL) - np.repeat(starts, flat)
+        entries: I64 = np.repeat(flat | TRAIL_FACTOR << 32 | worth[tokens] << 32 + _ADDENDS_AT, flat)
+        entries |= places << _ADDENDS_AT
+        return Table(entries.astype("<i8", copy=False), np.repeat(tokens, flat))
+
+
 class Decoder:
-    """Gives tokens back, step by step.
+    """Gives tokens back, stream by stream.
+
+    Beside its state every lane has a *trail*, a running mean of what its last tokens were worth, which may tell the
+    next one's context: with each token, trail becomes TRAIL_FACTOR · ⌊trail / 2^TRAIL_SHIFT⌋ + the token's worth. That
+    is what happens to the state, so both take part in the same array operations.
 
     Args:
         states: (L,) as the encoder left them.
@@ -153,44 +193,98 @@ class Decoder:
         what: for messages.
     """
 
-    def __init__(self, states: I64, words: bytes | memoryview, what: str) -> None:
-        self._states = states
-        self._words = np.frombuffer(words, "<u2").astype(np.int64)
+    def __init__(self, states: NDArray[np.integer], words: bytes | memoryview, what: str) -> None:
+        lanes = len(states)
+        # Pairs of state and trail as 32-bit numbers; also taken as one 64-bit number, and as 16-bit ones.
+        self._pairs = np.zeros(2 * lanes, "<u4")
+        self._pairs[0::2] = states
+        self._words = np.frombuffer(words, "<u2")
         self._read = 0
         self._what = what
-        self._slots = np.empty(len(states), np.int64)
-        self._entries = np.empty(len(states), np.int64)
+        # numpy is faster with arrays of constants than with constants.
+        self._shifts = np.tile(np.array([PRECISION, TRAIL_SHIFT], "<u4"), lanes)
+        constants = [32, CONTEXT_SHIFT, _ADDENDS_AT, TOTAL - 1, 0xFFFF0000, 0, _FACTORS, _ADDENDS]
+        self._constants = np.repeat(np.array(constants, np.int64)[:, None], lanes, axis=1)
 
-    def step(self, table: I64, contexts: I64, out: U8) -> None:
-        """Decode one token in each of the first lanes.
+    def stream(
+        self, table: Table, contexts: I64, known: Callable[[slice], I64], weight: int, trail: int, lanes: I64
+    ) -> U8:
+        """Decode a stream of a token a lane and step.
 
         Args:
-            table: from :func:`decoding_table`.
-            contexts: (lanes,) number of each lane's context, times :data:`TOTAL`.
-            out: (lanes,), takes the tokens.
+            table: of the model.
+            contexts: context · :data:`TOTAL` of each value of (known + weight · trail) >> CONTEXT_SHIFT; values below 0
+                and beyond the last are taken as these.
+            known: gives it for all lanes in some steps; asked for step after step.
+            weight: of the trail.
+            trail: of every lane at the start.
+            lanes: (T,) lanes that have a token in each step, the first ones; the others get token 0. Never grows.
+
+        Returns:
+            (T, L) tokens.
 
         Raises:
             DataError: no words are left.
         """
-        lanes = len(out)
-        states, slots, entries = self._states[:lanes], self._slots[:lanes], self._entries[:lanes]
-        np.bitwise_and(states, TOTAL - 1, out=slots)
-        slots += contexts
-        table.take(slots, out=entries, mode="clip")
-        out[:] = entries  # the token is the entry's lowest byte
-        states >>= PRECISION
-        np.right_shift(entries, 8 + PRECISION, out=slots)
-        states *= slots
-        entries >>= 8
-        entries &= TOTAL - 1
-        states += entries
-        (low,) = (states < LOWEST).nonzero()
-        if len(low):
-            words = self._words[self._read : self._read + len(low)]
-            if len(words) < len(low):
-                raise DataError(f"section '{self._what}' ends too early")
-            states[low] = states[low] << 16 | words
-            self._read += len(low)
+        self._pairs[1::2] = trail
+        tokens = np.zeros((len(lanes), len(self._pairs) // 2), np.uint8)
+        # Where the number of lanes changes, and before too much to keep in a cache.
+        rows = max(_DECODED // tokens.shape[1], 1)
+        ends = np.flatnonzero(np.diff(lanes, append=0)) + 1
+        start = 0
+        for end in ends.tolist():
+            count = int(lanes[start])
+            for first in range(start, end, rows):
+                steps = slice(first, min(first + rows, end))
+                if count:
+                    tokens[steps, :count] = self._steps(table, contexts, known(steps)[:, :count], weight)
+            start = end
+        return tokens
+
+    def _steps(self, table: Table, contexts: I64, known: I64, weight: int) -> U8:
+        """The next tokens of the first lanes, as many steps and lanes as there are of ``known``."""
+        slots = np.empty(known.shape, np.int64)
+        lanes = known.shape[1]
+        pairs, shifts = self._pairs[: 2 * lanes], self._shifts[: 2 * lanes]
+        both = pairs.view("<i8")
+        low, high = pairs.view("<u2")[0::4], pairs.view("<u2")[1::4]
+        halves, eights, down, low_bits, high_bits, none, in_factors, in_addends = self._constants[:, :lanes]
+        weights = np.full(lanes, weight, np.int64)
+        size, context, entry, factor = (np.empty(lanes, "<i8") for _ in range(4))
+        few = np.empty(lanes, bool)
+        addends, factors = entry.view("<u4"), factor.view("<u4")
+        find, look_up = contexts.take, table.entries.take
+        shift, multiply, add, mask, equal = np.right_shift, np.multiply, np.add, np.bitwise_and, np.equal
+        words, read = self._words, self._read
+        # Little is done in a step, so that what numpy takes to be called is most of the time: no call too many.
+        for base, slot in zip(known, slots, strict=True):
+            shift(both, halves, size)
+            multiply(size, weights, size)
+            add(size, base, size)
+            shift(size, eights, size)
+            find(size, None, context, "clip")
+            mask(both, low_bits, slot)
+            add(slot, context, slot)
+            look_up(slot, None, entry, "wrap")  # faster than the others, and there is nothing to wrap
+            mask(entry, in_factors, factor)
+            shift(entry, down, entry)
+            mask(entry, in_addends, entry)
+            shift(pairs, shifts, pairs)
+            multiply(pairs, factors, pairs)
+            add(pairs, addends, pairs)
+            mask(both, high_bits, size)
+            equal(size, none, few)
+            (at,) = few.nonzero()
+            if count := len(at):
+                taken = words[read : read + count]
+                read += count
+                if len(taken) < count:
+                    raise DataError(f"section '{self._what}' ends too early")
+                # States below 2^16 have nothing in their higher half: it takes the lower one, which takes a word.
+                high[at] = low[at]
+                low[at] = taken
+        self._read = read
+        return table.tokens.take(slots)
 
     def finish(self) -> None:
         """Check that all words were taken and every lane is back where its encoder began.
@@ -198,20 +292,5 @@ class Decoder:
         Raises:
             DataError: they are not.
         """
-        if self._read != len(self._words) or (self._states != LOWEST).any():
+        if self._read != len(self._words) or (self._pairs[0::2] != LOWEST).any():
             raise DataError(f"section '{self._what}' does not end where its last token does")
-
-
-def decoding_table(frequencies: I64) -> I64:
-    """For each context and each residue of a state: frequency << 20 | residue within the token << 8 | token.
-
-    Args:
-        frequencies: (contexts, A), every row adding up to :data:`TOTAL`.
-    """
-    contexts, alphabet = frequencies.shape
-    flat = frequencies.ravel()
-    tokens = np.repeat(np.tile(np.arange(alphabet), contexts), flat)
-    starts = (np.cumsum(frequencies, axis=1) - frequencies).ravel()
-    residues = np.tile(np.arange(TOTAL), contexts) - np.repeat(starts, flat)
-    table: I64 = np.repeat(flat, flat) << (8 + PRECISION) | residues << 8 | tokens
-    return table

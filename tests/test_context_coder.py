@@ -16,7 +16,7 @@ from potr_cl.errors import DataError
 
 
 def read(stored, splats, streams, signed, predicted, history=None):
-    return list(Reader(memoryview(stored), splats, streams, signed, predicted, history, "test"))
+    return [s.values for s in Reader(memoryview(stored), splats, streams, signed, predicted, history, "test")]
 
 
 def encode(streams, signed, predicted):

@@ -23,13 +23,13 @@ def coded(tokens, contexts, frequencies):
 
 
 def decoded(states, words, contexts, frequencies):
-    decoder = rans.Decoder(states.astype(np.int64), words, "test")
-    table = rans.decoding_table(frequencies)
-    out = np.zeros(contexts.shape, np.uint8)
-    for t in range(len(out)):
-        decoder.step(table, contexts[t] * rans.TOTAL, out[t])
+    decoder = rans.Decoder(states, words, "test")
+    table = rans.Table.of(frequencies, np.zeros(256, np.int64))
+    known = (contexts << rans.CONTEXT_SHIFT).__getitem__
+    lanes = np.full(len(contexts), contexts.shape[1])
+    tokens = decoder.stream(table, np.arange(len(frequencies)) * rans.TOTAL, known, 0, 0, lanes)
     decoder.finish()
-    return out
+    return tokens
 
 
 def sample(steps, lanes, alphabet, contexts, seed):
