@@ -16,6 +16,7 @@ import pytest
 from PIL import Image
 
 from potr_cl import cli
+from potr_cl.cli.options import size_in_bytes
 from potr_cl.device import DEVICE_VARIABLE, Device, compiler_fault, list_devices
 from potr_cl.errors import DeviceError
 from potr_cl.formats import load_cameras, load_scene, ply
@@ -178,7 +179,7 @@ def test_encode_to_the_impossible(tmp_path, excerpt, capsys):
     ],
 )
 def test_sizes_as_people_write_them(text, size):
-    assert cli.options.size_in_bytes(text) == size
+    assert size_in_bytes(text) == size
 
 
 def test_encode_report_page(tmp_path, excerpt, capsys):
@@ -510,7 +511,8 @@ def test_no_permission(scene_path):
             path.chmod(mode)
         # Root may do anything: give the right up, once everything is imported.
         script = (
-            "import os, sys; from potr_cl.cli import main;os.geteuid() or os.setuid(65534);sys.exit(main(sys.argv[1:]))"
+            "import locale, os, sys; from potr_cl.cli import encode, main; os.geteuid() or os.setuid(65534); "
+            "sys.exit(main(sys.argv[1:]))"
         )
         for source, target in ((scene, locked / "a.potr"), (secret, Path(folder) / "a.potr")):
             command = [sys.executable, "-c", script, "encode", str(source), "-o", str(target), *KEEP]
@@ -525,9 +527,31 @@ def test_interrupt(tmp_path, scene_path, capsys, monkeypatch):
     def interrupted(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(cli.encode, "encode", interrupted)
+    monkeypatch.setattr("potr_cl.cli.encode.encode", interrupted)
     fails(capsys, ["encode", scene_path, "-o", tmp_path / "a.potr", *KEEP], 130, "interrupted")
     assert sorted(p.name for p in tmp_path.iterdir()) == ["scene.ply"]
+
+
+def test_decoding_imports_what_decoding_needs(potr_path, tmp_path):
+    """To decode takes less time than to open an OpenCL loader."""
+    program = "import sys; from potr_cl import cli; code = cli.main(sys.argv[1:]); print(*sys.modules); sys.exit(code)"
+    command = [sys.executable, "-c", program, "decode", str(potr_path), "-o", str(tmp_path / "out.ply")]
+    modules = subprocess.run(command, check=True, capture_output=True, text=True).stdout.split()
+    assert "potr_cl.decoder" in modules
+    assert "pyopencl" not in modules
+
+
+def test_every_command_has_its_help(capsys):
+    with pytest.raises(SystemExit) as left:
+        cli.main(["--help"])
+    assert left.value.code == 0
+    listed = capsys.readouterr().out
+    for command in cli._COMMANDS:
+        with pytest.raises(SystemExit) as left:
+            cli.main([command, "--help"])
+        assert left.value.code == 0
+        assert f"potr-cl {command}" in capsys.readouterr().out
+        assert re.search(rf"^    {command} ", listed, re.MULTILINE)
 
 
 def test_module_runs():

@@ -6,28 +6,35 @@ import argparse
 import logging
 import sys
 from collections.abc import Sequence
+from importlib import import_module
 
 from potr_cl import __version__
-from potr_cl.cli import convert, devices, edit, encode, files, pictures
 from potr_cl.errors import PotrError
 
+#: The commands, and who adds them, in the order of the help.
+_COMMANDS = {
+    "encode": "encode",
+    "prune": "edit",
+    "compact": "edit",
+    "refit": "edit",
+    "decode": "files",
+    "info": "files",
+    "convert": "convert",
+    "render": "pictures",
+    "compare": "pictures",
+    "devices": "devices",
+}
 
-def _parser() -> argparse.ArgumentParser:
+
+def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="potr-cl", description="Compress trained 3D Gaussian Splatting scenes without retraining."
     )
     parser.add_argument("--version", action="version", version=f"potr-cl {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
-    encode.add_encode(commands)
-    edit.add_prune(commands)
-    edit.add_compact(commands)
-    edit.add_refit(commands)
-    files.add_decode(commands)
-    files.add_info(commands)
-    convert.add_convert(commands)
-    pictures.add_render(commands)
-    pictures.add_compare(commands)
-    devices.add_devices(commands)
+    # To decode takes less time than to import what other commands need.
+    for command in [argv[0]] if argv and argv[0] in _COMMANDS else _COMMANDS:
+        getattr(import_module(f"potr_cl.cli.{_COMMANDS[command]}"), f"add_{command}")(commands)
     return parser
 
 
@@ -38,7 +45,8 @@ def main(argv: Sequence[str] | None = None) -> int:
         0 success, 1 bad data, 2 wrong usage, 130 interrupted.
     """
     logging.basicConfig(format="%(message)s", level=logging.WARNING)
-    args = _parser().parse_args(argv)
+    argv = sys.argv[1:] if argv is None else argv
+    args = _parser(argv).parse_args(argv)
     try:
         args.run(args)
     except PotrError as error:

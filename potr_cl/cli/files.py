@@ -6,11 +6,14 @@ import argparse
 import json
 import time
 from pathlib import Path
+from typing import TYPE_CHECKING
 
-from potr_cl.cli.options import Commands
 from potr_cl.decoder import PotrFile, decode
 from potr_cl.formats import ply
 from potr_cl.report import file_report, format_report
+
+if TYPE_CHECKING:
+    from potr_cl.cli.options import Commands
 
 
 def _decode(args: argparse.Namespace) -> None:
