@@ -10,7 +10,7 @@ the normative description.
 from __future__ import annotations
 
 import struct
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from itertools import pairwise
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 
 from potr_cl import rans
 from potr_cl.errors import DataError
+from potr_cl.threads import Run
 
 #: Integers of at most this many bits are tokens by themselves.
 _DIRECT_BITS = 7
@@ -64,8 +65,6 @@ I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 U8 = NDArray[np.uint8]
 U16 = NDArray[np.uint16]
-#: Calls a function with each of some arguments and gives the results in their order, as :func:`map` does.
-Run = Callable[[Callable[[Any], Any], Iterable[Any]], Iterable[Any]]
 
 
 def _size_table(signed: bool) -> I32:
@@ -214,7 +213,7 @@ def encode(
 
     Args:
         chains: sections one after another; the sizes of those before tell those of the next. All hold as many splats.
-        run: in place of :func:`map`, to make several calls at a time: none of them needs another one's result.
+        run: in place of :func:`map`, to work with several threads.
         progress: told which part is done.
 
     Returns:

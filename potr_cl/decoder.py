@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 from collections.abc import Callable, Iterator
-from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
+from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
@@ -18,6 +18,7 @@ from potr_cl import bitstream, context_coder, octree, quantize
 from potr_cl.bitstream import Coder, Header, Property, Section
 from potr_cl.errors import DataError, UsageError
 from potr_cl.scene import SH_COEFFICIENTS, Scene
+from potr_cl.threads import thread_pool
 
 #: Splats dequantised at a time: few enough that temporaries stay in a cache, many enough that threads seldom wait.
 _BLOCK = 1 << 15
@@ -181,8 +182,7 @@ class PotrFile:
                 if contextual:
                     job(_now if threads == 1 else leave)
 
-        pool = ThreadPoolExecutor(threads)
-        try:
+        with thread_pool(threads) as pool:
             coded = pool.submit(one_by_one)
             means = pool.submit(self.means)
             others = [pool.submit(job, _now) for contextual, job in jobs if not contextual]
@@ -193,8 +193,6 @@ class PotrFile:
                     if future.done() and (error := future.exception()) is not None:
                         raise error
             return means.result()
-        finally:
-            pool.shutdown(cancel_futures=True)
 
     # ------------------------------------------------------------------------------------------ inside
 

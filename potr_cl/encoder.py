@@ -13,11 +13,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.atomic_write import replacing
-from potr_cl.bitstream import EntropyCoder
 from potr_cl.cameras import Camera, train_views
-from potr_cl.decoder import decode
 from potr_cl.device import Device
 from potr_cl.fallback import on_device
+from potr_cl.geometry import Geometry, quantise_geometry
 from potr_cl.options import EncodeOptions
 from potr_cl.photographs import Photographs, PhotographTargets
 from potr_cl.pruning import Pruned
@@ -26,6 +25,7 @@ from potr_cl.reduction import Progress, reduce_scene
 from potr_cl.refit import RefitOptions, Refitted, RenderedTargets, active_coefficients, refit_colours
 from potr_cl.scene import Scene
 from potr_cl.streams import code_scene
+from potr_cl.threads import thread_pool
 from potr_cl.virtual_cameras import is_virtual, place_cameras
 
 
@@ -71,12 +71,14 @@ class Reduced:
     Attributes:
         scene: what is left to code.
         pruned, refitted, device: as :class:`Encoded` has them.
+        geometry: of the scene, if the colours were re-fitted on it.
     """
 
     scene: Scene
     pruned: Pruned | None
     refitted: Refitted | None
     device: Device | None
+    geometry: Geometry | None = None
 
 
 class Stopwatch:
@@ -148,11 +150,13 @@ def reduce(
 
     def work(device: Device, options: EncodeOptions) -> Reduced:
         reduced, pruned = reduce_scene(scene, views, options, watch, device)
-        refitted = None
-        if options.refit:
-            refitted = refit(scene, reduced, views, options, watch, device)
-            reduced = replace(reduced, sh=refitted.sh)
-        return Reduced(reduced, pruned, refitted, device)
+        if not options.refit:
+            return Reduced(reduced, pruned, None, device)
+        watch("refit", 0.0)
+        with thread_pool(options.threads) as pool:
+            geometry = quantise_geometry(reduced, options.parameters, views, pool.map)
+        refitted = refit(scene, reduced, geometry, views, options, watch, device)
+        return Reduced(replace(reduced, sh=refitted.sh), pruned, refitted, device, geometry)
 
     return on_device(device or Device(), options, work)[0]
 
@@ -160,6 +164,7 @@ def reduce(
 def refit(
     scene: Scene,
     reduced: Scene,
+    geometry: Geometry,
     views: Sequence[Camera],
     options: EncodeOptions,
     watch: Stopwatch,
@@ -171,11 +176,7 @@ def refit(
     """
     watch("refit", 0.0)
     parameters = options.parameters
-    # The geometry alone: a file of degree 0, decoded again and brought back to the order of the splats.
-    bare = code_scene(replace(reduced, sh=reduced.sh[:, :1]), parameters, views, entropy=EntropyCoder("zstd", 1))
-    place = np.empty(len(reduced), np.int64)
-    place[bare.order] = np.arange(len(reduced))
-    decoded = decode(b"".join(bare.pieces)).subset(place)
+    decoded = geometry.decoded(reduced.sh)
     active = active_coefficients(reduced.sh, parameters.sf_sh) if options.compact else None
     how = RefitOptions(steps=options.refit, drop=parameters.drop, memory=options.sweep.memory)
     targets: RenderedTargets | PhotographTargets
@@ -191,7 +192,7 @@ def refit(
             stack.callback(targets.free)
         return refit_colours(
             device,
-            replace(decoded, sh=reduced.sh),
+            decoded,
             views,
             targets,
             how,
@@ -205,7 +206,12 @@ def code(scene: Scene, reduced: Reduced, views: Sequence[Camera], options: Encod
     """The second half of :func:`encode`: bytes."""
     pruned = reduced.pruned
     metadata = _metadata(scene, views, options, pruned)
-    coded = code_scene(reduced.scene, options.parameters, views, metadata, options.entropy, options.threads, watch)
+    geometry = reduced.geometry
+    if geometry is not None and geometry.asked != options.parameters:
+        geometry = None
+    coded = code_scene(
+        reduced.scene, options.parameters, views, metadata, options.entropy, options.threads, watch, geometry
+    )
     order = coded.order if pruned is None else pruned.survivors[coded.order]
     return Encoded(coded.pieces, coded.nbytes, order, pruned, reduced.refitted, reduced.device, watch.seconds)
 

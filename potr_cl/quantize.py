@@ -286,7 +286,7 @@ def quantize_rotations(imaginary: F64, factor: float | F32) -> Integers:
     return _to_steps(imaginary, factor, "quaternion component")
 
 
-def dequantize_rotations(steps: list[NDArray[np.integer]], factor: float | F32, out: F32) -> None:
+def dequantize_rotations(steps: Sequence[NDArray[np.integer]], factor: float | F32, out: F32) -> None:
     """Steps of x, y, z to unit quaternions w, x, y, z in ``out`` (N, 4); w ≥ 0 is computed from the rest."""
     rest = np.ones(len(out), np.float32)
     factor = np.asarray(factor, np.float32)

@@ -2,10 +2,9 @@
 
 from __future__ import annotations
 
-import os
 from collections.abc import Callable, Sequence
 from concurrent.futures import ThreadPoolExecutor
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import partial
 
 import numpy as np
@@ -13,16 +12,15 @@ from numpy.typing import NDArray
 
 from potr_cl import bitstream, context_coder, octree, quantize
 from potr_cl.bitstream import EntropyCoder, Header, Property, Section
-from potr_cl.cameras import Camera, camera_centres
-from potr_cl.context_coder import Run
+from potr_cl.cameras import Camera
+from potr_cl.geometry import Geometry, quantise_geometry
 from potr_cl.scene import Scene
+from potr_cl.threads import Run, thread_pool
 
 #: Splats worked on at a time where a stage needs large temporaries.
 _BLOCK = 1 << 14
-#: Splats whose distances to every camera are taken at a time: a few arrays of them fit a second-level cache.
-_NEAR_BLOCK = 1 << 14
 #: Splats whose SH coefficients are quantised at a time, for the same reason.
-_SH_BLOCK = 1 << 12
+_BLOCK = 1 << 12
 #: Of fewer splats the models of the context coder may weigh more than they save.
 _FEW = 1 << 15
 #: Streams of bytes, whose length means something.
@@ -54,6 +52,7 @@ def code_scene(
     entropy: EntropyCoder | None = None,
     threads: int = 0,
     progress: Callable[[str, float], None] | None = None,
+    geometry: Geometry | None = None,
 ) -> Coded:
     """Quantise and code a scene as it is.
 
@@ -63,35 +62,29 @@ def code_scene(
         views: they decide how coarse centres may be; without any, γ alone does.
         metadata: for the file's section of that name.
         entropy: the entropy stage.
-        threads: for the entropy stage. 0: one a processor.
+        threads: to work with; the bytes do not depend on it. 0: one a processor.
         progress: told how far each stage is.
+        geometry: of the scene, with these parameters and views, where it was quantised before.
 
     Raises:
         DataError: a value too large to quantise.
     """
     report = progress or (lambda stage, done: None)
     coder = entropy or EntropyCoder()
-    pool = ThreadPoolExecutor(threads or os.cpu_count() or 1)
-    try:
+    with thread_pool(threads) as pool:
         report("octree", 0.0)
-        nearest = _nearest(scene.means, views, pool.map)
-        parameters = _in_world_units(parameters, scene, nearest)
-        tolerance = np.maximum(parameters.gamma, parameters.beta * nearest)
-        tree, order = octree.build(scene.means, tolerance, absolute=parameters.version > 1)
+        geometry = geometry or quantise_geometry(scene, parameters, views, pool.map)
+        parameters, tree, order = geometry.parameters, geometry.tree, geometry.order
         report("octree", 1.0)
         stage = "quantise and code"
         report(stage, 0.0)
         groups = [*_octree_groups(tree), _Group(Property.METADATA, 0, [np.frombuffer(metadata, np.uint8)])]
         plain = pool.map(partial(_plain_sections, coder=coder), groups)
-        attributes = _attribute_groups if parameters.version == 1 else _balanced_attribute_groups
-        chains = attributes(scene, order, parameters, pool.map)
+        chains = _chains(geometry, _coefficients(scene, order, parameters, pool.map))
         report(stage, 0.2)
         coded = _code_chains(chains, coder, parameters.version, pool, lambda done: report(stage, 0.2 + 0.7 * done))
         coded += [section for sections in plain for section in sections]
         report(stage, 1.0)
-    finally:
-        # After Ctrl-C nothing that has not begun should begin.
-        pool.shutdown(cancel_futures=True)
     coded.sort(key=lambda pair: (pair[0].kind, pair[0].index))
     pieces = bitstream.assemble(
         Header(
@@ -112,59 +105,13 @@ def code_scene(
     return Coded(pieces, order)
 
 
-def _nearest(means: NDArray[np.float32], views: Sequence[Camera], run: Run) -> NDArray[np.float64]:
-    """(N,) distance to the nearest view; without views 0, which leaves the tolerance to γ."""
-    nearest = np.zeros(len(means))
-    if not views:
-        return nearest
-    eyes = camera_centres(views)
-
-    def find(start: int) -> None:
-        axes = means[start : start + _NEAR_BLOCK].T.astype(np.float64)
-        least = nearest[start : start + _NEAR_BLOCK]
-        squared, part = np.empty_like(least), np.empty_like(least)
-        least[:] = np.inf
-        for eye in eyes:
-            for axis, (coordinates, at) in enumerate(zip(axes, eye, strict=True)):
-                to = part if axis else squared
-                np.subtract(coordinates, at, out=to)
-                np.square(to, out=to)
-                if axis:
-                    np.add(squared, part, out=squared)
-            np.minimum(least, squared, out=least)
-        np.sqrt(least, out=least)
-
-    list(run(find, range(0, len(means), _NEAR_BLOCK)))
-    return nearest
-
-
-def _in_world_units(
-    parameters: quantize.HyperParameters, scene: Scene, nearest: NDArray[np.float64]
-) -> quantize.HyperParameters:
-    """β, γ and SF_scale, which version 2 takes in sizes of a typical splat, so that the unit of length does not matter.
-
-    A splat's size is its largest standard deviation, the typical one their median; seen from the views, the median of
-    size over distance.
-    """
-    if parameters.version == 1:
-        return parameters
-    sizes = np.exp(np.clip(scene.log_scales.max(axis=1).astype(np.float64), -60, 60))
-    size = float(np.median(sizes))
-    sf_scale = min(max(parameters.sf_scale / size, 1e-3), 1e9)
-    seen = nearest > 0
-    if seen.any():
-        beta = parameters.beta * float(np.median(sizes[seen] / nearest[seen]))
-        return replace(parameters, beta=beta, sf_scale=sf_scale)
-    return replace(parameters, gamma=max(parameters.gamma, parameters.beta * size), sf_scale=sf_scale)
-
-
 @dataclass(frozen=True)
 class _Group:
     """Streams of one property, with consecutive indices from ``index`` on."""
 
     prop: Property
     index: int
-    streams: list[NDArray[np.integer]]
+    streams: Sequence[NDArray[np.integer]]
 
     @property
     def contextual(self) -> bool:
@@ -176,7 +123,7 @@ def _plain_sections(group: _Group, coder: EntropyCoder) -> list[tuple[Section, b
     signed = bitstream.is_signed(group.prop)
     sections = []
     for index, stream in enumerate(group.streams, start=group.index):
-        if bitstream.is_predicted(group.prop, group.index):
+        if group.prop == Property.SH and index < 3:
             stream = stream.astype(np.int64)
             stream[1:] -= stream[:-1].copy()
         if group.prop in _BYTES:
@@ -199,11 +146,12 @@ def _code_chains(
 ) -> list[tuple[Section, bytes]]:
     """Sections of some groups: those of a chain tell each other's contexts, where there are contexts."""
     plain = partial(_plain_sections, coder=coder)
+    coded: list[tuple[Section, bytes]] = []
     if coder.name != "context" or version == 1:
-        groups = [group for chain in chains for group in chain]
-        coded = []
+        # Each stream by itself, so that there is something to do for every thread.
+        groups = [_Group(g.prop, g.index + k, [s]) for chain in chains for g in chain for k, s in enumerate(g.streams)]
         for done, sections in enumerate(pool.map(plain, groups), start=1):
-            coded.extend(sections)
+            coded += sections
             progress(done / len(groups))
         return coded
     kept = [[g for g in chain if g.prop == Property.OPACITY or any(s.any() for s in g.streams)] for chain in chains]
@@ -221,7 +169,6 @@ def _code_chains(
         pool.map,
         progress,
     )
-    coded = []
     for chain, groups, data, others in zip(chains, kept, stored, alternatives, strict=True):
         made = None if data is None else _context_sections(groups, data, [other.result() for other in others])
         coded += [section for group in chain for section in plain(group)] if made is None else made
@@ -255,22 +202,6 @@ def _octree_groups(tree: octree.OctreeStreams) -> list[_Group]:
     return [_Group(prop, 0, [stream]) for prop, stream in streams if len(stream)]
 
 
-def _canonical(scene: Scene, order: NDArray[np.int64], run: Run) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """:func:`potr_cl.quantize.canonical_rotations` in the order of the file."""
-    imaginary = np.empty((len(scene), 3))
-    log_scales = np.empty((len(scene), 3), np.float32)
-
-    def turn(start: int) -> None:
-        rows = order[start : start + _BLOCK]
-        block = slice(start, start + len(rows))
-        imaginary[block], log_scales[block] = quantize.canonical_rotations(
-            scene.quaternions[rows], scene.log_scales[rows]
-        )
-
-    list(run(turn, range(0, len(scene), _BLOCK)))
-    return imaginary, log_scales
-
-
 def _coefficients(
     scene: Scene, order: NDArray[np.int64], parameters: quantize.HyperParameters, run: Run
 ) -> NDArray[np.signedinteger]:
@@ -280,7 +211,7 @@ def _coefficients(
     wide: list[tuple[tuple[int, int, slice], quantize.Integers]] = []
 
     def take(start: int) -> None:
-        rows = order[start : start + _SH_BLOCK]
+        rows = order[start : start + _BLOCK]
         block = slice(start, start + len(rows))
         planar = np.ascontiguousarray(scene.sh[rows].transpose(1, 2, 0))
         for m, rgb in enumerate(planar.astype(np.float64)):
@@ -292,7 +223,7 @@ def _coefficients(
                 else:
                     wide.append(((m, c, block), made))
 
-    list(run(take, range(0, len(scene), _SH_BLOCK)))
+    list(run(take, range(0, len(scene), _BLOCK)))
     if wide:
         steps = steps.astype(np.result_type(*{made.dtype for _, made in wide}))
         for where, made in wide:
@@ -300,46 +231,17 @@ def _coefficients(
     return steps
 
 
-def _attribute_groups(
-    scene: Scene, order: NDArray[np.int64], parameters: quantize.HyperParameters, run: Run
-) -> list[list[_Group]]:
-    """Format version 1."""
-    imaginary, log_scales = _canonical(scene, order, run)
-    rotations = run(lambda part: quantize.quantize_rotations(part, parameters.sf_rotation), imaginary.T)
-    scales = run(lambda part: quantize.quantize_scales(part.astype(np.float64), parameters.sf_scale), log_scales.T)
-    coefficients = _coefficients(scene, order, parameters, run)
-    logits = scene.opacity_logits[order].astype(np.float64)
-    return [
-        [_Group(Property.ROTATION, 0, list(rotations))],
-        [_Group(Property.SCALE, 0, list(scales))],
-        *([_Group(Property.SH, 3 * m, list(channels))] for m, channels in enumerate(coefficients)),
-        [_Group(Property.OPACITY, 0, [quantize.quantize_opacities(logits, parameters.sf_opacity)])],
-    ]
-
-
-def _balanced_attribute_groups(
-    scene: Scene, order: NDArray[np.int64], parameters: quantize.HyperParameters, run: Run
-) -> list[list[_Group]]:
-    """Format version 2."""
-    imaginary, log_scales = _canonical(scene, order, run)
-    scales = list(
-        run(lambda part: quantize.quantize_scales(part.astype(np.float64), parameters.sf_scale), log_scales.T)
-    )
-    factors = quantize.rotation_factors(scales, parameters.sf_rotation)
-    # A splat that is decoded as a ball has no direction.
-    ball = (scales[0] == scales[1]) & (scales[1] == scales[2])
-    rotations = run(lambda part: np.where(ball, 0, quantize.quantize_rotations(part, factors)), imaginary.T)
-    logits = scene.opacity_logits[order].astype(np.float64)
-    coefficients = _coefficients(scene, order, parameters, run)
+def _chains(geometry: Geometry, coefficients: NDArray[np.signedinteger]) -> list[list[_Group]]:
+    """All integers of splats; the groups of a chain tell each other's contexts, the longest chain comes first."""
+    degree = round(len(coefficients) ** 0.5) - 1
     bands = [
-        _Group(Property.SH, 3 * first, list(coefficients[first : (band + 1) ** 2].reshape(-1, len(scene))))
-        for band in range(scene.sh_degree + 1)
-        for first in [band**2]
+        _Group(Property.SH, 3 * first, list(coefficients[first:end].reshape(-1, coefficients.shape[2])))
+        for first, end in ((band**2, (band + 1) ** 2) for band in range(degree + 1))
     ]
     return [
         bands[1:],
-        [_Group(Property.ROTATION, 0, list(rotations))],
-        [_Group(Property.SCALE, 0, scales)],
+        [_Group(Property.ROTATION, 0, geometry.rotations)],
+        [_Group(Property.SCALE, 0, geometry.scales)],
         bands[:1],
-        [_Group(Property.OPACITY, 0, [quantize.quantize_logits(logits, parameters.sf_opacity)])],
+        [_Group(Property.OPACITY, 0, [geometry.opacities])],
     ]

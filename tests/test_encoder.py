@@ -7,8 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl.encoder import Stopwatch, encode
+from potr_cl.encoder import Reduced, Stopwatch, code, encode
 from potr_cl.errors import UsageError
+from potr_cl.geometry import quantise_geometry
 from potr_cl.options import EncodeOptions
 from potr_cl.quantize import ac_sparsity
 from potr_cl.rasterizer import Rasterizer
@@ -89,6 +90,17 @@ def test_nothing_to_do_needs_no_device(monkeypatch):
 
 def test_same_bytes_every_time(device, lego_excerpt, views):
     files = {b"".join(encode(lego_excerpt, views, FEW, device=device).pieces) for _ in range(3)}
+    assert len(files) == 1
+
+
+def test_geometry_of_other_steps_is_not_coded():
+    """As a search codes a reduced scene again in other steps than the re-fit saw."""
+    scene, options = random_scene(300), EncodeOptions(preset="best")
+    known = (None, *(quantise_geometry(scene, EncodeOptions(preset="best", q=q).parameters, []) for q in (0.5, 0.2)))
+    files = {
+        b"".join(code(scene, Reduced(scene, None, None, None, geometry), [], options, Stopwatch()).pieces)
+        for geometry in known
+    }
     assert len(files) == 1
 
 
