@@ -356,7 +356,8 @@ def _finish(draft: _Draft, layout: _Layout) -> tuple[rans.Tokens, bytes]:
     tokens = rans.Tokens(
         draft.cells,
         [s % _CHANNELS for s in range(len(draft.cells))],
-        [model.frequencies[model.classes] for model in models],
+        [model.frequencies for model in models],
+        [model.classes for model in models],
     )
     draft.tokens.clear()
     return tokens, b"".join([_HEAD.pack(len(description), len(beside)), description, beside])

@@ -56,15 +56,17 @@ class Tokens:
     """What is coded into one stream of words, for :func:`encode`.
 
     Attributes:
-        cells: one array a stream, in the order of decoding: (T, L) uint16, each lane's token in each step as context ·
-            A + token, or contexts · A where a lane has none.
-        models: which of ``frequencies`` each stream has.
+        cells: one array a stream, in the order of decoding: (T, L) uint16, each lane's token in each step as class · A
+            + token, or classes · A where a lane has none.
+        models: which of those below each stream has.
         frequencies: (contexts, A) each, every row adding up to :data:`TOTAL`.
+        contexts: (classes,) each, the context of each class.
     """
 
     cells: Sequence[U16]
     models: Sequence[int]
     frequencies: Sequence[I64]
+    contexts: Sequence[NDArray[np.integer]]
 
 
 def encode(sections: Sequence[Tokens]) -> list[tuple[NDArray[np.uint32], bytes]]:
@@ -139,11 +141,12 @@ def _tables(sections: Sequence[Tokens]) -> tuple[list[list[int]], F64, F64]:
     size = 0
     for section in sections:
         bases.append([])
-        for model in section.frequencies:
+        for model, contexts in zip(section.frequencies, section.contexts, strict=True):
             bases[-1].append(size)
+            before = np.cumsum(model, axis=1) - model
             # With all of the frequency and nothing before it, a lane without a token stays as it is.
-            frequencies.append(np.append(model.ravel(), TOTAL).astype(np.float64))
-            starts.append(np.append((np.cumsum(model, axis=1) - model).ravel(), 0).astype(np.float64))
+            for parts, values, idle in ((frequencies, model, TOTAL), (starts, before, 0)):
+                parts.append(np.append(values.astype(np.float64)[contexts].ravel(), idle))
             size += len(starts[-1])
     return bases, np.concatenate(frequencies), np.concatenate(starts)
 

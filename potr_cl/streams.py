@@ -20,7 +20,7 @@ from potr_cl.threads import Run, thread_pool
 #: Splats worked on at a time where a stage needs large temporaries.
 _BLOCK = 1 << 14
 #: Splats whose SH coefficients are quantised at a time, for the same reason.
-_BLOCK = 1 << 12
+_BLOCK = 1 << 14
 #: Of fewer splats the models of the context coder may weigh more than they save.
 _FEW = 1 << 15
 #: Streams of bytes, whose length means something.
@@ -214,9 +214,9 @@ def _coefficients(
         rows = order[start : start + _BLOCK]
         block = slice(start, start + len(rows))
         planar = np.ascontiguousarray(scene.sh[rows].transpose(1, 2, 0))
-        for m, rgb in enumerate(planar.astype(np.float64)):
+        for m, rgb in enumerate(planar):
             factor = parameters.sf_dc if m == 0 else parameters.sf_sh
-            for c, values in enumerate(quantize.to_ycocg(rgb.T)):
+            for c, values in enumerate(quantize.to_ycocg(rgb.astype(np.float64).T)):
                 made = quantize.quantize_sh(values, factor)
                 if made.dtype == steps.dtype:
                     steps[m, c, block] = made

@@ -14,7 +14,7 @@ from potr_cl.errors import DataError
 def as_tokens(tokens, contexts, frequencies):
     """Of one stream, (steps, lanes)."""
     cells = (contexts * frequencies.shape[1] + tokens).astype(np.uint16)
-    return rans.Tokens([cells], [0], [frequencies])
+    return rans.Tokens([cells], [0], [frequencies], [np.arange(len(frequencies))])
 
 
 def coded(tokens, contexts, frequencies):
@@ -98,6 +98,7 @@ def test_as_the_textbook_does(lanes):
             [as_tokens(*stream).cells[0] for stream in streams],
             list(range(len(streams))),
             [frequencies for _, _, frequencies in streams],
+            [np.arange(len(frequencies)) for _, _, frequencies in streams],
         )
         for streams in sections
     ]
