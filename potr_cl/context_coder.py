@@ -46,11 +46,12 @@ _WEIGHT_BITS = 8
 #: Splats to which an encoder fits the weights.
 _FITTED = 1 << 16
 #: Sizes worked on at a time: few enough for temporaries to stay in a cache.
-_BLOCK = 1 << 14
+_BLOCK = 1 << 15
 #: Of these, those whose products are added at a time.
 _COLUMNS = 1 << 11
-#: Memory for sizes that are worked on at the same time, bytes.
-_WORKING_BYTES = 1 << 28
+#: Memory for sizes that are worked on at the same time, and what a coefficient takes of it a splat, bytes.
+_WORKING_BYTES = 1 << 27
+_COEFFICIENT_BYTES = 48
 #: From this many lanes on sections are coded one by one.
 _MANY_LANES = 1 << 11
 #: Bits that storing one frequency costs, about.
@@ -325,7 +326,7 @@ def _contexts(
         return draft, weights, cells
 
     at_once = max(_BLOCK // (_CHANNELS * shape[1]), 1)
-    at_a_time = max(_WORKING_BYTES // (40 * layout.lanes.splats * at_once), 4) * at_once
+    at_a_time = max(_WORKING_BYTES // (_COEFFICIENT_BYTES * layout.lanes.splats * at_once), 2) * at_once
     for start in range(0, len(jobs), at_a_time):
         window = jobs[start : start + at_a_time]
         parts = [window[k : k + at_once] for k in range(0, len(window), at_once)]
@@ -398,23 +399,25 @@ def _fit(sums: list[I32], sizes: I32, recents: I32, fitted: I64) -> NDArray[np.i
         (channels, terms) in the order of the format.
     """
     channels = len(sizes)
-    columns = np.empty((_CHANNELS + 2 * channels + 1, len(fitted)))
-    for column, term in zip(columns, [*sums, *sizes, *recents], strict=False):
-        column[:] = term.ravel().take(fitted)
-    columns[-1] = 1
+    terms = [*sums, *sizes, *recents]
+    columns = np.zeros((-(-len(fitted) // _COLUMNS), len(terms) + 1, _COLUMNS))
+    whole, rest = divmod(len(fitted), _COLUMNS)
+    for k, term in enumerate(terms):
+        values = term.ravel().take(fitted)
+        columns[:whole, k] = values[: whole * _COLUMNS].reshape(whole, _COLUMNS)
+        columns[whole:, k, :rest] = values[whole * _COLUMNS :]
+    columns[:whole, -1] = 1
+    columns[whole:, -1, :rest] = 1
     # Sums of products of integers, below 2^53: exact, in whatever order they are added. Few columns at a time stay in a
     # cache and do not wake the threads of a BLAS, which would stand in the way of those here.
-    products = np.zeros((len(columns), len(columns)))
-    for start in range(0, len(fitted), _COLUMNS):
-        part = columns[:, start : start + _COLUMNS]
-        products += part @ part.T
+    products = (columns @ columns.transpose(0, 2, 1)).sum(axis=0)
     weights = np.zeros((channels, _TERMS), np.int16)
     for c in range(channels):
-        terms = [*range(_CHANNELS + c), _CHANNELS + channels + c, -1]
-        gram = products[np.ix_(terms, terms)]
+        known = [*range(_CHANNELS + c), _CHANNELS + channels + c, -1]
+        gram = products[np.ix_(known, known)]
         gram[np.diag_indices_from(gram)] *= 1 + 1e-6
         gram[np.diag_indices_from(gram)] += 1e-6 * len(fitted)
-        solution = np.round(np.linalg.solve(gram, products[terms, _CHANNELS + c]) * (1 << _WEIGHT_BITS))
+        solution = np.round(np.linalg.solve(gram, products[known, _CHANNELS + c]) * (1 << _WEIGHT_BITS))
         cut = np.clip(solution, -32768, 32767)
         weights[c, : _CHANNELS + c] = cut[:-2]
         weights[c, -2:] = cut[-2:]

@@ -43,11 +43,20 @@ def normalise(counts: I64) -> I64:
     present = counts > 0
     frequencies: I64 = np.where(present, np.maximum(counts * TOTAL // int(counts.sum()), 1), 0)
     # What rounding left over goes to the token whose code it changes most for the better, or least for the worse.
-    while rest := TOTAL - int(frequencies.sum()):
-        if rest > 0:
-            frequencies[np.argmax(np.where(present, counts / np.maximum(frequencies, 1), -1))] += -(-rest // 4)
-        else:
-            frequencies[np.argmin(np.where(frequencies > 1, counts / np.maximum(frequencies, 1), np.inf))] -= 1
+    rest = TOTAL - int(frequencies.sum())
+    gains = np.where(present, counts / np.maximum(frequencies, 1), -1)
+    while rest > 0:
+        token = gains.argmax()
+        more = -(-rest // 4)
+        frequencies[token] += more
+        rest -= more
+        gains[token] = counts[token] / frequencies[token]
+    losses = np.where(frequencies > 1, counts / np.maximum(frequencies, 1), np.inf)
+    while rest < 0:
+        token = losses.argmin()
+        frequencies[token] -= 1
+        rest += 1
+        losses[token] = counts[token] / frequencies[token] if frequencies[token] > 1 else np.inf
     return frequencies
 
 
