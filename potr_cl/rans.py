@@ -2,7 +2,8 @@
 
 Every lane has a state of its own; all lanes take one token in each step and share one stream of 16-bit words. A step is
 a handful of array operations over the lanes, so plain numpy decodes tens of millions of tokens a second, and a GPU
-could give each lane a work-item. All arithmetic is on integers: the bytes are the same on every machine.
+could give each lane a work-item. All arithmetic is exact, on integers, also where floats hold them: the bytes are the
+same on every machine.
 docs/format.md, "Context coder", is the normative description.
 """
 
