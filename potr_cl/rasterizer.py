@@ -1,19 +1,23 @@
 """The rasterizer: projection, tile lists, depth order and compositing of one view after the other.
 
-The stages run in this order and leave their results in device buffers of a :class:`View`, so that whoever needs a view
-more than once keeps the view and repeats only the last stage:
+The stages run in this order and leave their results in device buffers of a :class:`ViewSet`, so that whoever needs
+views more than once keeps them and repeats only the last stage:
 
 1. ``project``: each splat's ellipse and colour on screen (cl/project.cl);
 2. ``count_tiles``, ``scan_tiles``, ``fill_tiles``: which splats touch which 16 x 16 tile (cl/tile_lists_*.cl);
-3. ``sort_tiles``: each tile's list front to back (cl/sort_*.cl); on CPUs ``entry_patches``: which parts of its tile
-   each entry touches (cl/entry_patches_cpu.cl);
+3. ``sort_tiles``: each tile's list front to back (cl/sort_*.cl); ``entry_patches``: which parts of its tile each entry
+   touches (cl/entry_patches_*.cl);
 4. ``composite``: the picture (cl/composite_*.cl).
+
+A GPU's kernels do all views of a set in one launch, a CPU's one view at a time.
 
 Semantics: the original 3DGS rasterizer (Kerbl et al. 2023); where renderers differ, :class:`RasterRules` says how.
 """
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from typing import Any
@@ -24,7 +28,7 @@ from numpy.typing import NDArray
 
 from potr_cl.cameras import Camera
 from potr_cl.device import Device, Scratch
-from potr_cl.errors import DeviceError, UsageError
+from potr_cl.errors import DeviceError, DeviceMemoryError, UsageError
 from potr_cl.scene import FloatArray, Scene
 
 TILE = 16
@@ -42,6 +46,12 @@ _MOST_TILES = 0xFFFF
 #: Standard deviations above this many world units are taken as this: nothing can be seen to differ, nothing overflows.
 _LARGEST_SCALE = 1e12
 
+#: Bytes of an entry's patches.
+_PATCHES_BYTES = {"cpu": 4, "gpu": 2}
+
+#: Splats whose parameters are uploaded at a time.
+_UPLOADED = 1 << 18
+
 #: Where the SH coefficients stand among the kernel's parameters.
 _SH = 4
 
@@ -57,6 +67,24 @@ _CAMERA = np.dtype(
         ("tiles", np.int32, 2),
     ]
 )
+
+#: ``SetView`` in cl/view_set.clh.
+_SET_VIEW = np.dtype(
+    [
+        ("view", _CAMERA),
+        ("first_tile", np.uint32),
+        ("first_offset", np.uint32),
+        ("first_entry", np.uint32),
+        ("first_pixel", np.uint32),
+    ]
+)
+
+#: Work-items of a work-group a tile, stage by stage. On a CPU one: PoCL would keep the private memory of more of them
+#: on its stack.
+_TILE_GROUPS = {
+    "cpu": {"scan": 1, "sort": 1, "patches": 1, "composite": 1},
+    "gpu": {"scan": 256, "sort": 256, "patches": 128, "composite": 128},
+}
 
 
 @dataclass(frozen=True)
@@ -117,19 +145,18 @@ def _tiles(camera: Camera) -> tuple[int, int]:
 
 
 class View:
-    """One camera's projection, tile lists and depth order, in device buffers.
+    """One camera's part of a :class:`ViewSet`; the buffers are there for the only view of a set.
 
     Attributes:
+        owner: the set.
         camera: whose view it is.
         columns, rows: tiles across and down.
-        shapes: (N, 8) float32, a splat's ellipse, see cl/splat.clh.
-        colours: (N, 4) float32; R, G, B of the splats that are drawn, the rest unset.
-        offsets: (columns * rows + 1,) uint32, where each tile's run of ``entries`` begins.
         entry_count: entries there are; set once the device is known to have found them all.
+        capacity: entries that there is room for.
     """
 
-    def __init__(self, device: Device, camera: Camera, splats: int, capacity: int) -> None:
-        self._device = device
+    def __init__(self, owner: ViewSet, camera: Camera) -> None:
+        self.owner = owner
         self.camera = camera
         self.columns, self.rows = _tiles(camera)
         if max(self.columns, self.rows) > _MOST_TILES:
@@ -137,16 +164,7 @@ class View:
                 f"view '{camera.name}': {camera.width} x {camera.height} pixels are more than {_MOST_TILES * TILE} "
                 "on a side; render a smaller image"
             )
-        with device.all_or_nothing():
-            self.shapes = device.allocate(32 * splats, "the projected splats")
-            self.colours = device.allocate(16 * splats, "the projected splats' colours")
-            self.offsets = device.allocate(4 * (self.tiles + 1), "the tile offsets")
-            self._lists = Scratch(device, "the tile lists")
-            self._lists.reserve(4 * capacity)
-            self._patches = Scratch(device, "the entries' patches") if device.family == "cpu" else None
-            if self._patches is not None:
-                self._patches.reserve(4 * capacity)
-        self.entry_count = 0
+        self.entry_count = self.capacity = 0
 
     @property
     def tiles(self) -> int:
@@ -154,55 +172,170 @@ class View:
         return self.columns * self.rows
 
     @property
+    def pixels(self) -> int:
+        """Number of pixels."""
+        return self.camera.width * self.camera.height
+
+    @property
+    def shapes(self) -> cl.Buffer:
+        """(N, 8) float32, a splat's ellipse, see cl/splat.clh."""
+        return self._alone.shapes
+
+    @property
+    def colours(self) -> cl.Buffer:
+        """(N, 4) float32; R, G, B of the splats that are drawn, the rest unset."""
+        return self._alone.colours
+
+    @property
+    def offsets(self) -> cl.Buffer:
+        """(columns * rows + 1,) uint32, where each tile's run of ``entries`` begins."""
+        return self._alone.offsets
+
+    @property
     def entries(self) -> cl.Buffer:
         """(capacity,) uint32 splat numbers, tile by tile, front to back within a tile."""
-        return self._lists.buffer
+        return self._alone.entries
 
     @property
-    def lists(self) -> tuple[cl.Buffer, ...]:
-        """The entries and, for CPU kernels, their patches: (capacity,) uint32 a bit for each patch of its tile that an
-        entry touches (cl/patches.clh)."""
-        return (self.entries,) if self._patches is None else (self.entries, self._patches.buffer)
+    def _alone(self) -> ViewSet:
+        (_,) = self.owner.views
+        return self.owner
+
+    def free(self) -> None:
+        """Give the buffers back."""
+        self._alone.free()
+
+
+def gpu_limits(device: Device) -> dict[str, int]:
+    """Macros of the GPU kernels that composite (cl/patch_lists.clh), by what the device can do."""
+    extensions = device.info.handle.extensions.split()
+    # Elsewhere than in the low word first, the two words of a total would be swapped.
+    int64 = "cl_khr_int64_base_atomics" in extensions and device.info.handle.endian_little
+    return {"NATIVE_EXP2": int(device.native_exp2), "INT64_ATOMICS": int(int64)}
+
+
+class ViewSet:
+    """Views whose buffers lie one after another, so that one launch can do them all.
+
+    Attributes:
+        views: each with the parts of the buffers that are its own.
+        tiles, pixels: of all of them.
+        capacity: room for entries, of all views.
+        entry_starts: where each view's entries begin, and their end.
+        table: where each view's part begins, ``SetView`` in cl/view_set.clh.
+        shapes, colours, offsets, entries: as :class:`View` has them, and N splats a view.
+        patches: (capacity,), a bit for each patch of its tile that an entry touches (cl/patches.clh), uint32 for CPU
+            kernels, uint16 for GPU kernels.
+    """
+
+    shapes: cl.Buffer
+    colours: cl.Buffer
+    offsets: cl.Buffer
+    entries: cl.Buffer
+    patches: cl.Buffer
+
+    def __init__(self, device: Device, cameras: Sequence[Camera], stride: int) -> None:
+        self._device = device
+        self._buffers: list[cl.Buffer] = []
+        self.views = [View(self, camera) for camera in cameras]
+        self.tiles = sum(view.tiles for view in self.views)
+        self.pixels = sum(view.pixels for view in self.views)
+        self.capacity = 0
+        self.entry_starts = [0] * (len(cameras) + 1)
+        self._offset_starts = [0, *itertools.accumulate(view.tiles + 1 for view in self.views)]
+        try:
+            self.shapes = self._take(32 * stride * len(cameras), "the projected splats")
+            self.colours = self._take(16 * stride * len(cameras), "the projected splats' colours")
+            self.offsets = self._take(4 * self._offset_starts[-1], "the tile offsets")
+            self.table = self._take(_SET_VIEW.itemsize * len(cameras), "the views")
+        except BaseException:
+            self.free()
+            raise
+        self._write_table()
+
+    def _take(self, nbytes: int, what: str) -> cl.Buffer:
+        self._buffers.append(self._device.allocate(nbytes, what))
+        return self._buffers[-1]
+
+    def _give_back(self, *buffers: cl.Buffer) -> None:
+        for buffer in buffers:
+            self._buffers.remove(buffer)
+            self._device.free(buffer)
+
+    def _write_table(self) -> None:
+        table = np.zeros(len(self.views), _SET_VIEW)
+        table["first_entry"] = self.entry_starts[:-1]
+        table["first_offset"] = self._offset_starts[:-1]
+        tile = pixel = 0
+        for row, view in zip(table, self.views, strict=True):
+            row["view"] = camera_struct(view.camera)
+            row["first_tile"], row["first_pixel"] = tile, pixel
+            tile += view.tiles
+            pixel += view.pixels
+        cl.enqueue_copy(self._device.queue, self.table, table, is_blocking=True)
+
+    def aim(self, camera: Camera) -> bool:
+        """Make the only view another camera's, if that has as many tiles across and down; whether it has."""
+        (view,) = self.views
+        if (view.columns, view.rows) != _tiles(camera):
+            return False
+        if camera is not view.camera:
+            view.camera = camera
+            self.pixels = view.pixels
+            self._write_table()
+        return True
+
+    def make_room(self, counts: Sequence[int]) -> None:
+        """Room for so many entries of each view; those there are get lost.
+
+        Raises:
+            DeviceMemoryError: the device has not that much, or not all in one buffer.
+        """
+        if self.capacity:
+            self._give_back(self.entries, self.patches)
+            self.capacity = 0
+        starts = [0, *itertools.accumulate(counts)]
+        if max(starts[-1], self.pixels) > 0xFFFFFFFF:
+            raise DeviceMemoryError(f"{len(counts)} views have more entries or pixels than can be numbered")
+        self.entries = self._take(4 * starts[-1], "the tile lists")
+        self.patches = self._take(_PATCHES_BYTES[self._device.family] * starts[-1], "the entries' patches")
+        for view, count in zip(self.views, counts, strict=True):
+            view.capacity = count
+        self.entry_starts, self.capacity = starts, starts[-1]
+        if len(self.views) > 1:
+            self._write_table()
+
+    def read_offsets(self) -> list[NDArray[np.uint32]]:
+        """Each view's ``offsets``, once the device has found them."""
+        words = self._device.download(self.offsets, (self._offset_starts[-1],), np.uint32)
+        return [words[start:stop] for start, stop in itertools.pairwise(self._offset_starts)]
+
+    def read_counts(self) -> list[int]:
+        """Each view's entries, once the device has found them; 2^32 - 1 for more than that."""
+        if len(self.views) > 1:
+            return [int(offsets[-1]) for offsets in self.read_offsets()]
+        last = np.empty(1, np.uint32)
+        with self._device.errors("failed while computing"):
+            cl.enqueue_copy(
+                self._device.queue, last, self.offsets, src_offset=4 * self.views[0].tiles, is_blocking=True
+            )
+        return [int(last[0])]
 
     @property
-    def capacity(self) -> int:
-        """Entries that there is room for."""
-        return self._lists.nbytes // 4
-
-    def grow(self, capacity: int) -> None:
-        """Make room for more entries; those there are get lost."""
-        self._lists.reserve(4 * capacity)
-        if self._patches is not None:
-            self._patches.reserve(4 * capacity)
-
-    def trim(self) -> None:
-        """Give back the room that the entries do not need."""
-        self._lists = self._trimmed(self._lists, "the tile lists")
-        if self._patches is not None:
-            self._patches = self._trimmed(self._patches, "the entries' patches")
-
-    def _trimmed(self, scratch: Scratch, what: str) -> Scratch:
-        trimmed = Scratch(self._device, what)
-        trimmed.reserve(4 * self.entry_count)
-        if self.entry_count:
-            cl.enqueue_copy(self._device.queue, trimmed.buffer, scratch.buffer, byte_count=4 * self.entry_count)
-        scratch.free()
-        return trimmed
+    def nbytes_kept(self) -> int:
+        """Bytes of all but shapes and colours."""
+        return (4 + _PATCHES_BYTES[self._device.family]) * self.capacity + 4 * self.tiles
 
     def free_geometry(self) -> None:
         """Give shapes and colours back, for those who keep the lists and project again (:meth:`Rasterizer.project`)."""
-        for buffer in (self.shapes, self.colours):
-            if buffer is not None:
-                self._device.free(buffer)
+        self._give_back(self.shapes, self.colours)
         self.shapes = self.colours = None
 
     def free(self) -> None:
         """Give the buffers back."""
-        self.free_geometry()
-        self._device.free(self.offsets)
-        self._lists.free()
-        if self._patches is not None:
-            self._patches.free()
+        for buffer in self._buffers:
+            self._device.free(buffer)
+        self._buffers = []
 
 
 class Rasterizer:
@@ -239,14 +372,12 @@ class Rasterizer:
         with device.all_or_nothing():
             self._upload(scene)
             self._build(scene.sh.shape[1])
-            self._bounds = device.allocate(8 * self.stride, "the projected splats' bounds")
-            self._total = device.allocate(4, "the entry count")
+        self._bounds = Scratch(device, "the projected splats' bounds")
         self._counts = Scratch(device, "the tile counts")
         self._keys = Scratch(device, "the tile lists' sort keys")
         self._image = Scratch(device, "the image")
         self._transmittance = Scratch(device, "the transmittance")
-        self._scratch: View | None = None
-        self._bound: View | None = None
+        self._scratch: ViewSet | None = None
 
     def _upload(self, scene: Scene) -> None:
         """Activate the parameters and copy them, structure of arrays, padded to the stride."""
@@ -254,7 +385,10 @@ class Rasterizer:
         upload = self._upload_columns
         quaternions = scene.quaternions.astype(np.float64)
         length = np.linalg.norm(quaternions, axis=1, keepdims=True)
-        quaternions = np.where(length > 0, quaternions / np.where(length > 0, length, 1), (1.0, 0.0, 0.0, 0.0))
+        nothing = np.flatnonzero(length == 0)
+        length[nothing] = 1
+        quaternions /= length
+        quaternions[nothing] = (1.0, 0.0, 0.0, 0.0)
         scales = np.minimum(np.exp(np.minimum(scene.log_scales.astype(np.float64), 100)), _LARGEST_SCALE)
         log2_opacities = -np.logaddexp(0, -scene.opacity_logits.astype(np.float64)) / np.log(2)
         self._parameters = [
@@ -265,15 +399,23 @@ class Rasterizer:
             upload(scene.sh.reshape(self.splats, -1), 0, "the SH coefficients"),
         ]
 
-    def _upload_columns(self, columns: NDArray[Any], fill: float, what: str) -> cl.Buffer:
-        padded = np.full((columns.shape[1], self.stride), fill, np.float32)
-        padded[:, : self.splats] = columns.T
-        return self.device.upload(padded, what)
+    def _upload_columns(self, rows: NDArray[Any], fill: float, what: str) -> cl.Buffer:
+        """A value a splat and column; rows are turned into columns on the device, some at a time."""
+        device, width = self.device, rows.shape[1]
+        result = device.allocate(4 * width * self.stride, what)
+        cl.enqueue_fill_buffer(device.queue, result, np.float32(fill), 0, 4 * width * self.stride)
+        turn = device.kernel("columns.cl", "columns")
+        for first in range(0, self.splats, _UPLOADED):
+            some = np.ascontiguousarray(rows[first : first + _UPLOADED], np.float32)
+            source = device.upload(some, what)
+            turn.set_args(source, np.uint32(first), np.uint32(width), np.uint32(self.stride), result)
+            device.launch(turn, (len(some),))
+            device.free(source)
+        return result
 
     def _build(self, sh_count: int) -> None:
         device, rules = self.device, self.rules
         self._lanes = 1 if device.family == "gpu" else device.vector_width
-        row_lanes = max(self._lanes, 8)
         self._project = device.kernel(
             "project.cl",
             "project",
@@ -282,67 +424,41 @@ class Rasterizer:
             NEAR=float(rules.near),
             SQUARE_EXTENT=int(rules.square_extent),
         )
-        # Work-items that share a tile. On a CPU one: PoCL would keep the private memory of more of them on its stack.
-        self._tile_group = 256 if device.family == "gpu" else 1
         lists = f"tile_lists_{device.family}.cl"
         self._count = device.kernel(lists, "count_tiles")
         self._scan = device.kernel(lists, "scan_tiles")
         self._fill = device.kernel(lists, "fill_tiles")
-        limits = {"ALPHA_CAP": float(rules.alpha_cap), "STOP": rules.stop}
+        limits: dict[str, float | int] = {"ALPHA_CAP": float(rules.alpha_cap), "STOP": rules.stop}
+        # Told the arguments' types, pyopencl sets them twenty times as fast.
+        number, buffer = np.uint32, None
+        self._project.set_scalar_arg_dtypes([*[buffer] * 5, number, *[buffer] * 4])
         if device.family == "gpu":
             # 16 KB of keys: half of what every GPU has, so that two tiles are sorted at a time.
             self._sort = device.kernel("sort_gpu.cl", "sort_tiles", SORT_CAPACITY=2048)
-            self._composite = device.kernel(
-                "composite_gpu.cl", "composite", NATIVE_EXP2=int(device.native_exp2), **limits
-            )
+            self._patches = device.kernel("entry_patches_gpu.cl", "entry_patches")
+            limits |= gpu_limits(device)
+            types: list[tuple[cl.Kernel, list[Any]]] = [
+                (self._count, [buffer, number, *[buffer] * 3]),
+                (self._scan, [buffer] * 3),
+                (self._fill, [buffer, number, *[buffer] * 4, number]),
+                (self._sort, [*[buffer] * 5, number]),
+                (self._patches, [buffer, number, *[buffer] * 4, number]),
+            ]
         else:
+            row_lanes = max(self._lanes, 8)
             self._sort = device.kernel("sort_cpu.cl", "sort_tiles")
-            self._entry_patches = device.kernel("entry_patches_cpu.cl", "entry_patches", LANES=row_lanes)
-            self._composite = device.kernel("composite_cpu.cl", "composite", LANES=row_lanes, **limits)
-
-    def _bind(self, view: View) -> None:
-        """Scratch memory for a view, and all kernel arguments but the camera; does nothing for the view bound last."""
-        device = self.device
-        if self._counts.reserve(_COUNTER_BYTES * view.tiles):  # zero at first; each view leaves them so
-            zeros = np.zeros(self._counts.nbytes // 4, np.uint32)
-            cl.enqueue_copy(device.queue, self._counts.buffer, zeros, is_blocking=True)
-            self._bound = None
-        pixels = view.camera.width * view.camera.height
-        for scratch, size in (
-            # The bitonic network sorts in place, merging needs room for as many keys again.
-            (self._keys, (8 if device.family == "gpu" else 16) * view.capacity),
-            (self._image, 12 * pixels),
-            (self._transmittance, 4 * pixels),
-        ):
-            if scratch.reserve(size):
-                self._bound = None
-        if self._bound is view:
-            return
-        stride, capacity = np.uint32(self.stride), np.uint32(view.capacity)
-        keys, counts, camera = self._keys.buffer, self._counts.buffer, camera_struct(view.camera)
-        self._project.set_args(*self._parameters, stride, camera, view.shapes, view.colours, self._bounds)
-        self._count.set_args(self._bounds, view.shapes, stride, camera, counts)
-        self._scan.set_args(counts, view.offsets, np.uint32(view.tiles), self._total)
-        self._fill.set_args(self._bounds, view.shapes, stride, camera, counts, keys, capacity)
-        self._sort.set_args(keys, view.offsets, view.entries, counts, capacity)
-        if device.family == "cpu":
-            self._entry_patches.set_args(view.shapes, view.offsets, *view.lists, capacity, camera)
-        self._composite.set_args(
-            view.shapes,
-            view.colours,
-            view.offsets,
-            *view.lists,
-            capacity,
-            camera,
-            *(np.float32(channel) for channel in self.background),
-            self._image.buffer,
-            self._transmittance.buffer,
-        )
-        self._bound = view
-
-    def _enqueue_project(self, view: View) -> None:
-        self._project.set_arg(6, camera_struct(view.camera))
-        self.device.launch(self._project, (self.stride // self._lanes,), (_SPLAT_GROUP // self._lanes,))
+            self._patches = device.kernel("entry_patches_cpu.cl", "entry_patches", LANES=row_lanes)
+            limits["LANES"] = row_lanes
+            types = [
+                (self._count, [buffer, buffer, number, _CAMERA, buffer]),
+                (self._scan, [buffer, buffer, number]),
+                (self._fill, [buffer, buffer, number, _CAMERA, buffer, buffer, number]),
+                (self._sort, [*[buffer] * 4, number]),
+                (self._patches, [*[buffer] * 4, number, _CAMERA]),
+            ]
+        for kernel, dtypes in types:
+            kernel.set_scalar_arg_dtypes(dtypes)
+        self._composite = device.kernel(f"composite_{device.family}.cl", "composite", **limits)
 
     def replace_sh(self, sh: FloatArray) -> cl.Buffer:
         """Give the scene other SH coefficients, (N, M, 3) float32 of the same degree.
@@ -354,49 +470,94 @@ class Rasterizer:
         """
         former = self._parameters[_SH]
         self._parameters[_SH] = self._upload_columns(sh.reshape(self.splats, -1), 0, "the SH coefficients")
-        self._bound = None
         return former
 
-    def project(self, camera: Camera, shapes: cl.Buffer, colours: cl.Buffer, sh: cl.Buffer | None = None) -> None:
-        """Enqueue a view's projection alone, into buffers like :class:`View`'s; with other SH if ``sh`` is given."""
-        parameters = [*self._parameters[:_SH], self._parameters[_SH] if sh is None else sh]
+    def project(
+        self,
+        views: ViewSet,
+        sh: cl.Buffer | None = None,
+        shapes: cl.Buffer | None = None,
+        colours: cl.Buffer | None = None,
+    ) -> None:
+        """Enqueue the projection alone of prepared views; with other SH, or into other buffers, if these are given."""
+        self._enqueue_project(views, self._room_for_bounds(views), sh, shapes, colours)
+
+    def _room_for_bounds(self, views: ViewSet) -> cl.Buffer:
+        self._bounds.reserve(8 * self.stride * len(views.views))
+        return self._bounds.buffer
+
+    def _enqueue_project(
+        self,
+        views: ViewSet,
+        bounds: cl.Buffer,
+        sh: cl.Buffer | None = None,
+        shapes: cl.Buffer | None = None,
+        colours: cl.Buffer | None = None,
+    ) -> None:
         self._project.set_args(
-            *parameters, np.uint32(self.stride), camera_struct(camera), shapes, colours, self._bounds
+            *self._parameters[:_SH],
+            self._parameters[_SH] if sh is None else sh,
+            self.stride,
+            views.table,
+            views.shapes if shapes is None else shapes,
+            views.colours if colours is None else colours,
+            bounds,
         )
-        self._bound = None
-        self.device.launch(self._project, (self.stride // self._lanes,), (_SPLAT_GROUP // self._lanes,))
+        lanes = self._lanes
+        self.device.launch(self._project, (self.stride // lanes, len(views.views)), (_SPLAT_GROUP // lanes, 1))
 
-    def _enqueue_lists(self, view: View) -> None:
-        """Enqueue tile lists and depth order of a projected view."""
-        camera = camera_struct(view.camera)
-        launch = self.device.launch
-        self._count.set_arg(3, camera)
-        launch(self._count, (self.stride,), (_SPLAT_GROUP,))
-        launch(self._scan, (self._tile_group,), (self._tile_group,))
-        self._fill.set_arg(3, camera)
-        launch(self._fill, (self.stride,), (_SPLAT_GROUP,))
-        launch(self._sort, (view.tiles * self._tile_group,), (self._tile_group,))
-        if self.device.family == "cpu":
-            self._entry_patches.set_arg(5, camera)
-            launch(self._entry_patches, (view.tiles,), (1,))
+    def _over_splats(self, kernel: cl.Kernel, views: ViewSet) -> None:
+        self.device.launch(kernel, (self.stride, len(views.views)), (_SPLAT_GROUP, 1))
 
-    def _enqueue_composite(self, view: View) -> None:
-        self._composite.set_arg(4 + len(view.lists), camera_struct(view.camera))
-        self.device.launch(self._composite, (view.tiles * self._tile_group,), (self._tile_group,))
+    def _over_tiles(self, stage: str, kernel: cl.Kernel, views: ViewSet, tiles: int | None = None) -> None:
+        group = _TILE_GROUPS[self.device.family][stage]
+        most = max(view.tiles for view in views.views) if tiles is None else tiles
+        self.device.launch(kernel, (most * group, len(views.views)), (group, 1))
 
-    def _settle(self, view: View) -> bool:
-        """Wait for the entry count; make room and say False if the lists did not fit."""
-        count = int(self.device.download(self._total, (1,), np.uint32)[0])
-        if count == 0xFFFFFFFF:
-            raise DeviceError(
-                f"view '{view.camera.name}' needs more than 2^32 tile entries: too many huge splats for this image size"
-            )
-        view.entry_count = count
-        if count <= view.capacity:
-            return True
-        self._bound = None
-        view.grow(count + count // 4)
-        return False
+    def _enqueue_count(self, views: ViewSet, bounds: cl.Buffer, counts: cl.Buffer) -> None:
+        """Enqueue the tile offsets of projected views."""
+        if self.device.family == "gpu":
+            self._count.set_args(views.table, self.stride, bounds, views.shapes, counts)
+            self._scan.set_args(views.table, counts, views.offsets)
+        else:
+            (view,) = views.views
+            self._count.set_args(bounds, view.shapes, self.stride, camera_struct(view.camera), counts)
+            self._scan.set_args(counts, view.offsets, view.tiles)
+        self._over_splats(self._count, views)
+        self._over_tiles("scan", self._scan, views, 1)
+
+    def _enqueue_lists(self, views: ViewSet, bounds: cl.Buffer, counts: cl.Buffer) -> None:
+        """Enqueue tile lists, depth order and patches of views with offsets. Leaves the counts zero."""
+        # The bitonic network sorts in place, merging needs room for as many keys again.
+        self._keys.reserve((8 if self.device.family == "gpu" else 16) * views.capacity)
+        keys, capacity = self._keys.buffer, views.capacity
+        if self.device.family == "gpu":
+            lists = (views.offsets, views.entries)
+            self._fill.set_args(views.table, self.stride, bounds, views.shapes, counts, keys, capacity)
+            self._sort.set_args(views.table, keys, *lists, counts, capacity)
+            self._patches.set_args(views.table, self.stride, views.shapes, *lists, views.patches, capacity)
+        else:
+            (view,) = views.views
+            camera = camera_struct(view.camera)
+            self._fill.set_args(bounds, view.shapes, self.stride, camera, counts, keys, capacity)
+            self._sort.set_args(keys, view.offsets, view.entries, counts, capacity)
+            self._patches.set_args(view.shapes, view.offsets, view.entries, views.patches, capacity, camera)
+        self._over_splats(self._fill, views)
+        self._over_tiles("sort", self._sort, views)
+        self._over_tiles("patches", self._patches, views)
+
+    def _enqueue_composite(self, views: ViewSet, image: cl.Buffer) -> None:
+        """Enqueue the pictures, one behind the other into ``image``."""
+        self._transmittance.reserve(4 * views.pixels)
+        lists = (views.shapes, views.colours, views.offsets, views.entries, views.patches)
+        capacity = np.uint32(views.capacity)
+        result = (*(np.float32(channel) for channel in self.background), image, self._transmittance.buffer)
+        if self.device.family == "gpu":
+            self._composite.set_args(views.table, np.uint32(self.stride), *lists, capacity, *result)
+        else:
+            (view,) = views.views
+            self._composite.set_args(*lists, capacity, camera_struct(view.camera), *result)
+        self._over_tiles("composite", self._composite, views)
 
     def _first_capacity(self) -> int:
         """Room for entries before anything is known of a view."""
@@ -411,26 +572,49 @@ class Rasterizer:
         Raises:
             DeviceError: it does not fit the device.
         """
-        view = View(self.device, camera, self.stride, self._first_capacity())
+        return self.prepare_set([camera]).views[0]
+
+    def prepare_set(self, cameras: Sequence[Camera]) -> ViewSet:
+        """:meth:`prepare` several views, waiting for the device but once. CPU kernels take one at a time.
+
+        Returns:
+            The views; :meth:`ViewSet.free` them.
+
+        Raises:
+            DeviceMemoryError: they do not fit the device, or not all in buffers of the size that it allows.
+            DeviceError: one view alone has too many entries, or the device failed.
+        """
+        device = self.device
+        views = ViewSet(device, cameras, self.stride)
         try:
-            self._bind(view)
-            self._enqueue_project(view)
-            self._enqueue_lists(view)
-            while not self._settle(view):
-                self._bind(view)
-                self._enqueue_lists(view)
-            view.trim()
+            counts, bounds = self._zeroed_counts(views), self._room_for_bounds(views)
+            self._enqueue_project(views, bounds)
+            self._enqueue_count(views, bounds, counts)
+            found = views.read_counts()
+            for view, count in zip(views.views, found, strict=True):
+                self._accept(view, count)
+            views.make_room(found)
+            self._enqueue_lists(views, bounds, counts)
         except BaseException:
-            view.free()
+            self._counts.free()  # not zero
+            views.free()
             raise
         finally:
-            self._bound = None
-        return view
+            if len(cameras) > 1:  # far more than a single view will need
+                for scratch in (self._keys, self._bounds, self._counts):
+                    scratch.free()
+        return views
+
+    def _zeroed_counts(self, views: ViewSet) -> cl.Buffer:
+        """Counters for all tiles: zero at first, and left so by what uses them."""
+        if self._counts.reserve(_COUNTER_BYTES * views.tiles):
+            cl.enqueue_fill_buffer(self.device.queue, self._counts.buffer, np.uint32(0), 0, self._counts.nbytes)
+        return self._counts.buffer
 
     def composite(self, view: View) -> tuple[FloatArray, FloatArray]:
         """The picture of a prepared view: as :meth:`render`."""
-        self._bind(view)
-        self._enqueue_composite(view)
+        self._image.reserve(12 * view.pixels)
+        self._enqueue_composite(view.owner, self._image.buffer)
         return self._pictures(view.camera)
 
     def render(self, camera: Camera) -> tuple[FloatArray, FloatArray]:
@@ -453,17 +637,65 @@ class Rasterizer:
             Buffers that begin with the image and the transmittance, as :meth:`render` describes them; the next call
             overwrites them.
         """
-        view = self._scratch_view(camera)
-        self._bind(view)
-        self._enqueue_project(view)
-        self._enqueue_lists(view)
-        self._enqueue_composite(view)
-        # Lists that did not fit are cut short, so the kernels above were safe; their result is thrown away.
-        while not self._settle(view):
-            self._bind(view)
-            self._enqueue_lists(view)
-            self._enqueue_composite(view)
-        return self._image.buffer, self._transmittance.buffer
+        views = self._scratch_view(camera)
+        (view,) = views.views
+        try:
+            self._image.reserve(12 * views.pixels)
+            counts, bounds = self._zeroed_counts(views), self._room_for_bounds(views)
+            while True:
+                self._enqueue_project(views, bounds)
+                self._enqueue_count(views, bounds, counts)
+                self._enqueue_lists(views, bounds, counts)
+                self._enqueue_composite(views, self._image.buffer)
+                # Lists that did not fit are cut short, so the kernels were safe; their result is thrown away.
+                (count,) = views.read_counts()
+                self._accept(view, count)
+                if count <= view.capacity:
+                    return self._image.buffer, self._transmittance.buffer
+                views.make_room([count + count // 4])
+        except BaseException:
+            self._counts.free()  # maybe not zero
+            raise
+
+    def render_into(self, cameras: Sequence[Camera], target: cl.Buffer) -> None:
+        """Render views one behind the other into ``target``, (pixels, 3) float32: on a GPU as many at a time as fit
+        easily."""
+        device, queue = self.device, self.device.queue
+        if device.family == "cpu":
+            start = 0
+            for camera in cameras:
+                nbytes = 12 * camera.width * camera.height
+                cl.enqueue_copy(queue, target, self.render_device(camera)[0], byte_count=nbytes, dst_offset=start)
+                start += nbytes
+            return
+        most = int(max((device.info.memory - device.allocated) // (512 * self.stride), 1))
+        number = start = 0
+        while number < len(cameras):
+            some = cameras[number : number + most]
+            try:
+                views = self.prepare_set(some)
+            except DeviceMemoryError:
+                if most == 1:
+                    raise
+                most //= 2
+                continue
+            try:
+                self._image.reserve(12 * views.pixels)
+                self._enqueue_composite(views, self._image.buffer)
+                nbytes = 12 * views.pixels
+                cl.enqueue_copy(queue, target, self._image.buffer, byte_count=nbytes, dst_offset=start)
+            finally:
+                views.free()
+            number += len(some)
+            start += nbytes
+
+    def _accept(self, view: View, count: int) -> None:
+        """Take the number of entries that the device found to a view."""
+        if count == 0xFFFFFFFF:
+            raise DeviceError(
+                f"view '{view.camera.name}' needs more than 2^32 tile entries: too many huge splats for this image size"
+            )
+        view.entry_count = count
 
     def _pictures(self, camera: Camera) -> tuple[FloatArray, FloatArray]:
         shape = (camera.height, camera.width)
@@ -472,27 +704,32 @@ class Rasterizer:
             self.device.download(self._transmittance.buffer, shape, np.float32),
         )
 
-    def _scratch_view(self, camera: Camera) -> View:
+    def _scratch_view(self, camera: Camera) -> ViewSet:
         """The view that :meth:`render` uses again and again; its lists keep the room that earlier views needed."""
         old = self._scratch
-        if old is not None and (old.columns, old.rows) == _tiles(camera):
-            old.camera = camera
-            return old
         capacity = self._first_capacity()
         if old is not None:
+            if old.aim(camera):
+                return old
             capacity = max(capacity, old.capacity)
             old.free()
             self._scratch = None
-        self._scratch = View(self.device, camera, self.stride, capacity)
-        return self._scratch
+        views = ViewSet(self.device, [camera], self.stride)
+        try:
+            views.make_room([capacity])
+        except BaseException:
+            views.free()
+            raise
+        self._scratch = views
+        return views
 
     def free(self) -> None:
         """Give all device memory back; the rasterizer is of no use afterwards."""
         if self._scratch is not None:
             self._scratch.free()
-        for buffer in (*self._parameters, self._bounds, self._total):
+        for buffer in self._parameters:
             self.device.free(buffer)
-        for scratch in (self._counts, self._keys, self._image, self._transmittance):
+        for scratch in (self._bounds, self._counts, self._keys, self._image, self._transmittance):
             scratch.free()
 
 

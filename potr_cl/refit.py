@@ -19,8 +19,7 @@ Not in the paper, which solves for each splat alone.
 
 from __future__ import annotations
 
-import itertools
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -30,17 +29,23 @@ from numpy.typing import NDArray
 from potr_cl.cameras import Camera
 from potr_cl.compaction import REFERENCE_PIXELS
 from potr_cl.device import Device
-from potr_cl.errors import UsageError
+from potr_cl.errors import DeviceMemoryError, UsageError
 from potr_cl.quantize import quantize_sh, to_ycocg
-from potr_cl.rasterizer import INRIA, TILE, Rasterizer, RasterRules, View, camera_struct
+from potr_cl.rasterizer import INRIA, TILE, Rasterizer, RasterRules, ViewSet, camera_struct, gpu_limits
 from potr_cl.scene import FloatArray, Scene
 
 #: Gives the picture that view number i should show: a device buffer that begins with (H, W, 3) float32, valid until the
 #: next call.
 Targets = Callable[[int], cl.Buffer]
 
-#: Views that a GPU sweeps at a time.
-_SLOTS = 16
+#: Views that a GPU does in one launch.
+_MOST_VIEWS = 32
+#: Work-items of a sweep's work-group.
+_SWEEP_GROUP = {"cpu": 1, "gpu": 128}
+#: Views that a work-item of ``view_colours`` does one after the other, the coefficients in its registers.
+_COLOURED = 8
+#: Splats whose coefficients the host turns from rows into columns at a time.
+_TURNED = 4096
 #: Work-items of a work-group of the stages on splats.
 _GROUP = 64
 #: Work-items that share a dot product.
@@ -149,21 +154,9 @@ class RenderedTargets:
     def __call__(self, number: int) -> cl.Buffer:
         return self._rasterizer.render_device(self._cameras[number])[0]
 
-
-class _Slot:
-    """What one view of a batch needs for itself."""
-
-    def __init__(self, device: Device, stride: int, pixels: int, tiles: int, queue: cl.CommandQueue) -> None:
-        self.queue = queue
-        with device.all_or_nothing():
-            self.colours = device.allocate(16 * stride, "the colours' change")
-            self.totals = device.upload(np.zeros((stride, 4), np.int64), "the re-fit's sums")
-            self.errors = device.allocate(4 * tiles, "the tiles' errors")
-            self.target = device.allocate(12 * pixels, "the target image")
-
-    def free(self, device: Device) -> None:
-        for buffer in (self.colours, self.totals, self.errors, self.target):
-            device.free(buffer)
+    def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
+        """The pictures of several views, one behind the other into a buffer of the caller's."""
+        self._rasterizer.render_into([self._cameras[number] for number in numbers], buffer)
 
 
 class ColourRefit:
@@ -176,6 +169,7 @@ class ColourRefit:
         options: of the solver.
         rules, background: of the rasterizer.
         progress: called with the views prepared and their number.
+        active: as :meth:`set_coefficients` takes it.
 
     Raises:
         UsageError: no camera.
@@ -191,12 +185,14 @@ class ColourRefit:
         rules: RasterRules = INRIA,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         progress: Callable[[int, int], None] | None = None,
+        active: NDArray[np.bool_] | None = None,
     ) -> None:
         if not cameras:
             raise UsageError("a re-fit needs at least one view")
         self.device = device
         self.options = options or RefitOptions()
         self._cameras = list(cameras)
+        self._largest_size = max(c.width for c in cameras), max(c.height for c in cameras)
         self._background = background
         self._sh_count = scene.sh.shape[1]
         self._columns = 3 * self._sh_count
@@ -208,9 +204,8 @@ class ColourRefit:
         means[:, : self._splats] = scene.means.T
         nbytes = 4 * self._columns * self._stride
         self._vectors: list[cl.Buffer] = []
-        self._views: dict[int, View] = {}
-        self._slots: list[_Slot] = []
-        self._kept: dict[int, cl.Buffer] = {}
+        self._sets: list[tuple[range, ViewSet | None]] = []
+        self._kept: dict[int, cl.Buffer] = {}  # by the number of a set's first view
         self._kept_of: Targets | None = None
         try:
             self._means = device.upload(means, "the centres")
@@ -221,8 +216,7 @@ class ColourRefit:
             self._gram = self._allocate(4 * self._triangle * self._stride, "the splats' normal equations")
             self._active = self._allocate(8 * self._stride, "the active coefficients")
             self._parts = self._allocate(8 * _DOT_ITEMS, "a dot product")
-            self.set_coefficients(scene.sh)
-            self._make_slots()
+            self.set_coefficients(scene.sh, active)
             self._prepare_views(progress)
         except BaseException:
             self.free()
@@ -240,11 +234,10 @@ class ColourRefit:
         self._lanes = 1 if device.family == "gpu" else device.vector_width
         limits: dict[str, float | int] = {"ALPHA_CAP": float(rules.alpha_cap), "STOP": rules.stop}
         if device.family == "gpu":
-            limits["NATIVE_EXP2"] = int(device.native_exp2)
+            limits |= gpu_limits(device)
         else:
             limits["LANES"] = max(device.vector_width, 8)
         source = f"refit_{device.family}.cl"
-        self._tile_group = 64 if device.family == "gpu" else 1
         self._sweeps = [device.kernel(source, "refit_sweep", WEIGHTS=weights, **limits) for weights in (0, 1)]
 
         def stage(name: str, weights: int = 0) -> cl.Kernel:
@@ -258,29 +251,50 @@ class ColourRefit:
         self._combine = stage("combine")
         self._dot_parts = stage("dot_parts")
 
-    def _make_slots(self) -> None:
-        device = self.device
-        pixels = max(c.width * c.height for c in self._cameras)
-        tiles = max(-(-c.width // TILE) * -(-c.height // TILE) for c in self._cameras)
-        count = min(_SLOTS, len(self._cameras)) if device.family == "gpu" else 1
-        for number in range(count):
-            queue = device.queue if number == 0 else cl.CommandQueue(device.context, device.info.handle)
-            self._slots.append(_Slot(device, self._stride, pixels, tiles, queue))
-
     def _prepare_views(self, progress: Callable[[int, int], None] | None) -> None:
+        """Prepare every view, keep as many as the budget allows, and make room for a sweep over some at a time."""
+        device = self.device
         memory = self.options.memory
-        free = self.device.info.memory - self.device.allocated
+        free = device.info.memory - device.allocated
         self._budget: float = free * _SHARE if memory is None else memory
-        for number, camera in enumerate(self._cameras):
-            view = self._rasterizer.prepare(camera)
-            nbytes = 48 * self._stride + 4 * (len(view.lists) * view.entry_count + view.tiles)
+        # A sweep's own buffers take half as much as the views at least, the sums included.
+        most = 1 if device.family == "cpu" else int(min(max(self._budget // (192 * self._stride), 1), _MOST_VIEWS))
+        number = 0
+        while number < len(self._cameras):
+            numbers = range(number, min(number + most, len(self._cameras)))
+            try:
+                views = self._prepare(numbers)
+            except DeviceMemoryError:
+                if most == 1:
+                    raise
+                most //= 2
+                continue
+            nbytes = 48 * self._stride * len(numbers) + views.nbytes_kept
             if nbytes > self._budget:
-                view.free()
+                views.free()
+                self._sets.append((numbers, None))
             else:
                 self._budget -= nbytes
-                self._views[number] = view
+                self._sets.append((numbers, views))
+            number += len(numbers)
             if progress is not None:
-                progress(number + 1, len(self._cameras))
+                progress(number, len(self._cameras))
+        largest = max(len(numbers) for numbers, _ in self._sets)
+        sets = [[self._cameras[number] for number in numbers] for numbers, _ in self._sets]
+        tiles = max(sum(-(-c.width // TILE) * -(-c.height // TILE) for c in cameras) for cameras in sets)
+        self._change = self._allocate(16 * self._stride * largest, "the colours' change")
+        self._totals = self._allocate(32 * self._stride * largest, "the re-fit's sums")
+        self._zero(self._totals)
+        self._errors = self._allocate(4 * tiles, "the tiles' errors")
+        self._scales = self._allocate(4 * len(self._cameras), "the views' scales")
+        largest = max(self._target_bytes(numbers) for numbers, _ in self._sets)
+        self._target = self._allocate(largest, "the target images")
+
+    def _prepare(self, numbers: range) -> ViewSet:
+        return self._rasterizer.prepare_set([self._cameras[number] for number in numbers])
+
+    def _target_bytes(self, numbers: range) -> int:
+        return 12 * sum(self._cameras[number].width * self._cameras[number].height for number in numbers)
 
     def set_coefficients(self, sh: FloatArray, active: NDArray[np.bool_] | None = None, hold: bool = False) -> None:
         """Where to start.
@@ -291,24 +305,39 @@ class ColourRefit:
             hold: the others keep their values; without, they are 0.
         """
         columns = np.zeros((self._columns, self._stride), np.float32)
-        for m in range(self._sh_count):
-            columns[3 * m : 3 * m + 3, : self._splats] = to_ycocg(sh[:, m].astype(np.float64))
+        for some in self._slices():
+            rows = sh[some].astype(np.float64)
+            for c, channel in enumerate(to_ycocg(rows.reshape(-1, 3))):
+                columns[c::3, some] = channel.reshape(-1, self._sh_count).T
         words = np.zeros((2, self._stride), np.uint32)
-        for column in range(self._columns):
-            flags = np.ones(self._splats, bool) if active is None else active[:, column // 3, column % 3]
-            if not hold:
-                columns[column, : self._splats] *= flags
-            words[column // 24, : self._splats] |= flags.astype(np.uint32) << np.uint32(column % 24)
+        if active is None:
+            words[0] = (1 << min(self._columns, 24)) - 1
+            words[1] = (1 << max(self._columns - 24, 0)) - 1
+        else:
+            for column in range(self._columns):
+                flags = active[:, column // 3, column % 3]
+                if not hold:
+                    columns[column, : self._splats] *= flags
+                words[column // 24, : self._splats] |= flags.astype(np.uint32) << np.uint32(column % 24)
         cl.enqueue_copy(self.device.queue, self._x, columns, is_blocking=True)
         cl.enqueue_copy(self.device.queue, self._active, words, is_blocking=True)
 
+    def _slices(self) -> Iterator[slice]:
+        """The splats, so many at a time that a CPU's cache holds their coefficients while they are turned."""
+        for first in range(0, self._splats, _TURNED):
+            yield slice(first, min(first + _TURNED, self._splats))
+
     def _coefficients(self, buffer: cl.Buffer) -> FloatArray:
         """A vector on the device as (N, M, 3) R, G, B."""
-        columns = self.device.download(buffer, (self._sh_count, 3, self._stride), np.float32)[:, :, : self._splats]
-        y, co, cg = columns[:, 0], columns[:, 1], columns[:, 2]
-        # In this order nothing overflows that did not in R, G, B.
-        rest = y - cg
-        return np.ascontiguousarray(np.stack([rest + co, y + cg, rest - co]).transpose(2, 1, 0))
+        columns = self.device.download(buffer, (self._sh_count, 3, self._stride), np.float32)
+        sh = np.empty((self._splats, self._sh_count, 3), np.float32)
+        for some in self._slices():
+            y, co, cg = columns[:, 0, some], columns[:, 1, some], columns[:, 2, some]
+            # In this order nothing overflows that did not in R, G, B.
+            rest = y - cg
+            for c, channel in enumerate((rest + co, y + cg, rest - co)):
+                sh[some, :, c] = channel.T
+        return sh
 
     # ------------------------------------------------------------------------------------------ vectors
 
@@ -371,120 +400,128 @@ class ColourRefit:
             The weighted squared error of the colours themselves.
         """
         error = 0.0
-        numbers = iter(range(len(self._cameras)))
-        while batch := list(itertools.islice(numbers, len(self._slots))):
-            work = [(slot, number, self._view(number)) for slot, number in zip(self._slots, batch, strict=False)]
-            self.device.queue.finish()
-            for slot, number, view in work:
-                self._enqueue_sweep(slot, number, view, coefficients, targets, unit, weights)
-            for slot in self._slots:
-                slot.queue.finish()
-            # One after the other: sums of floats depend on their order.
-            for slot, number, view in work:
-                self._gather(slot, view, result, unit, weights)
-                if targets is not None:
-                    tiles = self.device.download(slot.errors, (view.tiles,), np.float32)
-                    error += self._weight(view.camera) * float(tiles.sum(dtype=np.float64))
-                if number not in self._views:
-                    view.free()
+        self._upload_scales(unit)
+        for numbers, kept in self._sets:
+            views = kept or self._prepare(numbers)
+            if targets is not None:
+                self._enqueue_colours(views, coefficients, views.colours, False, 1.0)
+            else:
+                if kept is None:  # which colours are cut at 0 was settled where the way began
+                    self._enqueue_colours(views, self._start, views.colours, False, 1.0)
+                self._enqueue_colours(views, coefficients, self._change, True, unit)
+            self._enqueue_sweep(numbers, views, targets, weights)
+            self._gather(numbers, views, result, weights)
+            if targets is not None:
+                tiles = self.device.download(self._errors, (views.tiles,), np.float32)
+                ends = np.cumsum([view.tiles for view in views.views])
+                for view, part in zip(views.views, np.split(tiles, ends[:-1]), strict=True):
+                    error += self._weight(view.camera) * float(part.sum(dtype=np.float64))
+            if kept is None:
+                views.free()
         return error
 
-    def _view(self, number: int) -> View:
-        return self._views.get(number) or self._rasterizer.prepare(self._cameras[number])
-
-    def _enqueue_sweep(
-        self,
-        slot: _Slot,
-        number: int,
-        view: View,
-        coefficients: cl.Buffer,
-        targets: Targets | None,
-        unit: float,
-        weights: bool,
-    ) -> None:
-        """Enqueue the sweep of one view in its slot's queue."""
-        if targets is not None:
-            self._enqueue_colours(slot, view, coefficients, None, 1.0)
-        elif number not in self._views:
-            # Which colours are cut at 0 was settled where the way began.
-            self._enqueue_colours(slot, view, self._start, None, 1.0)
-        if targets is None:
-            self._enqueue_colours(slot, view, coefficients, slot.colours, unit)
-        sweep = self._sweeps[weights]
-        sweep.set_args(
-            view.shapes,
-            view.colours if targets is not None else slot.colours,
-            view.offsets,
-            *view.lists,
-            camera_struct(view.camera),
-            *(np.float32(channel if targets is not None else 0) for channel in self._background),
-            slot.target if targets is None else self._target(slot, number, targets),
+    def _enqueue_sweep(self, numbers: range, views: ViewSet, targets: Targets | None, weights: bool) -> None:
+        """Enqueue the sweep of a set's views."""
+        sweep, family = self._sweeps[weights], self.device.family
+        colours = views.colours if targets is not None else self._change
+        background = (np.float32(channel if targets is not None else 0) for channel in self._background)
+        target = self._target if targets is None else self._target_images(numbers, targets)
+        rest = (
+            *background,
+            target,
             np.int32(targets is not None),
-            np.float32(self._fixed_scale(view.camera)),
-            slot.errors,
-            slot.totals,
+            np.float32(self._fixed_scale(self._cameras[numbers[0]])),
+            self._errors,
+            self._totals,
         )
-        self.device.launch(sweep, (view.tiles * self._tile_group,), (self._tile_group,), slot.queue)
+        group = _SWEEP_GROUP[family]
+        if family == "cpu":
+            (view,) = views.views
+            lists: tuple[cl.Buffer, ...] = (views.offsets, views.entries, views.patches)
+            sweep.set_args(views.shapes, colours, *lists, camera_struct(view.camera), *rest)
+            self.device.launch(sweep, (views.tiles * group,), (group,))
+        else:
+            stride = np.uint32(self._stride)
+            lists = (views.offsets, views.entries, views.patches)
+            sweep.set_args(views.table, stride, views.shapes, colours, *lists, *rest)
+            most = max(view.tiles for view in views.views)
+            self.device.launch(sweep, (most * group, len(views.views)), (group, 1))
 
     def _enqueue_colours(
-        self, slot: _Slot, view: View, coefficients: cl.Buffer, change: cl.Buffer | None, unit: float
+        self, views: ViewSet, coefficients: cl.Buffer, result: cl.Buffer, change: bool, unit: float
     ) -> None:
-        """Enqueue a view's colours, or into ``change`` those that a direction adds where none is cut at 0."""
+        """Enqueue the views' colours, or those that a direction adds where none is cut at 0."""
+        count = len(views.views)
         self._view_colours.set_args(
             coefficients,
             self._means,
             np.uint32(self._stride),
-            camera_struct(view.camera),
-            np.int32(change is not None),
+            views.table,
+            np.uint32(count),
+            np.int32(change),
             np.float32(unit),
-            view.colours,
-            view.colours if change is None else change,
+            views.colours,
+            result,
         )
         group = max(_GROUP // self._lanes, 1)
-        self.device.launch(self._view_colours, (self._stride // self._lanes,), (group,), slot.queue)
+        self.device.launch(self._view_colours, (self._stride // self._lanes, -(-count // _COLOURED)), (group, 1))
 
-    def _target(self, slot: _Slot, number: int, targets: Targets) -> cl.Buffer:
-        """What a view should show, kept from the first time on while the memory budget lasts."""
+    def _target_images(self, numbers: range, targets: Targets) -> cl.Buffer:
+        """What a set's views should show, kept from the first time on while the memory budget lasts."""
         if targets is not self._kept_of:
             self._forget_targets()
             self._kept_of = targets
-        if number in self._kept:
-            return self._kept[number]
-        camera = self._cameras[number]
-        nbytes = 12 * camera.width * camera.height
-        buffer = slot.target
+        if numbers[0] in self._kept:
+            return self._kept[numbers[0]]
+        nbytes = self._target_bytes(numbers)
+        buffer = self._target
         if nbytes <= self._budget:
             self._budget -= nbytes
-            buffer = self._kept[number] = self.device.allocate(nbytes, "the target images")
-        cl.enqueue_copy(self.device.queue, buffer, targets(number), byte_count=nbytes)
-        self.device.queue.finish()
+            buffer = self._kept[numbers[0]] = self.device.allocate(nbytes, "the target images")
+        if isinstance(targets, RenderedTargets):
+            targets.into(numbers, buffer)
+            return buffer
+        start = 0
+        for number in numbers:
+            size = self._target_bytes(range(number, number + 1))
+            cl.enqueue_copy(self.device.queue, buffer, targets(number), byte_count=size, dst_offset=start)
+            self.device.queue.finish()
+            start += size
         return buffer
 
     def _forget_targets(self) -> None:
-        for number, buffer in self._kept.items():
-            self._budget += 12 * self._cameras[number].width * self._cameras[number].height
+        for buffer in self._kept.values():
+            self._budget += buffer.size
             self.device.free(buffer)
         self._kept, self._kept_of = {}, None
 
-    def _gather(self, slot: _Slot, view: View, result: cl.Buffer, unit: float, weights: bool) -> None:
-        """Enqueue the way from a view's sums to the coefficients."""
-        scale = self._weight(view.camera) / (self._fixed_scale(view.camera) * unit)
+    def _upload_scales(self, unit: float) -> None:
+        """By what each view's sums are multiplied on their way to the coefficients."""
+        scales = [self._weight(c) / (self._fixed_scale(c) * unit) for c in self._cameras]
+        cl.enqueue_copy(self.device.queue, self._scales, np.array(scales, np.float32), is_blocking=True)
+
+    def _gather(self, numbers: range, views: ViewSet, result: cl.Buffer, weights: bool) -> None:
+        """Enqueue the way from the views' sums to the coefficients."""
         gather = self._gathers[weights]
         gather.set_args(
-            slot.totals,
+            self._totals,
             self._means,
             np.uint32(self._stride),
-            camera_struct(view.camera),
-            np.float32(scale),
-            view.colours,
+            views.table,
+            np.uint32(len(numbers)),
+            self._scales,
+            np.uint32(numbers[0]),
+            views.colours,
             result,
             self._gram,
         )
         self._over_splats(gather, self._lanes)
 
     def _fixed_scale(self, camera: Camera) -> float:
-        """Fixed point of 62 bits for sums over a view's pixels, the largest power of two that cannot overflow."""
-        area = (camera.width + TILE - 1) * (camera.height + TILE - 1)
+        """Fixed point of 62 bits for sums over a view's pixels, the largest power of two that cannot overflow; on GPUs,
+        which do several views in one launch, in none of them."""
+        width, height = self._largest_size if self.device.family == "gpu" else (camera.width, camera.height)
+        area = (width + TILE - 1) * (height + TILE - 1)
         return float(2.0 ** np.floor(62 - np.log2(_LARGEST_VALUE * area)))
 
     # ------------------------------------------------------------------------------------------ the solver
@@ -614,14 +651,13 @@ class ColourRefit:
 
     def free(self) -> None:
         """Give all device memory back."""
-        for view in self._views.values():
-            view.free()
-        for slot in self._slots:
-            slot.free(self.device)
+        for _, views in self._sets:
+            if views is not None:
+                views.free()
         self._forget_targets()
         for buffer in self._vectors:
             self.device.free(buffer)
-        self._views, self._slots, self._vectors = {}, [], []
+        self._sets, self._vectors = [], []
         self._rasterizer.free()
 
 
@@ -651,9 +687,8 @@ def refit_colours(
         UsageError: no camera.
         DeviceError: the scene does not fit the device.
     """
-    refit = ColourRefit(device, scene, cameras, options, background=background)
+    refit = ColourRefit(device, scene, cameras, options, background=background, active=active)
     try:
-        refit.set_coefficients(scene.sh, active)
         return refit.solve(targets, progress)
     finally:
         refit.free()

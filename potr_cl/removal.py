@@ -10,6 +10,7 @@ What does not fit the memory budget is made again when it is needed: first the p
 
 from __future__ import annotations
 
+import functools
 import itertools
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
@@ -20,17 +21,22 @@ from numpy.typing import NDArray
 
 from potr_cl.cameras import Camera
 from potr_cl.device import Device
-from potr_cl.errors import UsageError
-from potr_cl.rasterizer import TILE, Rasterizer, View, camera_struct
+from potr_cl.errors import DeviceMemoryError, UsageError
+from potr_cl.rasterizer import TILE, Rasterizer, ViewSet, camera_struct, gpu_limits
 from potr_cl.scene import FloatArray
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
 
-#: Views that a GPU sweeps at a time.
-_QUEUES = 16
-#: Where the removal kernel's argument stands that has it store the target, behind the buffers of the lists.
-_FIRST_TIME = 9
+#: Views that a GPU does in one launch.
+_MOST_VIEWS = 32
+#: Launches that a GPU runs at a time.
+_QUEUES = 4
+#: Where the removal kernels' argument stands that has them store the target.
+_FIRST_TIME = {"cpu": 13, "gpu": 14}
+#: Work-items of a work-group, of the sweep and of what follows a removal.
+_SWEEP_GROUP = {"cpu": 1, "gpu": 128}
+_STALENESS_GROUP = {"cpu": 1, "gpu": 128}
 #: Below it transmittances lose digits in float32, and the sweep divides by them.
 _LEAST_STOP = 1e-30
 #: Part of the device's memory that the views may take unless the caller sets a budget. A CPU's is that of the host: the
@@ -93,13 +99,20 @@ class SweepOptions:
 
 @dataclass
 class _Swept:
-    """A view and what is kept of it from sweep to sweep.
+    """Views that are swept in one launch, and what is kept of them from sweep to sweep.
 
-    The kernels have all their arguments but the place of the tiles to sweep in the list of tiles.
+    Attributes:
+        number: of the first view among the cameras; the others follow it.
+        views: their lists.
+        lengths: (tiles,) uint32, entries that a tile has left.
+        sums: (entries, 2) float32, see cl/removal_cpu.cl.
+        target: (pixels, 3) float32.
+        first_tile: where their tiles begin among those of all views that are kept.
+        sweep, staleness: kernels with all their arguments but the place of the tiles to sweep in the list of tiles.
     """
 
-    view: View
-    begins: cl.Buffer
+    number: int
+    views: ViewSet
     lengths: cl.Buffer
     sums: cl.Buffer
     target: cl.Buffer
@@ -107,9 +120,14 @@ class _Swept:
     sweep: cl.Kernel = None
     staleness: cl.Kernel = None
 
+    @property
+    def numbers(self) -> range:
+        """Of the views among the cameras."""
+        return range(self.number, self.number + len(self.views.views))
+
     def free(self, device: Device) -> None:
-        self.view.free()
-        for buffer in (self.begins, self.lengths, self.sums, self.target):
+        self.views.free()
+        for buffer in (self.lengths, self.sums, self.target):
             device.free(buffer)
 
 
@@ -145,6 +163,7 @@ class RemovalSweep:
         self._options = options or SweepOptions()
         self._random = np.random.default_rng(self._options.seed)
         self._measured = 0
+        self._unsettled = False  # whether a removal is under way
         self._original_sh: cl.Buffer | None = None
         self.sweeps = 0.0
         self._build()
@@ -165,33 +184,27 @@ class RemovalSweep:
         memory = self._options.memory
         self._budget = default_memory(device) if memory is None else memory
         self._queues = [device.queue]
-        self._kept: dict[int, _Swept] = {}  # by the number of the view
+        self._kept: list[_Swept] = []
+        self._remade: list[range] = []  # numbers of the views that nothing is kept of, as many as are made at a time
         self._shared: tuple[cl.Buffer, cl.Buffer] | None = None
-        self._tile_count = 0
-        kept_tiles, most = 0, 1
-        for number, camera in enumerate(cameras):
-            swept = self._prepare(camera, kept_tiles)
-            most = max(most, swept.view.tiles)
-            self._tile_count += swept.view.tiles
-            if self._keep(number, swept):
-                kept_tiles += swept.view.tiles
-            if progress is not None:
-                progress(number + 1, len(cameras))
+        self._prepare_all(progress)
         # The kept views' tiles are numbered through: importance removed from each since its last sweep.
+        kept_tiles = sum(swept.views.tiles for swept in self._kept)
+        self._tile_count = sum(-(-c.width // TILE) * -(-c.height // TILE) for c in cameras)
         self._stale = np.full(kept_tiles, np.inf, np.float32)
-        self._stale_buffer = device.allocate(4 * kept_tiles, "the tiles' staleness")
-        self._tiles = device.allocate(4 * max(kept_tiles, most), "the tiles to sweep")
-        for swept in self._kept.values():
+        self._stale_buffer = device.allocate(4 * self._tile_count, "the tiles' staleness")
+        self._tiles = device.allocate(4 * self._tile_count, "the tiles to sweep")
+        for swept in self._kept:
             self._bind(swept, True, self._totals)
         if device.family == "gpu" and not self._shared:
-            # A view's longest tile list keeps one work-group busy when all others are done: other views fill the gap.
+            # A set's longest tile list keeps one work-group busy when all others are done: other sets fill the gap.
             self._queues = [
                 cl.CommandQueue(device.context, device.info.handle, device.queue.properties) for _ in range(_QUEUES)
             ]
 
     @property
     def kept_views(self) -> int:
-        return len(self._kept)
+        return sum(len(swept.views.views) for swept in self._kept)
 
     def _build(self) -> None:
         device, rules = self._device, self._rasterizer.rules
@@ -202,87 +215,180 @@ class RemovalSweep:
             "TIGHTEN": int(self._options.tighten),
         }
         if device.family == "gpu":
-            limits["NATIVE_EXP2"] = int(device.native_exp2)
+            limits |= gpu_limits(device)
         else:
             limits["LANES"] = max(device.vector_width, 8)
         self._limits = limits
         self._source = f"removal_{device.family}.cl"
-        self._group = 64 if device.family == "gpu" else 1
 
     def _zero_totals(self) -> cl.Buffer:
         return self._device.upload(np.zeros((self._rasterizer.stride, 4), np.uint32), "the removal effects")
 
-    def _prepare(self, camera: Camera, first_tile: int = 0) -> _Swept:
-        device = self._device
-        view = self._rasterizer.prepare(camera)
-        offsets = device.download(view.offsets, (view.tiles + 1,), np.uint32)
-        return _Swept(
-            view=view,
-            begins=device.upload(offsets[:-1], "the tile lists"),
-            lengths=device.upload(np.diff(offsets), "the tile lists"),
-            sums=device.upload(np.zeros((view.entry_count, 2), np.float32), "the tiles' removal effects"),
-            target=device.allocate(12 * camera.width * camera.height, "the target image"),
-            first_tile=first_tile,
-        )
+    def _prepare_all(self, progress: Callable[[int, int], None] | None) -> None:
+        """Prepare every view, and keep as many as the budget allows."""
+        most, first_tile, number = self._most_views(), 0, 0
+        while number < self._views:
+            try:
+                swept = self._prepare(range(number, min(number + most, self._views)), first_tile)
+            except DeviceMemoryError:
+                if most == 1:
+                    raise
+                most //= 2
+                continue
+            # The first views stand for the others: geometry is kept for all of them or for none.
+            if number == 0 and self._views * self._bytes_kept(swept) > self._budget * len(swept.numbers):
+                if most > 1:  # what is not kept is made again one by one
+                    swept.free(self._device)
+                    most = 1
+                    continue
+                self._shared = (
+                    self._device.allocate(32 * self._rasterizer.stride, "the projected splats"),
+                    self._device.allocate(16 * self._rasterizer.stride, "the projected splats' colours"),
+                )
+            if self._keep(swept):
+                first_tile += swept.views.tiles
+            number += len(swept.numbers)
+            if progress is not None:
+                progress(number, self._views)
 
-    def _keep(self, number: int, swept: _Swept) -> bool:
-        """Keep a prepared view as far as the budget allows; whether it does."""
-        view = swept.view
-        geometry = 48 * self._rasterizer.stride
-        an_entry = 8 + 4 * len(view.lists)
-        lists = an_entry * view.entry_count + 12 * view.tiles + 12 * view.camera.width * view.camera.height
-        # The first view stands for the others: geometry is kept for all of them or for none.
-        if number == 0 and self._views * (lists + geometry) > self._budget:
-            self._shared = (
-                self._device.allocate(32 * self._rasterizer.stride, "the projected splats"),
-                self._device.allocate(16 * self._rasterizer.stride, "the projected splats' colours"),
-            )
-        self._budget -= lists + (0 if self._shared else geometry)
+    def _most_views(self) -> int:
+        """Views to do in one launch: on a GPU as many as surely are a small part of the memory budget."""
+        if self._device.family == "cpu":
+            return 1
+        least = 48 * self._rasterizer.stride + 12 * self._pixels
+        return int(min(max(self._budget // (2 * least), 1), _MOST_VIEWS))
+
+    def _prepare(self, numbers: range, first_tile: int = 0) -> _Swept:
+        """Prepare the views of these numbers.
+
+        Raises:
+            DeviceMemoryError: they do not fit the device, or not all in buffers of the size that it allows.
+        """
+        device = self._device
+        views = self._rasterizer.prepare_set([self._cameras[number] for number in numbers])
+        try:
+            lengths = np.concatenate([np.diff(offsets) for offsets in views.read_offsets()])
+            with device.all_or_nothing():
+                swept = _Swept(
+                    number=numbers[0],
+                    views=views,
+                    lengths=device.upload(lengths, "the tile lists"),
+                    sums=device.allocate(8 * views.capacity, "the tiles' removal effects"),
+                    target=device.allocate(12 * views.pixels, "the target images"),
+                    first_tile=first_tile,
+                )
+        except BaseException:
+            views.free()
+            raise
+        self._zero_sums(swept)
+        return swept
+
+    def _zero_sums(self, swept: _Swept) -> None:
+        cl.enqueue_fill_buffer(self._device.queue, swept.sums, np.float32(0), 0, swept.sums.size)
+
+    def _bytes_kept(self, swept: _Swept, geometry: bool = True) -> int:
+        views = swept.views
+        lists = views.nbytes_kept + 8 * views.capacity + 4 * views.tiles + 12 * views.pixels
+        return lists + (48 * self._rasterizer.stride * len(views.views) if geometry else 0)
+
+    def _keep(self, swept: _Swept) -> bool:
+        """Keep prepared views as far as the budget allows; whether it does."""
+        self._budget -= self._bytes_kept(swept, not self._shared)
         if self._budget < 0:
             self._budget = 0
+            self._remade.append(swept.numbers)
             swept.free(self._device)
             return False
         if self._shared:
-            view.free_geometry()
-        self._kept[number] = swept
+            swept.views.free_geometry()
+        self._kept.append(swept)
         return True
 
     def _bind(self, swept: _Swept, first: bool, totals: cl.Buffer) -> None:
-        """Kernels of its own for a view: setting their arguments takes longer than launching them."""
-        device, view = self._device, swept.view
-        shapes, colours = self._shared if view.shapes is None and self._shared else (view.shapes, view.colours)
-        weight = self._pixels / (view.camera.width * view.camera.height)
-        lists = (swept.begins, swept.lengths, *view.lists)
+        """Kernels of its own for a set: setting their arguments takes longer than launching them."""
+        device, views, stride = self._device, swept.views, np.uint32(self._rasterizer.stride)
+        shapes, colours = self._shared if views.shapes is None and self._shared else (views.shapes, views.colours)
+        background = (np.float32(channel) for channel in self._rasterizer.background)
         swept.sweep = device.kernel(self._source, "removal", **self._limits)
+        swept.staleness = device.kernel(self._source, "staleness", **self._limits)
+        gone = (np.uint32(swept.first_tile), self._stale_buffer)
+        if device.family == "cpu":
+            (view,) = views.views
+            weight = self._pixels / views.pixels
+            lists: tuple[cl.Buffer, ...] = (views.offsets, swept.lengths, views.entries)
+            swept.sweep.set_args(
+                np.uint32(0),
+                self._tiles,
+                shapes,
+                colours,
+                self._alive_buffer,
+                *lists,
+                views.patches,
+                camera_struct(view.camera),
+                *background,
+                np.int32(first),
+                np.float32(self._scale * weight),
+                np.float32(self._bound / weight),
+                swept.target,
+                swept.sums,
+                totals,
+            )
+            swept.staleness.set_args(self._alive_buffer, *lists, swept.sums, *gone)
+            return
+        table = (views.table, np.uint32(len(views.views)))
+        lists = (views.offsets, swept.lengths, views.entries, views.patches)
         swept.sweep.set_args(
             np.uint32(0),
             self._tiles,
+            *table,
+            stride,
             shapes,
             colours,
-            self._alive_buffer,
             *lists,
-            camera_struct(view.camera),
-            *(np.float32(channel) for channel in self._rasterizer.background),
+            *background,
             np.int32(first),
-            np.float32(self._scale * weight),
-            np.float32(self._bound / weight),
+            np.float32(self._scale),
+            np.float32(self._pixels),
+            np.float32(self._bound),
             swept.target,
             swept.sums,
             totals,
         )
-        swept.staleness = device.kernel(self._source, "staleness", **self._limits)
-        swept.staleness.set_args(
-            self._alive_buffer, *lists[:3], swept.sums, np.uint32(swept.first_tile), self._stale_buffer
-        )
+        swept.staleness.set_args(self._alive_buffer, *table, *lists, swept.sums, *gone)
 
     def _sweep(self, swept: _Swept, start: int, count: int, queue: cl.CommandQueue | None = None) -> None:
-        """Sweep ``count`` of a view's tiles, listed in the tile buffer from ``start`` on."""
-        if swept.view.shapes is None:
+        """Sweep ``count`` tiles of a set, listed in the tile buffer from ``start`` on."""
+        if swept.views.shapes is None:
             assert self._shared is not None
-            self._rasterizer.project(swept.view.camera, *self._shared)
+            self._rasterizer.project(swept.views, None, *self._shared)
         swept.sweep.set_arg(0, np.uint32(start))
-        self._device.launch(swept.sweep, (count * self._group,), (self._group,), queue)
+        group = _SWEEP_GROUP[self._device.family]
+        self._device.launch(swept.sweep, (count * group,), (group,), queue)
         self.sweeps += count / self._tile_count
+
+    def _sweep_all(self, swept: _Swept) -> None:
+        """Sweep every tile of a set that is not kept."""
+        self._list_tiles(np.arange(swept.views.tiles))
+        if self._device.family == "gpu":  # there the sweep itself takes nothing out of the lists
+            self._after_removal(swept)
+        self._sweep(swept, 0, swept.views.tiles)
+
+    def _after_removal(self, swept: _Swept, queue: cl.CommandQueue | None = None) -> None:
+        """Enqueue what follows a removal: how much each tile has lost."""
+        group = _STALENESS_GROUP[self._device.family]
+        self._device.launch(swept.staleness, (swept.views.tiles * group,), (group,), queue)
+
+    def _enqueue(self, work: Sequence[Callable[[cl.CommandQueue], None]]) -> None:
+        """Enqueue pieces of work that do not depend on each other; :meth:`_wait` for them."""
+        self._device.queue.finish()
+        for piece, queue in zip(work, itertools.cycle(self._queues)):
+            piece(queue)
+            queue.flush()
+
+    def _wait(self) -> None:
+        with self._device.errors("failed while computing"):
+            for queue in self._queues:
+                queue.finish()
 
     def _list_tiles(self, tiles: NDArray[np.int64]) -> None:
         if len(tiles):
@@ -291,24 +397,30 @@ class RemovalSweep:
     def _sweep_stale(self, tolerance: float, turns: int = 1, sample: float = 1) -> None:
         """Sweep the kept views' tiles that have lost more than ``tolerance``, of every so many-th view only, and of
         those only a random part."""
+        self._settle()
         wanted = self._stale > tolerance
-        firsts = np.array([swept.first_tile for swept in self._kept.values()] + [len(wanted)], np.int64)
-        for number, (start, stop) in zip(self._kept, itertools.pairwise(firsts), strict=True):
-            if (self._measured + number) % turns:
-                wanted[start:stop] = False
+        starts = np.array([swept.first_tile for swept in self._kept] + [len(wanted)], np.int64)
+        if turns > 1:
+            tile = 0
+            for swept in self._kept:
+                for number, view in zip(swept.numbers, swept.views.views, strict=True):
+                    if (self._measured + number) % turns:
+                        wanted[tile : tile + view.tiles] = False
+                    tile += view.tiles
         if sample < 1:
             wanted &= self._random.random(len(wanted)) < sample
         numbers = np.flatnonzero(wanted)
-        bounds = np.searchsorted(numbers, firsts)
-        self._list_tiles(numbers - np.repeat(firsts[:-1], np.diff(bounds)))
-        self._device.queue.finish()
-        queues = itertools.cycle(self._queues)
-        for swept, (start, stop) in zip(self._kept.values(), itertools.pairwise(bounds), strict=True):
-            if stop > start:
-                self._sweep(swept, int(start), int(stop - start), next(queues))
-        for queue in self._queues:
-            queue.finish()
+        bounds = np.searchsorted(numbers, starts)
+        self._list_tiles(numbers - np.repeat(starts[:-1], np.diff(bounds)))
+        self._enqueue(
+            [
+                functools.partial(self._sweep, swept, int(start), int(stop - start))
+                for swept, (start, stop) in zip(self._kept, itertools.pairwise(bounds), strict=True)
+                if stop > start
+            ]
+        )
         self._stale[numbers] = 0 if self._options.tolerance >= 0 else np.inf
+        self._wait()
 
     def measure(self) -> tuple[F64, F64]:
         """ΔMSE_k and I_k of all N splats, float64; of removed splats they mean nothing.
@@ -320,39 +432,35 @@ class RemovalSweep:
         sampled = 0 < self._measured <= options.sampled
         self._sweep_stale(options.tolerance, options.turns if self._measured else 1, options.sample if sampled else 1)
         if self._measured == 0:
-            for swept in self._kept.values():
-                swept.sweep.set_arg(_FIRST_TIME + 2 + len(swept.view.lists), np.int32(0))
+            for swept in self._kept:
+                swept.sweep.set_arg(_FIRST_TIME[self._device.family], np.int32(0))
         words = self._device.download(self._totals, (self.splats, 2), np.int64)
-        if len(self._kept) < self._views:
+        if self._remade:
             words += self._measure_transient()
         self._measured += 1
-        values = words / (self._scale * self._pixels * self._views)
-        return values[:, 0] / 3, values[:, 1]
+        values = self._scale * self._pixels * self._views
+        effects = words[:, 0] / values
+        effects /= 3
+        return effects, words[:, 1] / values
 
     def _measure_transient(self) -> NDArray[np.int64]:
         """The views that nothing is kept of: lists, target and sums anew."""
         device = self._device
         totals, unused = self._zero_totals(), self._zero_totals()
         everything = np.ones_like(self._alive)
-        for number, camera in enumerate(self._cameras):
-            if number in self._kept:
-                continue
-            swept = self._prepare(camera)
-            view = swept.view
-            self._list_tiles(np.arange(view.tiles))
+        for numbers in self._remade:
+            swept = self._prepare(numbers)
             if self._measured:
                 cl.enqueue_copy(device.queue, self._alive_buffer, everything, is_blocking=True)
-                if self._original_sh is not None:
-                    self._rasterizer.project(camera, view.shapes, view.colours, self._original_sh)
+                self._rasterizer.project(swept.views, self._original_sh)
                 self._bind(swept, True, unused)
-                self._sweep(swept, 0, view.tiles)
+                self._sweep_all(swept)
                 if self._original_sh is not None:
-                    self._rasterizer.project(camera, view.shapes, view.colours)
+                    self._rasterizer.project(swept.views)
                 cl.enqueue_copy(device.queue, self._alive_buffer, self._alive, is_blocking=True)
-                device.free(swept.sums)
-                swept.sums = device.upload(np.zeros((view.entry_count, 2), np.float32), "the removal effects")
+                self._zero_sums(swept)
             self._bind(swept, self._measured == 0, totals)
-            self._sweep(swept, 0, view.tiles)
+            self._sweep_all(swept)
             device.queue.finish()
             swept.free(device)
         words = device.download(totals, (self.splats, 2), np.int64)
@@ -362,25 +470,35 @@ class RemovalSweep:
 
     def remove(self, splats: Indices) -> None:
         """Take splats out of all lists; note how much each tile loses."""
+        self._settle()
         device = self._device
         self._alive[splats] = 2  # just gone
         cl.enqueue_copy(device.queue, self._alive_buffer, self._alive, is_blocking=True)
-        for swept in self._kept.values():
-            device.launch(swept.staleness, (swept.view.tiles * self._group,), (self._group,))
-        self._stale += device.download(self._stale_buffer, self._stale.shape, np.float32)
+        self._enqueue([functools.partial(self._after_removal, swept) for swept in self._kept])
+        self._unsettled = True
         self._alive[splats] = 0
+
+    def _settle(self) -> None:
+        """Wait for what follows the last removal."""
+        if not self._unsettled:
+            return
+        self._unsettled = False
+        self._wait()
+        device = self._device
+        self._stale += device.download(self._stale_buffer, self._stale.shape, np.float32)
         cl.enqueue_copy(device.queue, self._alive_buffer, self._alive, is_blocking=True)
 
     def replace_sh(self, sh: FloatArray) -> None:
         """Go on with other colours: (N, M, 3) float32 of the same degree. The targets stay as they are."""
+        self._settle()
         former = self._rasterizer.replace_sh(sh)
         if self._original_sh is None:
             self._original_sh = former
         else:
             self._device.free(former)
-        for swept in self._kept.values():
-            if swept.view.shapes is not None:
-                self._rasterizer.project(swept.view.camera, swept.view.shapes, swept.view.colours)
+        for swept in self._kept:
+            if swept.views.shapes is not None:
+                self._rasterizer.project(swept.views)
         self.sweep_everything()
 
     def view_importances(self) -> Iterator[tuple[int, Indices, F64]]:
@@ -396,24 +514,38 @@ class RemovalSweep:
         if not self._measured:
             raise UsageError("importances are known after a measurement")
         self._sweep_stale(0)
-        for number, camera in enumerate(self._cameras):
-            kept = self._kept.get(number)
-            swept = kept or self._prepare(camera)
+        places = [*((swept.number, swept) for swept in self._kept), *((numbers[0], None) for numbers in self._remade)]
+        again = {numbers[0]: numbers for numbers in self._remade}
+        for number, kept in sorted(places, key=lambda place: place[0]):
+            swept = kept or self._sweep_once(again[number])
+            yield from self._importances(swept)
             if kept is None:
-                unused = self._zero_totals()
-                self._list_tiles(np.arange(swept.view.tiles))
-                self._bind(swept, True, unused)
-                self._sweep(swept, 0, swept.view.tiles)
-            view = swept.view
-            entries = self._device.download(view.entries, (view.entry_count,), np.uint32)
-            sums = self._device.download(swept.sums, (view.entry_count, 2), np.float32)
-            if kept is None:
-                self._device.free(unused)
                 swept.free(self._device)
+
+    def _sweep_once(self, numbers: range) -> _Swept:
+        """Views that nothing is kept of, prepared and swept for the sake of their sums."""
+        swept = self._prepare(numbers)
+        unused = self._zero_totals()
+        self._bind(swept, True, unused)
+        self._sweep_all(swept)
+        self._device.queue.finish()
+        self._device.free(unused)
+        return swept
+
+    def _importances(self, swept: _Swept) -> Iterator[tuple[int, Indices, F64]]:
+        """:meth:`view_importances` of the views of a set."""
+        views, device = swept.views, self._device
+        for number, view, start in zip(swept.numbers, views.views, views.entry_starts, strict=False):
+            entries, sums = np.empty(view.entry_count, np.uint32), np.empty((view.entry_count, 2), np.float32)
+            with device.errors("failed while computing"):
+                for array, buffer in ((entries, views.entries), (sums, swept.sums)):
+                    if view.entry_count:
+                        offset = start * array.nbytes // view.entry_count
+                        cl.enqueue_copy(device.queue, array, buffer, src_offset=offset, is_blocking=True)
             weights = np.maximum(sums[:, 1], 0)  # negative: touches no pixel
             total = np.bincount(entries, weights=weights, minlength=self.splats)[: self.splats]
             splats = np.flatnonzero((total > 0) & (self._alive[: self.splats] == 1))
-            yield number, splats, total[splats] / (camera.width * camera.height)
+            yield number, splats, total[splats] / (view.camera.width * view.camera.height)
 
     def sweep_everything(self) -> None:
         """Have the next measurement sweep every tile, whatever has changed."""
@@ -421,9 +553,9 @@ class RemovalSweep:
 
     def free(self) -> None:
         """Give all device memory back."""
-        for swept in self._kept.values():
+        for swept in self._kept:
             swept.free(self._device)
-        self._kept = {}
+        self._kept = []
         for buffer in (self._alive_buffer, self._totals, self._tiles, self._stale_buffer, *(self._shared or ())):
             self._device.free(buffer)
         if self._original_sh is not None:

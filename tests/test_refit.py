@@ -103,7 +103,7 @@ def test_the_length_of_a_picture_is_the_product_with_the_normal_matrix(device):
         with Case(device, scene, scene, [camera]) as case, Linearised(case) as linear:
             direction = np.random.default_rng(0).normal(size=scene.sh.shape)
             normal = linear.normal(direction)
-            tiles = linear.refit.device.download(linear.refit._slots[0].errors, (16,), np.float32)
+            tiles = linear.refit.device.download(linear.refit._errors, (16,), np.float32)
         squared = REFERENCE_PIXELS / 2500 * tiles.sum(dtype=np.float64) * np.abs(direction).max() ** 2
         assert np.sum(direction * normal) == pytest.approx(squared, rel=1e-5)
 

@@ -198,7 +198,7 @@ def test_tolerance_saves_sweeps(device, lego_excerpt, lego_excerpt_cameras):
 
 
 def entries_in_lists(removal: RemovalSweep) -> int:
-    lengths = [removal._device.download(s.lengths, (s.view.tiles,), np.uint32) for s in removal._kept.values()]
+    lengths = [removal._device.download(s.lengths, (s.views.tiles,), np.uint32) for s in removal._kept]
     return int(np.concatenate(lengths).sum())
 
 

@@ -149,15 +149,16 @@ def simulate() -> None:
     it know that a filled buffer has been written.
     """
 
-    def zero(refit: ColourRefit, buffer: cl.Buffer) -> None:
-        cl.enqueue_copy(refit.device.queue, buffer, np.zeros(buffer.size // 4, np.float32))
+    def fill(queue: cl.CommandQueue, buffer: cl.Buffer, pattern: Any, offset: int, size: int) -> None:
+        cl.enqueue_copy(queue, buffer, np.full(size // pattern.itemsize, pattern), dst_offset=offset)
 
-    ColourRefit._zero = zero  # type: ignore[method-assign, assignment]
+    cl.enqueue_fill_buffer = fill
     info = next(d for d in list_devices() if "oclgrind" in d.platform.lower())
     kept: list[Rasterizer] = []
+    freed: list[cl.Buffer] = []
     for family, width in (("gpu", 1), ("cpu", 4), ("cpu", 8), ("cpu", 16)):
         device = Device(dataclasses.replace(info, vector_width=width), family=family)  # type: ignore[arg-type]
-        device.free = lambda buffer: None  # type: ignore[method-assign]
+        device.free = freed.append  # type: ignore[method-assign, assignment]
         for rules in (INRIA, GSPLAT):
             for size in (60, 400):
                 scene, view = random_splats(size, 3, seed=1), tilted_camera(1, 40, 24)

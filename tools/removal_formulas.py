@@ -36,7 +36,7 @@ F64 = NDArray[np.float64]
 #: Where a removal kernel's second half begins; it ends before the next kernel.
 _SECOND_HALVES = {
     "removal_cpu.cl": "    /* From here on r, g, b are twice the difference",
-    "removal_gpu.cl": "    float br[PIXELS], bg[PIXELS], bb[PIXELS];",
+    "removal_gpu.cl": "    /* From here on r, g, b are twice the difference",
 }
 #: Pixels end here, in the sweeps and in float64.
 STOP = 1e-8

@@ -1,91 +1,138 @@
     /* The paper's second half of the removal kernel for GPUs: see removal_prefix_sums_cpu.cl, whose names and order of
-       operations these are. */
-    float dr[PIXELS], dg[PIXELS], db[PIXELS];
-    float pr[PIXELS], pg[PIXELS], pb[PIXELS];
+       operations these are. From here on r, g, b are the final colour, and behind_r, behind_g, behind_b the colour before
+       a splat. */
+    Mine mine = pixels_of(lid / SHARE, origin, lid);
+    int end = 0;
     for (int p = 0; p < PIXELS; ++p) {
-        const int row = first_row + p;
-        const float left = fabs(t[p]);
-        r[p] = mad(left, red, r[p]);
-        g[p] = mad(left, green, g[p]);
-        b[p] = mad(left, blue, b[p]);
-        dr[p] = dg[p] = db[p] = 0.0f;
-        if (column < view.width && row < view.height) {
-            size_t pixel = 3 * ((size_t)row * view.width + column);
-            if (first_time) {
-                target[pixel] = r[p];
-                target[pixel + 1] = g[p];
-                target[pixel + 2] = b[p];
-            }
-            dr[p] = 2.0f * (r[p] - target[pixel]);
-            dg[p] = 2.0f * (g[p] - target[pixel + 1]);
-            db[p] = 2.0f * (b[p] - target[pixel + 2]);
+        const int i = mine.first + p * SHARE;
+        const float left = fabs(state.t[i]);
+        state.r[i] = MAD(left, red, state.r[i]);
+        state.g[i] = MAD(left, green, state.g[i]);
+        state.b[i] = MAD(left, blue, state.b[i]);
+        if (first_time && inside(mine, p, picture)) {
+            global float *pixel = target + 3 * (views->first_pixel + pixel_number(mine, p, picture));
+            pixel[0] = state.r[i];
+            pixel[1] = state.g[i];
+            pixel[2] = state.b[i];
         }
-        t[p] = 1.0f;
-        pr[p] = pg[p] = pb[p] = 0.0f;
+        state.t[i] = 1.0f;
+        behind_r[i] = behind_g[i] = behind_b[i] = 0.0f;
+        end = max(end, state.last[i] + 1);
     }
+    if (swept == 0)
+        return;
+    atomic_max(&end_of_patch[mine.patch], end);
+    if (lid == 0)
+        rounds[0] = 0;
+    barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
+    if (lid < PATCHES)
+        near.places[lid] = 0;
 
-    for (uint batch = 0; batch < swept; batch += ITEMS) {
-        const uint size = min(swept - batch, (uint)ITEMS);
-        barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
-        if (lid < size) {
-            uint splat = entries[begin + batch + lid];
-            float4 s1 = shapes[2 * splat + 1];
-            float4 colour = colours[splat];
-            near_splat[lid] = splat;
-            near_s0[lid] = shapes[2 * splat];
-            near_s1[lid] = (float4)(s1.x, s1.y, colour.x, colour.y);
-            near_blue[lid] = colour.z;
-        }
+    local float2 *parts = all_parts + lid / SHARE * NEXT_PARTS;
+    int parity = 0;
+    for (batch = 0; batch < swept; batch += BATCH) {
+        const int size = min(swept - batch, (uint)BATCH);
+        fetch(&near, shapes, colours, entries + batch, patches + batch, size, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
-        for (int group = 0; group < (int)size; group += GROUP_ENTRIES) {
-            const int group_end = min(group + GROUP_ENTRIES, (int)size);
-            for (int k = group; k < group_end; ++k) {
-                float4 s0 = near_s0[k], s1 = near_s1[k];
-                float u0 = s0.z * (x - s0.x);
+        make_lists(&near, lid);
+        mine = pixels_of(near.dealt[lid / SHARE], origin, lid);
+        local const uchar *list = near.lists + mine.patch * LIST_ROOM;
+        const int count = near.counts[mine.patch];
+        const int place = near.places[mine.patch];
+        const int left = clamp(end_of_patch[mine.patch] - place, 0, count);
+        if (share == 0)
+            atomic_max(&rounds[parity], (left + ROUND - 1) / ROUND);
+        float t[PIXELS], r[PIXELS], g[PIXELS], b[PIXELS];
+        float dr[PIXELS], dg[PIXELS], db[PIXELS], pr[PIXELS], pg[PIXELS], pb[PIXELS];
+        int last[PIXELS];
+        for (int p = 0; p < PIXELS; ++p) {
+            const int i = mine.first + p * SHARE;
+            t[p] = state.t[i];
+            r[p] = state.r[i];
+            g[p] = state.g[i];
+            b[p] = state.b[i];
+            last[p] = state.last[i];
+            pr[p] = behind_r[i];
+            pg[p] = behind_g[i];
+            pb[p] = behind_b[i];
+            dr[p] = dg[p] = db[p] = 0.0f;
+            if (inside(mine, p, picture)) {
+                global const float *pixel = target + 3 * (views->first_pixel + pixel_number(mine, p, picture));
+                dr[p] = 2.0f * (r[p] - pixel[0]);
+                dg[p] = 2.0f * (g[p] - pixel[1]);
+                db[p] = 2.0f * (b[p] - pixel[2]);
+            }
+        }
+        for (int i = lid; i < BATCH; i += ITEMS)
+            for (int level = 0; level < 2 * LEVELS; ++level)
+                levels[level * BATCH + i] = 0;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        const int all_rounds = rounds[parity];
+        parity ^= 1;
+        if (lid == 0)
+            rounds[parity] = 0;
+        if (share == 0)
+            near.places[mine.patch] = place + places(count);
+        for (int first = 0; first < all_rounds * ROUND; first += ROUND) {
+            const int now = min(left - first, ROUND);
+            for (int j = 0; j < now; ++j) {
+                const int i = first + j;
+                local const float4 *splat = near.shapes + 3 * list[i];
+                const float4 s0 = splat[0], s1 = splat[1];
+                const float blue_k = splat[2].x;
+                const float u0 = s0.z * (mine.x - s0.x);
                 float effect = 0.0f, importance = 0.0f;
                 for (int p = 0; p < PIXELS; ++p) {
-                    float dy = first_row + p + 0.5f - s0.y;
-                    float u = mad(s0.w, dy, u0);
-                    float v = s1.x * dy;
-                    float power = s1.y - u * u - v * v;
-                    if (power >= LOG2_ALPHA_MIN && (int)batch + k <= last[p]) {
-                        float alpha = fmin(EXP2(power), ALPHA_CAP);
-                        float weight = alpha * t[p];
-                        float inverse = 1.0f / (1.0f - alpha);
-                        float after_r = mad(weight, s1.z, pr[p]);
-                        float after_g = mad(weight, s1.w, pg[p]);
-                        float after_b = mad(weight, near_blue[k], pb[p]);
-                        float pd_r = mad(mad(alpha, r[p], -after_r), inverse, pr[p]);
-                        float pd_g = mad(mad(alpha, g[p], -after_g), inverse, pg[p]);
-                        float pd_b = mad(mad(alpha, b[p], -after_b), inverse, pb[p]);
-                        effect = mad(pd_r, pd_r + dr[p], effect);
-                        effect = mad(pd_g, pd_g + dg[p], effect);
-                        effect = mad(pd_b, pd_b + db[p], effect);
-                        importance += weight;
-                        t[p] = mad(-alpha, t[p], t[p]);
+                    const float power = power_at(mine, p, u0, s0, s1);
+                    if (power >= LOG2_ALPHA_MIN && place + i <= last[p]) {
+                        const float alpha = fmin(EXP2(power), ALPHA_CAP);
+                        const float weight_k = alpha * t[p];
+                        const float inverse = 1.0f / (1.0f - alpha);
+                        const float after_r = MAD(weight_k, s1.z, pr[p]);
+                        const float after_g = MAD(weight_k, s1.w, pg[p]);
+                        const float after_b = MAD(weight_k, blue_k, pb[p]);
+                        const float pd_r = MAD(MAD(alpha, r[p], -after_r), inverse, pr[p]);
+                        const float pd_g = MAD(MAD(alpha, g[p], -after_g), inverse, pg[p]);
+                        const float pd_b = MAD(MAD(alpha, b[p], -after_b), inverse, pb[p]);
+                        effect = MAD(pd_r, pd_r + dr[p], effect);
+                        effect = MAD(pd_g, pd_g + dg[p], effect);
+                        effect = MAD(pd_b, pd_b + db[p], effect);
+                        importance += weight_k;
+                        t[p] = MAD(-alpha, t[p], t[p]);
                         pr[p] = after_r;
                         pg[p] = after_g;
                         pb[p] = after_b;
                     }
                 }
-                parts[(k - group) * ITEMS + lid] = (float2)(effect, importance);
+                parts[j * SHARE + share] = (float2)(effect, importance);
             }
             barrier(CLK_LOCAL_MEM_FENCE);
-            const int entry = lid / 4;
-            float2 sum = (float2)(0.0f, 0.0f);
-            if (group + entry < group_end)
-                for (int j = 0; j < ITEMS / 4; ++j)
-                    sum += parts[lid * (ITEMS / 4) + ((j + lid) & (ITEMS / 4 - 1))];
-            barrier(CLK_LOCAL_MEM_FENCE);
-            parts[lid] = sum;
-            barrier(CLK_LOCAL_MEM_FENCE);
-            if (lid < group_end - group) {
-                float2 after = (parts[4 * lid] + parts[4 * lid + 1]) + (parts[4 * lid + 2] + parts[4 * lid + 3]);
-                const uint slot = begin + batch + group + lid;
-                replace_sums(totals + TOTAL_WORDS * near_splat[group + lid], sums[slot], after, scale, bound);
-                sums[slot] = after;
+            const int summed = share / (SHARE / ROUND);
+            if (summed < now) {
+                float2 sum = (float2)(0.0f);
+                for (int j = 0; j < ROUND; ++j)
+                    sum += parts[share * ROUND + ((j + summed) & (ROUND - 1))];
+                sum = clamp(sum, -view_bound / PATCHES, view_bound / PATCHES);
+                const int k = list[first + summed];
+                add_parts(levels + k, BATCH, sum.x);
+                add_parts(levels + LEVELS * BATCH + k, BATCH, sum.y);
             }
             barrier(CLK_LOCAL_MEM_FENCE);
+        }
+        for (int p = 0; p < PIXELS; ++p) {
+            const int i = mine.first + p * SHARE;
+            state.t[i] = t[p];
+            behind_r[i] = pr[p];
+            behind_g[i] = pg[p];
+            behind_b[i] = pb[p];
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (int i = lid; i < size; i += ITEMS) {
+            const float2 after =
+                (float2)(whole_sum(levels + i, BATCH), whole_sum(levels + LEVELS * BATCH + i, BATCH));
+            const float2 before = sums[batch + i];
+            replace_sums(totals + TOTAL_WORDS * (size_t)near.splats[i], before, after, view_scale, view_bound);
+            sums[batch + i] = after;
         }
     }
 }

@@ -1,119 +1,58 @@
-/* Compositing for GPUs: one work-group a tile, one pixel a work-item (32 in a row make a block of 8 x 4
-   pixels), splats fetched into local memory in batches.
+/* Compositing for GPUs: one work-group a tile; get_group_id(1) is the view's number in its set. See patch_lists.clh for how
+   a tile's work is shared out.
 
-   Macros: ALPHA_CAP, STOP (a pixel ends before its transmittance would fall below it), NATIVE_EXP2. */
+   Macros: ALPHA_CAP, STOP, NATIVE_EXP2. */
 
-#define LANES 1
-#include "lanes.clh"
-#include "splat.clh"
+#define ROUND 1 /* there is nothing to sum */
+#include "patch_lists.clh"
 
-#define BATCH (TILE * TILE)
-/* Splats whose exponents are computed before the first is composited: independent work to hide latency behind. */
-#define AHEAD 8
-
-/* One splat of the next batch into registers, long before it is needed; past the end one that touches nothing. */
-#define FETCH                                              \
-    if (next < end) {                                      \
-        uint splat = entries[next];                        \
-        s0 = shapes[2 * splat];                            \
-        s1 = shapes[2 * splat + 1];                        \
-        colour = colours[splat];                           \
-    } else {                                               \
-        s0 = (float4)(0.0f);                               \
-        s1 = (float4)(0.0f, -1e30f, 0.0f, 0.0f);           \
-        colour = (float4)(0.0f);                           \
-    }                                                      \
-    next += BATCH;
-
-#if NATIVE_EXP2
-#define EXP2 native_exp2
-#else
-#define EXP2 exp2_polynomial
-#endif
-
-kernel __attribute__((reqd_work_group_size(BATCH, 1, 1)))
+kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 void composite(
+    global const SetView *views,
+    uint stride,
     global const float4 *shapes,
     global const float4 *colours,
     global const uint *offsets,
     global const uint *entries,
+    global const ushort *patches,
     uint capacity,
-    View view,
     float red,
     float green,
     float blue,
     global float *image,
     global float *transmittance)
 {
-    local float4 near_s0[BATCH], near_s1[BATCH];
-    local float near_blue[BATCH];
-    local int alive_count[2];
+    local State state;
+    local Batch near;
+    local int unfinished[2];
 
     const int lid = get_local_id(0);
-    const int tile = get_group_id(0);
-    const int column = tile % view.columns * TILE + (lid & 7) + (lid >> 2 & 8);
-    const int row = tile / view.columns * TILE + (lid >> 3 & 3) + (lid >> 6 << 2);
-    const int inside = column < view.width && row < view.height;
-    const float x = column + 0.5f, y = row + 0.5f;
-    const uint end = min(offsets[tile + 1], capacity);
-    const uint begin = min(offsets[tile], capacity);
-    uint next = begin + lid;
-
-    float t = 1.0f, r = 0.0f, g = 0.0f, b = 0.0f;
-    int alive = inside;
-    int parity = 0;
-    int tile_alive = 1;
-    float4 s0, s1, colour;
-    FETCH
-    for (uint batch = begin; batch < end && tile_alive; batch += BATCH) {
-        const int size = min((uint)BATCH, end - batch);
-        barrier(CLK_LOCAL_MEM_FENCE);
-        near_s0[lid] = s0;
-        near_s1[lid] = (float4)(s1.x, s1.y, colour.x, colour.y);
-        near_blue[lid] = colour.z;
-        if (lid == 0)
-            alive_count[parity] = 0;
-        barrier(CLK_LOCAL_MEM_FENCE);
-        FETCH
-        for (int k = 0; k < size && alive; k += AHEAD) {
-            float powers[AHEAD];
-            float most = LOG2_ALPHA_MIN - 1.0f;
-            for (int j = 0; j < AHEAD; ++j) {
-                float4 n0 = near_s0[k + j];
-                float2 n1 = near_s1[k + j].xy;
-                float dy = y - n0.y;
-                float u = MAD(n0.z, x - n0.x, n0.w * dy);
-                float v = n1.x * dy;
-                powers[j] = MAD(-u, u, MAD(-v, v, n1.y));
-                most = fmax(most, powers[j]);
-            }
-            if (most < LOG2_ALPHA_MIN)
-                continue;
-            /* Without branches from here on: a pixel that this splat misses or that has ended adds nothing. */
-            float alphas[AHEAD];
-            for (int j = 0; j < AHEAD; ++j)
-                alphas[j] = powers[j] >= LOG2_ALPHA_MIN ? min(EXP2(powers[j]), ALPHA_CAP) : 0.0f;
-            for (int j = 0; j < AHEAD; ++j) {
-                float after = MAD(-alphas[j], t, t);
-                alive = alive && after >= STOP;
-                float weight = alive ? alphas[j] * t : 0.0f;
-                r = MAD(weight, near_s1[k + j].z, r);
-                g = MAD(weight, near_s1[k + j].w, g);
-                b = MAD(weight, near_blue[k + j], b);
-                t = alive ? after : t;
-            }
+    const uint tile = get_group_id(0), number = get_group_id(1);
+    views += number;
+    const int2 picture = (int2)(views->view.width, views->view.height);
+    const int columns = views->view.columns;
+    if (tile >= (uint)(columns * views->view.rows))
+        return;
+    shapes += 2 * (size_t)stride * number;
+    colours += (size_t)stride * number;
+    offsets += views->first_offset + tile;
+    const uint room = capacity - min(capacity, views->first_entry);
+    const uint begin = min(offsets[0], room), end = min(offsets[1], room);
+    entries += views->first_entry + begin;
+    patches += views->first_entry + begin;
+    const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
+    uint last_batch;
+    forward(
+        &state, &near, unfinished, origin, picture, shapes, colours, entries, patches, end - begin, lid, &last_batch);
+    const Mine mine = pixels_of(lid / SHARE, origin, lid);
+    for (int p = 0; p < PIXELS; ++p)
+        if (inside(mine, p, picture)) {
+            const int i = mine.first + p * SHARE;
+            const size_t pixel = views->first_pixel + pixel_number(mine, p, picture);
+            const float t = fabs(state.t[i]);
+            image[3 * pixel] = MAD(t, red, state.r[i]);
+            image[3 * pixel + 1] = MAD(t, green, state.g[i]);
+            image[3 * pixel + 2] = MAD(t, blue, state.b[i]);
+            transmittance[pixel] = t;
         }
-        if (alive)
-            atomic_inc(&alive_count[parity]);
-        barrier(CLK_LOCAL_MEM_FENCE);
-        tile_alive = alive_count[parity];
-        parity ^= 1;
-    }
-    if (inside) {
-        size_t pixel = (size_t)row * view.width + column;
-        image[3 * pixel] = MAD(t, red, r);
-        image[3 * pixel + 1] = MAD(t, green, g);
-        image[3 * pixel + 2] = MAD(t, blue, b);
-        transmittance[pixel] = t;
-    }
 }

@@ -1,4 +1,5 @@
-/* Projection of every splat into a view, LANES splats a work-item, and the colour of those that can be seen.
+/* Projection of every splat into each view of a set, LANES splats a work-item, and the colour of those that can be seen;
+   get_global_id(1) is the view's number.
 
    Parameters come as structure of arrays, each `stride` splats long, already activated: standard deviations, unit
    quaternions, log2 of the opacity. Padding splats have log2 opacity -INFINITY.
@@ -7,6 +8,7 @@
 
 #include "lanes.clh"
 #include "splat.clh"
+#include "view_set.clh"
 #include "sh.clh"
 
 /* sqrt(log2(e) / 2): turns exp(-q / 2) into exp2(-q'). */
@@ -39,20 +41,24 @@ kernel void project(
     global const float *log2_opacities,
     global const float *sh,
     uint stride_,
-    View view,
+    global const SetView *views,
     global float4 *shapes,
     global float4 *colours,
     global ushort4 *bounds)
 {
     const size_t index = get_global_id(0);
     const size_t stride = stride_;
+    global const View *view = &views[get_global_id(1)].view;
+    shapes += 2 * stride * get_global_id(1);
+    colours += stride * get_global_id(1);
+    bounds += stride * get_global_id(1);
 
     vfloat lo = VLOAD(index, log2_opacities);
     /* Relative to the eye first: both are large where a scene is far from the origin, their difference is not. */
-    vfloat dx = (VLOAD(index, means) - view.eye_high[0]) - view.eye_low[0];
-    vfloat dy = (VLOAD(index, means + stride) - view.eye_high[1]) - view.eye_low[1];
-    vfloat dz = (VLOAD(index, means + 2 * stride) - view.eye_high[2]) - view.eye_low[2];
-    const float *w = view.rotation;
+    vfloat dx = (VLOAD(index, means) - view->eye_high[0]) - view->eye_low[0];
+    vfloat dy = (VLOAD(index, means + stride) - view->eye_high[1]) - view->eye_low[1];
+    vfloat dz = (VLOAD(index, means + 2 * stride) - view->eye_high[2]) - view->eye_low[2];
+    global const float *w = view->rotation;
     vfloat tx = w[0] * dx + w[1] * dy + w[2] * dz;
     vfloat ty = w[3] * dx + w[4] * dy + w[5] * dz;
     vfloat tz = w[6] * dx + w[7] * dy + w[8] * dz;
@@ -61,10 +67,10 @@ kernel void project(
     vfloat inverse_z = 1.0f / tz;
     vfloat ratio_x = tx * inverse_z;
     vfloat ratio_y = ty * inverse_z;
-    vfloat x = view.fx * ratio_x + view.cx;
-    vfloat y = view.fy * ratio_y + view.cy;
-    ratio_x = fmin(fmax(ratio_x, -view.limit_x), view.limit_x);
-    ratio_y = fmin(fmax(ratio_y, -view.limit_y), view.limit_y);
+    vfloat x = view->fx * ratio_x + view->cx;
+    vfloat y = view->fy * ratio_y + view->cy;
+    ratio_x = fmin(fmax(ratio_x, -view->limit_x), view->limit_x);
+    ratio_y = fmin(fmax(ratio_y, -view->limit_y), view->limit_y);
 
     /* Columns of the rotation, times the scale, through the view's rotation and the Jacobian: the axes on screen. */
     vfloat qw = VLOAD(index, quaternions);
@@ -82,8 +88,8 @@ kernel void project(
         vfloat uy = w[3] * axis[0] + w[4] * axis[1] + w[5] * axis[2];
         vfloat uz = w[6] * axis[0] + w[7] * axis[1] + w[8] * axis[2];
         vfloat scale = VLOAD(index, scales + k * stride) * inverse_z;
-        mx[k] = view.fx * scale * (ux - ratio_x * uz);
-        my[k] = view.fy * scale * (uy - ratio_y * uz);
+        mx[k] = view->fx * scale * (ux - ratio_x * uz);
+        my[k] = view->fy * scale * (uy - ratio_y * uz);
         vfloat shrink = fmin(AXIS_LIMIT / fmax(fmax(fabs(mx[k]), fabs(my[k])), 1.0f), 1.0f);
         mx[k] *= shrink;
         my[k] *= shrink;
@@ -114,8 +120,8 @@ kernel void project(
     vfloat reach_x = sqrt(level * sxx) / EXPONENT_SCALE + PIXEL_SLACK + RELATIVE_SLACK * fabs(x);
     vfloat reach_y = sqrt(level * syy) / EXPONENT_SCALE + PIXEL_SLACK + RELATIVE_SLACK * fabs(y);
     vfloat first_column, end_column, first_row, end_row;
-    tile_range(x, reach_x, radius, view.width, &first_column, &end_column);
-    tile_range(y, reach_y, radius, view.height, &first_row, &end_row);
+    tile_range(x, reach_x, radius, view->width, &first_column, &end_column);
+    tile_range(y, reach_y, radius, view->height, &first_row, &end_row);
     drawn = drawn && (first_column < end_column) && (first_row < end_row);
 
     vfloat rgb[3] = {(vfloat)(0.0f), (vfloat)(0.0f), (vfloat)(0.0f)};

@@ -9,6 +9,7 @@
 #include "reals.clh"
 #include "sh_basis.clh"
 #include "splat.clh"
+#include "view_set.clh"
 
 #define TOTALS 4
 #define TRIANGLE (SH_COUNT * (SH_COUNT + 1) / 2)
@@ -30,100 +31,119 @@ inline vfloat active_lanes(global const uint *active, size_t stride, size_t inde
     return VLOAD(0, lanes);
 }
 
-inline void basis_towards(global const float *means, size_t stride, size_t index, View view, vfloat *values)
+inline void basis_towards(global const float *means, size_t stride, size_t index, global const View *view, vfloat *values)
 {
-    const vfloat x = (VLOAD(index, means) - view.eye_high[0]) - view.eye_low[0];
-    const vfloat y = (VLOAD(index, means + stride) - view.eye_high[1]) - view.eye_low[1];
-    const vfloat z = (VLOAD(index, means + 2 * stride) - view.eye_high[2]) - view.eye_low[2];
+    const vfloat x = (VLOAD(index, means) - view->eye_high[0]) - view->eye_low[0];
+    const vfloat y = (VLOAD(index, means + stride) - view->eye_high[1]) - view->eye_low[1];
+    const vfloat z = (VLOAD(index, means + 2 * stride) - view->eye_high[2]) - view->eye_low[2];
     const vfloat length = sqrt(x * x + y * y + z * z);
     const vfloat inverse = 1.0f / (length > 0.0f ? length : (vfloat)(1.0f));
     sh_basis(x * inverse, y * inverse, z * inverse, values);
 }
 
-/* The splats' colours in a view: of the coefficients themselves (direction == 0), cut at 0, w telling which channels are
-   free (1, 2, 4: above 0); or their change along a direction, 0 where `free` says that the channel is cut. */
+/* The splats' colours in each view of a set: of the coefficients themselves (direction == 0), cut at 0, w telling which
+   channels are free (1, 2, 4: above 0); or their change along a direction, 0 where `free` says that the channel is cut.
+   Work-item i of the second dimension does views i, i + get_global_size(1), … */
 kernel void view_colours(
     global const float *coefficients,
     global const float *means,
     uint stride_,
-    View view,
+    global const SetView *views,
+    uint view_count,
     int direction,
     float unit,
     global const float4 *free,
     global float4 *colours)
 {
     const size_t index = get_global_id(0), stride = stride_;
-    VREAL basis[SH_COUNT];
-    basis_towards(means, stride, index, view, basis);
-    vfloat sums[3] = {(vfloat)(0.0f), (vfloat)(0.0f), (vfloat)(0.0f)};
-    for (int m = 0; m < SH_COUNT; ++m)
-        for (int c = 0; c < 3; ++c)
-            sums[c] = MAD(basis[m], VLOAD(index, coefficients + (3 * m + c) * stride), sums[c]);
-    float rgb[3][LANES];
-    VSTORE(sums[0] + sums[1] - sums[2], 0, rgb[0]);
-    VSTORE(sums[0] + sums[2], 0, rgb[1]);
-    VSTORE(sums[0] - sums[1] - sums[2], 0, rgb[2]);
-    for (int lane = 0; lane < LANES; ++lane) {
-        const size_t splat = index * LANES + lane;
-        float4 colour = (float4)(rgb[0][lane], rgb[1][lane], rgb[2][lane], 0.0f);
-        if (direction) {
-            const int channels = (int)free[splat].w;
-            colour.x = channels & 1 ? colour.x * unit : 0.0f;
-            colour.y = channels & 2 ? colour.y * unit : 0.0f;
-            colour.z = channels & 4 ? colour.z * unit : 0.0f;
-        } else {
-            colour = fmin(colour + (float4)(0.5f, 0.5f, 0.5f, 0.0f), 1e30f);
-            colour.w = (colour.x > 0.0f ? 1.0f : 0.0f) + (colour.y > 0.0f ? 2.0f : 0.0f) + (colour.z > 0.0f ? 4.0f : 0.0f);
-            colour = fmax(colour, 0.0f);
+    vfloat values[3 * SH_COUNT];
+    for (int i = 0; i < 3 * SH_COUNT; ++i)
+        values[i] = VLOAD(index, coefficients + i * stride);
+    for (uint number = get_global_id(1); number < view_count; number += get_global_size(1)) {
+        VREAL basis[SH_COUNT];
+        basis_towards(means, stride, index, &views[number].view, basis);
+        vfloat sums[3] = {(vfloat)(0.0f), (vfloat)(0.0f), (vfloat)(0.0f)};
+        for (int m = 0; m < SH_COUNT; ++m)
+            for (int c = 0; c < 3; ++c)
+                sums[c] = MAD(basis[m], values[3 * m + c], sums[c]);
+        float rgb[3][LANES];
+        VSTORE(sums[0] + sums[1] - sums[2], 0, rgb[0]);
+        VSTORE(sums[0] + sums[2], 0, rgb[1]);
+        VSTORE(sums[0] - sums[1] - sums[2], 0, rgb[2]);
+        for (int lane = 0; lane < LANES; ++lane) {
+            const size_t splat = number * stride + index * LANES + lane;
+            float4 colour = (float4)(rgb[0][lane], rgb[1][lane], rgb[2][lane], 0.0f);
+            if (direction) {
+                const int channels = (int)free[splat].w;
+                colour.x = channels & 1 ? colour.x * unit : 0.0f;
+                colour.y = channels & 2 ? colour.y * unit : 0.0f;
+                colour.z = channels & 4 ? colour.z * unit : 0.0f;
+            } else {
+                colour = fmin(colour + (float4)(0.5f, 0.5f, 0.5f, 0.0f), 1e30f);
+                colour.w =
+                    (colour.x > 0.0f ? 1.0f : 0.0f) + (colour.y > 0.0f ? 2.0f : 0.0f) + (colour.z > 0.0f ? 4.0f : 0.0f);
+                colour = fmax(colour, 0.0f);
+            }
+            colours[splat] = colour;
         }
-        colours[splat] = colour;
     }
 }
 
-/* A view's totals, times `scale`, onto the coefficients: result += basis x (Y, Co, Cg) of the free channels' sums.
-   With WEIGHTS also gram += the sum of w^2 x basis x basis. Leaves the totals zero for the next view. */
+/* The totals of a set's views, times the view's scale, onto the coefficients: result += basis x (Y, Co, Cg) of the free
+   channels' sums, view by view-> With WEIGHTS also gram += the sum of w^2 x basis x basis. Leaves the totals zero. */
 kernel void gather(
     global long *totals,
     global const float *means,
     uint stride_,
-    View view,
-    float scale,
+    global const SetView *views,
+    uint view_count,
+    global const float *scales,
+    uint first_scale,
     global const float4 *free,
     global float *result,
     global float *gram)
 {
     const size_t index = get_global_id(0), stride = stride_;
-    float parts[4][LANES];
-    int any_sum = 0;
-    for (int lane = 0; lane < LANES; ++lane) {
-        const size_t splat = index * LANES + lane;
-        const int channels = (int)free[splat].w;
-        for (int i = 0; i < 3 + WEIGHTS; ++i) {
-            const long total = totals[TOTALS * splat + i];
-            any_sum |= total != 0;
-            parts[i][lane] = i < 3 && !(channels & (1 << i)) ? 0.0f : (float)total * scale;
-            totals[TOTALS * splat + i] = 0;
+    vfloat results[3 * SH_COUNT];
+    int any_view = 0;
+    for (uint number = 0; number < view_count; ++number) {
+        float parts[4][LANES];
+        int any_sum = 0;
+        for (int lane = 0; lane < LANES; ++lane) {
+            const size_t splat = number * stride + index * LANES + lane;
+            const int channels = (int)free[splat].w;
+            for (int i = 0; i < 3 + WEIGHTS; ++i) {
+                const long total = totals[TOTALS * splat + i];
+                any_sum |= total != 0;
+                parts[i][lane] = i < 3 && !(channels & (1 << i)) ? 0.0f : (float)total * scales[first_scale + number];
+                totals[TOTALS * splat + i] = 0;
+            }
         }
-    }
-    if (!any_sum)
-        return;
-    VREAL basis[SH_COUNT];
-    basis_towards(means, stride, index, view, basis);
-    const vfloat r = VLOAD(0, parts[0]), g = VLOAD(0, parts[1]), b = VLOAD(0, parts[2]);
-    const vfloat channels[3] = {r + g + b, r - b, g - r - b};
-    for (int m = 0; m < SH_COUNT; ++m)
-        for (int c = 0; c < 3; ++c) {
-            global float *column = result + (3 * m + c) * stride;
-            VSTORE(MAD(basis[m], channels[c], VLOAD(index, column)), index, column);
-        }
+        if (!any_sum)
+            continue;
+        if (!any_view)
+            for (int i = 0; i < 3 * SH_COUNT; ++i)
+                results[i] = VLOAD(index, result + i * stride);
+        any_view = 1;
+        VREAL basis[SH_COUNT];
+        basis_towards(means, stride, index, &views[number].view, basis);
+        const vfloat r = VLOAD(0, parts[0]), g = VLOAD(0, parts[1]), b = VLOAD(0, parts[2]);
+        const vfloat channels[3] = {r + g + b, r - b, g - r - b};
+        for (int m = 0; m < SH_COUNT; ++m)
+            for (int c = 0; c < 3; ++c)
+                results[3 * m + c] = MAD(basis[m], channels[c], results[3 * m + c]);
 #if WEIGHTS
-    const vfloat weight = VLOAD(0, parts[3]);
-    for (int i = 0; i < SH_COUNT; ++i)
-        for (int j = i; j < SH_COUNT; ++j) {
-            global float *column = gram + AT(i, j) * stride;
-            VSTORE(MAD(weight * basis[i], basis[j], VLOAD(index, column)), index, column);
-        }
+        const vfloat weight = VLOAD(0, parts[3]);
+        for (int i = 0; i < SH_COUNT; ++i)
+            for (int j = i; j < SH_COUNT; ++j) {
+                global float *column = gram + AT(i, j) * stride;
+                VSTORE(MAD(weight * basis[i], basis[j], VLOAD(index, column)), index, column);
+            }
 #endif
+    }
+    if (any_view)
+        for (int i = 0; i < 3 * SH_COUNT; ++i)
+            VSTORE(results[i], index, result + i * stride);
 }
 
 /* sums += (lambda, on AC only, + prior) x coefficients, and 0 where a coefficient is not active. */

@@ -1,8 +1,12 @@
-/* Depth order of each tile's list, for GPUs: one work-group a tile, a bitonic network.
+/* Depth order of each tile's list, for GPUs: one work-group a tile, get_group_id(1) the view's number in its set; a bitonic
+   network.
 
    Every merge of size `size` begins with a mirrored step (partner = index ^ (size - 1)), so all comparisons put the
    smaller key first and positions beyond the end behave like infinite keys without being stored. Lists of up to
    SORT_CAPACITY keys stay in local memory; in longer ones, steps that reach further than that run in global memory. */
+
+#include "splat.clh"
+#include "view_set.clh"
 
 #define GROUP 256
 #define COUNTER_STRIDE 8 /* as in tile_lists_gpu.cl */
@@ -44,16 +48,27 @@ inline void merge_local(local ulong *keys, uint n, uint reach, int mirrored, uin
 
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sort_tiles(
-    global ulong *all_keys, global const uint *offsets, global uint *entries, global uint *counts, uint capacity)
+    global const SetView *views,
+    global ulong *all_keys,
+    global const uint *offsets,
+    global uint *entries,
+    global uint *counts,
+    uint capacity)
 {
     local ulong near[SORT_CAPACITY];
     const uint lid = get_local_id(0);
     const uint tile = get_group_id(0);
-    const uint begin = min(offsets[tile], capacity);
-    const uint n = min(offsets[tile + 1], capacity) - begin;
+    views += get_group_id(1);
+    if (tile >= (uint)(views->view.columns * views->view.rows))
+        return;
+    offsets += views->first_offset + tile;
+    /* Offsets that did not fit 32 bits are at their end: no overflow below. */
+    const uint room = capacity - min(capacity, views->first_entry);
+    const uint begin = views->first_entry + min(offsets[0], room);
+    const uint n = views->first_entry + min(offsets[1], room) - begin;
     global ulong *keys = all_keys + begin;
     if (lid == 0)
-        counts[tile * COUNTER_STRIDE] = 0; /* ready for the next view */
+        counts[(views->first_tile + tile) * COUNTER_STRIDE] = 0; /* ready for the next view */
 
     /* Pieces that fit local memory, sorted one by one. */
     for (uint piece = 0; piece < n; piece += SORT_CAPACITY) {

@@ -5,6 +5,8 @@
 #define GROUP 1
 #define COUNTER_STRIDE 1
 
+#include "scan_tiles.clh"
+
 kernel void count_tiles(
     global const ushort4 *bounds, global const float4 *shapes, uint splats, View view, volatile global uint *counts)
 {
@@ -41,4 +43,9 @@ kernel void fill_tiles(
     }
 }
 
-#include "scan_tiles.clh"
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void scan_tiles(global uint *counts, global uint *offsets, uint tiles)
+{
+    local ulong sums[GROUP];
+    scan(counts, offsets, tiles, sums);
+}
