@@ -226,10 +226,16 @@ def encode(
     if not streams:
         return [[] for _ in chains]
     layout = _Layout.of(len(streams[0][0].section.values[0]))
+    too_large = set()
     made = run(lambda job: _tokens_of(job[0].section, job[1], layout), streams)
     for (draft, _), tokens in zip(streams, made, strict=True):
-        draft.tokens.append(tokens)
-    coded = [chain for chain in drafts if all(tokens for draft in chain for tokens in draft.tokens)]
+        if tokens is None:
+            too_large.add(id(draft))
+        else:
+            draft.tokens.append(tokens[0])
+            draft.beside.append(tokens[1])
+            draft.alphabet = max(draft.alphabet, int(tokens[0].max()) + 1)
+    coded = [chain for chain in drafts if too_large.isdisjoint(map(id, chain))]
     report(0.2)
     for draft, weights, cells in _contexts(coded, layout, run):
         draft.weights.append(weights)
@@ -272,21 +278,20 @@ class _Draft:
     """A section on its way to bytes.
 
     Attributes:
-        tokens: of each stream, (steps, lanes), and the bits beside; None for one with an integer too large.
+        tokens: of each stream, (steps, lanes), as long as they are needed.
+        beside: the bits beside them.
+        alphabet: one more than the largest token.
         weights: of each coefficient, (channels, terms).
         cells: of each stream, (steps, lanes): expected size · alphabet + token.
     """
 
     section: Streams
-    tokens: list[tuple[U8, NDArray[np.bool_]] | None] = field(default_factory=list)
+    tokens: list[U8 | None] = field(default_factory=list)
+    beside: list[NDArray[np.bool_]] = field(default_factory=list)
+    alphabet: int = 1
     weights: list[NDArray[np.int16]] = field(default_factory=list)
     cells: list[U16] = field(default_factory=list)
     stored: bytes = b""
-
-    @property
-    def alphabet(self) -> int:
-        """One more than the largest token."""
-        return max(int(tokens[0].max()) for tokens in self.tokens if tokens) + 1
 
 
 def _tokens_of(section: Streams, stream: int, layout: _Layout) -> tuple[U8, NDArray[np.bool_]] | None:
@@ -302,14 +307,16 @@ def _contexts(
     chains: list[list[_Draft]], layout: _Layout, run: Run
 ) -> Iterator[tuple[_Draft, NDArray[np.int16], list[U16]]]:
     """Weights and cells of every coefficient of some chains, in order."""
-    alphabets = {id(draft): draft.alphabet for chain in chains for draft in chain}
     jobs = [(chain, draft, s) for chain in chains for draft in chain for s in range(0, len(draft.tokens), _CHANNELS)]
     shape = (layout.lanes.steps, layout.lanes.number)
     sums = {id(chain): [np.zeros(shape, np.int32)] * _CHANNELS for chain in chains}
 
     def measure(part: list[tuple[list[_Draft], _Draft, int]]) -> tuple[list[list[U8]], I32, I32]:
         """Sizes and recent ones of some coefficients; of several at once, as it takes a call a step."""
-        tokens = [[pair[0] for pair in draft.tokens[s : s + _CHANNELS] if pair] for _, draft, s in part]
+        tokens = []
+        for _, draft, s in part:
+            tokens.append([token for token in draft.tokens[s : s + _CHANNELS] if token is not None])
+            draft.tokens[s : s + _CHANNELS] = [None] * len(tokens[-1])
         sizes = np.empty((sum(map(len, tokens)), *shape), np.int32)
         of_all = [(token, draft) for (_, draft, _), own in zip(part, tokens, strict=True) for token in own]
         for size, (token, draft) in zip(sizes, of_all, strict=True):
@@ -320,7 +327,7 @@ def _contexts(
         draft, before, tokens, sizes, recent = job
         weights = _fit(before, sizes, recent, layout.fitted)
         cells = [
-            _cells([*before, *sizes[:c], recent[c]], weights[c], token, alphabets[id(draft)])
+            _cells([*before, *sizes[:c], recent[c]], weights[c], token, draft.alphabet)
             for c, token in enumerate(tokens)
         ]
         return draft, weights, cells
@@ -345,22 +352,20 @@ def _contexts(
 
 def _finish(draft: _Draft, layout: _Layout) -> tuple[rans.Tokens, bytes]:
     """What the range coder takes of a section, and the stored bytes before its own."""
-    alphabet = draft.alphabet
     channels = range(min(_CHANNELS, len(draft.cells)))
-    models = [_fit_model(draft.cells[c::_CHANNELS], layout.idle, alphabet) for c in channels]
+    models = [_fit_model(draft.cells[c::_CHANNELS], layout.idle, draft.alphabet) for c in channels]
     for cells in draft.cells:
-        cells.ravel()[layout.idle] = (_LARGEST_SIZE + 1) * alphabet
+        cells.ravel()[layout.idle] = (_LARGEST_SIZE + 1) * draft.alphabet
     description = zstandard.ZstdCompressor(level=19, write_checksum=False).compress(
         np.concatenate(draft.weights).astype(_WEIGHTS).tobytes() + b"".join(model.to_bytes() for model in models)
     )
-    beside = np.packbits(np.concatenate([bits for _, bits in filter(None, draft.tokens)]), bitorder="little").tobytes()
+    beside = np.packbits(np.concatenate(draft.beside), bitorder="little").tobytes()
     tokens = rans.Tokens(
         draft.cells,
         [s % _CHANNELS for s in range(len(draft.cells))],
         [model.frequencies for model in models],
         [model.classes for model in models],
     )
-    draft.tokens.clear()
     return tokens, b"".join([_HEAD.pack(len(description), len(beside)), description, beside])
 
 
