@@ -329,7 +329,7 @@ def test_programs_are_built_once(device: Device) -> None:
 def test_headers_are_included_once() -> None:
     source = kernel_source("project.cl")
     assert "#include" not in source
-    assert source.count("typedef struct {") == 1
+    assert source.count("#define TILE ") == 1
 
 
 def test_failing_build_names_the_device(device: Device) -> None:
