@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -11,9 +11,9 @@ from numpy.typing import NDArray
 
 from potr_cl.cameras import Camera
 from potr_cl.device import Device
-from potr_cl.errors import DataError, DeviceError, UsageError
+from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, UsageError
 from potr_cl.formats import load_cameras, load_scene
-from potr_cl.rasterizer import GSPLAT, INRIA, TILE, Rasterizer, RasterRules, View, render
+from potr_cl.rasterizer import GSPLAT, INRIA, TILE, Rasterizer, RasterRules, View, ViewSet, render
 from potr_cl.scene import Scene
 from tests import reference
 from tests.devices import KERNELS, open_device
@@ -136,6 +136,56 @@ def test_prepared_views_composite_as_rendered(device: Device) -> None:
     for view in views:
         assert view.capacity == view.entry_count > 0
         view.free()
+    rasterizer.free()
+
+
+def test_views_of_a_set_are_those_prepared_alone(device: Device) -> None:
+    """Different sizes, one view that sees nothing, lists one behind the other."""
+    if device.family == "cpu":
+        pytest.skip("CPU kernels take one view at a time")
+    scene = random_splats(2000, 2, seed=4)
+    rasterizer = Rasterizer(device, scene)
+    cameras = [tilted_camera(1, 64, 64), tilted_camera(2, 120, 33, offset=1e4), tilted_camera(3, 17, 15)]
+    views = rasterizer.prepare_set(cameras)
+    offsets = views.read_offsets()
+    entries = device.download(views.entries, (views.capacity,), np.uint32)
+    patches = device.download(views.patches, (views.capacity,), np.uint16)
+    for i, view in enumerate(cameras):
+        alone = rasterizer.prepare(view)
+        part = slice(views.entry_starts[i], views.entry_starts[i + 1])
+        own_offsets, own_entries = read_lists(device, alone)
+        assert np.array_equal(offsets[i], own_offsets)
+        assert np.array_equal(entries[part], own_entries)
+        own_patches = device.download(alone.owner.patches, (alone.entry_count,), np.uint16)
+        assert np.array_equal(patches[part], own_patches)
+        assert views.views[i].entry_count == alone.entry_count
+        assert (alone.entry_count == 0) == (i == 1)
+        alone.free()
+    views.free()
+    rasterizer.free()
+
+
+@pytest.mark.parametrize("most", [None, 2])
+def test_pictures_of_several_views_in_one_buffer(
+    device: Device, monkeypatch: pytest.MonkeyPatch, most: int | None
+) -> None:
+    """Those of one after the other, also where the device holds no more than two views at a time."""
+    rasterizer = Rasterizer(device, random_splats(500, 1, seed=5))
+    prepare_set = Rasterizer.prepare_set
+
+    def at_most(self: Rasterizer, cameras: Sequence[Camera]) -> ViewSet:
+        if most is not None and len(cameras) > most:
+            raise DeviceMemoryError("too many views")
+        return prepare_set(self, cameras)
+
+    monkeypatch.setattr(Rasterizer, "prepare_set", at_most)
+    cameras = [tilted_camera(1, 64, 64), tilted_camera(2, 50, 33), *(tilted_camera(seed, 17, 15) for seed in range(3))]
+    wanted = [rasterizer.render(view)[0].reshape(-1, 3) for view in cameras]
+    pixels = sum(map(len, wanted))
+    buffer = device.allocate(12 * pixels, "pictures")
+    rasterizer.render_into(cameras, buffer)
+    assert np.array_equal(device.download(buffer, (pixels, 3), np.float32), np.concatenate(wanted))
+    device.free(buffer)
     rasterizer.free()
 
 

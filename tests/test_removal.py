@@ -175,6 +175,23 @@ def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, lego_ex
     assert np.array_equal(*results)
 
 
+def test_buffers_too_small_for_all_views_change_nothing(device, lego_excerpt, lego_excerpt_cameras, monkeypatch):
+    """A device that allows no large buffer has fewer views at a time, and keeps them all."""
+    cameras, results, sets = lego_excerpt_cameras[:7], [], []
+    for largest in (device.info.largest_buffer, 3 * 12 * cameras[0].width * cameras[0].height):
+        monkeypatch.setattr(device, "info", dataclasses.replace(device.info, largest_buffer=largest))
+        rasterizer = Rasterizer(device, lego_excerpt)
+        removal = RemovalSweep(rasterizer, cameras, SweepOptions(0))
+        removal.measure()
+        removal.remove(np.arange(0, 1500, 10))
+        results.append(np.stack(removal.measure())[:, np.arange(1, 1500, 10)])
+        assert removal.kept_views == 7
+        sets.append(len(removal._kept))
+        finish(rasterizer, removal)
+    assert np.array_equal(*results)
+    assert sets == ([7, 7] if device.family == "cpu" else [1, 4])  # of at most two views
+
+
 def test_views_in_turns(device, lego_excerpt, lego_excerpt_cameras):
     rasterizer = Rasterizer(device, lego_excerpt)
     removal = RemovalSweep(rasterizer, lego_excerpt_cameras[:4], SweepOptions(-1, turns=2))
