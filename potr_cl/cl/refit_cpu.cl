@@ -11,17 +11,6 @@
 #include "patch_vectors.clh"
 #include "refit.clh"
 
-/* T alpha of one splat in LANES pixels, whose transmittances t move on; negative ones belong to pixels that have ended. */
-#define BLEND(weight, power, t)                                     \
-    vfloat alpha = exp2_polynomial(power);                          \
-    alpha = LESSER(alpha, (vfloat)(ALPHA_CAP));                     \
-    alpha = (power) >= LOG2_ALPHA_MIN ? alpha : (vfloat)(0.0f);     \
-    const vfloat before = t;                                        \
-    const vfloat after = MAD(-alpha, before, before);               \
-    const vint goes_on = after >= STOP;                             \
-    const vfloat weight = goes_on ? alpha * before : (vfloat)(0.0f); \
-    t = goes_on ? after : NEGATIVE(before)
-
 kernel void refit_sweep(
     global const float4 *shapes,
     global const float4 *colours,

@@ -78,14 +78,7 @@ kernel void removal(
             for (; todo; todo &= todo - 1) {
                 const int i = LOWEST_PATCH(todo);
                 const vfloat power = patch_power(&splat, i, origin);
-                vfloat alpha = exp2_polynomial(power);
-                alpha = LESSER(alpha, (vfloat)(ALPHA_CAP));
-                alpha = power >= LOG2_ALPHA_MIN ? alpha : (vfloat)(0.0f);
-                const vfloat before = t[i];
-                const vfloat after = MAD(-alpha, before, before);
-                const vint goes_on = after >= STOP;
-                const vfloat weight = goes_on ? alpha * before : (vfloat)(0.0f);
-                t[i] = goes_on ? after : NEGATIVE(before);
+                BLEND(weight, power, t[i]);
                 last[i] = goes_on ? place : last[i];
                 r[i] = MAD(weight, (vfloat)(splat.red), r[i]);
                 g[i] = MAD(weight, (vfloat)(splat.green), g[i]);
