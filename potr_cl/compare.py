@@ -6,9 +6,8 @@ A is the reference scene (uncompressed), B the candidate. With photographs, both
 from __future__ import annotations
 
 import math
-import os
 from collections import deque
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from pathlib import Path
@@ -20,10 +19,12 @@ from numpy.typing import NDArray
 from potr_cl.cameras import Camera
 from potr_cl.errors import UsageError
 from potr_cl.formats.view_files import IMAGE_SUFFIXES, stem
-from potr_cl.images import image_size, read_photograph, to_8_bits
-from potr_cl.metrics import Lpips, psnr, ssim
+from potr_cl.images import Colour, image_size, read_photograph, to_8_bits
+from potr_cl.metrics import Lpips
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.scene import FloatArray, Scene
+from potr_cl.similarity import Picture, Similarity, in_batches, place_pictures, rendered
+from potr_cl.threads import thread_pool
 
 _TITLES = {
     "b_against_a": "B against A",
@@ -32,8 +33,8 @@ _TITLES = {
     "loss": "loss by photo",
 }
 
-#: Views judged at a time: each takes some ten times the memory of its picture.
-_MOST_THREADS = 8
+#: Photographs read before they are needed.
+_READ_AHEAD = 32
 
 #: Factors by which an error map may be amplified.
 _FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
@@ -90,13 +91,10 @@ class Comparison:
     Attributes:
         views: in the order of the cameras.
         worst: index of the view with the lowest PSNR of B against A.
-        worst_a, worst_b: (H, W, 3) float32, that view's pictures.
     """
 
     views: list[ViewFigures]
     worst: int
-    worst_a: FloatArray
-    worst_b: FloatArray
 
 
 def find_photographs(folder: Path, cameras: Sequence[Camera]) -> dict[str, Path]:
@@ -153,7 +151,7 @@ def compare(
     """Render every view of both scenes and compare.
 
     Args:
-        a, b: the reference scene and the candidate, with the same rules and background.
+        a, b: the reference scene and the candidate, on one device, with the same rules and background.
         cameras: at least one.
         photographs: by view name, see :func:`find_photographs`.
         lpips: the metric, where it is installed.
@@ -165,47 +163,52 @@ def compare(
         DeviceError: a view does not fit the device.
     """
 
-    def against(image: NDArray[Any], reference: NDArray[Any]) -> Figures:
-        return Figures(psnr(image, reference), ssim(image, reference), lpips(image, reference) if lpips else None)
-
-    def judge(camera: Camera, picture_a: FloatArray, picture_b: FloatArray) -> ViewFigures:
-        figures = {"b_against_a": against(picture_b, picture_a)}
-        if photographs is not None:
-            photograph = read_photograph(photographs[camera.name], a.background)
-            figures["a_against_photograph"] = against(picture_a, photograph)
-            figures["b_against_photograph"] = against(picture_b, photograph)
-            figures["loss"] = _loss(figures["a_against_photograph"], figures["b_against_photograph"])
-        return ViewFigures(camera.name, figures)
-
     stage = f"comparing {len(cameras)} view{'s' if len(cameras) > 1 else ''}"
+    device, similarity = a.device, Similarity(a.device)
     views: list[ViewFigures] = []
-    worst = 0
-    worst_pictures: tuple[FloatArray, FloatArray] | None = None
-    pending: deque[tuple[FloatArray, FloatArray, Future[ViewFigures]]] = deque()
 
-    def take() -> None:
-        nonlocal worst, worst_pictures
-        picture_a, picture_b, judged = pending.popleft()
-        view = judged.result()
-        if worst_pictures is None or view.figures["b_against_a"].psnr < views[worst].figures["b_against_a"].psnr:
-            worst, worst_pictures = len(views), (picture_a, picture_b)
-        views.append(view)
-        progress(stage, len(views) / len(cameras))
+    def figures(pairs: list[tuple[Picture, Picture]]) -> list[Figures]:
+        distances = [lpips(*(picture.download(device) for picture in pair)) if lpips else None for pair in pairs]
+        return [Figures(*found, distance) for found, distance in zip(similarity(pairs), distances, strict=True)]
+
+    def judge(some: Sequence[Camera], of_a: list[Picture], of_b: list[Picture]) -> Iterator[ViewFigures]:
+        found = [figures(list(zip(of_b, of_a, strict=True)))]
+        names = ["b_against_a"]
+        if photographs is not None:
+            buffer = device.upload(np.concatenate([next(read).reshape(-1) for _ in some]), "the photographs")
+            try:
+                truths = place_pictures(buffer, some)
+                found += [figures(list(zip(of, truths, strict=True))) for of in (of_a, of_b)]
+            finally:
+                device.free(buffer)
+            found.append([_loss(*losses) for losses in zip(*found[1:], strict=True)])
+            names += ["a_against_photograph", "b_against_photograph", "loss"]
+        for camera, of_view in zip(some, zip(*found, strict=True), strict=True):
+            yield ViewFigures(camera.name, dict(zip(names, of_view, strict=True)))
 
     progress(stage, 0.0)
-    # The next views are rendered while others are judged; a network of LPIPS uses all processors by itself.
-    threads = 1 if lpips else min(os.cpu_count() or 1, _MOST_THREADS)
-    with ThreadPoolExecutor(threads) as pool:
-        for camera in cameras:
-            picture_a, picture_b = a.render(camera)[0], b.render(camera)[0]
-            pending.append((picture_a, picture_b, pool.submit(judge, camera, picture_a, picture_b)))
-            if len(pending) > threads:
-                take()
-        while pending:
-            take()
-    if worst_pictures is None:
+    with thread_pool() as pool:
+        read = _photographs(pool, [photographs[camera.name] for camera in cameras] if photographs else [], a.background)
+        for some in in_batches(device, cameras):
+            with rendered(a, some) as of_a, rendered(b, some) as of_b:
+                for view in judge(some, of_a, of_b):
+                    views.append(view)
+                    progress(stage, len(views) / len(cameras))
+    if not views:
         raise UsageError("there is no view to compare")
-    return Comparison(views, worst, *worst_pictures)
+    worst = min(range(len(views)), key=lambda number: views[number].figures["b_against_a"].psnr)
+    return Comparison(views, worst)
+
+
+def _photographs(pool: ThreadPoolExecutor, paths: Sequence[Path], background: Colour) -> Iterator[FloatArray]:
+    """The photographs in order, some read ahead."""
+    pending: deque[Future[FloatArray]] = deque()
+    for path in paths:
+        pending.append(pool.submit(read_photograph, path, background))
+        if len(pending) > _READ_AHEAD:
+            yield pending.popleft().result()
+    while pending:
+        yield pending.popleft().result()
 
 
 def _loss(a: Figures, b: Figures) -> Figures:

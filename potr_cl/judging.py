@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 from typing import Literal
 
@@ -14,9 +15,9 @@ from potr_cl.compare import Comparison, compare
 from potr_cl.device import Device
 from potr_cl.errors import UsageError
 from potr_cl.images import Colour
-from potr_cl.metrics import psnr
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.scene import FloatArray, Scene
+from potr_cl.similarity import Picture, Similarity, in_batches, rendered
 from potr_cl.virtual_cameras import is_virtual
 
 #: So many training views, spread evenly, stand for all of them where there are no test views.
@@ -90,8 +91,10 @@ class Judge:
         self._device = device
         self._background = background
         self._reference = Rasterizer(device, scene, background=background)
-        self._pictures: dict[str, FloatArray] = {}
-        self._room = _KEPT_PICTURES
+        self._similarity = Similarity(device)
+        self._pictures: dict[str, Picture] = {}
+        self._kept = ExitStack()
+        self._room = min(_KEPT_PICTURES, device.info.memory // 16)
 
     def psnr(self, candidate: Scene, most: int | None = None) -> float:
         """Mean over the views of the PSNR against the uncompressed scene's pictures, in decibels.
@@ -106,21 +109,31 @@ class Judge:
         if most is not None and most < len(views):
             views = [views[k] for k in np.linspace(0, len(views) - 1, most).round().astype(int)]
         rasterizer = Rasterizer(self._device, candidate, background=self._background)
+        values: list[float] = []
         try:
-            values = [psnr(rasterizer.render(camera)[0], self._picture(camera)) for camera in views]
+            for some in in_batches(self._device, views):
+                with self._references(some) as references, rendered(rasterizer, some) as pictures:
+                    values += [psnr for psnr, _ in self._similarity(list(zip(pictures, references, strict=True)))]
         finally:
             rasterizer.free()
         finite = [value for value in values if math.isfinite(value)]
         return sum(finite) / len(finite) if finite else math.inf
 
-    def _picture(self, camera: Camera) -> FloatArray:
-        picture = self._pictures.get(camera.name)
-        if picture is None:
-            picture, _ = self._reference.render(camera)
-            if picture.nbytes <= self._room:
-                self._room -= picture.nbytes
-                self._pictures[camera.name] = picture
-        return picture
+    @contextmanager
+    def _references(self, cameras: Sequence[Camera]) -> Iterator[list[Picture]]:
+        """The uncompressed scene's pictures; kept from one candidate to the next while there is room."""
+        missing = [camera for camera in cameras if camera.name not in self._pictures]
+        with ExitStack() as stack:
+            new: list[Picture] = []
+            if missing:
+                nbytes = sum(12 * camera.width * camera.height for camera in missing)
+                keep = nbytes <= self._room
+                new = (self._kept if keep else stack).enter_context(rendered(self._reference, missing))
+                if keep:
+                    self._room -= nbytes
+                    self._pictures |= {camera.name: picture for camera, picture in zip(missing, new, strict=True)}
+            rest = iter(new)
+            yield [self._pictures.get(camera.name) or next(rest) for camera in cameras]
 
     def compare(self, candidate: Scene, progress: Callable[[str, float], None]) -> Comparison:
         """PSNR and SSIM from every view; see :func:`potr_cl.compare.compare`."""
@@ -139,10 +152,12 @@ class Judge:
         cameras = [self.views.named(name) for name in names]
         rasterizer = Rasterizer(self._device, candidate, background=self._background)
         try:
-            return [(self._picture(camera), rasterizer.render(camera)[0]) for camera in cameras]
+            return [(self._reference.render(camera)[0], rasterizer.render(camera)[0]) for camera in cameras]
         finally:
             rasterizer.free()
 
     def free(self) -> None:
         """Give all device memory back."""
+        self._kept.close()
+        self._pictures = {}
         self._reference.free()

@@ -1,4 +1,6 @@
-"""PSNR, SSIM and LPIPS of two pictures, as the papers of the field compute them.
+"""PSNR, SSIM and LPIPS of two pictures, as the papers of the field compute them: the definitions in double precision.
+
+:mod:`potr_cl.similarity` finds PSNR and SSIM of pictures that lie on a device.
 
 All take (H, W, 3) arrays of colours, clamp them to [0, 1] and do not round them to 8 bits.
 """
@@ -18,10 +20,10 @@ from potr_cl.errors import UsageError
 
 #: SSIM's Gaussian window: 11 x 11 pixels, sigma 1.5; the weights from its centre outwards along one axis.
 _RADIUS = 5
-_WINDOW = np.exp(-np.square(np.arange(_RADIUS + 1)) / (2 * 1.5**2))
-_WINDOW /= _WINDOW[0] + 2 * _WINDOW[1:].sum()
+WINDOW = np.exp(-np.square(np.arange(_RADIUS + 1)) / (2 * 1.5**2))
+WINDOW /= WINDOW[0] + 2 * WINDOW[1:].sum()
 #: The constants that keep its fractions finite: (0.01 L)² and (0.03 L)² for colours up to L = 1.
-_C1, _C2 = 0.01**2, 0.03**2
+C1, C2 = 0.01**2, 0.03**2
 #: Rows of a picture worked on at a time: their temporaries fit a second-level cache.
 _BAND = 32
 
@@ -58,8 +60,8 @@ def ssim(image: NDArray[Any], reference: NDArray[Any]) -> float:
         # Only the sum of the two variances counts.
         mean_x, mean_y, squares, products = (_blurred(v) for v in (x, y, x * x + y * y, x * y))
         mean_product, mean_squares = mean_x * mean_y, mean_x * mean_x + mean_y * mean_y
-        similarity = (2 * mean_product + _C1) * (2 * (products - mean_product) + _C2)
-        similarity /= (mean_squares + _C1) * (squares - mean_squares + _C2)
+        similarity = (2 * mean_product + C1) * (2 * (products - mean_product) + C2)
+        similarity /= (mean_squares + C1) * (squares - mean_squares + C2)
         total += float(similarity.sum())
     return total / image.size
 
@@ -69,11 +71,11 @@ def _blurred(values: NDArray[np.float64]) -> NDArray[np.float64]:
     for axis in (0, 1):
         length = values.shape[axis] - 2 * _RADIUS
         shifted = [values[(slice(None),) * axis + (slice(s, s + length),)] for s in range(2 * _RADIUS + 1)]
-        blurred = shifted[_RADIUS] * _WINDOW[0]
+        blurred = shifted[_RADIUS] * WINDOW[0]
         pair = np.empty_like(blurred)
         for distance in range(1, _RADIUS + 1):
             np.add(shifted[_RADIUS - distance], shifted[_RADIUS + distance], out=pair)
-            pair *= _WINDOW[distance]
+            pair *= WINDOW[distance]
             blurred += pair
         values = blurred
     return values

@@ -116,9 +116,9 @@ def _compare(args: argparse.Namespace) -> None:
         progress = stack.enter_context(contextlib.closing(Progress()))
         comparison = compare(rasterizer_a, rasterizer_b, views, photographs, lpips, progress)
         if picture is not None:
-            pixels, factor = side_by_side(comparison.worst_a, comparison.worst_b)
-            worst = comparison.views[comparison.worst].name
-            text = f"view {worst}: A, B and their difference times {factor}"
+            worst = views[comparison.worst]
+            pixels, factor = side_by_side(*(each.render(worst)[0] for each in (rasterizer_a, rasterizer_b)))
+            text = f"view {worst.name}: A, B and their difference times {factor}"
             write_png(picture, pixels, f"{text}; A is {args.a.name}, B is {args.b.name}")
             notes.append(f"{args.output}: {text}")
     if args.json:
