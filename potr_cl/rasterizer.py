@@ -208,10 +208,15 @@ class View:
 
 def gpu_limits(device: Device) -> dict[str, int]:
     """Macros of the GPU kernels that composite (cl/patch_lists.clh), by what the device can do."""
+    return {"NATIVE_EXP2": int(device.native_exp2)} | totals_limits(device)
+
+
+def totals_limits(device: Device) -> dict[str, int]:
+    """Macros of kernels with exact totals (cl/totals.clh), by what the device can do."""
     extensions = device.info.handle.extensions.split()
     # Elsewhere than in the low word first, the two words of a total would be swapped.
     int64 = "cl_khr_int64_base_atomics" in extensions and device.info.handle.endian_little
-    return {"NATIVE_EXP2": int(device.native_exp2), "INT64_ATOMICS": int(int64)}
+    return {"INT64_ATOMICS": int(int64)}
 
 
 class ViewSet:

@@ -31,7 +31,7 @@ from potr_cl.compaction import REFERENCE_PIXELS
 from potr_cl.device import Device
 from potr_cl.errors import DeviceMemoryError, UsageError
 from potr_cl.quantize import quantize_sh, to_ycocg
-from potr_cl.rasterizer import INRIA, TILE, Rasterizer, RasterRules, ViewSet, camera_struct, gpu_limits
+from potr_cl.rasterizer import INRIA, TILE, Rasterizer, RasterRules, ViewSet, camera_struct, gpu_limits, totals_limits
 from potr_cl.scene import FloatArray, Scene
 
 #: Gives the picture that view number i should show: a device buffer that begins with (H, W, 3) float32, valid until the
@@ -236,7 +236,7 @@ class ColourRefit:
         if device.family == "gpu":
             limits |= gpu_limits(device)
         else:
-            limits["LANES"] = max(device.vector_width, 8)
+            limits |= {"LANES": max(device.vector_width, 8)} | totals_limits(device)
         source = f"refit_{device.family}.cl"
         self._sweeps = [device.kernel(source, "refit_sweep", WEIGHTS=weights, **limits) for weights in (0, 1)]
 

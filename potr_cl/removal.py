@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 from potr_cl.cameras import Camera
 from potr_cl.device import Device
 from potr_cl.errors import DeviceMemoryError, UsageError
-from potr_cl.rasterizer import TILE, Rasterizer, ViewSet, camera_struct, gpu_limits
+from potr_cl.rasterizer import TILE, Rasterizer, ViewSet, camera_struct, gpu_limits, totals_limits
 from potr_cl.scene import FloatArray
 
 F64 = NDArray[np.float64]
@@ -217,7 +217,7 @@ class RemovalSweep:
         if device.family == "gpu":
             limits |= gpu_limits(device)
         else:
-            limits["LANES"] = max(device.vector_width, 8)
+            limits |= {"LANES": max(device.vector_width, 8)} | totals_limits(device)
         self._limits = limits
         self._source = f"removal_{device.family}.cl"
 
