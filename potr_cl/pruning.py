@@ -226,7 +226,7 @@ def prune(
     splats: int,
     options: PruningOptions,
     progress: Callable[[int, int], None] | None = None,
-    after_iteration: Callable[[int, Indices], None] | None = None,
+    after_iteration: Callable[[int], None] | None = None,
 ) -> Pruned:
     """Run the schedule.
 
@@ -235,7 +235,7 @@ def prune(
         splats: N.
         options: thresholds and iterations.
         progress: called with the iterations done and the number of splats left.
-        after_iteration: called with the iteration and the splats that it removed.
+        after_iteration: called with the iteration.
     """
     alive = np.arange(splats, dtype=np.int64)
     iteration_of = np.full(splats, -1, np.int32)
@@ -261,6 +261,6 @@ def prune(
         if progress is not None:
             progress(done, len(alive))
         if after_iteration is not None:
-            after_iteration(iteration, gone)
+            after_iteration(iteration)
     kept = alive[np.argsort(delta_mse[alive], kind="stable")]
     return Pruned(np.concatenate([*removed, kept]), len(kept), iteration_of, done, tuple(history))

@@ -329,7 +329,7 @@ class ViewSet:
     @property
     def nbytes_kept(self) -> int:
         """Bytes of all but shapes and colours."""
-        return (4 + _PATCHES_BYTES[self._device.family]) * self.capacity + 4 * self.tiles
+        return sum(buffer.size for buffer in self._buffers if buffer not in (self.shapes, self.colours))
 
     def free_geometry(self) -> None:
         """Give shapes and colours back, for those who keep the lists and project again (:meth:`Rasterizer.project`)."""

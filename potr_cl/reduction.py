@@ -6,14 +6,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import replace
 
 import numpy as np
-from numpy.typing import NDArray
 
 from potr_cl.cameras import Camera, train_views
 from potr_cl.compaction import Compactor, ViewWeights
 from potr_cl.device import Device
 from potr_cl.errors import UsageError
 from potr_cl.options import EncodeOptions
-from potr_cl.pruning import Pruned, PruningOptions, prune
+from potr_cl.pruning import Pruned, PruningOptions
+from potr_cl.pruning_on_device import prune_scene
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.refit import RefitOptions, RenderedTargets, refit_colours
 from potr_cl.removal import RemovalSweep
@@ -80,7 +80,8 @@ def reduce_scene(
     def refit() -> None:
         nonlocal sh
         report("refit", 0.0)
-        left = np.flatnonzero(alive)
+        assert removal is not None
+        left = np.flatnonzero(removal.alive)
         source = Rasterizer(device, scene, background=options.background)
         try:
             refitted = refit_colours(
@@ -98,12 +99,10 @@ def reduce_scene(
         sh[left] = refitted.sh
         report("refit", 1.0)
 
-    alive = np.ones(len(scene), bool)
     refits = {max(round(part * options.iterations), 1) for part in options.refit_at}
 
-    def after_iteration(iteration: int, gone: NDArray[np.int64]) -> None:
+    def after_iteration(iteration: int) -> None:
         assert removal is not None
-        alive[gone] = False
         if not compacted and iteration + 1 >= options.compact_at * options.iterations:
             compact()
             removal.replace_sh(sh)
@@ -119,9 +118,8 @@ def reduce_scene(
         survivors = np.arange(len(scene))
         if options.prune:
             report("prune", 0.0)
-            pruned = prune(
+            pruned = prune_scene(
                 removal,
-                len(scene),
                 schedule,
                 lambda done, kept: report("prune", min(done / options.iterations, 0.99)),
                 after_iteration,

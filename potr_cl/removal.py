@@ -30,10 +30,16 @@ Indices = NDArray[np.int64]
 
 #: Views that a GPU does in one launch.
 _MOST_VIEWS = 32
+#: At least so many launches' views fill the memory budget where it does not hold all.
+_LEAST_SETS = 16
+#: Bytes of a projected splat of a view.
+_BYTES_PROJECTED = 48
 #: Launches that a GPU runs at a time.
 _QUEUES = 4
 #: Where the removal kernels' argument stands that has them store the target.
 _FIRST_TIME = {"cpu": 13, "gpu": 14}
+#: Where the tolerance stands among the arguments of the GPU kernel that follows a removal.
+_TOLERANCE = 10
 #: Work-items of a work-group, of the sweep and of what follows a removal.
 _SWEEP_GROUP = {"cpu": 1, "gpu": 128}
 _STALENESS_GROUP = {"cpu": 1, "gpu": 128}
@@ -164,6 +170,9 @@ class RemovalSweep:
         self._random = np.random.default_rng(self._options.seed)
         self._measured = 0
         self._unsettled = False  # whether a removal is under way
+        self._marked = False  # whether splats were removed that the host has not been told of
+        self._listed: list[int] | None = None  # tiles of each set that the device has listed to be swept
+        self._listed_above = np.inf  # staleness of which it lists them
         self._original_sh: cl.Buffer | None = None
         self.sweeps = 0.0
         self._build()
@@ -189,13 +198,14 @@ class RemovalSweep:
         self._shared: tuple[cl.Buffer, cl.Buffer] | None = None
         self._prepare_all(progress)
         # The kept views' tiles are numbered through: importance removed from each since its last sweep.
-        kept_tiles = sum(swept.views.tiles for swept in self._kept)
+        self._kept_tiles = sum(swept.views.tiles for swept in self._kept)
         self._tile_count = sum(-(-c.width // TILE) * -(-c.height // TILE) for c in cameras)
-        self._stale = np.full(kept_tiles, np.inf, np.float32)
-        self._stale_buffer = device.allocate(4 * self._tile_count, "the tiles' staleness")
+        self._stale = device.upload(np.full(self._kept_tiles, np.inf, np.float32), "the tiles' staleness")
+        self._unused_stale = device.allocate(4 * self._tile_count if self._remade else 0, "the tiles' staleness")
         self._tiles = device.allocate(4 * self._tile_count, "the tiles to sweep")
-        for swept in self._kept:
-            self._bind(swept, True, self._totals)
+        self._listed_buffer = device.allocate(4 * len(self._kept), "the numbers of tiles to sweep")
+        for place, swept in enumerate(self._kept):
+            self._bind(swept, True, self._totals, place)
         if device.family == "gpu" and not self._shared:
             # A set's longest tile list keeps one work-group busy when all others are done: other sets fill the gap.
             self._queues = [
@@ -235,16 +245,6 @@ class RemovalSweep:
                     raise
                 most //= 2
                 continue
-            # The first views stand for the others: geometry is kept for all of them or for none.
-            if number == 0 and self._views * self._bytes_kept(swept) > self._budget * len(swept.numbers):
-                if most > 1:  # what is not kept is made again one by one
-                    swept.free(self._device)
-                    most = 1
-                    continue
-                self._shared = (
-                    self._device.allocate(32 * self._rasterizer.stride, "the projected splats"),
-                    self._device.allocate(16 * self._rasterizer.stride, "the projected splats' colours"),
-                )
             if self._keep(swept):
                 first_tile += swept.views.tiles
             number += len(swept.numbers)
@@ -252,11 +252,12 @@ class RemovalSweep:
                 progress(number, self._views)
 
     def _most_views(self) -> int:
-        """Views to do in one launch: on a GPU as many as surely are a small part of the memory budget."""
+        """Views to do in one launch: on a GPU as many as surely are a small part of the memory budget, which is used
+        up a launch's views at a time."""
         if self._device.family == "cpu":
             return 1
-        least = 48 * self._rasterizer.stride + 12 * self._pixels
-        return int(min(max(self._budget // (2 * least), 1), _MOST_VIEWS))
+        least = _BYTES_PROJECTED * self._rasterizer.stride + 12 * self._pixels
+        return int(min(max(self._budget // (_LEAST_SETS * least), 1), _MOST_VIEWS))
 
     def _prepare(self, numbers: range, first_tile: int = 0) -> _Swept:
         """Prepare the views of these numbers.
@@ -286,32 +287,50 @@ class RemovalSweep:
     def _zero_sums(self, swept: _Swept) -> None:
         cl.enqueue_fill_buffer(self._device.queue, swept.sums, np.float32(0), 0, swept.sums.size)
 
-    def _bytes_kept(self, swept: _Swept, geometry: bool = True) -> int:
-        views = swept.views
-        lists = views.nbytes_kept + 8 * views.capacity + 4 * views.tiles + 12 * views.pixels
-        return lists + (48 * self._rasterizer.stride * len(views.views) if geometry else 0)
+    def _bytes_of_lists(self, swept: _Swept) -> int:
+        """What a set takes without its geometry."""
+        own: int = swept.lengths.size + swept.sums.size + swept.target.size
+        return swept.views.nbytes_kept + own
+
+    def _bytes_of_geometry(self, swept: _Swept) -> int:
+        return _BYTES_PROJECTED * self._rasterizer.stride * len(swept.views.views)
 
     def _keep(self, swept: _Swept) -> bool:
-        """Keep prepared views as far as the budget allows; whether it does."""
-        self._budget -= self._bytes_kept(swept, not self._shared)
-        if self._budget < 0:
-            self._budget = 0
+        """Keep prepared views as far as the budget allows; whether it does.
+
+        Lists take longer to make again than geometry, which is given up for them: that of the newest views first.
+        """
+        to_spare = [other for other in (*self._kept, swept) if other.views.shapes is not None]
+        shared = 0 if self._shared else self._bytes_of_geometry(max(to_spare, key=self._bytes_of_geometry))
+        needed = self._bytes_of_lists(swept)
+        if needed + shared > self._budget + sum(map(self._bytes_of_geometry, to_spare[:-1])):
             self._remade.append(swept.numbers)
             swept.free(self._device)
             return False
-        if self._shared:
-            swept.views.free_geometry()
         self._kept.append(swept)
+        self._budget -= needed + self._bytes_of_geometry(swept)
+        while self._budget < 0:
+            other = to_spare.pop()
+            self._budget += self._bytes_of_geometry(other)
+            other.views.free_geometry()
+            if self._shared is None:
+                self._budget -= shared
+                splats = shared // _BYTES_PROJECTED
+                self._shared = (
+                    self._device.allocate(32 * splats, "the projected splats"),
+                    self._device.allocate(16 * splats, "the projected splats' colours"),
+                )
         return True
 
-    def _bind(self, swept: _Swept, first: bool, totals: cl.Buffer) -> None:
-        """Kernels of its own for a set: setting their arguments takes longer than launching them."""
+    def _bind(self, swept: _Swept, first: bool, totals: cl.Buffer, place: int | None = None) -> None:
+        """Kernels of its own for a set, kept at this place or not at all: setting their arguments takes longer than
+        launching them."""
         device, views, stride = self._device, swept.views, np.uint32(self._rasterizer.stride)
         shapes, colours = self._shared if views.shapes is None and self._shared else (views.shapes, views.colours)
         background = (np.float32(channel) for channel in self._rasterizer.background)
         swept.sweep = device.kernel(self._source, "removal", **self._limits)
         swept.staleness = device.kernel(self._source, "staleness", **self._limits)
-        gone = (np.uint32(swept.first_tile), self._stale_buffer)
+        gone = (np.uint32(swept.first_tile), self._unused_stale if place is None else self._stale)
         if device.family == "cpu":
             (view,) = views.views
             weight = self._pixels / views.pixels
@@ -354,7 +373,8 @@ class RemovalSweep:
             swept.sums,
             totals,
         )
-        swept.staleness.set_args(self._alive_buffer, *table, *lists, swept.sums, *gone)
+        listing = (np.float32(np.inf), self._tiles, np.uint32(place or 0), self._listed_buffer)
+        swept.staleness.set_args(self._alive_buffer, *table, *lists, swept.sums, *gone, *listing)
 
     def _sweep(self, swept: _Swept, start: int, count: int, queue: cl.CommandQueue | None = None) -> None:
         """Sweep ``count`` tiles of a set, listed in the tile buffer from ``start`` on."""
@@ -398,7 +418,8 @@ class RemovalSweep:
         """Sweep the kept views' tiles that have lost more than ``tolerance``, of every so many-th view only, and of
         those only a random part."""
         self._settle()
-        wanted = self._stale > tolerance
+        stale = self._device.download(self._stale, (self._kept_tiles,), np.float32)
+        wanted = stale > tolerance
         starts = np.array([swept.first_tile for swept in self._kept] + [len(wanted)], np.int64)
         if turns > 1:
             tile = 0
@@ -412,15 +433,34 @@ class RemovalSweep:
         numbers = np.flatnonzero(wanted)
         bounds = np.searchsorted(numbers, starts)
         self._list_tiles(numbers - np.repeat(starts[:-1], np.diff(bounds)))
+        self._sweep_listed(bounds[:-1].tolist(), np.diff(bounds).tolist())
+        stale[numbers] = 0 if self._options.tolerance >= 0 else np.inf
+        if len(numbers):
+            cl.enqueue_copy(self._device.queue, self._stale, stale, is_blocking=True)
+        self._wait()
+
+    def _sweep_listed(self, starts: Sequence[int], counts: Sequence[int]) -> None:
+        """Enqueue the sweep of so many tiles of each kept set, listed in the tile buffer from these starts on."""
         self._enqueue(
             [
-                functools.partial(self._sweep, swept, int(start), int(stop - start))
-                for swept, (start, stop) in zip(self._kept, itertools.pairwise(bounds), strict=True)
-                if stop > start
+                functools.partial(self._sweep, swept, start, count)
+                for swept, start, count in zip(self._kept, starts, counts, strict=True)
+                if count
             ]
         )
-        self._stale[numbers] = 0 if self._options.tolerance >= 0 else np.inf
-        self._wait()
+
+    def _sweep_anew(self) -> None:
+        """Bring the totals of the kept views up to date."""
+        options = self._options
+        if self._listed is not None:
+            self._sweep_what_is_listed()
+        else:
+            sampled = 0 < self._measured <= options.sampled
+            turns, sample = options.turns if self._measured else 1, options.sample if sampled else 1
+            self._sweep_stale(options.tolerance, turns, sample)
+        if self._measured == 0:
+            for swept in self._kept:
+                swept.sweep.set_arg(_FIRST_TIME[self._device.family], np.int32(0))
 
     def measure(self) -> tuple[F64, F64]:
         """ΔMSE_k and I_k of all N splats, float64; of removed splats they mean nothing.
@@ -428,12 +468,7 @@ class RemovalSweep:
         ΔMSE is the change of the mean squared error over all views, pixels and channels against the uncompressed
         scene's renders if that splat alone went; I the mean over views and pixels of T α.
         """
-        options = self._options
-        sampled = 0 < self._measured <= options.sampled
-        self._sweep_stale(options.tolerance, options.turns if self._measured else 1, options.sample if sampled else 1)
-        if self._measured == 0:
-            for swept in self._kept:
-                swept.sweep.set_arg(_FIRST_TIME[self._device.family], np.int32(0))
+        self._sweep_anew()
         words = self._device.download(self._totals, (self.splats, 2), np.int64)
         if self._remade:
             words += self._measure_transient()
@@ -471,6 +506,7 @@ class RemovalSweep:
     def remove(self, splats: Indices) -> None:
         """Take splats out of all lists; note how much each tile loses."""
         self._settle()
+        self._have_listed(np.inf)
         device = self._device
         self._alive[splats] = 2  # just gone
         cl.enqueue_copy(device.queue, self._alive_buffer, self._alive, is_blocking=True)
@@ -479,14 +515,97 @@ class RemovalSweep:
         self._alive[splats] = 0
 
     def _settle(self) -> None:
-        """Wait for what follows the last removal."""
-        if not self._unsettled:
-            return
-        self._unsettled = False
-        self._wait()
+        """Wait for what follows the last removal, and for what the device has listed on its own."""
+        if self._listed is not None:
+            self._sweep_what_is_listed()
+        self._agree_on_marks()
+
+    def _agree_on_marks(self) -> None:
+        """Have host and device know the same splats as left, and none as just gone."""
         device = self._device
-        self._stale += device.download(self._stale_buffer, self._stale.shape, np.float32)
+        if self._unsettled:
+            self._unsettled = False
+            self._wait()
+        elif self._marked:
+            self._marked = False
+            self._alive = device.download(self._alive_buffer, self._alive.shape, np.uint8)
+            self._alive[self._alive == 2] = 0
+        else:
+            return
         cl.enqueue_copy(device.queue, self._alive_buffer, self._alive, is_blocking=True)
+
+    # ------------------------------------------------------------- for a controller that lives on the device itself
+
+    @property
+    def steerable(self) -> bool:
+        """Whether the device can decide what to remove and to sweep (:mod:`potr_cl.pruning_on_device`)."""
+        options = self._options
+        skips = options.turns > 1 or options.sample < 1
+        return self._device.family == "gpu" and not self._remade and not skips
+
+    @property
+    def device(self) -> Device:
+        """Where everything is."""
+        return self._device
+
+    @property
+    def limits(self) -> dict[str, float | int]:
+        """Macros that the sweep's kernels are built with."""
+        return self._limits
+
+    @property
+    def units(self) -> tuple[float, float]:
+        """ΔMSE and I of 1 in the totals."""
+        importance = 1 / (self._scale * self._pixels * self._views)
+        return importance / 3, importance
+
+    @property
+    def totals(self) -> cl.Buffer:
+        """(N, 2) int64 in the device's memory: ΔMSE_k and I_k in :attr:`units`."""
+        return self._totals
+
+    @property
+    def marks(self) -> cl.Buffer:
+        """(N,) uint8 in the device's memory: 1 for splats that are left, 2 for those that :meth:`remove_marked` shall
+        take out; whoever marks next makes 0 of 2."""
+        return self._alive_buffer
+
+    def measure_on_device(self) -> None:
+        """Bring :attr:`totals` up to date."""
+        self._sweep_anew()
+        self._measured += 1
+
+    def remove_marked(self) -> None:
+        """Take the splats out that are marked 2; the device lists the tiles that the next measurement sweeps."""
+        device = self._device
+        cl.enqueue_fill_buffer(device.queue, self._listed_buffer, np.uint32(0), 0, 4 * len(self._kept))
+        self._have_listed(self._options.tolerance)
+        for swept in self._kept:
+            self._after_removal(swept)
+        self._marked = True
+        self._listed = device.download(self._listed_buffer, (len(self._kept),), np.uint32).tolist()
+
+    def _have_listed(self, tolerance: float) -> None:
+        """Have the device list the tiles that are staler than this from now on, on its own."""
+        if tolerance != self._listed_above:
+            self._listed_above = tolerance
+            for swept in self._kept:
+                swept.staleness.set_arg(_TOLERANCE, np.float32(tolerance))
+
+    def _sweep_what_is_listed(self) -> None:
+        assert self._listed is not None
+        counts, self._listed = self._listed, None
+        self._sweep_listed([swept.first_tile for swept in self._kept], counts)
+        self._wait()
+
+    # ---------------------------------------------------------------------------------------------------------------
+
+    @property
+    def alive(self) -> NDArray[np.bool_]:
+        """(N,) which splats are left."""
+        self._agree_on_marks()
+        alive: NDArray[np.bool_] = self._alive[: self.splats] == 1
+        return alive
 
     def replace_sh(self, sh: FloatArray) -> None:
         """Go on with other colours: (N, M, 3) float32 of the same degree. The targets stay as they are."""
@@ -549,14 +668,24 @@ class RemovalSweep:
 
     def sweep_everything(self) -> None:
         """Have the next measurement sweep every tile, whatever has changed."""
-        self._stale[:] = np.inf
+        self._settle()
+        if self._kept_tiles:
+            cl.enqueue_fill_buffer(self._device.queue, self._stale, np.float32(np.inf), 0, 4 * self._kept_tiles)
 
     def free(self) -> None:
         """Give all device memory back."""
         for swept in self._kept:
             swept.free(self._device)
         self._kept = []
-        for buffer in (self._alive_buffer, self._totals, self._tiles, self._stale_buffer, *(self._shared or ())):
+        for buffer in (
+            self._alive_buffer,
+            self._totals,
+            self._tiles,
+            self._stale,
+            self._unused_stale,
+            self._listed_buffer,
+            *(self._shared or ()),
+        ):
             self._device.free(buffer)
         if self._original_sh is not None:
             self._device.free(self._original_sh)

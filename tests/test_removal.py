@@ -356,6 +356,33 @@ def test_views_of_different_sizes_count_the_same(device):
         assert np.allclose(together[i], (separate[0][i] + separate[1][i]) / 2, rtol=1e-5, atol=1e-13)
 
 
+@pytest.mark.parametrize("share", [0.2, 0.3, 0.5, 0.7, 0.95])
+def test_the_memory_budget_is_used_and_not_exceeded(device, share):
+    """Lists first, then geometry of as many views as there is room for; the effects are the same whatever is kept."""
+    scene = visible_scene(3000)
+    cameras = ring_of_cameras(40, size=48)
+    rasterizer = Rasterizer(device, scene)
+
+    def measured(memory):
+        before = device.allocated
+        removal = RemovalSweep(rasterizer, cameras, SweepOptions(memory=memory))
+        taken = device.allocated - before
+        removal.measure()
+        removal.remove(np.arange(0, 3000, 3))
+        effects = np.stack(removal.measure())
+        removal.free()
+        return taken, effects
+
+    nothing, _ = measured(0)
+    everything, expected = measured(None)
+    budget = int(share * (everything - nothing))
+    taken, effects = measured(budget)
+    rasterizer.free()
+    assert 0.9 * budget <= taken - nothing <= 1.001 * budget
+    left = np.arange(3000) % 3 > 0
+    assert (effects[:, left] == expected[:, left]).all()
+
+
 def test_identical_splats_share_their_effect(device):
     scene = visible_scene(1).subset(np.zeros(40, np.int64))
     cameras = ring_of_cameras(2, size=48)

@@ -24,7 +24,8 @@ from potr_cl.device import Device
 from potr_cl.encoder import encode
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.options import EncodeOptions
-from potr_cl.pruning import PruningOptions, prune
+from potr_cl.pruning import PruningOptions
+from potr_cl.pruning_on_device import prune_scene
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.removal import RemovalSweep, SweepOptions
 from potr_cl.scene import Scene
@@ -94,7 +95,7 @@ class Needs:
         """The pruning alone: sweeps of all tiles that it took, and iterations."""
         rasterizer = Rasterizer(self.device, self.scene)
         removal = RemovalSweep(rasterizer, self.views, sweep)
-        pruned = prune(removal, len(self.scene), PruningOptions(threshold, self.iterations))
+        pruned = prune_scene(removal, PruningOptions(threshold, self.iterations))
         swept = removal.sweeps
         removal.free()
         rasterizer.free()

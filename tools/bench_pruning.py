@@ -36,6 +36,7 @@ from potr_cl.device import Device
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.images import read_photograph
 from potr_cl.pruning import Pruned, PruningOptions, prune
+from potr_cl.pruning_on_device import prune_scene
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.removal import RemovalSweep, SweepOptions
 from tools.pruning_baselines import mesongs_power, removal_order, scores, transmittance_sums
@@ -160,8 +161,10 @@ class Bench:
         removal = RemovalSweep(self.rasterizer, cameras, sweep)
         small = RemovalSweep(self.rasterizer, [halved(c) for c in cameras], sweep) if half else None
         prepared = time.perf_counter()
-        effects = HalfSizeFirst(removal, small, half) if small else removal
-        result = prune(effects, len(self.scene), options)
+        if small:
+            result = prune(HalfSizeFirst(removal, small, half), len(self.scene), options)
+        else:
+            result = prune_scene(removal, options)
         self.device.queue.finish()
         ended = time.perf_counter()
         sweeps = removal.sweeps

@@ -173,7 +173,8 @@ kernel void removal(
     }
 }
 
-/* How much of each tile's area the splats that have just gone (alive == 2) covered when the tile was last swept. */
+/* Adds to each tile's staleness how much of its area the splats that have just gone (alive == 2) covered when it was last
+   swept. */
 kernel void staleness(
     global const uchar *alive,
     global const uint *begins,
@@ -189,5 +190,5 @@ kernel void staleness(
     for (uint e = begin; e < end; ++e)
         if (alive[entries[e]] == 2 && sums[e].y >= 0.0f)
             gone += fmax(sums[e].y, LEAST_STALENESS);
-    stale[first + tile] = gone * (1.0f / (TILE * TILE));
+    stale[first + tile] += gone * (1.0f / (TILE * TILE));
 }

@@ -226,8 +226,9 @@ void removal(
     }
 }
 
-/* How much of each tile's area the splats that have just gone (alive == 2) covered when the tile was last swept. On the way
-   the tile's list loses, in place, those that are not alive (!= 1) and those that the last sweep marked. */
+/* Adds to each tile's staleness how much of its area the splats that have just gone (alive == 2) covered when it was last
+   swept. On the way the tile's list loses, in place, those that are not alive (!= 1) and those that the last sweep marked.
+   A tile that is staler than the tolerance is listed to be swept, and is fresh then. */
 kernel __attribute__((reqd_work_group_size(LISTERS, 1, 1)))
 void staleness(
     global const uchar *alive,
@@ -239,7 +240,11 @@ void staleness(
     global ushort *patches,
     global float2 *sums,
     uint first,
-    global float *stale)
+    global float *stale,
+    float tolerance,
+    global uint *tiles,
+    uint set,
+    volatile global uint *listed)
 {
     local float parts[LISTERS];
     /* A bit an entry that goes. Three in turn: one in use, one still being read, one that is cleared. */
@@ -310,7 +315,11 @@ void staleness(
         barrier(CLK_LOCAL_MEM_FENCE);
     }
     if (lid == 0) {
-        stale[first + set_tile] = parts[0] * (1.0f / (TILE * TILE));
+        const float staleness = stale[first + set_tile] + parts[0] * (1.0f / (TILE * TILE));
+        const int wanted = staleness > tolerance;
+        stale[first + set_tile] = wanted ? 0.0f : staleness;
+        if (wanted)
+            tiles[first + atomic_inc(&listed[set])] = set_tile;
         lengths[set_tile] = kept;
     }
 }
