@@ -7,7 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -151,7 +151,7 @@ def mapping(x: F64, a: float) -> F64:
     return mapped
 
 
-def _ascending(score: F64) -> Indices:
+def ascending(score: NDArray[Any]) -> Indices:
     """Stable argsort: by score, ties by number. The unstable sort is ten times as fast, and ties are few."""
     order = np.argsort(score)
     ordered = score[order]
@@ -181,7 +181,7 @@ def choose(delta_mse: F64, importance: F64, alive: Indices, remaining: int, opti
         wanted = effect < options.delta_mse_max
         limit = options.delta_mse_max
     else:
-        cheapest = _ascending(effect)[: max(len(alive) - options.count, 0)]
+        cheapest = ascending(effect)[: max(len(alive) - options.count, 0)]
         wanted = np.zeros(len(alive), bool)
         wanted[cheapest] = True
         limit = float(effect[cheapest[-1]]) if len(cheapest) else 0.0
@@ -195,7 +195,7 @@ def choose(delta_mse: F64, importance: F64, alive: Indices, remaining: int, opti
     if remaining > 1 and len(candidates):
         candidates = candidates[_cheapest(score, weight[candidates], remaining)]
     else:
-        candidates = candidates[_ascending(score)]
+        candidates = candidates[ascending(score)]
     gone: Indices = alive[np.concatenate([unseen, candidates])]
     return gone
 
@@ -217,7 +217,7 @@ def _cheapest(score: F64, weight: F64, remaining: int) -> Indices:
                 break
     else:
         some = np.arange(len(score))
-    some = some[_ascending(score[some])]
+    some = some[ascending(score[some])]
     return some[: int(np.searchsorted(np.cumsum(weight[some]), budget)) + 1]
 
 
@@ -262,5 +262,5 @@ def prune(
             progress(done, len(alive))
         if after_iteration is not None:
             after_iteration(iteration)
-    kept = alive[np.argsort(delta_mse[alive], kind="stable")]
+    kept = alive[ascending(delta_mse[alive])]
     return Pruned(np.concatenate([*removed, kept]), len(kept), iteration_of, done, tuple(history))

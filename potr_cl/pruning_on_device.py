@@ -11,7 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import pyopencl as cl
 
-from potr_cl.pruning import Iteration, Pruned, PruningOptions, prune
+from potr_cl.pruning import Iteration, Pruned, PruningOptions, ascending, prune
 from potr_cl.removal import RemovalSweep
 
 _SOURCE = "choose_gpu.cl"
@@ -115,12 +115,12 @@ class _Controller:
         removed = device.download(self._removed, (n,), _REMOVED)
         iteration = np.where(alive, -1, removed["iteration"].astype(np.int64)).astype(np.int32)
         gone = np.flatnonzero(~alive)
-        gone = gone[np.lexsort((gone, removed["key"][gone], iteration[gone]))]
+        gone = gone[ascending(removed["iteration"][gone].astype(np.uint64) << np.uint64(32) | removed["key"][gone])]
         if len(gone) == n:  # an empty scene is no scene
             alive[gone[-1]], iteration[gone[-1]] = True, -1
             gone = gone[:-1]
         kept = np.flatnonzero(alive)
-        kept = kept[np.argsort(damped[kept], kind="stable")]
+        kept = kept[ascending(damped[kept])]
         order = np.concatenate([gone, kept])
         return Pruned(order, len(kept), iteration, done, self._history(removed[gone], iteration[gone]))
 
