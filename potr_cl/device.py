@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ctypes
 import hashlib
 import importlib.metadata
 import logging
@@ -9,6 +10,7 @@ import os
 import re
 import sys
 import tempfile
+import threading
 import warnings
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
@@ -131,17 +133,57 @@ def _register_intel_runtime() -> None:
 
 
 _devices: list[DeviceInfo] | None = None
+_listing = threading.Lock()
 
 
 def list_devices() -> list[DeviceInfo]:
     """All usable OpenCL devices, in the order of the platforms.
 
-    Platforms that fail to answer or have no device are left out, each with a warning or silently as they deserve.
+    Platforms that fail to answer or have no device are left out, each with a warning or silently as they deserve. The
+    first call loads the drivers; other threads go on meanwhile.
     """
     global _devices
-    if _devices is None:
-        _devices = list(_find_devices())
+    with _listing:
+        if _devices is None:
+            _devices = list(_find_devices())
     return list(_devices)
+
+
+def _loader_function(name: str) -> Any:
+    """A function of the OpenCL loader that pyopencl has loaded; None where it cannot be had.
+
+    pyopencl would call it too, but keep all other threads waiting meanwhile; a driver takes a tenth of a second to load
+    and another to make a context.
+    """
+    try:
+        return getattr(ctypes.CDLL(cl._cl.__file__), name)
+    except (OSError, AttributeError):
+        return None
+
+
+def _load_drivers() -> None:
+    list_platforms, list_handles = _loader_function("clGetPlatformIDs"), _loader_function("clGetDeviceIDs")
+    if list_platforms is None or list_handles is None:
+        return
+    every_type = ctypes.c_uint64(0xFFFFFFFF)
+    count = ctypes.c_uint()
+    list_platforms(0, None, ctypes.byref(count))
+    platforms = (ctypes.c_void_p * count.value)()
+    list_platforms(count, platforms, None)
+    for platform in platforms:
+        list_handles(ctypes.c_void_p(platform), every_type, 0, None, ctypes.byref(count))
+
+
+def _new_context(handle: cl.Device) -> cl.Context:
+    create = _loader_function("clCreateContext")
+    if create is not None:
+        create.restype = ctypes.c_void_p
+        error = ctypes.c_int()
+        devices = (ctypes.c_void_p * 1)(handle.int_ptr)
+        context = create(None, 1, devices, None, None, ctypes.byref(error))
+        if context:
+            return cl.Context.from_int_ptr(context, retain=False)
+    return cl.Context([handle])  # which says what is wrong
 
 
 def _find_devices() -> Iterator[DeviceInfo]:
@@ -149,6 +191,7 @@ def _find_devices() -> Iterator[DeviceInfo]:
         _register_intel_runtime()
     else:
         _register_intel_runtime_on_windows()
+    _load_drivers()
     try:
         platforms = cl.get_platforms()
     except cl.Error as error:  # the loader's way of saying that there is none
@@ -360,7 +403,7 @@ class Device:
         self._build_options = tuple(build_options)
         self._programs: dict[tuple[str, tuple[tuple[str, str], ...]], cl.Program] = {}
         with self.errors("cannot be opened"):
-            self.context = cl.Context([self.info.handle])
+            self.context = _new_context(self.info.handle)
             flags = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
             self.queue = cl.CommandQueue(self.context, self.info.handle, properties=flags)
         if self.info.max_work_group < 256 and self.family == "gpu":

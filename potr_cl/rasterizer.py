@@ -389,13 +389,15 @@ class Rasterizer:
 
         upload = self._upload_columns
         quaternions = scene.quaternions.astype(np.float64)
-        length = np.linalg.norm(quaternions, axis=1, keepdims=True)
+        length = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))[:, None]
         nothing = np.flatnonzero(length == 0)
         length[nothing] = 1
         quaternions /= length
         quaternions[nothing] = (1.0, 0.0, 0.0, 0.0)
         scales = np.minimum(np.exp(np.minimum(scene.log_scales.astype(np.float64), 100)), _LARGEST_SCALE)
-        log2_opacities = -np.logaddexp(0, -scene.opacity_logits.astype(np.float64)) / np.log(2)
+        logits = scene.opacity_logits.astype(np.float64)
+        # log(sigmoid(logit)): logaddexp says the same, and takes eight times as long.
+        log2_opacities = (np.minimum(logits, 0) - np.log1p(np.exp(-np.abs(logits)))) / np.log(2)
         self._parameters = [
             upload(scene.means, 0, "the centres"),
             upload(scales, 0, "the scales"),

@@ -185,6 +185,28 @@ def test_the_report_shows_what_cannot_compile(machine: list[DeviceInfo], faults:
     assert not any(entry["chosen"] for entry in device_report(check=False))  # nothing to take is no reason to fail
 
 
+@pytest.mark.skipif(sys.platform == "win32", reason="a module's own libraries cannot be looked through there")
+def test_other_threads_go_on_while_a_device_is_opened() -> None:
+    """pyopencl's calls keep the interpreter's lock: the loader's own functions are found, and take what it takes."""
+    assert None not in [device_module._loader_function(name) for name in ("clGetPlatformIDs", "clCreateContext")]
+    info = choose_device()
+    assert device_module._new_context(info.handle).devices == [info.handle]
+
+
+def test_without_the_loaders_functions_pyopencl_does_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = list_devices()
+    monkeypatch.setattr(device_module, "_loader_function", lambda name: None)
+    monkeypatch.setattr(device_module, "_devices", None)
+    assert list_devices() == known
+    assert Device().vector_width >= 1
+
+
+def test_a_loader_without_platforms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It leaves the count as it was and returns an error; nothing is asked of it any more."""
+    monkeypatch.setattr(device_module, "_loader_function", lambda name: lambda *arguments: -1001)
+    device_module._load_drivers()
+
+
 def test_compilers_of_this_machine() -> None:
     """A device that is said to compile does, one that is said not to refuses what the others take."""
     for info in list_devices():

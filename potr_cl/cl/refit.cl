@@ -3,7 +3,8 @@
    Coefficient vectors are SH_COUNT x 3 columns of `stride` floats each, column 3 m + c: coefficient m, channel c of
    Y, Co, Cg. R = Y + Co - Cg, G = Y + Cg, B = Y - Co - Cg.
 
-   Macros: LANES, SH_COUNT, WEIGHTS (1: the totals hold the sums of w^2 too). */
+   Macros: LANES, SH_COUNT, WEIGHTS (1: the totals hold the sums of w^2 too, and of the kernels there is gather
+   alone, which takes them). */
 
 #define DOUBLE 0
 #include "reals.clh"
@@ -41,6 +42,7 @@ inline void basis_towards(global const float *means, size_t stride, size_t index
     sh_basis(x * inverse, y * inverse, z * inverse, values);
 }
 
+#if !WEIGHTS
 /* The splats' colours in each view of a set: of the coefficients themselves (direction == 0), cut at 0, w telling which
    channels are free (1, 2, 4: above 0); or their change along a direction, 0 where `free` says that the channel is cut.
    Work-item i of the second dimension does views i, i + get_global_size(1), … */
@@ -88,6 +90,7 @@ kernel void view_colours(
         }
     }
 }
+#endif
 
 /* The totals of a set's views, times the view's scale, onto the coefficients: result += basis x (Y, Co, Cg) of the free
    channels' sums, view by view-> With WEIGHTS also gram += the sum of w^2 x basis x basis. Leaves the totals zero. */
@@ -146,6 +149,7 @@ kernel void gather(
             VSTORE(results[i], index, result + i * stride);
 }
 
+#if !WEIGHTS
 /* sums += (lambda, on AC only, + prior) x coefficients, and 0 where a coefficient is not active. */
 kernel void regularise(
     global float *sums,
@@ -325,3 +329,4 @@ kernel void dot_parts(global const float *x, global const float *y, ulong count,
     parts[first] = sum;
     parts[items + first] = largest;
 }
+#endif

@@ -8,6 +8,7 @@ import dataclasses
 import json
 import sys
 import time
+from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
@@ -41,6 +42,7 @@ from potr_cl.rasterizer import Rasterizer
 from potr_cl.scene import Scene
 from potr_cl.search import Target, encode_to_target
 from potr_cl.summary import encode_report, format_encode_report, quality_report, search_report
+from potr_cl.threads import in_background
 
 
 def _options(args: argparse.Namespace) -> EncodeOptions:
@@ -89,6 +91,11 @@ def _refit_steps(wanted: str) -> int | None:
     return int(wanted)
 
 
+def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
+    """Whether anything may be rendered: to encode, or to judge what was encoded."""
+    return options.prune or options.refit > 0 or options.compact or not (args.cameras is None or args.no_quality)
+
+
 def _target(args: argparse.Namespace) -> Target | None:
     if args.max_size is not None:
         return Target(max_bytes=size_in_bytes(args.max_size))
@@ -104,13 +111,15 @@ def _encode(args: argparse.Namespace) -> None:
         raise UsageError("--report-view needs --report, the page that shows it")
     if args.report is not None and args.report.resolve() == args.output.resolve():
         raise UsageError("--report and --output name the same file")
+    # Opened while the scene is read.
+    opened = in_background(Device, args.device) if _looks(args, options) else None
     cameras = given_cameras(args)
     photographs = None
     if options.photographs is not None and cameras is not None:
         photographs = Photographs(options.photographs, cameras, options.background)
     scene = load_scene(args.scene)
     options = dataclasses.replace(options, count=count(args, len(scene)))
-    device = Device(args.device) if needs_views(scene, options) else None
+    device = opened.result() if opened is not None and needs_views(scene, options) else None
     with contextlib.ExitStack() as stack:
         progress = stack.enter_context(contextlib.closing(Progress()))
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None
@@ -134,13 +143,13 @@ def _encode(args: argparse.Namespace) -> None:
         pictures: list[PicturePair] = []
         quality: dict[str, Any] | str = "not judged, as asked"
         if views is not None:
-            quality, pictures = _judge(args, scene, written, views, encoded.device or device, watch)
+            quality, pictures = _judge(args, scene, written, views, encoded.device, opened, watch)
         elif cameras is None:
             quality = "not judged: there are no cameras to look from"
         seconds = placing.seconds | encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
         report = encode_report(args.scene, scene, args.output, written, encoded, options, search, quality, seconds)
         if photographs is not None and cameras is not None:
-            used = encoded.device or Device(args.device)
+            used = encoded.device or device or Device(args.device)
             _judge_by_photographs(photographs, cameras, scene, decode(written.data), used, options.background)
         if page is not None:
             page.write(html_report(report, pictures).encode())
@@ -153,6 +162,7 @@ def _judge(
     written: PotrFile,
     views: JudgingViews,
     device: Device | None,
+    opened: Future[Device] | None,
     watch: Stopwatch,
 ) -> tuple[dict[str, Any] | str, list[PicturePair]]:
     """The figures, or why there are none: a device that fails now must not take the finished file with it.
@@ -161,7 +171,8 @@ def _judge(
     """
     watch("judge", 0.0)
     try:
-        judge = Judge(device or Device(args.device), scene, views, parse_colour(args.background))
+        device = device or (Device(args.device) if opened is None else opened.result())
+        judge = Judge(device, scene, views, parse_colour(args.background))
         try:
             candidate = decode(written.data)
             quality = quality_report(views, judge.compare(candidate, lambda _, done: watch("judge", done)))
