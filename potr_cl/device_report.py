@@ -49,20 +49,32 @@ def _entry(info: DeviceInfo, chosen: bool, check: bool) -> dict[str, Any]:
 
 
 def format_devices(report: Sequence[dict[str, Any]]) -> str:
-    """The report as lines for people; ``*`` marks the device that is taken without ``--device``."""
+    """The report as lines for people.
+
+    ``*`` marks the device that is taken without ``--device``, ``!`` those that do not work, as far as was looked.
+    """
     lines = [
         f"{'':<2}{'index':<7}{'kind':<6}{'kernels':<9}{'memory':>9}{'buffer':>9}{'local':>8}{'units':>7}{'vector':>8}"
         "  name (platform)"
     ]
     for entry in report:
         lines.append(
-            f"{'*' if entry['chosen'] else '':<2}{entry['index']:<7}{entry['kind']:<6}{entry['kernels']:<9}"
+            f"{_mark(entry):<2}{entry['index']:<7}{entry['kind']:<6}{entry['kernels']:<9}"
             f"{entry['memory_bytes'] / 1e9:>6.1f} GB{entry['largest_buffer_bytes'] / 1e9:>6.1f} GB"
             f"{entry['local_memory_bytes'] / 1024:>5.0f} KB{entry['compute_units']:>7}{entry['vector_width']:>8}"
             f"  {entry['name']} ({entry['platform']})"
         )
         if entry["fault"] is not None:
             lines.append(f"  cannot compile anything: {entry['fault']}")
-        if "check" in entry:
+        elif "check" in entry:
             lines.append(f"  self-check: {entry['check']}")
     return "\n".join(lines)
+
+
+def works(entry: dict[str, Any]) -> bool:
+    """Whether a device can compile and, where it was checked, passed."""
+    return entry["fault"] is None and entry.get("check", "passed") == "passed"
+
+
+def _mark(entry: dict[str, Any]) -> str:
+    return ("*" if entry["chosen"] else "") + ("" if works(entry) else "!")

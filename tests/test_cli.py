@@ -834,11 +834,10 @@ def test_devices(capsys):
 
 
 def test_devices_check(capsys, monkeypatch):
-    """What can compile computes right on this machine; what cannot fails, and only that."""
-    code = cli.main(["devices", "--check", "--json"])
+    """What can compile computes right on this machine; what cannot is passed over, and only marked."""
+    assert cli.main(["devices", "--check", "--json"]) == 0
     report = json.loads(capsys.readouterr().out)
     assert [entry["check"] == "passed" for entry in report] == [entry["fault"] is None for entry in report]
-    assert code == (0 if all(entry["fault"] is None for entry in report) else 1)
 
     def broken(self):
         raise DeviceError("1 + 1 is 3")
@@ -846,8 +845,29 @@ def test_devices_check(capsys, monkeypatch):
     monkeypatch.setattr(Device, "self_check", broken)
     assert cli.main(["devices", "--check"]) == 1
     captured = capsys.readouterr()
+    assert "\n*!" in captured.out
     assert "self-check: 1 + 1 is 3" in captured.out
     assert captured.err.startswith("potr-cl: ")
+    assert captured.err.endswith("none works\n")
+
+
+@pytest.mark.parametrize(
+    ("checks", "code", "said"),
+    [
+        (["passed", "wrong"], 0, ""),
+        (["wrong", "passed"], 1, "choose another with --device: 1"),
+        (["wrong", "wrong"], 1, "none works"),
+    ],
+)
+def test_devices_check_fails_if_the_one_to_be_taken_does(capsys, monkeypatch, checks, code, said):
+    entry = json.loads(run(capsys, "devices", "--json"))[0] | {"fault": None}
+    entries = [entry | {"index": i, "chosen": i == 0, "check": check} for i, check in enumerate(checks)]
+    monkeypatch.setattr("potr_cl.cli.devices.device_report", lambda check: entries)
+    assert cli.main(["devices", "--check"]) == code
+    captured = capsys.readouterr()
+    assert said in captured.err
+    marks = [line[:2].strip() for line in captured.out.splitlines() if line[2:3].isdigit()]
+    assert marks == [("*" if i == 0 else "") + ("" if check == "passed" else "!") for i, check in enumerate(checks)]
 
 
 def test_no_device(capsys, monkeypatch):

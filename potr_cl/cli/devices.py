@@ -6,20 +6,26 @@ import argparse
 import json
 
 from potr_cl.cli.options import Commands
-from potr_cl.device_report import device_report, format_devices
+from potr_cl.device_report import device_report, format_devices, works
 from potr_cl.errors import DeviceError
 
 
 def _devices(args: argparse.Namespace) -> None:
     report = device_report(args.check)
     print(json.dumps(report, indent=1) if args.json else format_devices(report))
-    failed = [entry["name"] for entry in report if entry.get("check", "passed") != "passed"]
-    if failed:
-        raise DeviceError(f"{len(failed)} of {len(report)} devices failed the self-check: {', '.join(failed)}")
+    # A device that does not work is no harm while another is taken.
+    if args.check and not any(entry["chosen"] and works(entry) for entry in report):
+        able = [str(entry["index"]) for entry in report if works(entry)]
+        advice = f"choose another with --device: {', '.join(able)}" if able else "none works"
+        raise DeviceError(f"the device that would be taken fails the self-check, or there is none: {advice}")
 
 
 def add_devices(commands: Commands) -> None:
-    p = commands.add_parser("devices", help="the OpenCL devices; * marks the one that is taken by default")
-    p.add_argument("--check", action="store_true", help="prove that each computes right; takes seconds")
+    p = commands.add_parser("devices", help="the OpenCL devices; * marks the one that is taken by default, ! what does not work")
+    p.add_argument(
+        "--check",
+        action="store_true",
+        help="prove that each computes right; takes seconds. Fails if the one that is taken by default does not",
+    )
     p.add_argument("--json", action="store_true", help="for programs")
     p.set_defaults(run=_devices)
