@@ -21,7 +21,9 @@ def _devices(args: argparse.Namespace) -> None:
 
 
 def add_devices(commands: Commands) -> None:
-    p = commands.add_parser("devices", help="the OpenCL devices; * marks the one that is taken by default, ! what does not work")
+    p = commands.add_parser(
+        "devices", help="the OpenCL devices; * marks the one that is taken by default, ! what does not work"
+    )
     p.add_argument(
         "--check",
         action="store_true",
