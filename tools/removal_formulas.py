@@ -52,7 +52,7 @@ def prefix_sums_source(name: str) -> str:
     if name not in _SECOND_HALVES:
         return source
     first_half, begin, rest = source.partition(_SECOND_HALVES[name])
-    _, end, others = rest.partition("/* How much of each tile's area")
+    _, end, others = rest.partition("/* Adds to each tile's staleness")
     if not (begin and end):
         raise RuntimeError(f"{name} has changed: its second half is not where {Path(__file__).name} looks for it")
     second_half = Path(__file__).with_name(name.replace("removal_", "removal_prefix_sums_"))
