@@ -9,7 +9,8 @@ views more than once keeps them and repeats only the last stage:
    touches (cl/entry_patches_*.cl);
 4. ``composite``: the picture (cl/composite_*.cl).
 
-A GPU's kernels do all views of a set in one launch, a CPU's one view at a time.
+A GPU's kernels do all views of a set in one launch, a CPU's one view at a time. A view alone on a GPU is composited by
+``composite_frame`` (cl/composite_frame_gpu.cl), which needs no patches.
 
 Semantics: the original 3DGS rasterizer (Kerbl et al. 2023); where renderers differ, :class:`RasterRules` says how.
 """
@@ -83,7 +84,7 @@ _SET_VIEW = np.dtype(
 #: on its stack.
 _TILE_GROUPS = {
     "cpu": {"scan": 1, "sort": 1, "patches": 1, "composite": 1},
-    "gpu": {"scan": 256, "sort": 256, "patches": 128, "composite": 128},
+    "gpu": {"scan": 256, "sort": 256, "patches": 128, "composite": 128, "frame": 256},
 }
 
 
@@ -466,6 +467,9 @@ class Rasterizer:
         for kernel, dtypes in types:
             kernel.set_scalar_arg_dtypes(dtypes)
         self._composite = device.kernel(f"composite_{device.family}.cl", "composite", **limits)
+        if device.family == "gpu":
+            self._frame = device.kernel("composite_frame_gpu.cl", "composite_frame", **limits)
+            self._frame.set_scalar_arg_dtypes([*[buffer] * 5, number, *[np.float32] * 3, *[buffer] * 2])
 
     def replace_sh(self, sh: FloatArray) -> cl.Buffer:
         """Give the scene other SH coefficients, (N, M, 3) float32 of the same degree.
@@ -533,8 +537,9 @@ class Rasterizer:
         self._over_splats(self._count, views)
         self._over_tiles("scan", self._scan, views, 1)
 
-    def _enqueue_lists(self, views: ViewSet, bounds: cl.Buffer, counts: cl.Buffer) -> None:
-        """Enqueue tile lists, depth order and patches of views with offsets. Leaves the counts zero."""
+    def _enqueue_lists(self, views: ViewSet, bounds: cl.Buffer, counts: cl.Buffer, frame: bool = False) -> None:
+        """Enqueue tile lists, depth order and patches of views with offsets; of a frame that is only composited no
+        patches where that needs none. Leaves the counts zero."""
         # The bitonic network sorts in place, merging needs room for as many keys again.
         self._keys.reserve((8 if self.device.family == "gpu" else 16) * views.capacity)
         keys, capacity = self._keys.buffer, views.capacity
@@ -551,11 +556,17 @@ class Rasterizer:
             self._patches.set_args(view.shapes, view.offsets, view.entries, views.patches, capacity, camera)
         self._over_splats(self._fill, views)
         self._over_tiles("sort", self._sort, views)
-        self._over_tiles("patches", self._patches, views)
+        if not (frame and self.device.family == "gpu"):
+            self._over_tiles("patches", self._patches, views)
 
     def _enqueue_composite(self, views: ViewSet, image: cl.Buffer) -> None:
         """Enqueue the pictures, one behind the other into ``image``."""
         self._transmittance.reserve(4 * views.pixels)
+        if self.device.family == "gpu" and len(views.views) == 1:
+            alone = (views.table, views.shapes, views.colours, views.offsets, views.entries, views.capacity)
+            self._frame.set_args(*alone, *self.background, image, self._transmittance.buffer)
+            self._over_tiles("frame", self._frame, views)
+            return
         lists = (views.shapes, views.colours, views.offsets, views.entries, views.patches)
         capacity = np.uint32(views.capacity)
         result = (*(np.float32(channel) for channel in self.background), image, self._transmittance.buffer)
@@ -652,7 +663,7 @@ class Rasterizer:
             while True:
                 self._enqueue_project(views, bounds)
                 self._enqueue_count(views, bounds, counts)
-                self._enqueue_lists(views, bounds, counts)
+                self._enqueue_lists(views, bounds, counts, frame=True)
                 self._enqueue_composite(views, self._image.buffer)
                 # Lists that did not fit are cut short, so the kernels were safe; their result is thrown away.
                 (count,) = views.read_counts()

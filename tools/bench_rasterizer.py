@@ -79,7 +79,8 @@ def least_bytes(scene: Scene, camera: Camera, entries: float) -> dict[str, float
         "fill_tiles": splats * 12 + entries * 8,
         "sort_tiles": entries * 12,
         "entry_patches": splats * 32 + entries * 6,
-        "composite": splats * 48 + entries * 4 + camera.width * camera.height * 16,
+        "composite": splats * 48 + entries * 6 + camera.width * camera.height * 16,
+        "composite_frame": splats * 48 + entries * 4 + camera.width * camera.height * 16,
     }
 
 

@@ -259,7 +259,7 @@ def rasterizer_rows(info: DeviceInfo, load: Workload, quick: bool, stages: Seque
         "project": ("project",),
         "tile lists": ("count_tiles", "scan_tiles", "fill_tiles"),
         "sort": ("sort_tiles",),
-        "composite": ("composite",),
+        "composite": ("composite", "composite_frame"),
     }
     for name, default, device in kernel_variants(info, quick):
         times = rasterizer_times(device, load)
@@ -271,7 +271,7 @@ def rasterizer_rows(info: DeviceInfo, load: Workload, quick: bool, stages: Seque
             about = {"sorts": "sort", "polynomial": "composite", "native exponential": "composite"}
             only = next((kernel for word, kernel in about.items() if word in name), stage)
             if stage in stages and stage == only:
-                yield Row(stage, name, sum(times[part] for part in parts), float(errors[stage]), default)
+                yield Row(stage, name, sum(times[part] for part in parts if part in times), float(errors[stage]), default)
 
 
 def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
