@@ -271,7 +271,9 @@ def rasterizer_rows(info: DeviceInfo, load: Workload, quick: bool, stages: Seque
             about = {"sorts": "sort", "polynomial": "composite", "native exponential": "composite"}
             only = next((kernel for word, kernel in about.items() if word in name), stage)
             if stage in stages and stage == only:
-                yield Row(stage, name, sum(times[part] for part in parts if part in times), float(errors[stage]), default)
+                yield Row(
+                    stage, name, sum(times[part] for part in parts if part in times), float(errors[stage]), default
+                )
 
 
 def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
