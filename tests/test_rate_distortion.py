@@ -55,13 +55,29 @@ def test_a_curve_is_measured_written_and_continued(monkeypatch, folder, tmp_path
     assert (images / "rate_distortion_excerpt.png").stat().st_size > 1000
 
 
+def test_series_of_the_sweeps_options_and_their_gaps(monkeypatch, folder, tmp_path, capsys):
+    _, options = rate_distortion.parse_series("lazy:preset=fast,sweep.tolerance=0.1,iterations=8")
+    lazy = rate_distortion.encode_options({**options, "q": 0.4})
+    assert (lazy.sweep.tolerance, lazy.iterations, lazy.q, lazy.preset) == (0.1, 8, 0.4, "fast")
+    out = tmp_path / "out.json"
+    series = ("plain:iterations=4", "same:iterations=4", "lazy:iterations=4,sweep.tolerance=0.5")
+    call(monkeypatch, rate_distortion, "measure", folder, "--json", out, "--qualities", 0.4, 0.6, "--series", *series)
+    capsys.readouterr()
+    call(monkeypatch, rate_distortion, "report", out, "--against", "plain", "--at", 0.4)
+    said = capsys.readouterr().out
+    rows = {line.split(" | ")[0].strip("| "): line for line in said.splitlines()[2:]}
+    assert "+0.0 %" in rows["plain"]
+    assert "+0.0 %" in rows["same"]
+    assert "+0.0 %" not in rows["lazy"]
+
+
 def test_interpolation_along_a_curve():
     points = [{"bytes": b, "psnr": p} for b, p in ((4000, 40.0), (1000, 30.0), (16000, 45.0))]
-    assert compare_formats.size_at(points, "psnr", 35.0) == pytest.approx(2000)
-    assert compare_formats.value_at(points, "psnr", 2000) == pytest.approx(35)
-    assert compare_formats.value_at(points, "psnr", 16000) == 45
-    assert compare_formats.size_at(points, "psnr", 45.1) is None
-    assert compare_formats.value_at(points, "psnr", 999) is None
+    assert rate_distortion.size_at(points, "psnr", 35.0) == pytest.approx(2000)
+    assert rate_distortion.value_at(points, "psnr", 2000) == pytest.approx(35)
+    assert rate_distortion.value_at(points, "psnr", 16000) == 45
+    assert rate_distortion.size_at(points, "psnr", 45.1) is None
+    assert rate_distortion.value_at(points, "psnr", 999) is None
 
 
 def test_the_report_on_formats(monkeypatch, tmp_path, capsys):

@@ -47,8 +47,7 @@ from potr_cl.refit import ColourRefit, RefitOptions, RenderedTargets, Targets, a
 from potr_cl.removal import RemovalSweep, SweepOptions
 from potr_cl.scene import FloatArray, Scene
 from potr_cl.streams import code_scene
-from tools.compare_formats import size_at
-from tools.rate_distortion import write_json
+from tools.rate_distortion import size_at, write_json
 
 #: By name: whether splat by splat (the paper's compaction) comes first, and how the re-fit is done, if at all.
 WAYS = {

@@ -21,13 +21,11 @@ import time
 from pathlib import Path
 from typing import Any
 
-import numpy as np
-
 from potr_cl.device import Device
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene
 from tools.judging import JudgedScene
-from tools.rate_distortion import write_json
+from tools.rate_distortion import size_at, value_at, write_json
 
 FORMATS = ("compressed.ply", "spz", "sog")
 
@@ -102,24 +100,6 @@ def _measure(args: argparse.Namespace) -> None:
 
 
 # ------------------------------------------------------------------------------------------------ report
-
-
-def size_at(points: list[dict[str, Any]], key: str, value: float) -> float | None:
-    """Bytes at which a curve reaches ``value`` of ``key``; None beyond its ends."""
-    ordered = sorted(points, key=lambda p: float(p[key]))
-    values = [p[key] for p in ordered]
-    if not values[0] <= value <= values[-1]:
-        return None
-    return float(np.exp(np.interp(value, values, np.log([p["bytes"] for p in ordered]))))
-
-
-def value_at(points: list[dict[str, Any]], key: str, size: float) -> float | None:
-    """What a curve has of ``key`` at ``size`` bytes; None beyond its ends."""
-    ordered = sorted(points, key=lambda p: int(p["bytes"]))
-    sizes = np.log([p["bytes"] for p in ordered])
-    if not sizes[0] <= np.log(size) <= sizes[-1]:
-        return None
-    return float(np.interp(np.log(size), sizes, [p[key] for p in ordered]))
 
 
 def _cells(points: list[dict[str, Any]], row: dict[str, Any], key: str) -> str:

@@ -1,12 +1,14 @@
 """Size against quality: encode at many qualities, decode, judge by all test views; then tables and plots.
 
 python -m tools.rate_distortion measure SCENE … --json OUT.json [--qualities Q …] [--series NAME[:OPTION=VALUE,…] …]
-python -m tools.rate_distortion report OUT.json [--formats FORMATS.json] [--images DIR]
+python -m tools.rate_distortion report OUT.json [--formats FORMATS.json] [--images DIR] [--against NAME --at Q]
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photographs in images. A series is a curve:
-the name it gets and the fields of EncodeOptions in which it differs from the defaults, as in best:preset=best.
-``measure`` writes its results after every encode and goes on where an existing file stops. ``report`` prints Markdown
-and draws DIR/rate_distortion_SCENE.png; the points of other formats come from tools.compare_formats.
+the name it gets and the fields of EncodeOptions in which it differs from the defaults, as in best:preset=best; those of
+its SweepOptions too, as in exact:preset=best,sweep.tolerance=0. ``measure`` writes its results after every encode and
+goes on where an existing file stops. ``report`` prints Markdown and draws DIR/rate_distortion_SCENE.png; the points of
+other formats come from tools.compare_formats. With --against it prints instead how many bytes more or fewer each series
+takes at the PSNR that the series NAME has at quality Q, by interpolation, and how long its encodes take.
 """
 
 from __future__ import annotations
@@ -15,8 +17,11 @@ import argparse
 import ast
 import dataclasses
 import json
+import statistics
 from pathlib import Path
 from typing import Any
+
+import numpy as np
 
 from potr_cl.atomic_write import replacing
 from potr_cl.decoder import PotrFile
@@ -24,6 +29,7 @@ from potr_cl.device import Device
 from potr_cl.encoder import encode
 from potr_cl.errors import UsageError
 from potr_cl.options import EncodeOptions
+from potr_cl.removal import SweepOptions
 from potr_cl.report import file_report
 from tools.judging import JudgedScene
 
@@ -41,7 +47,8 @@ def parse_series(text: str) -> tuple[str, dict[str, Any]]:
     """
     name, _, rest = text.partition(":")
     options: dict[str, Any] = {}
-    fields = {field.name for field in dataclasses.fields(EncodeOptions)}
+    fields = {field.name for field in dataclasses.fields(EncodeOptions)} - {"sweep"}
+    fields |= {f"sweep.{field.name}" for field in dataclasses.fields(SweepOptions)}
     for part in filter(None, rest.split(",")):
         key, _, value = part.partition("=")
         if key not in fields or key == "q":
@@ -51,6 +58,13 @@ def parse_series(text: str) -> tuple[str, dict[str, Any]]:
         except (ValueError, SyntaxError):
             options[key] = value
     return name, options
+
+
+def encode_options(changes: dict[str, Any]) -> EncodeOptions:
+    """The options of a series, quality included."""
+    sweep = {key.removeprefix("sweep."): value for key, value in changes.items() if key.startswith("sweep.")}
+    plain = {key: value for key, value in changes.items() if not key.startswith("sweep.")}
+    return EncodeOptions.for_preset(**{"preset": EncodeOptions.preset, **plain, "sweep": SweepOptions(**sweep)})
 
 
 def measure_encode(judge: JudgedScene, options: EncodeOptions, device: Device) -> dict[str, Any]:
@@ -89,8 +103,7 @@ def _measure(args: argparse.Namespace) -> None:
             for q in args.qualities:
                 if q in done:
                     continue
-                changes = {"preset": EncodeOptions.preset, **options, "q": q}
-                point = measure_encode(judge, EncodeOptions.for_preset(**changes), device)
+                point = measure_encode(judge, encode_options({**options, "q": q}), device)
                 curve["encodes"].append(point)
                 curve["encodes"].sort(key=lambda p: p["q"])
                 write_json(args.json, results)
@@ -168,8 +181,51 @@ def _within(limits: tuple[float, float], value: float) -> bool:
     return limits[0] <= value <= limits[1]
 
 
+def size_at(points: list[dict[str, Any]], key: str, value: float) -> float | None:
+    """Bytes at which a curve reaches ``value`` of ``key``; None beyond its ends."""
+    ordered = sorted(points, key=lambda p: float(p[key]))
+    values = [p[key] for p in ordered]
+    if not values[0] <= value <= values[-1]:
+        return None
+    return float(np.exp(np.interp(value, values, np.log([p["bytes"] for p in ordered]))))
+
+
+def value_at(points: list[dict[str, Any]], key: str, size: float) -> float | None:
+    """What a curve has of ``key`` at ``size`` bytes; None beyond its ends."""
+    ordered = sorted(points, key=lambda p: int(p["bytes"]))
+    sizes = np.log([p["bytes"] for p in ordered])
+    if not sizes[0] <= np.log(size) <= sizes[-1]:
+        return None
+    return float(np.interp(np.log(size), sizes, [p[key] for p in ordered]))
+
+
+def print_gaps(scenes: dict[str, Any], against: str, q: float) -> None:
+    """Bytes at equal PSNR, a row a series."""
+    print(
+        "| | "
+        + " | ".join(f"{name}: bytes | encode" for name in scenes)
+        + " |\n"
+        + "|---" * (2 * len(scenes) + 1)
+        + "|"
+    )
+    for series in next(iter(scenes.values()))["series"]:
+        cells = []
+        for entry in scenes.values():
+            points = entry["series"][series]["encodes"]
+            reference = entry["series"][against]["encodes"]
+            (at,) = (point["psnr"] for point in reference if point["q"] == q)
+            size, usual = size_at(points, "psnr", at), size_at(reference, "psnr", at)
+            gap = f"{100 * size / usual - 100:+.1f} %" if size and usual else "beyond its ends"
+            seconds = statistics.median(sum(point["seconds"].values()) for point in points)
+            cells.append(f"{gap} | {seconds:.2f} s")
+        print(f"| {series} | " + " | ".join(cells) + " |")
+
+
 def _report(args: argparse.Namespace) -> None:
     results = json.loads(args.results.read_text())
+    if args.against is not None:
+        print_gaps(results["scenes"], args.against, args.at)
+        return
     formats = json.loads(args.formats.read_text())["scenes"] if args.formats is not None else {}
     for name, entry in results["scenes"].items():
         views = entry["test_views"]
@@ -194,6 +250,8 @@ def main() -> None:
     report.add_argument("results", type=Path)
     report.add_argument("--formats", type=Path, help="what tools.compare_formats measured")
     report.add_argument("--images", type=Path, metavar="DIR", help="draw the curves too")
+    report.add_argument("--against", metavar="NAME")
+    report.add_argument("--at", type=float, default=0.5, metavar="Q")
     report.set_defaults(run=_report)
     args = parser.parse_args()
     args.run(args)
