@@ -412,11 +412,11 @@ class Rasterizer:
         device, width = self.device, rows.shape[1]
         result = device.allocate(4 * width * self.stride, what)
         cl.enqueue_fill_buffer(device.queue, result, np.float32(fill), 0, 4 * width * self.stride)
-        turn = device.kernel("columns.cl", "columns")
+        turn = device.shared_kernel("columns.cl", "columns", [None, np.uint32, np.uint32, np.uint32, None])
         for first in range(0, self.splats, _UPLOADED):
             some = np.ascontiguousarray(rows[first : first + _UPLOADED], np.float32)
             source = device.upload(some, what)
-            turn.set_args(source, np.uint32(first), np.uint32(width), np.uint32(self.stride), result)
+            turn.set_args(source, first, width, self.stride, result)
             device.launch(turn, (len(some),))
             device.free(source)
         return result
@@ -424,52 +424,40 @@ class Rasterizer:
     def _build(self, sh_count: int) -> None:
         device, rules = self.device, self.rules
         self._lanes = 1 if device.family == "gpu" else device.vector_width
-        self._project = device.kernel(
+        number, real, buffer = np.uint32, np.float32, None
+        self._project = device.shared_kernel(
             "project.cl",
             "project",
+            [*[buffer] * 5, number, *[buffer] * 4],
             LANES=self._lanes,
             SH_COUNT=sh_count,
             NEAR=float(rules.near),
             SQUARE_EXTENT=int(rules.square_extent),
         )
-        lists = f"tile_lists_{device.family}.cl"
-        self._count = device.kernel(lists, "count_tiles")
-        self._scan = device.kernel(lists, "scan_tiles")
-        self._fill = device.kernel(lists, "fill_tiles")
+        make = device.shared_kernel
+        lists, patches = f"tile_lists_{device.family}.cl", f"entry_patches_{device.family}.cl"
+        picture: list[Any] = [real, real, real, buffer, buffer]
         limits: dict[str, float | int] = {"ALPHA_CAP": float(rules.alpha_cap), "STOP": rules.stop}
-        # Told the arguments' types, pyopencl sets them twenty times as fast.
-        number, buffer = np.uint32, None
-        self._project.set_scalar_arg_dtypes([*[buffer] * 5, number, *[buffer] * 4])
         if device.family == "gpu":
+            self._count = make(lists, "count_tiles", [buffer, number, *[buffer] * 3])
+            self._scan = make(lists, "scan_tiles", [buffer] * 3)
+            self._fill = make(lists, "fill_tiles", [buffer, number, *[buffer] * 4, number])
             # 16 KB of keys: half of what every GPU has, so that two tiles are sorted at a time.
-            self._sort = device.kernel("sort_gpu.cl", "sort_tiles", SORT_CAPACITY=2048)
-            self._patches = device.kernel("entry_patches_gpu.cl", "entry_patches")
+            self._sort = make("sort_gpu.cl", "sort_tiles", [*[buffer] * 5, number], SORT_CAPACITY=2048)
+            self._patches = make(patches, "entry_patches", [buffer, number, *[buffer] * 4, number])
             limits |= gpu_limits(device)
-            types: list[tuple[cl.Kernel, list[Any]]] = [
-                (self._count, [buffer, number, *[buffer] * 3]),
-                (self._scan, [buffer] * 3),
-                (self._fill, [buffer, number, *[buffer] * 4, number]),
-                (self._sort, [*[buffer] * 5, number]),
-                (self._patches, [buffer, number, *[buffer] * 4, number]),
-            ]
+            composite = [buffer, number, *[buffer] * 5, number, *picture]
+            frame = [*[buffer] * 5, number, *picture]
+            self._frame = make("composite_frame_gpu.cl", "composite_frame", frame, **limits)
         else:
-            row_lanes = max(self._lanes, 8)
-            self._sort = device.kernel("sort_cpu.cl", "sort_tiles")
-            self._patches = device.kernel("entry_patches_cpu.cl", "entry_patches", LANES=row_lanes)
-            limits["LANES"] = row_lanes
-            types = [
-                (self._count, [buffer, buffer, number, _CAMERA, buffer]),
-                (self._scan, [buffer, buffer, number]),
-                (self._fill, [buffer, buffer, number, _CAMERA, buffer, buffer, number]),
-                (self._sort, [*[buffer] * 4, number]),
-                (self._patches, [*[buffer] * 4, number, _CAMERA]),
-            ]
-        for kernel, dtypes in types:
-            kernel.set_scalar_arg_dtypes(dtypes)
-        self._composite = device.kernel(f"composite_{device.family}.cl", "composite", **limits)
-        if device.family == "gpu":
-            self._frame = device.kernel("composite_frame_gpu.cl", "composite_frame", **limits)
-            self._frame.set_scalar_arg_dtypes([*[buffer] * 5, number, *[np.float32] * 3, *[buffer] * 2])
+            limits["LANES"] = max(self._lanes, 8)
+            self._count = make(lists, "count_tiles", [buffer, buffer, number, _CAMERA, buffer])
+            self._scan = make(lists, "scan_tiles", [buffer, buffer, number])
+            self._fill = make(lists, "fill_tiles", [buffer, buffer, number, _CAMERA, buffer, buffer, number])
+            self._sort = make("sort_cpu.cl", "sort_tiles", [*[buffer] * 4, number])
+            self._patches = make(patches, "entry_patches", [*[buffer] * 4, number, _CAMERA], LANES=limits["LANES"])
+            composite = [*[buffer] * 5, number, _CAMERA, *picture]
+        self._composite = make(f"composite_{device.family}.cl", "composite", composite, **limits)
 
     def replace_sh(self, sh: FloatArray) -> cl.Buffer:
         """Give the scene other SH coefficients, (N, M, 3) float32 of the same degree.
@@ -568,13 +556,12 @@ class Rasterizer:
             self._over_tiles("frame", self._frame, views)
             return
         lists = (views.shapes, views.colours, views.offsets, views.entries, views.patches)
-        capacity = np.uint32(views.capacity)
-        result = (*(np.float32(channel) for channel in self.background), image, self._transmittance.buffer)
+        result = (*self.background, image, self._transmittance.buffer)
         if self.device.family == "gpu":
-            self._composite.set_args(views.table, np.uint32(self.stride), *lists, capacity, *result)
+            self._composite.set_args(views.table, self.stride, *lists, views.capacity, *result)
         else:
             (view,) = views.views
-            self._composite.set_args(*lists, capacity, camera_struct(view.camera), *result)
+            self._composite.set_args(*lists, views.capacity, camera_struct(view.camera), *result)
         self._over_tiles("composite", self._composite, views)
 
     def _first_capacity(self) -> int:

@@ -63,8 +63,14 @@ class Similarity:
         numbers: dict[str, float | int] = {f"WEIGHT_{k}": float(weight) for k, weight in enumerate(WINDOW)}
         if device.family == "cpu":
             numbers["LANES"] = max(device.vector_width, 8)
-        self._kernel = device.kernel(f"similarity_{device.family}.cl", "similarity", **numbers, C1=C1, C2=C2)
-        self._kernel.set_scalar_arg_dtypes([None, np.uint64, None, np.uint64, np.int32, np.int32, None, np.uint32])
+        self._kernel = device.shared_kernel(
+            f"similarity_{device.family}.cl",
+            "similarity",
+            [None, np.uint64, None, np.uint64, np.int32, np.int32, None, np.uint32],
+            **numbers,
+            C1=C1,
+            C2=C2,
+        )
 
     def __call__(self, pairs: Sequence[tuple[Picture, Picture]]) -> list[tuple[float, float]]:
         """PSNR in decibels (infinite for identical pictures) and SSIM of each pair of pictures of one size.
