@@ -11,7 +11,6 @@ import dataclasses
 import json
 import os
 import platform
-import resource
 import statistics
 import subprocess
 import sys
@@ -31,6 +30,7 @@ from potr_cl.encoder import encode
 from potr_cl.formats import load_cameras, load_scene, ply
 from potr_cl.options import EncodeOptions
 from potr_cl.report import file_report
+from tools.bench_memory import reset_peak, resident
 from tools.large_scene import DEFAULT_SCENE, EXCERPT, large_scene
 
 SCENES = DEFAULT_SCENE.parents[1]
@@ -43,12 +43,18 @@ def _processor() -> str:
     return platform.processor()
 
 
-def _resident() -> int:
-    return int(Path("/proc/self/statm").read_text().split()[1]) * os.sysconf("SC_PAGE_SIZE")
+class _Peak:
+    """By how many bytes the resident set has grown at most since this was made.
 
+    Not what getrusage calls the peak: a child's begins with what its parent held.
+    """
 
-def _peak() -> int:
-    return resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
+    def __init__(self) -> None:
+        reset_peak()
+        self._before = resident("VmRSS")
+
+    def growth(self) -> float:
+        return 1e9 * (resident("VmHWM") - self._before)
 
 
 def _times(run: Callable[[], Any], runs: int) -> list[float]:
@@ -72,9 +78,9 @@ def _child(part: str, *arguments: object) -> dict[str, Any]:
 
 def _child_decode(path: str) -> dict[str, Any]:
     """Peak memory of one decode, and decode times with one and all threads."""
-    before = _resident()
+    peak = _Peak()
     scene = PotrFile.open(path).scene()
-    growth = _peak() - before
+    growth = peak.growth()
     arrays = scene.nbytes
     del scene
     file = PotrFile.open(path)
@@ -114,7 +120,7 @@ def _child_encode(scene_path: str, cameras: str, level: str) -> dict[str, Any]:
     """Time by stage and peak memory of one encode."""
     views = load_cameras(Path(cameras)) if cameras else None
     scene = load_scene(Path(scene_path))
-    before = _resident()
+    peak = _Peak()
     started = time.perf_counter()
     encoded = encode(scene, views, EncodeOptions(entropy=EntropyCoder("zstd", int(level)), prune=False, compact=False))
     seconds = time.perf_counter() - started
@@ -122,7 +128,7 @@ def _child_encode(scene_path: str, cameras: str, level: str) -> dict[str, Any]:
         "seconds": seconds,
         "stages": encoded.seconds,
         "bytes": encoded.nbytes,
-        "growth": _peak() - before,
+        "growth": peak.growth(),
         "arrays": scene.nbytes,
     }
 

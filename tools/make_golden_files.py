@@ -1,7 +1,9 @@
 """Make the golden files of both versions of the format: python -m tools.make_golden_files
 
 Writes tests/data/golden_vN_NAME.potr and, with the independent decoder of the tests, the values that they must yield
-for ever. Refuses to touch a golden file that exists: those are never made again.
+for ever. Refuses to touch a golden file that exists: those are never made again. What an encoder of another day makes
+of the same scenes differs (metadata, steps, what the re-fit and the coder find), which is as it should be: an encoder
+may change, what a decoder makes of an old file may not.
 """
 
 from __future__ import annotations
