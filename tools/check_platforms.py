@@ -30,9 +30,12 @@ from potr_cl.cameras import camera_centres
 from potr_cl.compaction import Compactor, ViewWeights
 from potr_cl.device import Device, DeviceInfo, list_devices
 from potr_cl.formats import load_cameras, load_scene
+from potr_cl.pruning import PruningOptions
+from potr_cl.pruning_on_device import prune_scene
 from potr_cl.rasterizer import GSPLAT, INRIA, Rasterizer
 from potr_cl.refit import ColourRefit, RefitOptions, RenderedTargets
 from potr_cl.removal import RemovalSweep, SweepOptions
+from potr_cl.similarity import Similarity, rendered
 from tests import reference
 from tests.raster_scenes import camera, random_splats, splats, tilted_camera
 from tests.refit_cases import Case, Linearised, Pictures, visible_scene
@@ -173,8 +176,12 @@ def simulate() -> None:
         removal.measure()
         removal.remove(np.arange(0, 60, 5))
         removal.measure()
+        prune_scene(RemovalSweep(kept[-1], views, SweepOptions(0)), PruningOptions(1e-4, 3))
         refit = ColourRefit(device, scene, views, RefitOptions(steps=2, gain=0, drop=1e-9))
         refit.solve(RenderedTargets(kept[-1], views))
+        other = Rasterizer(device, random_splats(60, 3, seed=3))
+        with rendered(kept[-1], views) as some, rendered(other, views) as others:
+            Similarity(device)(list(zip(some, others, strict=True)))
         weights = ViewWeights.from_importances(len(scene), removal.view_importances())
         for degree in (1, 2, 3):
             Compactor(device).compact(random_splats(60, degree, seed=2), camera_centres(views), weights)
