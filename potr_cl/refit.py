@@ -30,6 +30,7 @@ from potr_cl.cameras import Camera
 from potr_cl.compaction import REFERENCE_PIXELS
 from potr_cl.device import Device
 from potr_cl.errors import DeviceMemoryError, UsageError
+from potr_cl.kept_views import KeptViews
 from potr_cl.quantize import quantize_sh, to_ycocg
 from potr_cl.rasterizer import INRIA, TILE, Rasterizer, RasterRules, ViewSet, camera_struct, gpu_limits, totals_limits
 from potr_cl.scene import FloatArray, Scene
@@ -40,6 +41,8 @@ Targets = Callable[[int], cl.Buffer]
 
 #: Views that a GPU does in one launch.
 _MOST_VIEWS = 32
+#: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
+_SWEEP_BYTES = 48
 #: Work-items of a sweep's work-group.
 _SWEEP_GROUP = {"cpu": 1, "gpu": 128}
 #: Views that a work-item of ``view_colours`` does one after the other, the coefficients in its registers.
@@ -256,9 +259,10 @@ class ColourRefit:
         device = self.device
         memory = self.options.memory
         free = device.info.memory - device.allocated
-        self._budget: float = free * _SHARE if memory is None else memory
-        # A sweep's own buffers take half as much as the views at least, the sums included.
-        most = 1 if device.family == "cpu" else int(min(max(self._budget // (192 * self._stride), 1), _MOST_VIEWS))
+        self._keeper = KeptViews(self._rasterizer, free * _SHARE if memory is None else memory)
+        # A sweep's own buffers take as much as geometry does, the sums included.
+        own = _SWEEP_BYTES * self._stride
+        most = 1 if device.family == "cpu" else self._keeper.most_views(_MOST_VIEWS, own)
         number = 0
         while number < len(self._cameras):
             numbers = range(number, min(number + most, len(self._cameras)))
@@ -269,13 +273,11 @@ class ColourRefit:
                     raise
                 most //= 2
                 continue
-            nbytes = 48 * self._stride * len(numbers) + views.nbytes_kept
-            if nbytes > self._budget:
+            if self._keeper.keep(views):
+                self._sets.append((numbers, views))
+            else:
                 views.free()
                 self._sets.append((numbers, None))
-            else:
-                self._budget -= nbytes
-                self._sets.append((numbers, views))
             number += len(numbers)
             if progress is not None:
                 progress(number, len(self._cameras))
@@ -403,22 +405,27 @@ class ColourRefit:
         self._upload_scales(unit)
         for numbers, kept in self._sets:
             views = kept or self._prepare(numbers)
+            with self._keeper.geometry(views) as anew:
+                if targets is not None:
+                    self._enqueue_colours(views, coefficients, views.colours, False, 1.0)
+                else:
+                    if anew or kept is None:  # which colours are cut at 0 was settled where the way began
+                        self._enqueue_colours(views, self._start, views.colours, False, 1.0)
+                    self._enqueue_colours(views, coefficients, self._change, True, unit)
+                self._enqueue_sweep(numbers, views, targets, weights)
+                self._gather(numbers, views, result, weights)
             if targets is not None:
-                self._enqueue_colours(views, coefficients, views.colours, False, 1.0)
-            else:
-                if kept is None:  # which colours are cut at 0 was settled where the way began
-                    self._enqueue_colours(views, self._start, views.colours, False, 1.0)
-                self._enqueue_colours(views, coefficients, self._change, True, unit)
-            self._enqueue_sweep(numbers, views, targets, weights)
-            self._gather(numbers, views, result, weights)
-            if targets is not None:
-                tiles = self.device.download(self._errors, (views.tiles,), np.float32)
-                ends = np.cumsum([view.tiles for view in views.views])
-                for view, part in zip(views.views, np.split(tiles, ends[:-1]), strict=True):
-                    error += self._weight(view.camera) * float(part.sum(dtype=np.float64))
+                error += self._error(views)
             if kept is None:
                 views.free()
         return error
+
+    def _error(self, views: ViewSet) -> float:
+        """The weighted squared error that the last sweep found in these views."""
+        tiles = self.device.download(self._errors, (views.tiles,), np.float32)
+        ends = np.cumsum([view.tiles for view in views.views])
+        parts = zip(views.views, np.split(tiles, ends[:-1]), strict=True)
+        return sum(self._weight(view.camera) * float(part.sum(dtype=np.float64)) for view, part in parts)
 
     def _enqueue_sweep(self, numbers: range, views: ViewSet, targets: Targets | None, weights: bool) -> None:
         """Enqueue the sweep of a set's views."""
@@ -475,8 +482,8 @@ class ColourRefit:
             return self._kept[numbers[0]]
         nbytes = self._target_bytes(numbers)
         buffer = self._target
-        if nbytes <= self._budget:
-            self._budget -= nbytes
+        if nbytes <= self._keeper.room:
+            self._keeper.room -= nbytes
             buffer = self._kept[numbers[0]] = self.device.allocate(nbytes, "the target images")
         if isinstance(targets, RenderedTargets):
             targets.into(numbers, buffer)
@@ -491,7 +498,7 @@ class ColourRefit:
 
     def _forget_targets(self) -> None:
         for buffer in self._kept.values():
-            self._budget += buffer.size
+            self._keeper.room += buffer.size
             self.device.free(buffer)
         self._kept, self._kept_of = {}, None
 
@@ -654,6 +661,7 @@ class ColourRefit:
         for _, views in self._sets:
             if views is not None:
                 views.free()
+        self._keeper.free()
         self._forget_targets()
         for buffer in self._vectors:
             self.device.free(buffer)

@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from potr_cl.cameras import Camera
 from potr_cl.device import Device
 from potr_cl.errors import DeviceMemoryError, UsageError
+from potr_cl.kept_views import KeptViews
 from potr_cl.rasterizer import TILE, Rasterizer, ViewSet, camera_struct, gpu_limits, totals_limits
 from potr_cl.scene import FloatArray
 
@@ -30,10 +31,6 @@ Indices = NDArray[np.int64]
 
 #: Views that a GPU does in one launch.
 _MOST_VIEWS = 32
-#: At least so many launches' views fill the memory budget where it does not hold all.
-_LEAST_SETS = 16
-#: Bytes of a projected splat of a view.
-_BYTES_PROJECTED = 48
 #: Launches that a GPU runs at a time.
 _QUEUES = 4
 #: Where the removal kernels' argument stands that has them store the target.
@@ -191,11 +188,10 @@ class RemovalSweep:
         self._totals = self._zero_totals()
 
         memory = self._options.memory
-        self._budget = default_memory(device) if memory is None else memory
+        self._keeper = KeptViews(rasterizer, default_memory(device) if memory is None else memory)
         self._queues = [device.queue]
         self._kept: list[_Swept] = []
         self._remade: list[range] = []  # numbers of the views that nothing is kept of, as many as are made at a time
-        self._shared: tuple[cl.Buffer, cl.Buffer] | None = None
         self._prepare_all(progress)
         # The kept views' tiles are numbered through: importance removed from each since its last sweep.
         self._kept_tiles = sum(swept.views.tiles for swept in self._kept)
@@ -206,7 +202,7 @@ class RemovalSweep:
         self._listed_buffer = device.allocate(4 * len(self._kept), "the numbers of tiles to sweep")
         for place, swept in enumerate(self._kept):
             self._bind(swept, True, self._totals, place)
-        if device.family == "gpu" and not self._shared:
+        if device.family == "gpu" and not self._keeper.shared:
             # A set's longest tile list keeps one work-group busy when all others are done: other sets fill the gap.
             self._queues = [
                 cl.CommandQueue(device.context, device.info.handle, device.queue.properties) for _ in range(_QUEUES)
@@ -236,7 +232,8 @@ class RemovalSweep:
 
     def _prepare_all(self, progress: Callable[[int, int], None] | None) -> None:
         """Prepare every view, and keep as many as the budget allows."""
-        most, first_tile, number = self._most_views(), 0, 0
+        most = 1 if self._device.family == "cpu" else self._keeper.most_views(_MOST_VIEWS, 12 * self._pixels)
+        first_tile = number = 0
         while number < self._views:
             try:
                 swept = self._prepare(range(number, min(number + most, self._views)), first_tile)
@@ -250,14 +247,6 @@ class RemovalSweep:
             number += len(swept.numbers)
             if progress is not None:
                 progress(number, self._views)
-
-    def _most_views(self) -> int:
-        """Views to do in one launch: on a GPU as many as surely are a small part of the memory budget, which is used
-        up a launch's views at a time."""
-        if self._device.family == "cpu":
-            return 1
-        least = _BYTES_PROJECTED * self._rasterizer.stride + 12 * self._pixels
-        return int(min(max(self._budget // (_LEAST_SETS * least), 1), _MOST_VIEWS))
 
     def _prepare(self, numbers: range, first_tile: int = 0) -> _Swept:
         """Prepare the views of these numbers.
@@ -287,46 +276,22 @@ class RemovalSweep:
     def _zero_sums(self, swept: _Swept) -> None:
         cl.enqueue_fill_buffer(self._device.queue, swept.sums, np.float32(0), 0, swept.sums.size)
 
-    def _bytes_of_lists(self, swept: _Swept) -> int:
-        """What a set takes without its geometry."""
-        own: int = swept.lengths.size + swept.sums.size + swept.target.size
-        return swept.views.nbytes_kept + own
-
-    def _bytes_of_geometry(self, swept: _Swept) -> int:
-        return _BYTES_PROJECTED * self._rasterizer.stride * len(swept.views.views)
-
     def _keep(self, swept: _Swept) -> bool:
-        """Keep prepared views as far as the budget allows; whether it does.
-
-        Lists take longer to make again than geometry, which is given up for them: that of the newest views first.
-        """
-        to_spare = [other for other in (*self._kept, swept) if other.views.shapes is not None]
-        shared = 0 if self._shared else self._bytes_of_geometry(max(to_spare, key=self._bytes_of_geometry))
-        needed = self._bytes_of_lists(swept)
-        if needed + shared > self._budget + sum(map(self._bytes_of_geometry, to_spare[:-1])):
+        """Keep prepared views as far as the budget allows; whether it does."""
+        own: int = swept.lengths.size + swept.sums.size + swept.target.size
+        if not self._keeper.keep(swept.views, own):
             self._remade.append(swept.numbers)
             swept.free(self._device)
             return False
         self._kept.append(swept)
-        self._budget -= needed + self._bytes_of_geometry(swept)
-        while self._budget < 0:
-            other = to_spare.pop()
-            self._budget += self._bytes_of_geometry(other)
-            other.views.free_geometry()
-            if self._shared is None:
-                self._budget -= shared
-                splats = shared // _BYTES_PROJECTED
-                self._shared = (
-                    self._device.allocate(32 * splats, "the projected splats"),
-                    self._device.allocate(16 * splats, "the projected splats' colours"),
-                )
         return True
 
     def _bind(self, swept: _Swept, first: bool, totals: cl.Buffer, place: int | None = None) -> None:
         """Kernels of its own for a set, kept at this place or not at all: setting their arguments takes longer than
         launching them."""
         device, views, stride = self._device, swept.views, np.uint32(self._rasterizer.stride)
-        shapes, colours = self._shared if views.shapes is None and self._shared else (views.shapes, views.colours)
+        shared = self._keeper.shared
+        shapes, colours = shared if views.shapes is None and shared else (views.shapes, views.colours)
         background = (np.float32(channel) for channel in self._rasterizer.background)
         swept.sweep = device.kernel(self._source, "removal", **self._limits)
         swept.staleness = device.kernel(self._source, "staleness", **self._limits)
@@ -379,8 +344,8 @@ class RemovalSweep:
     def _sweep(self, swept: _Swept, start: int, count: int, queue: cl.CommandQueue | None = None) -> None:
         """Sweep ``count`` tiles of a set, listed in the tile buffer from ``start`` on."""
         if swept.views.shapes is None:
-            assert self._shared is not None
-            self._rasterizer.project(swept.views, None, *self._shared)
+            assert self._keeper.shared is not None
+            self._rasterizer.project(swept.views, None, *self._keeper.shared)
         swept.sweep.set_arg(0, np.uint32(start))
         group = _SWEEP_GROUP[self._device.family]
         self._device.launch(swept.sweep, (count * group,), (group,), queue)
@@ -677,6 +642,7 @@ class RemovalSweep:
         for swept in self._kept:
             swept.free(self._device)
         self._kept = []
+        self._keeper.free()
         for buffer in (
             self._alive_buffer,
             self._totals,
@@ -684,7 +650,6 @@ class RemovalSweep:
             self._stale,
             self._unused_stale,
             self._listed_buffer,
-            *(self._shared or ()),
         ):
             self._device.free(buffer)
         if self._original_sh is not None:

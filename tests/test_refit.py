@@ -225,6 +225,24 @@ def test_a_small_memory_budget_changes_the_time_and_nothing_else(case, memory):
     assert everything.errors == little.errors
 
 
+@pytest.mark.parametrize("share", [0.2, 0.4, 0.6, 0.9])
+def test_the_memory_budget_is_used_and_not_exceeded(device, share):
+    """What the device holds when views and targets are kept, above what it holds at most when none is."""
+    cameras = ring_of_cameras(60, size=32)
+    with Case(device, visible_scene(2000), visible_scene(60, 1, seed=7), cameras) as case:
+
+        def taken(memory):
+            seen = Linearised(case, options=RefitOptions(steps=0, memory=memory))
+            nbytes, room = device.allocated, seen.refit._keeper.room
+            seen.refit.free()
+            return nbytes, room
+
+        plenty = 10**9
+        wanted = plenty - taken(plenty)[1]
+        budget = int(share * wanted)
+        assert 0.88 * budget <= taken(budget)[0] - taken(0)[0] <= 1.1 * budget
+
+
 def test_more_views_than_are_swept_at_a_time(device):
     """Some views kept, some made again, and more of both than a GPU's queues."""
     with Case(device, visible_scene(30, 1), visible_scene(50, 1, 5), ring_of_cameras(37, size=20)) as case:
