@@ -13,7 +13,7 @@ import pyopencl as cl
 
 from potr_cl.rasterizer import Rasterizer, ViewSet
 
-#: At least so many launches' views should fill a budget that does not hold all: it is used up by those of one at a time.
+#: At least so many launches' views should fill a budget that does not hold all: it is used up launch by launch.
 _LEAST_SETS = 16
 #: Bytes of a projected splat of a view: shape and colour.
 _SHAPE, _COLOUR = 32, 16

@@ -105,7 +105,7 @@ class Pruned:
     @property
     def survivors(self) -> Indices:
         """Indices of the kept splats, ascending."""
-        return np.sort(self.order[len(self.order) - self.kept :])
+        return np.flatnonzero(self.iteration_of < 0)
 
 
 class DampedEffects:

@@ -113,7 +113,8 @@ class _Controller:
         alive = self._removal.alive.copy()
         damped = device.download(self._damped, (n,), np.float32)
         removed = device.download(self._removed, (n,), _REMOVED)
-        iteration = np.where(alive, -1, removed["iteration"].astype(np.int64)).astype(np.int32)
+        iteration = removed["iteration"].astype(np.int32)
+        iteration[alive] = -1
         gone = np.flatnonzero(~alive)
         gone = gone[ascending(removed["iteration"][gone].astype(np.uint64) << np.uint64(32) | removed["key"][gone])]
         if len(gone) == n:  # an empty scene is no scene

@@ -537,6 +537,9 @@ class RemovalSweep:
 
     def measure_on_device(self) -> None:
         """Bring :attr:`totals` up to date."""
+        if self._listed is None:  # nothing is marked: what is stale is listed
+            self._agree_on_marks()
+            self.remove_marked()
         self._sweep_anew()
         self._measured += 1
 
