@@ -13,7 +13,7 @@ import tempfile
 import threading
 import warnings
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.resources import files
 from pathlib import Path
@@ -155,10 +155,11 @@ def _loader_function(name: str) -> Any:
     pyopencl would call it too, but keep all other threads waiting meanwhile; a driver takes a tenth of a second to load
     and another to make a context.
     """
-    try:
-        return getattr(ctypes.CDLL(cl._cl.__file__), name)
-    except (OSError, AttributeError):
-        return None
+    # First what the whole process sees: a library may stand before the loader, as Oclgrind's does.
+    for library in (None, cl._cl.__file__):
+        with suppress(OSError, AttributeError, TypeError):
+            return getattr(ctypes.CDLL(library), name)
+    return None
 
 
 def _load_drivers() -> None:

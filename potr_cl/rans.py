@@ -161,11 +161,10 @@ def _tables(sections: Sequence[Tokens]) -> tuple[list[list[int]], F64, F64]:
     return bases, np.concatenate(frequencies), np.concatenate(starts)
 
 
-#: Where an entry of a table has its parts: the token's frequency, the trail's factor; from the 13th bit on the slot's
-#: place within the token and what the token adds to the trail: where a pair of state and trail needs them.
+#: Where an entry of a table has its parts: the token's frequency, the trail's factor; from the 13th bit on of each half
+#: the slot's place within the token and what the token adds to the trail: where a pair of state and trail needs them.
 _FACTORS = 2 * TOTAL - 1 | TRAIL_FACTOR << 32
 _ADDENDS_AT = 13
-_ADDENDS = TOTAL - 1 | 0x7FFFF << 32
 
 
 @dataclass(frozen=True)
@@ -216,7 +215,8 @@ class Decoder:
         self._what = what
         # numpy is faster with arrays of constants than with constants.
         self._shifts = np.tile(np.array([PRECISION, TRAIL_SHIFT], "<u4"), lanes)
-        constants = [32, CONTEXT_SHIFT, _ADDENDS_AT, TOTAL - 1, 0xFFFF0000, 0, _FACTORS, _ADDENDS]
+        self._down = np.full(2 * lanes, _ADDENDS_AT, "<u4")
+        constants = [32, CONTEXT_SHIFT, TOTAL - 1, 0xFFFF0000, 0, _FACTORS]
         self._constants = np.repeat(np.array(constants, np.int64)[:, None], lanes, axis=1)
 
     def stream(
@@ -261,7 +261,8 @@ class Decoder:
         pairs, shifts = self._pairs[: 2 * lanes], self._shifts[: 2 * lanes]
         both = pairs.view("<i8")
         low, high = pairs.view("<u2")[0::4], pairs.view("<u2")[1::4]
-        halves, eights, down, low_bits, high_bits, none, in_factors, in_addends = self._constants[:, :lanes]
+        halves, eights, low_bits, high_bits, none, in_factors = self._constants[:, :lanes]
+        down = self._down[: 2 * lanes]
         weights = np.full(lanes, weight, np.int64)
         size, context, entry, factor = (np.empty(lanes, "<i8") for _ in range(4))
         few = np.empty(lanes, bool)
@@ -280,8 +281,7 @@ class Decoder:
             add(slot, context, slot)
             look_up(slot, None, entry, "wrap")  # faster than the others, and there is nothing to wrap
             mask(entry, in_factors, factor)
-            shift(entry, down, entry)
-            mask(entry, in_addends, entry)
+            shift(addends, down, addends)
             shift(pairs, shifts, pairs)
             multiply(pairs, factors, pairs)
             add(pairs, addends, pairs)

@@ -151,7 +151,8 @@ def rendered(rasterizer: Rasterizer, cameras: Sequence[Camera]) -> Iterator[list
     device = rasterizer.device
     buffer = device.allocate(sum(12 * camera.width * camera.height for camera in cameras), "the pictures")
     try:
-        rasterizer.render_into(cameras, buffer)
+        with device.errors("failed while rendering"):
+            rasterizer.render_into(cameras, buffer)
         yield place_pictures(buffer, cameras)
     finally:
         device.free(buffer)

@@ -2,8 +2,8 @@
 
 Each device and kernel family runs in a process of its own, so that a runtime that crashes is one row of the table. What
 is checked: the device's self-check; small random scenes of every SH degree and both rules against the float64
-definition; the same bytes twice; the re-fit's maps and its solution against float64; and, where FOLDER holds scenes
-with reference renders, PSNR against them.
+definition; the same bytes twice; SSIM, the re-fit's maps and its solution against float64; and, where FOLDER holds
+scenes with reference renders, PSNR against them.
 
 Oclgrind, where installed, simulates small scenes under its race, bounds and initialisation checks. pip's PoCL, Debian's
 PoCL (pocl-opencl-icd), Intel's (intel-opencl-rt) and Mesa's rusticl (mesa-opencl-icd) are found if they are there.
@@ -29,13 +29,15 @@ import pyopencl as cl
 from potr_cl.cameras import camera_centres
 from potr_cl.compaction import Compactor, ViewWeights
 from potr_cl.device import Device, DeviceInfo, list_devices
+from potr_cl.errors import DeviceError
 from potr_cl.formats import load_cameras, load_scene
+from potr_cl.metrics import ssim
 from potr_cl.pruning import PruningOptions
 from potr_cl.pruning_on_device import prune_scene
 from potr_cl.rasterizer import GSPLAT, INRIA, Rasterizer
 from potr_cl.refit import ColourRefit, RefitOptions, RenderedTargets
 from potr_cl.removal import RemovalSweep, SweepOptions
-from potr_cl.similarity import Similarity, rendered
+from potr_cl.similarity import Picture, Similarity
 from tests import reference
 from tests.raster_scenes import camera, random_splats, splats, tilted_camera
 from tests.refit_cases import Case, Linearised, Pictures, visible_scene
@@ -65,6 +67,21 @@ def check_definition(device: Device, sizes: tuple[int, ...] = (30, 400)) -> dict
                 flips += int((error > TOLERANCE).sum())
                 pixels += error.size
     return {"error": worst, "flips": flips, "pixels": pixels, "same_bytes": same}
+
+
+def check_similarity(device: Device) -> None:
+    """SSIM of noisy, flat and bright pictures against float64.
+
+    Raises:
+        DeviceError: it is more than 1e-6 away.
+    """
+    rng = np.random.default_rng(0)
+    for level, noise in ((0.5, 0.2), (0.98, 1e-3)):
+        a, b = (np.float32(level) + noise * rng.standard_normal((37, 50, 3), np.float32) for _ in range(2))
+        pair = Picture(device.upload(a, "a picture"), 0, 50, 37), Picture(device.upload(b, "a picture"), 0, 50, 37)
+        ((_, found),) = Similarity(device)([pair])
+        if abs(found - ssim(a, b)) > 1e-6:
+            raise DeviceError(f"SSIM is {found}, not {ssim(a, b)}")
 
 
 def check_refit(device: Device) -> dict[str, Any]:
@@ -138,6 +155,7 @@ def check_device(index: int, family: str, scenes: Path | None) -> dict[str, Any]
     """Everything about one device and family."""
     device = Device(list_devices()[index], family=family)  # type: ignore[arg-type]
     device.self_check()
+    check_similarity(device)
     result = {"vector_width": device.vector_width, **check_definition(device), "refit": check_refit(device)}
     for name in ("lego", "plush"):
         if scenes and (scenes / name / "reference").exists():
@@ -149,7 +167,7 @@ def simulate(what: str) -> None:
     """Inside Oclgrind: every kernel, every vector width, on scenes as small as it is slow.
 
     Args:
-        what: "similarity", of both families, or all kernels but that of a family.
+        what: the family of the kernels.
 
     Nothing is freed: Oclgrind mistakes a new buffer in an old one's place for memory that no one has written. Nor does
     it know that a filled buffer has been written.
@@ -163,18 +181,11 @@ def simulate(what: str) -> None:
     kept: list[Rasterizer] = []
     freed: list[cl.Buffer] = []
     for family, width in (("gpu", 1), ("cpu", 4), ("cpu", 8), ("cpu", 16)):
-        if what not in ("similarity", family):
+        if what != family:
             continue
         simulated = dataclasses.replace(info, vector_width=width)
         device = Device(simulated, family=family, build_options=["-DNO_PREFETCH"])  # type: ignore[arg-type]
         device.free = freed.append  # type: ignore[method-assign, assignment]
-        if what == "similarity":
-            pair = [Rasterizer(device, random_splats(60, 3, seed=seed)) for seed in (2, 3)]
-            views = [tilted_camera(seed, 40, 24) for seed in range(2)]
-            with rendered(pair[0], views) as some, rendered(pair[1], views) as others:
-                Similarity(device)(list(zip(some, others, strict=True)))
-            kept += pair
-            continue
         for rules in (INRIA, GSPLAT):
             for size in (60, 400):
                 scene, view = random_splats(size, 3, seed=1), tilted_camera(1, 40, 24)
@@ -198,17 +209,14 @@ def simulate(what: str) -> None:
         centres = np.random.default_rng(0).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (5000, 3))
         kept.append(Rasterizer(device, splats(centres, sigma=1e-3, logit=1)))
         kept[-1].render(camera(16, 16))  # a list longer than local memory
+        check_similarity(device)
 
 
 def run_oclgrind() -> str:
     """One line: what Oclgrind found."""
-    # Looking for uninitialised values it crashes where vectors are loaded from a work-item's own array, and where local
-    # arrays have two dimensions.
-    for what, checks in (
-        ("gpu", ["--data-races", "--uninitialized"]),
-        ("cpu", ["--data-races"]),
-        ("similarity", ["--data-races"]),
-    ):
+    # Looking for uninitialised values it crashes where vectors are loaded from a work-item's own array, and where a vector
+    # is made of shorter ones.
+    for what, checks in (("gpu", ["--data-races", "--uninitialized"]), ("cpu", ["--data-races"])):
         with tempfile.TemporaryDirectory() as folder:
             log = Path(folder) / "log"
             # Its optimiser breaks stores of vectors; programs from pyopencl's cache lose their sources.
@@ -255,7 +263,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, help="folder with lego and plush")
     parser.add_argument("--device", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--family", help=argparse.SUPPRESS)
-    parser.add_argument("--simulate", choices=("gpu", "cpu", "similarity"), help=argparse.SUPPRESS)
+    parser.add_argument("--simulate", choices=("gpu", "cpu"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
     if arguments.simulate is not None:
         simulate(arguments.simulate)

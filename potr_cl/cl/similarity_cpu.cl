@@ -119,6 +119,10 @@ kernel void similarity(
         }
         ADD_ROW(row_dissimilarities, dissimilarities, dissimilarities_lost)
     }
-    sums[first_sum + get_global_id(1) * get_global_size(0) + get_global_id(0)] =
-        (float2)(sum_lanes(errors), sum_lanes(dissimilarities));
+    VSTORE(errors, 0, s);
+    VSTORE(dissimilarities, 0, d);
+    float2 sum = (float2)(0.0f, 0.0f);
+    for (int i = 0; i < LANES; ++i)
+        sum += (float2)(s[i], d[i]);
+    sums[first_sum + get_global_id(1) * get_global_size(0) + get_global_id(0)] = sum;
 }

@@ -21,7 +21,7 @@ kernel __attribute__((reqd_work_group_size(GROUP, GROUP, 1))) void similarity(
     uint first_sum)
 {
     local float2 values[WIDE][WIDE]; /* s and d */
-    local float4 rows[WIDE][GROUP]; /* s, d and their squares, under the window along a row */
+    local float2 means[WIDE][GROUP], squares[WIDE][GROUP]; /* of s and d, under the window along a row */
     local float2 partial[GROUP * GROUP];
 
     const int x = get_local_id(0), y = get_local_id(1), item = y * GROUP + x;
@@ -51,13 +51,15 @@ kernel __attribute__((reqd_work_group_size(GROUP, GROUP, 1))) void similarity(
         for (int row = y; row < WIDE; row += GROUP) {
 #define AT_VALUE(k) values[row][x + RADIUS + (k)]
 #define AT_SQUARE(k) (AT_VALUE(k) * AT_VALUE(k))
-            rows[row][x] = (float4)(UNDER_WINDOW(AT_VALUE), UNDER_WINDOW(AT_SQUARE));
+            means[row][x] = UNDER_WINDOW(AT_VALUE);
+            squares[row][x] = UNDER_WINDOW(AT_SQUARE);
         }
         barrier(CLK_LOCAL_MEM_FENCE);
-#define AT_ROW(k) rows[y + RADIUS + (k)][x]
-        const float4 mean = UNDER_WINDOW(AT_ROW);
+#define AT_MEAN(k) means[y + RADIUS + (k)][x]
+#define AT_SQUARE_MEAN(k) squares[y + RADIUS + (k)][x]
+        const float2 mean = UNDER_WINDOW(AT_MEAN), square = UNDER_WINDOW(AT_SQUARE_MEAN);
         if (inside)
-            sum.y += dissimilarity(mean.x, mean.y, mean.z, mean.w, taken.x, taken.y);
+            sum.y += dissimilarity(mean.x, mean.y, square.x, square.y, taken.x, taken.y);
     }
     partial[item] = sum;
     for (int step = GROUP * GROUP / 2; step; step /= 2) {
