@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from potr_cl.device import Device
 from potr_cl.pruning import DampedEffects, PruningOptions, choose, prune
 from potr_cl.pruning_on_device import prune_scene
 from potr_cl.rasterizer import Rasterizer
@@ -142,6 +143,22 @@ def test_host_and_device_take_turns(gpu, lego_excerpt, cameras):
     plain, _ = run(gpu, lego_excerpt, cameras, OPTIONS, SweepOptions(0.0))
     assert len(seen) == 2
     assert found.order.tobytes() == plain.order.tobytes()
+
+
+def test_the_same_without_atomics_on_64_bits(gpu, lego_excerpt, cameras):
+    class Device32(Device):
+        def program(self, source, **defines):
+            asked.add(defines.get("INT64_ATOMICS"))
+            if "INT64_ATOMICS" in defines:
+                defines["INT64_ATOMICS"] = 0
+            return super().program(source, **defines)
+
+    asked: set[int | None] = set()
+    found, _ = run(gpu, lego_excerpt, cameras, OPTIONS)
+    other, _ = run(Device32(gpu.info, family="gpu"), lego_excerpt, cameras, OPTIONS)
+    assert asked & {0, 1}
+    assert other.order.tobytes() == found.order.tobytes()
+    assert other.history == found.history
 
 
 def test_options_that_only_the_host_knows(gpu, lego_excerpt, cameras):
