@@ -214,8 +214,8 @@ def simulate(what: str) -> None:
 
 def run_oclgrind() -> str:
     """One line: what Oclgrind found."""
-    # Looking for uninitialised values it crashes where vectors are loaded from a work-item's own array, and where a vector
-    # is made of shorter ones.
+    # Looking for uninitialised values it crashes where vectors are loaded from a work-item's own array, and where a
+    # vector is made of shorter ones.
     for what, checks in (("gpu", ["--data-races", "--uninitialized"]), ("cpu", ["--data-races"])):
         with tempfile.TemporaryDirectory() as folder:
             log = Path(folder) / "log"
