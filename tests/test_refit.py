@@ -96,6 +96,26 @@ def test_the_normal_matrix(device, degree):
         assert np.abs(blocks - np.triu(wanted)).max() < 1e-5 * wanted.max()
 
 
+def test_lists_of_more_splats_than_are_walked_at_a_time(device):
+    """CPU kernels take 1024 at a time."""
+    scene = visible_scene(1400, 1)
+    scene.log_scales[:] = -4.5
+    scene.opacity_logits[:] = -3.5
+    rng = np.random.default_rng(0)
+    with Case(device, scene, visible_scene(60, 1, seed=7), ring_of_cameras(1, size=16)) as case:
+        reference = case.reference()
+        rendered = reference.pictures(reference.start)
+        images = [p - t.reshape(-1, 3) for p, t in zip(rendered, case.pictures, strict=True)]
+        direction = rng.normal(size=scene.sh.shape)
+        with Linearised(case) as linear:
+            transposed = -linear.vector(linear.refit._residual)
+            normal = linear.normal(direction)
+            blocks = linear.gram()
+        assert relative(transposed, reference.transposed(images)) < 1e-5
+        assert relative(normal, reference.transposed(reference.forward(direction))) < 1e-5
+        assert np.abs(blocks - np.triu(reference.gram())).max() < 1e-5 * blocks.max()
+
+
 def test_the_length_of_a_picture_is_the_product_with_the_normal_matrix(device):
     """d · Aᵀ A d = |A d|², both from the kernels: the forward map's picture and the transposed map's sums."""
     scene = visible_scene(60, 3, seed=2)

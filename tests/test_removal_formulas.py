@@ -44,6 +44,20 @@ def test_prefix_sums_agree_where_pixels_end_early(family):
     agree(family, visible_scene(600).subset(np.repeat(np.arange(600), 4)), ring_of_cameras(2, size=40))
 
 
+@pytest.mark.parametrize(("splats", "segments"), [(3000, 2), (25000, 17)])
+def test_prefix_sums_agree_in_lists_of_many_segments(splats, segments):
+    """CPU kernels walk a list 1024 splats at a time, and remember 16 places in it at the most."""
+    scene = visible_scene(splats)
+    scene.log_scales[:] = -4.5
+    scene.opacity_logits[:] = -4.5
+    camera = ring_of_cameras(1, size=16)[0]
+    agree("cpu", scene, [camera])
+    device = devices(family="cpu")[0]
+    rasterizer = Rasterizer(device, scene)
+    assert rasterizer.prepare(camera).entry_count > 1024 * segments
+    assert rasterizer.render(camera)[1].max() > 1e-4  # pixels go on to the end
+
+
 def test_only_the_removal_kernel_is_replaced():
     for family in ("cpu", "gpu"):
         assert "paper's second half" in prefix_sums_source(f"removal_{family}.cl")

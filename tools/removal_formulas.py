@@ -2,8 +2,9 @@
 
 Back to front is what the package computes, PD = T alpha (B - c) with the colour behind B grown from the last splat on.
 Prefix sums is the paper's, PD_k = P_k - P_{k+1} / (1 - alpha) + alpha / (1 - alpha) P_K, in a second sweep from front
-to back once the final colour P_K is known (removal_prefix_sums_*.cl): the rest of the kernel, lists and sums are the
-same.
+to back once the final colour P_K is known (removal_prefix_sums_*.cl): lists and sums are the same, and on GPUs the
+rest of the kernel. On CPUs back to front walks patch by patch and remembers alphas, prefix sums go splat by splat and
+do not, so there only the errors compare formulas.
 
 Compared: the error where an opaque splat stands behind many layers, the error on real scenes, both against removals in
 float64 that leave the pixels' ends where they are, and the time of a sweep. On the scenes both formulas also share the
@@ -33,9 +34,10 @@ from tools.removal_exactness import NOISE_FLOOR, SCENES, BruteForce, choose_spla
 
 F64 = NDArray[np.float64]
 
-#: Where a removal kernel's second half begins; it ends before the next kernel.
+#: Where what the paper's formula replaces begins: a GPU kernel's second half, all of a CPU kernel. It ends before the
+#: next kernel.
 _SECOND_HALVES = {
-    "removal_cpu.cl": "    /* From here on r, g, b are twice the difference",
+    "removal_cpu.cl": "/* Where a list's transmittances are kept",
     "removal_gpu.cl": "    /* From here on r, g, b are twice the difference",
 }
 #: Pixels end here, in the sweeps and in float64.

@@ -1,10 +1,90 @@
-    /* The paper's second half of the removal kernel (section "Effect of a splat's removal"): the tile's list front to
-       back once more, the final colour P_K known, P_k and T as running sums and products,
+/* The removal kernel with the paper's second half (section "Effect of a splat's removal"), one tile a work-item, splat by
+   splat: the tile's list front to back twice, the second time with the final colour P_K known, P_k and T as running sums
+   and products,
 
-           PD_k = P_k - P_{k+1} / (1 - alpha) + alpha / (1 - alpha) P_K
+       PD_k = P_k - P_{k+1} / (1 - alpha) + alpha / (1 - alpha) P_K
 
-       Stands in removal_cpu.cl for the sweep from back to front; see removal_formulas.py. From here on r, g, b are the
-       final colour, dr, dg, db twice its difference to the target, and pr, pg, pb the colour before a splat. */
+   Stands in removal_cpu.cl for the walks patch by patch; see removal_formulas.py. */
+
+/* Work-item i handles tile tiles[start + i]. */
+kernel void removal(
+    uint start,
+    global const uint *tiles,
+    global const float4 *shapes,
+    global const float4 *colours,
+    global const uchar *alive,
+    global const uint *begins,
+    global uint *lengths,
+    global uint *entries,
+    global uint *patches,
+    View view,
+    float red,
+    float green,
+    float blue,
+    int first_time,
+    float scale,
+    float bound,
+    global float *target,
+    global float2 *sums,
+    volatile global uint *totals)
+{
+    const int tile = tiles[start + get_global_id(0)];
+    const int2 origin = (int2)(tile % view.columns, tile / view.columns) * TILE;
+    const uint begin = begins[tile];
+    const uint end = begin + lengths[tile];
+
+    vfloat t[PATCHES], r[PATCHES], g[PATCHES], b[PATCHES];
+    vint last[PATCHES];
+    for (int i = 0; i < PATCHES; ++i) {
+        t[i] = patch_transmittance(i, origin, view.width, view.height);
+        r[i] = g[i] = b[i] = (vfloat)(0.0f);
+        last[i] = (vint)(-1);
+    }
+
+    uint living = ALL_PATCHES;
+    uint kept = begin, swept = begin;
+    for (uint read = begin; read < end; ++read) {
+        if (living && read + AHEAD < end)
+            prefetch_splat(shapes, colours, entries[read + AHEAD]);
+        const uint number = entries[read];
+        if (!alive[number] || sums[read].y < 0.0f)
+            continue;
+        uint todo = patches[read];
+        if (kept < read) {
+            entries[kept] = number;
+            sums[kept] = sums[read];
+            patches[kept] = todo;
+        }
+        const vint place = (vint)((int)(kept++ - begin));
+        if (!living)
+            continue;
+        swept = kept;
+        todo &= living;
+        if (todo) {
+            const Splat splat = load_splat(shapes, colours, number);
+            for (; todo; todo &= todo - 1) {
+                const int i = LOWEST_PATCH(todo);
+                const vfloat power = patch_power(&splat, i, origin);
+                BLEND(weight, power, t[i]);
+                last[i] = goes_on ? place : last[i];
+                r[i] = MAD(weight, (vfloat)(splat.red), r[i]);
+                g[i] = MAD(weight, (vfloat)(splat.green), g[i]);
+                b[i] = MAD(weight, (vfloat)(splat.blue), b[i]);
+            }
+        }
+        if ((kept - begin) % AHEAD == 0)
+            living = living_patches(t);
+    }
+    lengths[tile] = kept - begin;
+    /* What lies behind the last pixel's end has no effect any more; nor have the slots that the dead left. */
+    for (uint e = swept; e < end; ++e) {
+        if (e < kept)
+            replace_sums(totals + TOTAL_WORDS * entries[e], sums[e], (float2)(0.0f, 0.0f), scale, bound);
+        sums[e] = (float2)(0.0f, 0.0f);
+    }
+
+    /* From here on r, g, b are the final colour, dr, dg, db twice its difference to the target, and pr, pg, pb the colour
+       before a splat. */
     vfloat dr[PATCHES], dg[PATCHES], db[PATCHES];
     vfloat pr[PATCHES], pg[PATCHES], pb[PATCHES];
     float differences[3][TILE * TILE];

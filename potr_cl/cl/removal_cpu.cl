@@ -1,13 +1,16 @@
-/* Removal effects for CPUs: one tile a work-item, one sweep forward and one back over the tile's list.
+/* Removal effects for CPUs: one tile a work-item, patch by patch, one walk forward and one back over a patch's list.
 
-   Forward as in composite_cpu.cl, for the pixels' colours, transmittances and last splats. Then from the last splat to
-   the first: B, the colour behind a splat as seen with nothing in front, is a convex sum that grows by one splat at a
-   time, and the transmittance in front follows from the one behind by a division. So nothing cancels, however many
-   layers hide a splat. Per splat and tile the sweep leaves the sums over the tile's pixels of
+   Forward as in composite_cpu.cl, for the pixels' colours; each splat's alphas and weights w = T alpha are remembered.
+   Then from the last splat to the first: B, the colour behind a splat as seen with nothing in front, is a convex sum that
+   grows by one splat at a time. So nothing cancels, however many layers hide a splat. Per splat and tile the sweep leaves
+   the sums over the tile's pixels of
 
        PD^2 + 2 PD (c - c_t),  PD = T alpha (B - c_k)      and      T alpha
 
    (paper, section "Effect of a splat's removal"), in the slot of the splat's entry.
+
+   A list of more than SEGMENT splats is walked segment by segment: forward through all of them, the transmittances before
+   each kept, then from the last segment to the first, each walked forward once more for its alphas and weights.
 
    Lists are compacted on the way: entries of splats that are not alive, or that the last sweep marked, are dropped, in
    place; a tile's list begins at begins[tile] and has lengths[tile] entries.
@@ -17,7 +20,119 @@
 #include "lanes.clh"
 #include "splat.clh"
 #include "patch_vectors.clh"
+#include "patch_walk.clh"
 #include "removal.clh"
+
+/* Where a list's transmittances are kept at the most; of the segments between two of them those before are walked again. */
+#define CHECKPOINTS 16
+
+/* Gathers the splats from entry `begin` on, up to SEGMENT, and lists them by patch; returns their number. */
+inline uint gather_splats(
+    global const float4 *shapes,
+    global const float4 *colours,
+    global const uint *entries,
+    global const uint *patches,
+    uint begin,
+    uint end,
+    Splat *splats,
+    ushort lists[PATCHES][SEGMENT],
+    uint *listed)
+{
+    const uint count = min(end - begin, (uint)SEGMENT);
+    for (int i = 0; i < PATCHES; ++i)
+        listed[i] = 0;
+    for (uint k = 0; k < count; ++k) {
+        const uint e = begin + k;
+        if (e + AHEAD < end)
+            prefetch_splat(shapes, colours, entries[e + AHEAD]);
+        splats[k] = load_splat(shapes, colours, entries[e]);
+        list_splat(k, patches[e], lists, listed);
+    }
+    return count;
+}
+
+/* A patch's walk forward: its transmittances and colours move on, memory[2 j] and memory[2 j + 1] become the j-th splat's
+   alphas and weights. Returns the number of splats before the last pixel's end. */
+inline uint walk(
+    const Splat *splats,
+    const ushort *list,
+    uint length,
+    float2 first,
+    vfloat t[1],
+    vfloat rgb[3],
+    float *memory,
+    uchar *touching)
+{
+    vfloat through = t[0], r = rgb[0], g = rgb[1], b = rgb[2];
+    uint j = 0;
+    while (j < length && (TIGHTEN || VANY(through > 0.0f))) {
+        const uint stop = min(j + PAIRS_AT_ONCE, length);
+        for (; j < stop; ++j) {
+            const Splat *splat = &splats[list[j]];
+            const vfloat power = splat_power(splat, first);
+            BLEND(weight, power, through);
+            r = MAD(weight, (vfloat)(splat->red), r);
+            g = MAD(weight, (vfloat)(splat->green), g);
+            b = MAD(weight, (vfloat)(splat->blue), b);
+            VSTORE(goes_on ? alpha : (vfloat)(0.0f), 2 * j, memory);
+            VSTORE(weight, 2 * j + 1, memory);
+            if (TIGHTEN && VANY(power >= LOG2_ALPHA_MIN))
+                touching[list[j]] = 1;
+        }
+    }
+    t[0] = through;
+    rgb[0] = r;
+    rgb[1] = g;
+    rgb[2] = b;
+    return j;
+}
+
+/* A patch's walk back over what the walk forward remembers; `twice` is twice the colour's difference to the target,
+   `behind` the colour behind. sums[list[j]] += the j-th splat's sums over the pixels. */
+inline void walk_back(
+    const Splat *splats,
+    const ushort *list,
+    uint length,
+    const vfloat twice[3],
+    vfloat behind[3],
+    float *memory,
+    float2 *sums)
+{
+    const vfloat r = twice[0], g = twice[1], b = twice[2];
+    vfloat br = behind[0], bg = behind[1], bb = behind[2];
+    for (uint j = length; j-- > 0;) {
+        const Splat *splat = &splats[list[j]];
+        const vfloat alpha = VLOAD(2 * j, memory), weight = VLOAD(2 * j + 1, memory);
+        const vfloat gap_r = br - splat->red, gap_g = bg - splat->green, gap_b = bb - splat->blue;
+        const vfloat pd_r = weight * gap_r, pd_g = weight * gap_g, pd_b = weight * gap_b;
+        VSTORE(MAD(pd_r, pd_r + r, MAD(pd_g, pd_g + g, pd_b * (pd_b + b))), 2 * j, memory);
+        br = MAD(-alpha, gap_r, br);
+        bg = MAD(-alpha, gap_g, bg);
+        bb = MAD(-alpha, gap_b, bb);
+    }
+    behind[0] = br;
+    behind[1] = bg;
+    behind[2] = bb;
+
+    for (uint j = length; j % LANES; ++j) {
+        VSTORE((vfloat)(0.0f), 2 * j, memory);
+        VSTORE((vfloat)(0.0f), 2 * j + 1, memory);
+    }
+    for (uint j = 0; j < length; j += LANES) {
+        vfloat effects[LANES], importances[LANES];
+        for (int k = 0; k < LANES; ++k) {
+            effects[k] = VLOAD(2 * (j + k), memory);
+            importances[k] = VLOAD(2 * (j + k) + 1, memory);
+        }
+        const vfloat effect = sum_each(effects), importance = sum_each(importances);
+        float pairs[2 * LANES];
+        VSTORE(ZIP_LOW(effect, importance), 0, pairs);
+        VSTORE(ZIP_HIGH(effect, importance), 1, pairs);
+        const uint count = min(length - j, (uint)LANES);
+        for (uint k = 0; k < count; ++k)
+            sums[list[j + k]] += vload2(k, pairs);
+    }
+}
 
 /* Work-item i handles tile tiles[start + i]. */
 kernel void removal(
@@ -46,130 +161,104 @@ kernel void removal(
     const uint begin = begins[tile];
     const uint end = begin + lengths[tile];
 
-    vfloat t[PATCHES], r[PATCHES], g[PATCHES], b[PATCHES];
-    vint last[PATCHES];
-    for (int i = 0; i < PATCHES; ++i) {
-        t[i] = patch_transmittance(i, origin, view.width, view.height);
-        r[i] = g[i] = b[i] = (vfloat)(0.0f);
-        last[i] = (vint)(-1);
-    }
-
-    uint living = ALL_PATCHES;
-    uint kept = begin, swept = begin;
+    uint kept = begin;
     for (uint read = begin; read < end; ++read) {
-        if (living && read + AHEAD < end)
-            prefetch_splat(shapes, colours, entries[read + AHEAD]);
         const uint number = entries[read];
         if (!alive[number] || sums[read].y < 0.0f)
             continue;
-        uint todo = patches[read];
         if (kept < read) {
             entries[kept] = number;
             sums[kept] = sums[read];
-            patches[kept] = todo;
+            patches[kept] = patches[read];
         }
-        const vint place = (vint)((int)(kept++ - begin));
-        if (!living)
-            continue;
-        swept = kept;
-        todo &= living;
-        if (todo) {
-            const Splat splat = load_splat(shapes, colours, number);
-            for (; todo; todo &= todo - 1) {
-                const int i = LOWEST_PATCH(todo);
-                const vfloat power = patch_power(&splat, i, origin);
-                BLEND(weight, power, t[i]);
-                last[i] = goes_on ? place : last[i];
-                r[i] = MAD(weight, (vfloat)(splat.red), r[i]);
-                g[i] = MAD(weight, (vfloat)(splat.green), g[i]);
-                b[i] = MAD(weight, (vfloat)(splat.blue), b[i]);
-            }
-        }
-        if ((kept - begin) % AHEAD == 0)
-            living = living_patches(t);
+        ++kept;
     }
     lengths[tile] = kept - begin;
-    /* What lies behind the last pixel's end has no effect any more; nor have the slots that the dead left. */
-    for (uint e = swept; e < end; ++e) {
-        if (e < kept)
-            replace_sums(totals + TOTAL_WORDS * entries[e], sums[e], (float2)(0.0f, 0.0f), scale, bound);
+    for (uint e = kept; e < end; ++e)
         sums[e] = (float2)(0.0f, 0.0f);
+
+    Splat splats[SEGMENT];
+    ushort lists[PATCHES][SEGMENT];
+    uint listed[PATCHES];
+    uchar touching[SEGMENT];
+    float memory[2 * (SEGMENT + LANES) * LANES];
+    float2 fresh[SEGMENT];
+    vfloat t[PATCHES], rgb[PATCHES][3], twice[PATCHES][3], behind[PATCHES][3];
+    vfloat checkpoints[CHECKPOINTS][PATCHES];
+    for (int i = 0; i < PATCHES; ++i) {
+        t[i] = patch_transmittance(i, origin, view.width, view.height);
+        rgb[i][0] = rgb[i][1] = rgb[i][2] = (vfloat)(0.0f);
+        behind[i][0] = (vfloat)(red);
+        behind[i][1] = (vfloat)(green);
+        behind[i][2] = (vfloat)(blue);
     }
 
-    /* From here on r, g, b are twice the difference of the colour to the target, and br, bg, bb the colour behind. */
-    vfloat br[PATCHES], bg[PATCHES], bb[PATCHES];
-    float differences[3][TILE * TILE];
-    for (int i = 0; i < PATCHES; ++i) {
-        t[i] = fabs(t[i]);
-        store_patch(MAD(t[i], (vfloat)(red), r[i]), i, differences[0]);
-        store_patch(MAD(t[i], (vfloat)(green), g[i]), i, differences[1]);
-        store_patch(MAD(t[i], (vfloat)(blue), b[i]), i, differences[2]);
-        br[i] = (vfloat)(red);
-        bg[i] = (vfloat)(green);
-        bb[i] = (vfloat)(blue);
-    }
-    const int pixel_columns = min(TILE, view.width - origin.x), pixel_rows = min(TILE, view.height - origin.y);
-    for (int row = 0; row < pixel_rows; ++row) {
-        size_t place = 3 * ((size_t)(origin.y + row) * view.width + origin.x);
-        for (int pixel = row * TILE; pixel < row * TILE + pixel_columns; ++pixel)
-            for (int channel = 0; channel < 3; ++channel, ++place) {
-                if (first_time)
-                    target[place] = differences[channel][pixel];
-                differences[channel][pixel] = 2.0f * (differences[channel][pixel] - target[place]);
-            }
-    }
-    int ends[PATCHES]; /* the last splat that any of a patch's pixels sees */
-    for (int i = 0; i < PATCHES; ++i) {
-        r[i] = load_patch(i, differences[0]);
-        g[i] = load_patch(i, differences[1]);
-        b[i] = load_patch(i, differences[2]);
-        int lanes[LANES];
-        VSTORE(last[i], 0, lanes);
-        ends[i] = -1;
-        for (int lane = 0; lane < LANES; ++lane)
-            ends[i] = max(ends[i], lanes[lane]);
-    }
-
-    uint seeing = 0;
-    for (uint e = swept; e-- > begin;) {
-        if (e >= begin + AHEAD)
-            prefetch_splat(shapes, colours, entries[e - AHEAD]);
-        if (e == swept - 1 || (e - begin) % AHEAD == AHEAD - 1)
+    const uint segments = max((kept - begin + SEGMENT - 1) / SEGMENT, 1u);
+    const uint apart = (segments + CHECKPOINTS - 1) / CHECKPOINTS;
+    uint last = 0; /* the last segment in which a pixel goes on */
+    for (; last + 1 < segments && living_patches(t); ++last) {
+        if (last % apart == 0)
             for (int i = 0; i < PATCHES; ++i)
-                if (TIGHTEN || ends[i] >= (int)((e - begin) / AHEAD * AHEAD))
-                    seeing |= 1u << i;
-        const uint number = entries[e];
-        const vint place = (vint)((int)(e - begin));
-        vfloat effect = (vfloat)(0.0f), importance = (vfloat)(0.0f);
-        vint touched = (vint)(0);
-        uint todo = patches[e] & seeing;
-        if (todo) {
-            const Splat splat = load_splat(shapes, colours, number);
-            for (; todo; todo &= todo - 1) {
-                const int i = LOWEST_PATCH(todo);
-                const vfloat power = patch_power(&splat, i, origin);
-                vfloat alpha = exp2_polynomial(power);
-                alpha = LESSER(alpha, (vfloat)(ALPHA_CAP));
-                const vint reached = power >= LOG2_ALPHA_MIN;
-                touched |= reached;
-                alpha = reached && (place <= last[i]) ? alpha : (vfloat)(0.0f);
-                const vfloat front = t[i] / (1.0f - alpha);
-                t[i] = front;
-                const vfloat weight = front * alpha;
-                const vfloat gap_r = br[i] - splat.red, gap_g = bg[i] - splat.green, gap_b = bb[i] - splat.blue;
-                const vfloat pd_r = weight * gap_r, pd_g = weight * gap_g, pd_b = weight * gap_b;
-                effect = MAD(pd_r, pd_r + r[i], effect);
-                effect = MAD(pd_g, pd_g + g[i], effect);
-                effect = MAD(pd_b, pd_b + b[i], effect);
-                importance += weight;
-                br[i] = MAD(-alpha, gap_r, br[i]);
-                bg[i] = MAD(-alpha, gap_g, bg[i]);
-                bb[i] = MAD(-alpha, gap_b, bb[i]);
+                checkpoints[last / apart][i] = t[i];
+        gather_splats(shapes, colours, entries, patches, begin + last * SEGMENT, kept, splats, lists, listed);
+        for (int i = 0; i < PATCHES; ++i)
+            walk(splats, lists[i], listed[i], patch_centre(origin, i), &t[i], rgb[i], memory, touching);
+    }
+
+    for (uint segment = last + 1; segment-- > 0;) {
+        const uint from = begin + segment * SEGMENT;
+        if (segment < last) {
+            const uint checkpoint = segment / apart;
+            for (int i = 0; i < PATCHES; ++i)
+                t[i] = checkpoints[checkpoint][i];
+            for (uint before = checkpoint * apart; before < segment; ++before) {
+                gather_splats(shapes, colours, entries, patches, begin + before * SEGMENT, kept, splats, lists, listed);
+                for (int i = 0; i < PATCHES; ++i)
+                    walk(splats, lists[i], listed[i], patch_centre(origin, i), &t[i], rgb[i], memory, touching);
             }
         }
-        const float2 sum = (float2)(sum_lanes(effect), sum_lanes(importance));
-        replace_sums(totals + TOTAL_WORDS * number, sums[e], sum, scale, bound);
-        sums[e] = TIGHTEN && !VANY(touched) ? NEVER : sum;
+        const uint count = gather_splats(shapes, colours, entries, patches, from, kept, splats, lists, listed);
+        for (uint k = 0; k < count; ++k) {
+            fresh[k] = (float2)(0.0f, 0.0f);
+            touching[k] = 0;
+        }
+        for (int i = 0; i < PATCHES; ++i) {
+            const uint walked =
+                walk(splats, lists[i], listed[i], patch_centre(origin, i), &t[i], rgb[i], memory, touching);
+            if (segment == last) {
+                const vfloat through = fabs(t[i]);
+                float differences[3][LANES];
+                VSTORE(MAD(through, (vfloat)(red), rgb[i][0]), 0, differences[0]);
+                VSTORE(MAD(through, (vfloat)(green), rgb[i][1]), 0, differences[1]);
+                VSTORE(MAD(through, (vfloat)(blue), rgb[i][2]), 0, differences[2]);
+                for (int lane = 0; lane < LANES; ++lane) {
+                    const int column = origin.x + PATCH_COLUMN(i) + lane % PATCH_WIDTH;
+                    const int row = origin.y + PATCH_ROW(i) + lane / PATCH_WIDTH;
+                    if (column >= view.width || row >= view.height)
+                        continue;
+                    const size_t place = 3 * ((size_t)row * view.width + column);
+                    for (int channel = 0; channel < 3; ++channel) {
+                        if (first_time)
+                            target[place + channel] = differences[channel][lane];
+                        differences[channel][lane] = 2.0f * (differences[channel][lane] - target[place + channel]);
+                    }
+                }
+                for (int channel = 0; channel < 3; ++channel)
+                    twice[i][channel] = VLOAD(0, differences[channel]);
+            }
+            walk_back(splats, lists[i], walked, twice[i], behind[i], memory, fresh);
+        }
+        for (uint k = 0; k < count; ++k) {
+            if (k + AHEAD < count)
+                PREFETCH_TO_WRITE(totals + TOTAL_WORDS * entries[from + k + AHEAD]);
+            replace_sums(totals + TOTAL_WORDS * entries[from + k], sums[from + k], fresh[k], scale, bound);
+            sums[from + k] = TIGHTEN && !touching[k] ? NEVER : fresh[k];
+        }
+    }
+    /* What lies behind the last pixel's end has no effect any more. */
+    for (uint e = begin + (last + 1) * SEGMENT; e < kept; ++e) {
+        replace_sums(totals + TOTAL_WORDS * entries[e], sums[e], (float2)(0.0f, 0.0f), scale, bound);
+        sums[e] = (float2)(0.0f, 0.0f);
     }
 }
 
