@@ -26,10 +26,8 @@
 /* 1 where a coefficient may change, 0 where not. */
 inline vfloat active_lanes(global const uint *active, size_t stride, size_t index, size_t column)
 {
-    float lanes[LANES];
-    for (int lane = 0; lane < LANES; ++lane)
-        lanes[lane] = (float)(active[(column / 24) * stride + index * LANES + lane] >> (column % 24) & 1);
-    return VLOAD(0, lanes);
+    const vint words = VLOAD(index, (global const int *)(active + column / 24 * stride));
+    return CONVERT_VFLOAT(words >> (int)(column % 24) & 1);
 }
 
 inline void basis_towards(global const float *means, size_t stride, size_t index, global const View *view, vfloat *values)
@@ -40,6 +38,20 @@ inline void basis_towards(global const float *means, size_t stride, size_t index
     const vfloat length = sqrt(x * x + y * y + z * z);
     const vfloat inverse = 1.0f / (length > 0.0f ? length : (vfloat)(1.0f));
     sh_basis(x * inverse, y * inverse, z * inverse, values);
+}
+
+/* The channels of LANES splats' colours that are not cut at 0: 1, 2, 4. */
+inline vint free_channels(global const float4 *colours, size_t place)
+{
+#if LANES == 1
+    return (int)colours[place].w;
+#else
+    vfloat four[4], red, green, blue, channels;
+    for (int k = 0; k < 4; ++k)
+        four[k] = VLOAD(4 * place + k, (global const float *)colours);
+    separate(four, &red, &green, &blue, &channels);
+    return CONVERT_VINT(channels);
+#endif
 }
 
 #if !WEIGHTS
@@ -68,29 +80,70 @@ kernel void view_colours(
         for (int m = 0; m < SH_COUNT; ++m)
             for (int c = 0; c < 3; ++c)
                 sums[c] = MAD(basis[m], values[3 * m + c], sums[c]);
-        float rgb[3][LANES];
-        VSTORE(sums[0] + sums[1] - sums[2], 0, rgb[0]);
-        VSTORE(sums[0] + sums[2], 0, rgb[1]);
-        VSTORE(sums[0] - sums[1] - sums[2], 0, rgb[2]);
-        for (int lane = 0; lane < LANES; ++lane) {
-            const size_t splat = number * stride + index * LANES + lane;
-            float4 colour = (float4)(rgb[0][lane], rgb[1][lane], rgb[2][lane], 0.0f);
-            if (direction) {
-                const int channels = (int)free[splat].w;
-                colour.x = channels & 1 ? colour.x * unit : 0.0f;
-                colour.y = channels & 2 ? colour.y * unit : 0.0f;
-                colour.z = channels & 4 ? colour.z * unit : 0.0f;
-            } else {
-                colour = fmin(colour + (float4)(0.5f, 0.5f, 0.5f, 0.0f), 1e30f);
-                colour.w =
-                    (colour.x > 0.0f ? 1.0f : 0.0f) + (colour.y > 0.0f ? 2.0f : 0.0f) + (colour.z > 0.0f ? 4.0f : 0.0f);
-                colour = fmax(colour, 0.0f);
-            }
-            colours[splat] = colour;
+        vfloat red = sums[0] + sums[1] - sums[2], green = sums[0] + sums[2], blue = sums[0] - sums[1] - sums[2];
+        vfloat channels = (vfloat)(0.0f);
+        const size_t place = number * stride / LANES + index;
+        if (direction) {
+            const vint kept = free_channels(free, place);
+            red = (kept & 1) != 0 ? red * unit : (vfloat)(0.0f);
+            green = (kept & 2) != 0 ? green * unit : (vfloat)(0.0f);
+            blue = (kept & 4) != 0 ? blue * unit : (vfloat)(0.0f);
+        } else {
+            red = fmin(red + 0.5f, (vfloat)(1e30f));
+            green = fmin(green + 0.5f, (vfloat)(1e30f));
+            blue = fmin(blue + 0.5f, (vfloat)(1e30f));
+            channels = (red > 0.0f ? (vfloat)(1.0f) : (vfloat)(0.0f)) + (green > 0.0f ? (vfloat)(2.0f) : (vfloat)(0.0f)) +
+                (blue > 0.0f ? (vfloat)(4.0f) : (vfloat)(0.0f));
+            red = fmax(red, (vfloat)(0.0f));
+            green = fmax(green, (vfloat)(0.0f));
+            blue = fmax(blue, (vfloat)(0.0f));
         }
+#if LANES == 1
+        colours[place] = (float4)(red, green, blue, channels);
+#else
+        vfloat four[4];
+        interleave(red, green, blue, channels, four);
+        for (int k = 0; k < 4; ++k)
+            VSTORE(four[k], 4 * place + k, (global float *)colours);
+#endif
     }
 }
 #endif
+
+/* The totals of LANES splats times a scale, channel by channel; they become 0. Whether any was not. */
+inline int take_totals(global long *totals, float scale, vfloat *sums)
+{
+#if LANES == 1
+    int any_sum = 0;
+    for (int i = 0; i < 3 + WEIGHTS; ++i) {
+        any_sum |= totals[i] != 0;
+        sums[i] = (float)totals[i] * scale;
+        totals[i] = 0;
+    }
+    return any_sum;
+#else
+    global long4 *splats = (global long4 *)totals;
+    long4 all = splats[0];
+    for (int lane = 1; lane < LANES; ++lane)
+        all |= splats[lane];
+    if (!(all.x | all.y | all.z | all.w))
+        return 0;
+    float values[4 * LANES];
+    for (int lane = 0; lane < LANES; ++lane) {
+        /* In two parts of 32 bits: conversions of 64 are calls on some CPU runtimes. */
+        const long4 total = splats[lane], high = (total + (1l << 30)) >> 31;
+        const float4 value =
+            MAD(convert_float4(convert_int4(high)), (float4)(0x1p31f), convert_float4(convert_int4(total - (high << 31))));
+        vstore4(value * scale, lane, values);
+        splats[lane] = (long4)(0);
+    }
+    vfloat four[4];
+    for (int k = 0; k < 4; ++k)
+        four[k] = VLOAD(k, values);
+    separate(four, &sums[0], &sums[1], &sums[2], &sums[3]);
+    return 1;
+#endif
+}
 
 /* The totals of a set's views, times the view's scale, onto the coefficients: result += basis x (Y, Co, Cg) of the free
    channels' sums, view by view-> With WEIGHTS also gram += the sum of w^2 x basis x basis. Leaves the totals zero. */
@@ -110,18 +163,9 @@ kernel void gather(
     vfloat results[3 * SH_COUNT];
     int any_view = 0;
     for (uint number = 0; number < view_count; ++number) {
-        float parts[4][LANES];
-        int any_sum = 0;
-        for (int lane = 0; lane < LANES; ++lane) {
-            const size_t splat = number * stride + index * LANES + lane;
-            const int channels = (int)free[splat].w;
-            for (int i = 0; i < 3 + WEIGHTS; ++i) {
-                const long total = totals[TOTALS * splat + i];
-                any_sum |= total != 0;
-                parts[i][lane] = i < 3 && !(channels & (1 << i)) ? 0.0f : (float)total * scales[first_scale + number];
-                totals[TOTALS * splat + i] = 0;
-            }
-        }
+        const size_t place = number * stride / LANES + index;
+        vfloat sums[4];
+        const int any_sum = take_totals(totals + (size_t)TOTALS * LANES * place, scales[first_scale + number], sums);
         if (!any_sum)
             continue;
         if (!any_view)
@@ -130,13 +174,16 @@ kernel void gather(
         any_view = 1;
         VREAL basis[SH_COUNT];
         basis_towards(means, stride, index, &views[number].view, basis);
-        const vfloat r = VLOAD(0, parts[0]), g = VLOAD(0, parts[1]), b = VLOAD(0, parts[2]);
+        const vint kept = free_channels(free, place);
+        const vfloat r = (kept & 1) != 0 ? sums[0] : (vfloat)(0.0f);
+        const vfloat g = (kept & 2) != 0 ? sums[1] : (vfloat)(0.0f);
+        const vfloat b = (kept & 4) != 0 ? sums[2] : (vfloat)(0.0f);
         const vfloat channels[3] = {r + g + b, r - b, g - r - b};
         for (int m = 0; m < SH_COUNT; ++m)
             for (int c = 0; c < 3; ++c)
                 results[3 * m + c] = MAD(basis[m], channels[c], results[3 * m + c]);
 #if WEIGHTS
-        const vfloat weight = VLOAD(0, parts[3]);
+        const vfloat weight = sums[3];
         for (int i = 0; i < SH_COUNT; ++i)
             for (int j = i; j < SH_COUNT; ++j) {
                 global float *column = gram + AT(i, j) * stride;

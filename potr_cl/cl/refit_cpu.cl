@@ -83,8 +83,11 @@ inline void sum_pairs(const ushort *list, uint length, float *weights, const flo
             squares = MAD(w[k], w[k], squares);
 #endif
         }
+        vfloat four[4];
+        interleave(r, g, b, squares, four);
         float vectors[4 * LANES];
-        interleave(r, g, b, squares, vectors);
+        for (int k = 0; k < 4; ++k)
+            VSTORE(four[k], k, vectors);
         const uint count = min(length - j, (uint)LANES);
         for (uint k = 0; k < count; ++k)
             sums[list[j + k]] += vload4(k, vectors);
