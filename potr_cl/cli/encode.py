@@ -42,7 +42,7 @@ from potr_cl.rasterizer import Rasterizer
 from potr_cl.scene import Scene
 from potr_cl.search import Target, encode_to_target
 from potr_cl.summary import encode_report, format_encode_report, quality_report, search_report
-from potr_cl.threads import in_background
+from potr_cl.threads import thread_pool
 
 
 def _options(args: argparse.Namespace) -> EncodeOptions:
@@ -111,16 +111,16 @@ def _encode(args: argparse.Namespace) -> None:
         raise UsageError("--report-view needs --report, the page that shows it")
     if args.report is not None and args.report.resolve() == args.output.resolve():
         raise UsageError("--report and --output name the same file")
-    # Opened while the scene is read.
-    opened = in_background(Device, args.device) if _looks(args, options) else None
-    cameras = given_cameras(args)
-    photographs = None
-    if options.photographs is not None and cameras is not None:
-        photographs = Photographs(options.photographs, cameras, options.background)
-    scene = load_scene(args.scene)
-    options = dataclasses.replace(options, count=count(args, len(scene)))
-    device = opened.result() if opened is not None and needs_views(scene, options) else None
     with contextlib.ExitStack() as stack:
+        # Opened while the scene is read.
+        opened = stack.enter_context(thread_pool(1)).submit(Device, args.device) if _looks(args, options) else None
+        cameras = given_cameras(args)
+        photographs = None
+        if options.photographs is not None and cameras is not None:
+            photographs = Photographs(options.photographs, cameras, options.background)
+        scene = load_scene(args.scene)
+        options = dataclasses.replace(options, count=count(args, len(scene)))
+        device = opened.result() if opened is not None and needs_views(scene, options) else None
         progress = stack.enter_context(contextlib.closing(Progress()))
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None
         placing = Stopwatch(progress)
