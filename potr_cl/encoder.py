@@ -145,23 +145,46 @@ def reduce(
     scene: Scene, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch, device: Device | None = None
 ) -> Reduced:
     """The first half of :func:`encode`: fewer splats with sparser colours, as far as views and options allow."""
+    return refit(scene, thin(scene, views, options, watch, device), views, options, watch)
+
+
+def thin(
+    scene: Scene, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch, device: Device | None = None
+) -> Reduced:
+    """The part of :func:`reduce` that comes before the re-fit: pruning and compaction."""
     if not views or not needs_views(scene, options):
         return Reduced(scene, None, None, None)
 
     def work(device: Device, options: EncodeOptions) -> Reduced:
-        reduced, pruned = reduce_scene(scene, views, options, watch, device)
-        if not options.refit:
-            return Reduced(reduced, pruned, None, device)
-        watch("refit", 0.0)
-        with thread_pool(options.threads) as pool:
-            geometry = quantise_geometry(reduced, options.parameters, views, pool.map)
-        refitted = refit(scene, reduced, geometry, views, options, watch, device)
-        return Reduced(replace(reduced, sh=refitted.sh), pruned, refitted, device, geometry)
+        return Reduced(*reduce_scene(scene, views, options, watch, device), None, device)
 
     return on_device(device or Device(), options, work)[0]
 
 
-def refit(
+def refit(scene: Scene, thinned: Reduced, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch) -> Reduced:
+    """The rest of :func:`reduce`: re-fit the colours, if the options ask for it.
+
+    On the geometry and the opacities that a decoder will see, so that the colours make up for quantised geometry too.
+
+    Args:
+        scene: the uncompressed one.
+        thinned: of :func:`thin`; not changed, so that it may be re-fitted for other options again.
+        views, options, watch: as :func:`thin` takes them.
+    """
+    if not options.refit or thinned.device is None:
+        return thinned
+    watch("refit", 0.0)
+    with thread_pool(options.threads) as pool:
+        geometry = quantise_geometry(thinned.scene, options.parameters, views, pool.map)
+
+    def work(device: Device, options: EncodeOptions) -> Reduced:
+        refitted = _refit(scene, thinned.scene, geometry, views, options, watch, device)
+        return Reduced(replace(thinned.scene, sh=refitted.sh), thinned.pruned, refitted, device, geometry)
+
+    return on_device(thinned.device, options, work)[0]
+
+
+def _refit(
     scene: Scene,
     reduced: Scene,
     geometry: Geometry,
@@ -170,10 +193,6 @@ def refit(
     watch: Stopwatch,
     device: Device,
 ) -> Refitted:
-    """Re-fit the colours of what is left of a scene, on the geometry and the opacities that a decoder will see.
-
-    So the colours make up for quantised geometry too.
-    """
     watch("refit", 0.0)
     parameters = options.parameters
     decoded = geometry.decoded(reduced.sh)

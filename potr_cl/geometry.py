@@ -60,6 +60,11 @@ class Geometry:
         means[self.order] = octree.parse(self.tree, n)
         return Scene(means, log_scales, quaternions, opacity_logits, sh)
 
+    def with_colour_steps(self, parameters: quantize.HyperParameters) -> Geometry:
+        """The same for parameters that differ in the steps of colours alone, which geometry does not depend on."""
+        world = replace(self.parameters, sf_dc=parameters.sf_dc, sf_sh=parameters.sf_sh)
+        return replace(self, asked=parameters, parameters=world)
+
 
 def quantise_geometry(
     scene: Scene, parameters: quantize.HyperParameters, views: Sequence[Camera], run: Run = map

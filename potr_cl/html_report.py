@@ -240,7 +240,13 @@ def _chart(title: str, series: Sequence[tuple[str, Sequence[float]]], logarithmi
 
 
 def _search(search: dict[str, Any]) -> str:
-    kinds = {"estimate": "estimate", "encode": "full encode", "steps": "other quantiser steps"}
+    kinds = {
+        "scout": "rough encode",
+        "encode": "full encode",
+        "refit": "its splats, re-fitted",
+        "steps": "other quantiser steps",
+        "colours": "other steps of colours",
+    }
     rows = [[kinds[step["kind"]], f"{step['q']:g}", escape(step["said"])] for step in search["tries"]]
     said = f"<p>Asked for: {escape(search['target'])}. Reached: {escape(search['reached'])}.</p>"
     return said + _table(["step", "q", "result"], rows)

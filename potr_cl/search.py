@@ -1,59 +1,91 @@
-"""Encode to a size or to a quality: the q whose file just meets a target, with work shared between tries.
+"""Encode to a size or to a quality: the q whose file just meets a target, in about three encodes' time.
 
-1. A survey prunes once, from q = 1 downwards, in few iterations: it tells about how many splats each q keeps, and
-   which.
-2. Estimates for single q cost seconds: the survey's splats, compacted and quantised; a fast entropy stage for the size,
-   few views for the PSNR. They lead to a q.
-3. That q is encoded in full. What the estimates were wrong by is known then.
-4. What is missing is made up by the quantiser alone, whose steps are taken from a neighbouring q: seconds again. If
-   that is not enough, estimates put right by 3 lead to another q and another full encode.
+Size and PSNR grow with q, in most scenes at about the same rate, if from another height. So:
+
+1. A rough encode, with fewer looks at the views, of the q that a typical scene would need tells the height.
+2. The q that follows is encoded in full.
+3. Its splats are kept, and all else is done again as a q close by would have it: re-fit and steps, or without a re-fit
+   the steps alone.
+4. What is still missing, a per cent perhaps, is made up by the steps of colours. Their re-fit has not seen these, so
+   that nothing that it made up for changes.
+
+Where 2 is too far off for 3, another q is encoded in full. What is found after a re-fit is what a plain encode makes of
+the options that come with it.
 """
 
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 import numpy as np
-from numpy.typing import NDArray
 
 from potr_cl.bitstream import EntropyCoder
 from potr_cl.cameras import Camera, train_views
-from potr_cl.compaction import Compactor, ViewWeights
 from potr_cl.decoder import decode
 from potr_cl.device import Device
-from potr_cl.encoder import Encoded, Reduced, Stopwatch, code, needs_views, reduce
+from potr_cl.encoder import Encoded, Reduced, Stopwatch, code, needs_views, refit, thin
 from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.fallback import on_device
 from potr_cl.judging import Judge, JudgingViews
 from potr_cl.options import EncodeOptions
-from potr_cl.pruning import PruningOptions, choose
-from potr_cl.rasterizer import Rasterizer
+from potr_cl.quantize import Preset
 from potr_cl.reduction import Progress
-from potr_cl.removal import RemovalSweep
 from potr_cl.scene import Scene
-from potr_cl.streams import code_scene
-from potr_cl.virtual_cameras import place_cameras, standpoints
+from potr_cl.virtual_cameras import place_cameras
 
-#: The survey's stages, in steps of q, and the pruning iterations of each.
-_STAGE = 0.25
-_ITERATIONS = 3
-#: Views that an estimate of the PSNR looks at.
-_FEW_VIEWS = 24
-#: By how much the fineness (:class:`_Axis`) of the quantiser may differ from that of everything else: steps by a third.
-_MOST_STEPS = math.log(4 / 3)
-#: The highest of zstd's levels that costs no time to speak of, and the logarithm of what is about gained beyond.
-_QUICK_LEVEL, _LEVEL_GAIN = 9, -0.08
-#: Full encodes at most; one or two are the rule.
-_ENCODES = 4
+#: Qualities, and what they give in a typical scene: bytes a splat of the source, and PSNR in decibels. Means of two
+#: scenes (docs/benchmarks.md, "Rate and distortion"), less sure below 0.1. Above all the rate of growth matters.
+_TYPICAL_Q = (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1)
+_TYPICAL: dict[Preset, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    "paper": (
+        (0.77, 2.01, 2.97, 4.1, 6.2, 8.3, 10.1, 11.9, 13.7, 15.3, 17.0, 18.7, 20.4),
+        (9.7, 29.7, 34.2, 35.7, 38.2, 39.7, 41.2, 42.8, 44.3, 45.6, 46.6, 47.9, 48.6),
+    ),
+    "fast": (
+        (2.23, 2.34, 2.52, 2.83, 3.58, 4.52, 5.56, 6.76, 8.21, 9.82, 11.63, 13.81, 16.19),
+        (35.3, 35.7, 36.2, 37.2, 38.8, 40.5, 42.3, 44.0, 45.7, 47.5, 49.4, 51.2, 53.0),
+    ),
+    "best": (
+        (1.91, 2.00, 2.15, 2.42, 3.08, 3.90, 4.83, 5.90, 7.21, 8.66, 10.26, 12.19, 14.28),
+        (35.7, 36.1, 36.7, 37.6, 39.3, 41.0, 42.7, 44.5, 46.3, 48.0, 49.7, 51.5, 53.3),
+    ),
+}
+#: A scout's pruning iterations and steps of the re-fit, and by how much what it finds is smaller than a full encode's:
+#: the logarithm of bytes, and decibels; about, and where there is a re-fit.
+_SCOUT_ITERATIONS, _SCOUT_STEPS = 12, 2
+_SCOUT_MISSES = (-0.02, -0.55)
+#: By how much the fineness (:class:`_Axis`) may differ from that of the q that the splats are of: with a re-fit, which
+#: does what else there is to do again (a ninth costs 0.06 dB), and without, where steps are all that changes.
+_NEAR, _MOST_STEPS = 0.12, math.log(4 / 3)
+#: How fast the value then grows, as a part of how it grows with q.
+_NEAR_RATE, _STEPS_RATE = 0.7, 0.5
+#: By how much the logarithm of the fineness of colours alone may differ (a tenth is 0.06 dB), and where all else has
+#: been tried: in scenes so small that values leap.
+_MOST_COLOUR_STEPS, _LAST_COLOUR_STEPS = 0.12, 0.5
+#: How fast the size's logarithm and decibels grow with it.
+_COLOUR_RATES = (0.12, 0.45)
+#: Full encodes at most; one is the rule. And where there is nothing to prune or fit.
+_ENCODES, _CHEAP_ENCODES = 5, 12
+#: Tries of one kind with what a full encode has kept.
+_TRIES = 3
+#: Bounds of a measured rate, as parts of the typical one, beyond the places that are known.
+_SLOWEST, _FASTEST = 0.25, 3.0
+#: What is only judged is coded so, which costs no time.
+_QUICK_CODER = EntropyCoder("zstd", 1)
 #: Stands for the infinite PSNR of identical pictures, decibels.
 _IDENTICAL = 200.0
-#: Values that one solution for q may ask for.
-_STEPS = 12
-#: The fineness between two qualities that is too little to tell them apart, by estimates and by real values.
-_SAME_BY_ESTIMATE, _SAME = 0.015, 0.001
+#: The kinds of tries (:class:`Try`), and what is said of each; to be followed by a value.
+KINDS = {
+    "scout": "quality {}, roughly:",
+    "encode": "quality {}:",
+    "refit": "re-fitted for quality {}:",
+    "steps": "steps of quality {}:",
+    "colours": "quality {}, other steps of colours:",
+}
 
 
 @dataclass(frozen=True)
@@ -93,15 +125,15 @@ class Target:
         """The value to aim at: the middle of the window."""
         return sum(self.window) / 2
 
-    @property
-    def slope(self) -> float:
-        """About how much the value grows with the fineness (:class:`_Axis`)."""
-        return 0.55 if self.max_bytes is not None else 6.5
-
     def met(self, value: float) -> bool:
         """Whether a value keeps the promise, if not by how little."""
         low, high = self.window
         return value <= high if self.max_bytes is not None else value >= low
+
+    def inside(self, value: float) -> bool:
+        """Whether the search is content with a value."""
+        low, high = self.window
+        return low <= value <= high
 
     def plain(self, value: float) -> float:
         """A value as bytes or decibels."""
@@ -120,8 +152,9 @@ class Try:
     """One step of a search.
 
     Attributes:
-        kind: "estimate", "encode" (in full), or "steps" (other quantiser steps for the last full encode).
-        q: of the encode; of the quantiser for "steps".
+        kind: "scout" (a rough encode), "encode" (in full), "refit" (the splats of the last full encode, re-fitted and
+            quantised for another q), "steps" (other quantiser steps alone), or "colours" (of colours alone).
+        q: of the encode, the re-fit or the steps.
         value: see :meth:`Target.plain`.
     """
 
@@ -136,7 +169,8 @@ class Found:
 
     Attributes:
         encoded: the file that meets the target.
-        options: that it was encoded with: q, and quantiser steps of their own where they differ from that q's.
+        options: that it was encoded with: q, and parameters of their own where they differ from that q's. Without
+            compaction :func:`potr_cl.encoder.encode` makes the same file of them.
         value: that was reached; see :meth:`Target.plain`.
         tries: all steps, in order.
     """
@@ -190,69 +224,23 @@ def encode_to_target(
     return found
 
 
-class _Survey:
-    """One pruning from q = 1 downwards, as far as it is asked for, and how much each splat shows where at the start."""
+@dataclass(frozen=True)
+class _Candidate:
+    """Something that may be what is searched for.
 
-    def __init__(
-        self, scene: Scene, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch, device: Device
-    ) -> None:
-        self._options = options
-        self._splats = len(scene)
-        self._alive = np.arange(len(scene), dtype=np.int64)
-        self._removed: list[NDArray[np.int64]] = []
-        self._stages: list[tuple[float, int]] = []  # the logarithm of ΔMSE_MAX, and how many splats it leaves
-        self._next_q = 1.0
-        self._watch = watch
-        self._rasterizer: Rasterizer | None = Rasterizer(device, scene, background=options.background)
-        self._removal = RemovalSweep(
-            self._rasterizer, views, options.sweep, lambda done, count: watch("prepare views", done / count)
-        )
-        self._effects = self._removal.measure()
-        self.weights: ViewWeights | None = None
-        if (options.compact or options.refit) and scene.sh_degree > 0:
-            self.weights = ViewWeights.from_importances(len(scene), self._removal.view_importances())
+    Attributes:
+        thinned: the scene before the re-fit.
+        reduced: and after it.
+        options: that lead there.
+        value: of the file that they give.
+        encoded: that file, if the value needed all of it.
+    """
 
-    def survivors(self, q: float) -> NDArray[np.int64]:
-        """About the splats that quality q keeps, ascending."""
-        options = dataclasses.replace(self._options, q=q)
-        if not options.prune:
-            return self._alive
-        wanted = _log(options.parameters.delta_mse_max)
-        while self._rasterizer is not None and (
-            not self._stages or (self._next_q >= 0 and wanted > self._stages[-1][0])
-        ):
-            self._prune_further()
-        thresholds, counts = zip(*[(-1e9, self._splats), *self._stages], strict=True)
-        count = round(float(np.interp(wanted, thresholds, counts)))
-        order = np.concatenate([*self._removed, self._alive])
-        return np.sort(order[len(order) - max(count, 1) :])
-
-    def _prune_further(self) -> None:
-        limit = dataclasses.replace(self._options, q=self._next_q).parameters.delta_mse_max
-        schedule = PruningOptions(limit, _ITERATIONS, count=self._options.count)
-        for iteration in range(_ITERATIONS):
-            self._watch("survey", min(1 - self._next_q + _STAGE * iteration / _ITERATIONS, 0.99))
-            gone = choose(*self._effects, self._alive, _ITERATIONS - iteration, schedule)[: len(self._alive) - 1]
-            if not len(gone):
-                break
-            self._removed.append(gone)
-            self._alive = np.setdiff1d(self._alive, gone, assume_unique=True)
-            self._removal.remove(gone)
-            self._effects = self._removal.measure()
-        self._watch("survey", 1.0)
-        self._stages.append((_log(limit), len(self._alive)))
-        self._next_q -= _STAGE
-
-    def free(self) -> None:
-        """Give the device memory back; what is known stays known."""
-        if self._rasterizer is not None:
-            self._removal.free()
-            self._rasterizer.free()
-            self._rasterizer = None
-
-
-def _log(value: float) -> float:
-    return math.log(max(value, 1e-300))
+    thinned: Reduced
+    reduced: Reduced
+    options: EncodeOptions
+    value: float
+    encoded: Encoded | None
 
 
 class _Search:
@@ -275,172 +263,201 @@ class _Search:
         self._device = device
         self._tell = tell
         self._tries: list[Try] = []
-        self._estimates: dict[float, float] = {}
         self._encoded: dict[float, float] = {}  # values of full encodes
+        self._typical = _Typical(target, options, len(scene))
         self._axis = _Axis(options)
-        self._survey: _Survey | None = None
         self._judge: Judge | None = None
 
     def run(self) -> Found:
-        target, options = self._target, self._options
-        if self._views and needs_views(self._scene, options):
-            self._watch("prepare views", 0.0)
-            self._survey = _Survey(self._scene, self._views, options, self._watch, self._device)
+        target = self._target
         if target.min_psnr is not None:
-            self._judge = Judge(self._device, self._scene, JudgingViews.of(self._cameras), options.background)
-        low, high = target.window
-        best: Found | None = None
-        encoded = self._encoded
-        q = 0.5
-        for left in reversed(range(_ENCODES)):
-            # Between what is known to be too little and too much.
-            bounds = (
-                max((p for p in encoded if encoded[p] < target.aim), default=0.0),
-                min((p for p in encoded if encoded[p] >= target.aim), default=1.0),
-            )
-            first = min(max(q, bounds[0]), bounds[1])
-            q, _ = _solve(self._expected, target.aim, target, self._axis, first, *bounds, same=_SAME_BY_ESTIMATE)
-            if q in encoded and best is None:  # the last hope
-                q = 0.0 if target.max_bytes is not None else 1.0
-            if q in encoded:
-                break
-            reduced, found = self._encode(q)
-            encoded[q] = found.value
-            found = self._adjust(reduced, found, left == 0)
-            if target.met(found.value) and (best is None or self._rank(found) < self._rank(best)):
+            self._judge = Judge(self._device, self._scene, JudgingViews.of(self._cameras), self._options.background)
+        q = self._typical.quality(target.aim)
+        if 0 < q < 1:
+            q = self._scout(q)
+        reduces = bool(self._views) and needs_views(self._scene, self._options)
+        best: _Candidate | None = None
+        for left in reversed(range(_ENCODES if reduces else _CHEAP_ENCODES)):
+            found = self._encode(q)
+            end = (q == 0 and found.value > target.aim) or (q == 1 and found.value < target.aim)
+            if reduces and not end:
+                found = self._approach(found, left == 0)
+            if target.met(found.value) and (best is None or self._distance(found) < self._distance(best)):
                 best = found
-            if low <= found.value <= high or (q == 0 and found.value > high) or (q == 1 and found.value < low):
+            if end or target.inside(found.value):
+                break
+            q = self._next()
+            if best is None and (left == 1 or q in self._encoded):  # the last hope
+                q = 0.0 if target.max_bytes is not None else 1.0
+            if q in self._encoded:
                 break
         if best is None:
             raise UnreachableError(f"{target} cannot be reached: {self._extremes()}")
-        return dataclasses.replace(best, tries=self._tries)
+        encoded = best.encoded or code(self._scene, best.reduced, self._views, best.options, self._watch)
+        return Found(encoded, best.options, best.value, self._tries)
 
-    def _rank(self, found: Found) -> tuple[bool, float]:
+    # ------------------------------------------------------------------------------------------ steps of the search
+
+    def _scout(self, q: float) -> float:
+        """The q to begin with, by a rough encode of one, if that takes less time than a full one."""
+        options = dataclasses.replace(
+            self._options,
+            q=q,
+            iterations=min(self._options.iterations, _SCOUT_ITERATIONS),
+            refit=min(self._options.refit, _SCOUT_STEPS),
+            refit_at=(),
+        )
+        looks = self._options.prune and options.iterations < self._options.iterations
+        if not self._views or not (looks or options.refit < self._options.refit):
+            return q
+        thinned = self._thin(options)
+        found = self._evaluate("scout", q, thinned, self._refit(thinned, options), options)
+        size, psnr = _SCOUT_MISSES if options.refit < self._options.refit else (0.0, 0.0)
+        missed = size if self._target.max_bytes is not None else psnr
+        return self._typical.quality(self._typical.value(q) + self._target.aim - found.value - missed)
+
+    def _encode(self, q: float) -> _Candidate:
+        """A full encode."""
+        options = dataclasses.replace(self._options, q=q)
+        thinned = self._thin(options)
+        found = self._evaluate("encode", q, thinned, self._refit(thinned, options), options)
+        self._encoded[q] = found.value
+        return found
+
+    def _next(self) -> float:
+        """The q to encode in full next, by what is known of others."""
+        points = {self._typical.value(q): value for q, value in self._encoded.items()}
+        return self._typical.quality(_meet(points, self._target.aim, 1.0))
+
+    def _approach(self, found: _Candidate, last: bool) -> _Candidate:
+        """Come nearer to the aim with what a full encode has kept, unless that is too far, and not the last one."""
+        target, typical = self._target, self._typical
+        fitted = self._options.refit > 0
+        reach, rate = (_NEAR, _NEAR_RATE) if fitted else (_MOST_STEPS, _STEPS_RATE)
+        start, best, q = found, found, found.options.q
+        ends = [self._axis.quality(self._axis.fineness(q) + sign * reach) for sign in (-1, 1)]
+        points = {typical.value(q): found.value}
+        for _ in range(_TRIES):
+            if self._colours_suffice(best.value):
+                best = self._with_other_colours(best, _MOST_COLOUR_STEPS)
+            if target.inside(best.value):
+                return best
+            wanted = typical.quality(_meet(points, target.aim, rate))
+            q = min(max(wanted, ends[0]), ends[1])
+            known = typical.value(q) in points
+            if q != wanted and (len(points) == 1 or known) and not last:
+                return best
+            if known:
+                break
+            near = self._again(start, q) if fitted else self._with_other_steps(start, q)
+            points[typical.value(q)] = near.value
+            best = min(best, near, key=self._distance)
+        return self._with_other_colours(best, _LAST_COLOUR_STEPS)
+
+    def _again(self, start: _Candidate, q: float) -> _Candidate:
+        """The splats of a candidate, re-fitted and quantised as another q would have it."""
+        parameters = start.options.parameters
+        names = ["delta_mse_max", *(["lam", "alpha"] if self._options.compact else [])]
+        kept = {name: getattr(parameters, name) for name in names}
+        options = dataclasses.replace(self._options, q=q, **kept)
+        return self._evaluate("refit", q, start.thinned, self._refit(start.thinned, options), options)
+
+    def _with_other_steps(self, start: _Candidate, q: float) -> _Candidate:
+        """A candidate that was not re-fitted, with the quantiser steps of another q."""
+        return self._evaluate("steps", q, start.thinned, start.reduced, _with_steps(start.options, q))
+
+    def _with_other_colours(self, start: _Candidate, most: float) -> _Candidate:
+        """A candidate with steps of colours up to so much finer or coarser: the nearest to the aim of a few."""
+        points, best = {0.0: start.value}, start
+        for _ in range(_TRIES):
+            finer = _meet(points, self._target.aim, self._colour_rate)
+            finer = round(min(max(finer, -most), most), 4)
+            options = _with_colour_steps(start.options, self._options, finer)
+            if finer in points or options == start.options or self._target.inside(best.value):
+                break
+            reduced, geometry = start.reduced, start.reduced.geometry
+            if geometry is not None:
+                reduced = dataclasses.replace(reduced, geometry=geometry.with_colour_steps(options.parameters))
+            found = self._evaluate("colours", start.options.q, start.thinned, reduced, options)
+            points[finer] = found.value
+            best = min(best, found, key=self._distance)
+        return best
+
+    def _colours_suffice(self, value: float) -> bool:
+        """Whether other steps of colours will probably do."""
+        given = self._options.sf_dc is not None and self._options.sf_sh is not None
+        low, high = self._target.window
+        spare = (high - low) / 4
+        reach = self._colour_rate * _MOST_COLOUR_STEPS
+        return not given and not low <= value <= high and low + spare - reach <= value <= high - spare + reach
+
+    @property
+    def _colour_rate(self) -> float:
+        return _COLOUR_RATES[self._target.max_bytes is None]
+
+    # ------------------------------------------------------------------------------------------ parts of an encode
+
+    def _thin(self, options: EncodeOptions) -> Reduced:
+        thinned = thin(self._scene, self._views, options, self._watch, self._device)
+        self._device = thinned.device or self._device
+        return thinned
+
+    def _refit(self, thinned: Reduced, options: EncodeOptions) -> Reduced:
+        reduced = refit(self._scene, thinned, self._views, options, self._watch)
+        self._device = reduced.device or self._device
+        return reduced
+
+    def _evaluate(self, kind: str, q: float, thinned: Reduced, reduced: Reduced, options: EncodeOptions) -> _Candidate:
+        encoded: Encoded | None
+        if self._judge is None:
+            encoded = code(self._scene, reduced, self._views, options, self._watch)
+            value = math.log(encoded.nbytes)
+        else:
+            encoded = None
+            quick = dataclasses.replace(options, entropy=_QUICK_CODER)
+            pieces = code(self._scene, reduced, self._views, quick, self._watch).pieces
+            self._watch("judge tries", 0.0)
+            value = min(self._judge.psnr(decode(b"".join(pieces))), _IDENTICAL)
+            self._watch("judge tries", 1.0)
+        self._tries.append(Try(kind, q, value))
+        self._tell(f"{KINDS[kind].format(f'{q:g}')} {self._target.describe(value)}")
+        return _Candidate(thinned, reduced, options, value, encoded)
+
+    # ------------------------------------------------------------------------------------------ comparing
+
+    def _distance(self, found: _Candidate) -> tuple[bool, float]:
         return not self._target.met(found.value), abs(found.value - self._target.aim)
 
-    def _expected(self, q: float) -> float:
-        """The estimate for a q, put right by what those were wrong by that were encoded in full."""
-        estimate = self._estimate(q)
-        if not self._encoded:
-            slow = self._judge is None and self._quick_coder() != self._options.entropy
-            return estimate + (_LEVEL_GAIN if slow else 0.0)
-        known = sorted(self._encoded)
-        errors = [self._encoded[p] - self._estimate(p) for p in known]
-        return estimate + float(np.interp(self._axis.fineness(q), [self._axis.fineness(p) for p in known], errors))
-
     def _extremes(self) -> str:
-        said = []
-        for q in (0.0, 1.0):
-            about = "" if q in self._encoded else "about "
-            value = self._encoded[q] if q in self._encoded else self._expected(q)
-            said.append(f"quality {q:g} gives {about}{self._target.describe(value)}")
-        return ", ".join(said)
-
-    def _estimate(self, q: float) -> float:
-        if q not in self._estimates:
-            self._watch("estimate", 0.0)
-            scene, options = self._scene, dataclasses.replace(self._options, q=q)
-            if self._survey is not None:
-                survivors = self._survey.survivors(q)
-                scene = scene.subset(survivors)
-                # A re-fit gives up coefficients too, and is as small as a compaction, but loses much less.
-                if self._survey.weights is not None and (options.compact or self._judge is None):
-                    weights = _of_splats(self._survey.weights, survivors)
-                    eyes = standpoints(self._views, self._scene.means)
-                    scene = Compactor(self._device).compact(scene, eyes, weights, options.compaction)
-            self._estimates[q] = self._note("estimate", q, self._quick_value(scene, options, _FEW_VIEWS))
-        return self._estimates[q]
-
-    def _quick_value(self, scene: Scene, options: EncodeOptions, most_views: int | None = None) -> float:
-        """The value without the time that the real entropy stage takes."""
-        self._watch("estimate", 0.0)
-        coded = code_scene(scene, options.parameters, self._views, b"", self._quick_coder(), options.threads)
-        return self._value(coded.pieces, most_views)
-
-    def _quick_coder(self) -> EntropyCoder:
-        if self._judge is not None:
-            return EntropyCoder("zstd", 1)
-        coder = self._options.entropy
-        if coder.name == "zstd" or (coder.name == "context" and self._options.parameters.version == 1):
-            return EntropyCoder("zstd", min(coder.level, _QUICK_LEVEL))
-        return coder
-
-    def _value(self, pieces: list[bytes], most_views: int | None = None) -> float:
-        self._watch("estimate", 0.0)
-        if self._judge is None:
-            value = math.log(sum(map(len, pieces)))
-        else:
-            value = min(self._judge.psnr(decode(b"".join(pieces)), most_views), _IDENTICAL)
-        self._watch("estimate", 1.0)
-        return value
-
-    def _note(self, kind: str, q: float, value: float) -> float:
-        self._tries.append(Try(kind, q, value))
-        said = {"estimate": f"quality {q:g}: about", "encode": f"quality {q:g}:", "steps": f"steps of quality {q:g}:"}
-        self._tell(f"{said[kind]} {self._target.describe(value)}")
-        return value
-
-    def _encode(self, q: float) -> tuple[Reduced, Found]:
-        """A full encode."""
-        if self._survey is not None:
-            self._survey.free()
-        options = dataclasses.replace(self._options, q=q)
-        reduced = reduce(self._scene, self._views, options, self._watch, self._device)
-        return reduced, self._finish("encode", q, reduced, options)
-
-    def _finish(self, kind: str, q: float, reduced: Reduced, options: EncodeOptions) -> Found:
-        encoded = code(self._scene, reduced, self._views, options, self._watch)
-        return Found(encoded, options, self._note(kind, q, self._value(encoded.pieces)), [])
-
-    def _adjust(self, reduced: Reduced, found: Found, last: bool) -> Found:
-        """Come nearer to the aim with other quantiser steps, if that suffices or nothing else is left to do."""
-        low, high = self._target.window
-        q = found.options.q
-        first, best = q, found
-        for _ in range(2):
-            if low <= best.value <= high:
-                break
-            # A fast entropy stage is off by much, but by much the same for all steps.
-            error = best.value - self._quick_value(reduced.scene, best.options)
-
-            def value(steps: float, error: float = error) -> float:
-                return self._quick_value(reduced.scene, _with_steps(found.options, steps)) + error
-
-            ends = (self._axis.quality(self._axis.fineness(q) + sign * _MOST_STEPS) for sign in (-1, 1))
-            first, expected = _solve(value, self._target.aim, self._target, self._axis, first, *ends)
-            if not (low <= expected <= high or last):
-                break
-            other = self._finish("steps", first, reduced, _with_steps(found.options, first))
-            if self._rank(other) >= self._rank(best):
-                break
-            best = other
-        return best
+        """What the lowest and the highest quality give, encoded if need be."""
+        values = (self._encoded[q] if q in self._encoded else self._encode(q).value for q in (0.0, 1.0))
+        low, high = map(self._target.describe, values)
+        return f"quality 0 gives {low}, quality 1 gives {high}"
 
     def free(self) -> None:
         """Give all device memory back."""
-        for owner in (self._survey, self._judge):
-            if owner is not None:
-                owner.free()
+        if self._judge is not None:
+            self._judge.free()
 
 
-def _with_steps(options: EncodeOptions, q: float) -> EncodeOptions:
-    """The options with the quantiser's parameters of another q, as far as they are not given on their own."""
-    parameters = dataclasses.replace(options, q=q).parameters
-    names = [field.name for field in dataclasses.fields(parameters)]
-    steps = [name for name in names if name.startswith("sf_") or name in ("beta", "gamma")]
-    return dataclasses.replace(options, **{name: getattr(parameters, name) for name in steps})
+class _Typical:
+    """What a target's value is in a typical scene, by quality."""
 
+    def __init__(self, target: Target, options: EncodeOptions, splats: int) -> None:
+        nbytes, psnr = _TYPICAL[options.preset]
+        self._values = np.log(nbytes) + math.log(splats) if target.max_bytes is not None else np.array(psnr)
 
-def _of_splats(weights: ViewWeights, splats: NDArray[np.int64]) -> ViewWeights:
-    """The view weights of some of the splats, in their order."""
-    counts = np.diff(weights.offsets)[splats]
-    offsets = np.concatenate([[0], np.cumsum(counts)])
-    entries = np.arange(offsets[-1]) + np.repeat(weights.offsets[splats] - offsets[:-1], counts)
-    return ViewWeights(offsets, weights.views[entries], weights.weights[entries])
+    def value(self, q: float) -> float:
+        """Of a quality from 0 to 1."""
+        return float(np.interp(q, _TYPICAL_Q, self._values))
+
+    def quality(self, value: float) -> float:
+        """The nearest q from 0 to 1, rounded to what matters."""
+        return round(float(np.interp(value, self._values, _TYPICAL_Q)), 5)
 
 
 class _Axis:
-    """Qualities by the logarithm of the quantiser's fineness: sizes and PSNR grow more evenly with it than with q."""
+    """Qualities by the logarithm of the quantiser's fineness."""
 
     def __init__(self, options: EncodeOptions) -> None:
         self._options = dataclasses.replace(options, sf_sh=None)
@@ -458,40 +475,39 @@ class _Axis:
         return round(high if fineness > self.fineness(0) else 0.0, 5)
 
 
-def _solve(
-    value: Callable[[float], float],
-    aim: float,
-    target: Target,
-    axis: _Axis,
-    first: float,
-    low: float = 0.0,
-    high: float = 1.0,
-    same: float = _SAME,
-) -> tuple[float, float]:
-    """The q at which a growing function meets the aim (``low`` or ``high`` if that lies beyond), and its value."""
-    points: dict[float, float] = {}
-    window = target.window
-    tolerance = (window[1] - window[0]) / 4
-    q = first
-    for step in range(_STEPS):
-        points[q] = value(q)
-        if abs(points[q] - aim) <= tolerance:
-            break
-        below = [p for p in points if points[p] < aim]
-        above = [p for p in points if points[p] >= aim]
-        if below and above:
-            a, b = max(below), min(above)
-            if axis.fineness(b) - axis.fineness(a) < same:
-                break  # or it does not grow everywhere: this is as near as it gets
-            # Along a line, but now and then in the middle: where the curve bends, one of the two would stay for long.
-            part = (aim - points[a]) / (points[b] - points[a]) if step % 3 < 2 else 0.5
-            q = axis.quality(axis.fineness(a) + (axis.fineness(b) - axis.fineness(a)) * min(max(part, 0.05), 0.95))
-        else:
-            # Somewhat further than the slope tells, so that the aim comes to lie between two points, and ever further.
-            nearest = max(below) if below else min(above)
-            way = 1.1 * 2**step * (aim - points[nearest]) / target.slope
-            q = min(max(axis.quality(axis.fineness(nearest) + math.copysign(max(abs(way), 0.05), way)), low), high)
-        if q in points:
-            break
-    best = min(points, key=lambda p: abs(points[p] - aim))
-    return best, points[best]
+def _with_steps(options: EncodeOptions, q: float) -> EncodeOptions:
+    """The options with the quantiser's parameters of another q, as far as they are not given on their own."""
+    parameters = dataclasses.replace(options, q=q).parameters
+    names = [field.name for field in dataclasses.fields(parameters)]
+    steps = [name for name in names if name.startswith("sf_") or name in ("beta", "gamma")]
+    return dataclasses.replace(options, **{name: getattr(parameters, name) for name in steps})
+
+
+def _with_colour_steps(options: EncodeOptions, given: EncodeOptions, finer: float) -> EncodeOptions:
+    """The options with steps of colours that are finer by a factor, given by its logarithm, unless they are given."""
+    parameters = options.parameters
+    names = [name for name in ("sf_dc", "sf_sh") if getattr(given, name) is None]
+    return dataclasses.replace(options, **{name: getattr(parameters, name) * math.exp(finer) for name in names})
+
+
+def _meet(points: dict[float, float], aim: float, rate: float) -> float:
+    """Where a growing function of which some points are known probably meets the aim.
+
+    Args:
+        points: at least one, values by places.
+        rate: at which the function typically grows; it counts while the aim does not lie between known values, and
+            those that there are leave it open.
+    """
+    places = sorted(points)
+    rising = [(b - a, a, b) for a, b in itertools.pairwise(places) if points[a] < aim <= points[b]]
+    if rising:
+        _, a, b = min(rising)
+        return a + (b - a) * (aim - points[a]) / (points[b] - points[a])
+    # Beyond all that is known; values that do not grow everywhere may lie on both sides.
+    if points[places[0]] < aim:
+        places.reverse()
+    edge, *others = places
+    if others:
+        measured = (points[others[0]] - points[edge]) / (others[0] - edge)
+        rate *= min(max(measured / rate, _SLOWEST), _FASTEST)
+    return edge + (aim - points[edge]) / rate
