@@ -58,9 +58,13 @@ _TYPICAL: dict[Preset, tuple[tuple[float, ...], tuple[float, ...]]] = {
 #: the logarithm of bytes, and decibels; about, and where there is a re-fit.
 _SCOUT_ITERATIONS, _SCOUT_STEPS = 12, 2
 _SCOUT_MISSES = (-0.02, -0.55)
+#: The highest q of a scout, and 1 less the lowest: the scene may be far from typical.
+_SCOUT_END = 0.9
+#: The value's way from a scout, in windows, from which on it tells how fast the value grows.
+_FAR = 20
 #: By how much the fineness (:class:`_Axis`) may differ from that of the q that the splats are of: with a re-fit, which
-#: does what else there is to do again (a ninth costs 0.06 dB), and without, where steps are all that changes.
-_NEAR, _MOST_STEPS = 0.12, math.log(4 / 3)
+#: does what else there is to do again (a tenth costs 0.06 dB), and without, where steps are all that changes.
+_NEAR, _MOST_STEPS = 0.1, math.log(4 / 3)
 #: How fast the value then grows, as a part of how it grows with q.
 _NEAR_RATE, _STEPS_RATE = 0.7, 0.5
 #: By how much the logarithm of the fineness of colours alone may differ (a tenth is 0.06 dB), and where all else has
@@ -266,15 +270,14 @@ class _Search:
         self._encoded: dict[float, float] = {}  # values of full encodes
         self._typical = _Typical(target, options, len(scene))
         self._axis = _Axis(options)
+        self._scouted: tuple[float, float] | None = None  # where, and the value of a full encode, about
         self._judge: Judge | None = None
 
     def run(self) -> Found:
         target = self._target
         if target.min_psnr is not None:
             self._judge = Judge(self._device, self._scene, JudgingViews.of(self._cameras), self._options.background)
-        q = self._typical.quality(target.aim)
-        if 0 < q < 1:
-            q = self._scout(q)
+        q = self._scout(self._typical.quality(target.aim))
         reduces = bool(self._views) and needs_views(self._scene, self._options)
         best: _Candidate | None = None
         for left in reversed(range(_ENCODES if reduces else _CHEAP_ENCODES)):
@@ -300,9 +303,10 @@ class _Search:
 
     def _scout(self, q: float) -> float:
         """The q to begin with, by a rough encode of one, if that takes less time than a full one."""
+        rough = min(max(q, 1 - _SCOUT_END), _SCOUT_END)
         options = dataclasses.replace(
             self._options,
-            q=q,
+            q=rough,
             iterations=min(self._options.iterations, _SCOUT_ITERATIONS),
             refit=min(self._options.refit, _SCOUT_STEPS),
             refit_at=(),
@@ -311,10 +315,12 @@ class _Search:
         if not self._views or not (looks or options.refit < self._options.refit):
             return q
         thinned = self._thin(options)
-        found = self._evaluate("scout", q, thinned, self._refit(thinned, options), options)
-        size, psnr = _SCOUT_MISSES if options.refit < self._options.refit else (0.0, 0.0)
-        missed = size if self._target.max_bytes is not None else psnr
-        return self._typical.quality(self._typical.value(q) + self._target.aim - found.value - missed)
+        value = self._evaluate("scout", rough, thinned, self._refit(thinned, options), options).value
+        if options.refit < self._options.refit:
+            size, psnr = _SCOUT_MISSES
+            value -= size if self._target.max_bytes is not None else psnr
+        self._scouted = self._typical.value(rough), value
+        return self._typical.quality(self._scouted[0] + self._target.aim - value)
 
     def _encode(self, q: float) -> _Candidate:
         """A full encode."""
@@ -327,13 +333,26 @@ class _Search:
     def _next(self) -> float:
         """The q to encode in full next, by what is known of others."""
         points = {self._typical.value(q): value for q, value in self._encoded.items()}
-        return self._typical.quality(_meet(points, self._target.aim, 1.0))
+        return self._typical.quality(_meet(points, self._target.aim, self._rate()))
+
+    def _rate(self) -> float:
+        """How fast the value grows with the typical one, as far as a scout that went far enough away can tell."""
+        if self._scouted is None:
+            return 1.0
+        place, value = self._scouted
+        other = max(self._encoded, key=lambda q: abs(self._typical.value(q) - place))
+        way = self._typical.value(other) - place
+        low, high = self._target.window
+        if abs(way) < _FAR * (high - low):
+            return 1.0
+        return min(max((self._encoded[other] - value) / way, _SLOWEST), _FASTEST)
 
     def _approach(self, found: _Candidate, last: bool) -> _Candidate:
         """Come nearer to the aim with what a full encode has kept, unless that is too far, and not the last one."""
         target, typical = self._target, self._typical
         fitted = self._options.refit > 0
         reach, rate = (_NEAR, _NEAR_RATE) if fitted else (_MOST_STEPS, _STEPS_RATE)
+        rate *= self._rate()
         start, best, q = found, found, found.options.q
         ends = [self._axis.quality(self._axis.fineness(q) + sign * reach) for sign in (-1, 1)]
         points = {typical.value(q): found.value}
