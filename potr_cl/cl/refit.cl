@@ -113,16 +113,18 @@ kernel void view_colours(
 /* The totals of LANES splats times a scale, channel by channel; they become 0. Whether any was not. */
 inline int take_totals(global long *totals, float scale, vfloat *sums)
 {
-#if LANES == 1
-    int any_sum = 0;
-    for (int i = 0; i < 3 + WEIGHTS; ++i) {
-        any_sum |= totals[i] != 0;
-        sums[i] = (float)totals[i] * scale;
-        totals[i] = 0;
-    }
-    return any_sum;
-#else
     global long4 *splats = (global long4 *)totals;
+#if LANES == 1
+    const long4 total = splats[0];
+    if (!(total.x | total.y | total.z | total.w))
+        return 0;
+    splats[0] = (long4)(0);
+    sums[0] = (float)total.x * scale;
+    sums[1] = (float)total.y * scale;
+    sums[2] = (float)total.z * scale;
+    sums[3] = (float)total.w * scale;
+    return 1;
+#else
     long4 all = splats[0];
     for (int lane = 1; lane < LANES; ++lane)
         all |= splats[lane];
