@@ -37,6 +37,14 @@ if _POCL is not None:
     KERNELS += [pytest.param(f"{family}-pocl", marks=pytest.mark.slow) for family in ("cpu", "gpu")]
 
 
+def skip_without_cpu() -> None:
+    """Skip the test where there is only a GPU."""
+    try:
+        choose_device("cpu")
+    except DeviceError:
+        pytest.skip("no CPU among the OpenCL devices")
+
+
 def open_device(kernels: str) -> Device:
     """The device of one of :data:`KERNELS`; skips the test if it cannot run that family."""
     family, _, runtime = kernels.partition("-")

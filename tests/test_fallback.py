@@ -14,6 +14,7 @@ from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.fallback import on_device
 from potr_cl.options import EncodeOptions
 from potr_cl.removal import SweepOptions, default_memory
+from tests.devices import skip_without_cpu
 from tests.scenes import random_scene, ring_of_cameras
 
 # Tolerance 0: views that are made anew each time are swept in full, and so are those that are kept.
@@ -73,6 +74,7 @@ def test_less_is_kept_until_it_fits(peaks, wanted, caplog):
 
 
 def test_a_cpu_takes_over(peaks, wanted, caplog):
+    skip_without_cpu()
     device = with_memory(Device(), peaks[1] // 2, "gpu")
     with caplog.at_level(logging.WARNING, "potr_cl"):
         encoded = encode(SCENE, CAMERAS, OPTIONS, device=device)

@@ -23,6 +23,7 @@ from potr_cl.quantize import PRESETS, HyperParameters
 from potr_cl.rasterizer import Rasterizer
 from potr_cl.removal import SweepOptions
 from potr_cl.search import KINDS, Target, _Axis, _meet, _Typical, _with_colour_steps, _with_steps, encode_to_target
+from tests.devices import skip_without_cpu
 from tests.scenes import random_scene, ring_of_cameras
 
 FEW = EncodeOptions(iterations=6)
@@ -215,6 +216,7 @@ def test_colours_may_be_fitted_to_photographs(device, lego_excerpt, cameras, tmp
 
 def test_a_cpu_takes_over(lego_excerpt, cameras, caplog):
     """From a device whose memory does not hold the scene's views."""
+    skip_without_cpu()
     options = EncodeOptions.for_preset("fast", iterations=3)
     target = Target(max_bytes=20_000)
     wanted = encode_to_target(lego_excerpt, cameras, target, options)

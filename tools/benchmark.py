@@ -456,8 +456,7 @@ def encode_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
             encoded = encode(load.scene, load.train, options, device=device)
             seconds = time.perf_counter() - started
         psnr = judge.psnr(decode(b"".join(encoded.pieces)))
-        default = name == EncodeOptions.preset
-        yield Row("encode", name, seconds, 10 ** (-psnr / 20), default, encoded.nbytes)
+        yield Row("encode", name, seconds, 10 ** (-psnr / 20), name == "best", encoded.nbytes)
     judge.free()
 
 
