@@ -179,7 +179,9 @@ class _Slot:
         self._mapped: list[NDArray[np.uint8]] = []
         self._maps: list[cl.MemoryMap] = []
         with device.all_or_nothing(), device.errors("cannot hold the splats to compact"):
-            self.queue = cl.CommandQueue(device.context, device.info.handle, properties=device.queue.properties)
+            self.queue = device.queue
+            if device.several_queues:
+                self.queue = cl.CommandQueue(device.context, device.info.handle, properties=device.queue.properties)
             self.buffers = [device.allocate(nbytes, what) for nbytes, what in sizes]
             if device.family == "gpu":
                 # One more than there are buffers: results are fetched while the next batch is filled in.

@@ -416,6 +416,11 @@ class Device:
         self.vector_width = self._proven_vector_width()
         self.native_exp2 = self.family == "gpu" and self._native_exp2_is_exact()
 
+    @property
+    def several_queues(self) -> bool:
+        """Whether what one queue has finished is there for others. With Mesa's rusticl (22.3) it is not, silently."""
+        return "rusticl" not in self.info.platform.lower()
+
     @contextmanager
     def errors(self, what: str) -> Iterator[None]:
         """Turn pyopencl's errors into a DeviceError that says ``what`` about this device, or a DeviceMemoryError."""

@@ -202,7 +202,7 @@ class RemovalSweep:
         self._listed_buffer = device.allocate(4 * len(self._kept), "the numbers of tiles to sweep")
         for place, swept in enumerate(self._kept):
             self._bind(swept, True, self._totals, place)
-        if device.family == "gpu" and not self._keeper.shared:
+        if device.family == "gpu" and device.several_queues and not self._keeper.shared:
             # A set's longest tile list keeps one work-group busy when all others are done: other sets fill the gap.
             self._queues = [
                 cl.CommandQueue(device.context, device.info.handle, device.queue.properties) for _ in range(_QUEUES)
