@@ -96,6 +96,7 @@ def test_names_and_splits(around_ball):
     assert "judge" not in describe(few)
 
 
+@pytest.mark.slow
 def test_large_scenes_get_fewer_and_larger_views(monkeypatch):
     def placed(splats_times_views: int) -> tuple[int, int]:
         monkeypatch.setattr(virtual_cameras, "_SPLATS_TIMES_VIEWS", splats_times_views)
@@ -132,6 +133,7 @@ def floaters(count: int, spread: float) -> Scene:
     return flat_splats(spread * rng.normal(size=(count, 3)), np.tile([0.0, 0, 1], (count, 1)), 0.05)
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     "clutter",
     [floaters(400, 10), sphere(1500, 60, 4, seed=1), flat_splats([[1e4, 0, 0]] * 80, [[0.0, 0, 1]] * 80, 1)],
@@ -227,6 +229,7 @@ DEGENERATE = {
 }
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("name", DEGENERATE)
 def test_degenerate_scenes(name):
     scene = DEGENERATE[name]
