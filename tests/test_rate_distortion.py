@@ -69,6 +69,9 @@ def test_series_of_the_sweeps_options_and_their_gaps(monkeypatch, folder, tmp_pa
     assert "+0.0 %" in rows["plain"]
     assert "+0.0 %" in rows["same"]
     assert "+0.0 %" not in rows["lazy"]
+    for name, quality in (("plane", 0.4), ("plain", 0.5)):
+        with pytest.raises(UsageError, match=f"no encode of '{name}' at quality {quality}"):
+            call(monkeypatch, rate_distortion, "report", out, "--against", name, "--at", quality)
 
 
 def test_interpolation_along_a_curve():

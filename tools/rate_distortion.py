@@ -224,6 +224,10 @@ def print_gaps(scenes: dict[str, Any], against: str, q: float) -> None:
 def _report(args: argparse.Namespace) -> None:
     results = json.loads(args.results.read_text())
     if args.against is not None:
+        for name, entry in results["scenes"].items():
+            measured = {point["q"] for point in entry["series"].get(args.against, {"encodes": []})["encodes"]}
+            if args.at not in measured:
+                raise UsageError(f"{args.results}: {name} has no encode of '{args.against}' at quality {args.at:g}")
         print_gaps(results["scenes"], args.against, args.at)
         return
     formats = json.loads(args.formats.read_text())["scenes"] if args.formats is not None else {}

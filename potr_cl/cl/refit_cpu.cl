@@ -13,31 +13,6 @@
 #include "patch_walk.clh"
 #include "refit.clh"
 
-/* Gathers the splats from `begin` on, up to SEGMENT, and lists them by patch; returns their number. */
-inline uint gather_splats(
-    global const float4 *shapes,
-    global const float4 *colours,
-    global const uint *entries,
-    global const uint *patches,
-    uint begin,
-    uint end,
-    Splat *splats,
-    ushort lists[PATCHES][SEGMENT],
-    uint *lengths)
-{
-    const uint count = min(end - begin, (uint)SEGMENT);
-    for (int i = 0; i < PATCHES; ++i)
-        lengths[i] = 0;
-    for (uint k = 0; k < count; ++k) {
-        const uint e = begin + k;
-        if (e + AHEAD < end)
-            prefetch_splat(shapes, colours, entries[e + AHEAD]);
-        splats[k] = load_splat(shapes, colours, entries[e]);
-        list_splat(k, patches[e], lists, lengths);
-    }
-    return count;
-}
-
 /* A patch's walk over its list: its transmittances and colours move on, weights[j] becomes the j-th splat's. Returns the
    number of splats before the last pixel's end. */
 inline uint blend(

@@ -26,31 +26,6 @@
 /* Where a list's transmittances are kept at the most; of the segments between two of them those before are walked again. */
 #define CHECKPOINTS 16
 
-/* Gathers the splats from entry `begin` on, up to SEGMENT, and lists them by patch; returns their number. */
-inline uint gather_splats(
-    global const float4 *shapes,
-    global const float4 *colours,
-    global const uint *entries,
-    global const uint *patches,
-    uint begin,
-    uint end,
-    Splat *splats,
-    ushort lists[PATCHES][SEGMENT],
-    uint *listed)
-{
-    const uint count = min(end - begin, (uint)SEGMENT);
-    for (int i = 0; i < PATCHES; ++i)
-        listed[i] = 0;
-    for (uint k = 0; k < count; ++k) {
-        const uint e = begin + k;
-        if (e + AHEAD < end)
-            prefetch_splat(shapes, colours, entries[e + AHEAD]);
-        splats[k] = load_splat(shapes, colours, entries[e]);
-        list_splat(k, patches[e], lists, listed);
-    }
-    return count;
-}
-
 /* A patch's walk forward: its transmittances and colours move on, memory[2 j] and memory[2 j + 1] become the j-th splat's
    alphas and weights. Returns the number of splats before the last pixel's end. */
 inline uint walk(
