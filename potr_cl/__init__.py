@@ -17,16 +17,16 @@ from importlib import import_module
 from typing import TYPE_CHECKING, Any
 
 if TYPE_CHECKING:
-    from potr_cl.cameras import Camera
-    from potr_cl.decoder import decode
-    from potr_cl.encoder import Encoded, encode
+    from potr_cl.codec.decoder import decode
     from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, PotrError, UnreachableError, UsageError
     from potr_cl.formats import load_cameras, load_scene
-    from potr_cl.options import EncodeOptions
-    from potr_cl.rasterizer import render
-    from potr_cl.scene import Scene
-    from potr_cl.search import Target, encode_to_target
-    from potr_cl.virtual_cameras import place_cameras
+    from potr_cl.model.camera import Camera
+    from potr_cl.model.scene import Scene
+    from potr_cl.model.virtual_cameras import place_cameras
+    from potr_cl.pipeline.encode import Encoded, encode
+    from potr_cl.pipeline.options import EncodeOptions
+    from potr_cl.pipeline.search import Target, encode_to_target
+    from potr_cl.raster.rasterizer import render
 
 __version__ = "0.1.0"
 
@@ -54,24 +54,24 @@ __all__ = [
 
 #: Imported on first use: the OpenCL loader and NumPy are not everybody's who asks for the version.
 _HOMES = {
-    "Camera": "cameras",
+    "Camera": "model.camera",
     "DataError": "errors",
     "DeviceError": "errors",
     "DeviceMemoryError": "errors",
-    "EncodeOptions": "options",
-    "Encoded": "encoder",
+    "EncodeOptions": "pipeline.options",
+    "Encoded": "pipeline.encode",
     "PotrError": "errors",
-    "Scene": "scene",
-    "Target": "search",
+    "Scene": "model.scene",
+    "Target": "pipeline.search",
     "UnreachableError": "errors",
     "UsageError": "errors",
-    "decode": "decoder",
-    "encode": "encoder",
-    "encode_to_target": "search",
+    "decode": "codec.decoder",
+    "encode": "pipeline.encode",
+    "encode_to_target": "pipeline.search",
     "load_cameras": "formats",
     "load_scene": "formats",
-    "place_cameras": "virtual_cameras",
-    "render": "rasterizer",
+    "place_cameras": "model.virtual_cameras",
+    "render": "raster.rasterizer",
 }
 
 

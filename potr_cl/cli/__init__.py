@@ -10,7 +10,7 @@ from importlib import import_module
 
 from potr_cl import __version__
 from potr_cl.errors import PotrError
-from potr_cl.threads import in_background
+from potr_cl.host.threads import in_background
 
 #: The commands, and who adds them, in the order of the help.
 _COMMANDS = {
@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     if argv and argv[0] in _ON_A_DEVICE and not {"-h", "--help"} & set(argv):
         # Drivers take as long to load as the command's modules to be imported.
-        in_background(import_module("potr_cl.device").list_devices)
+        in_background(import_module("potr_cl.opencl.device").list_devices)
     args = _parser(argv).parse_args(argv)
     try:
         args.run(args)

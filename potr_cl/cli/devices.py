@@ -6,8 +6,8 @@ import argparse
 import json
 
 from potr_cl.cli.options import Commands
-from potr_cl.device_report import device_report, format_devices, works
 from potr_cl.errors import DeviceError
+from potr_cl.report.devices import device_report, format_devices, works
 
 
 def _devices(args: argparse.Namespace) -> None:

@@ -11,8 +11,6 @@ from pathlib import Path
 
 import numpy as np
 
-from potr_cl.atomic_write import replacing
-from potr_cl.cameras import Camera, test_views, train_views
 from potr_cl.cli.options import (
     Commands,
     add_compaction_options,
@@ -27,20 +25,23 @@ from potr_cl.cli.options import (
 )
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
-from potr_cl.device import Device
+from potr_cl.codec.quantize import ac_sparsity
 from potr_cl.errors import UsageError
-from potr_cl.fallback import on_device
-from potr_cl.formats import load_scene, ply
-from potr_cl.images import parse_colour
-from potr_cl.judging import Judge, JudgingViews
-from potr_cl.options import EncodeOptions
-from potr_cl.photographs import Photographs, PhotographTargets
-from potr_cl.quantize import ac_sparsity
-from potr_cl.rasterizer import Rasterizer
-from potr_cl.reduction import reduce_scene
-from potr_cl.refit import RefitOptions, Refitted, RenderedTargets, active_coefficients, refit_colours
-from potr_cl.removal import SweepOptions
-from potr_cl.scene import Scene
+from potr_cl.formats import load_scene
+from potr_cl.formats.images import parse_colour
+from potr_cl.formats.scenes import ply
+from potr_cl.host.atomic_write import replacing
+from potr_cl.model.camera import Camera, test_views, train_views
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.fallback import on_device
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.reduction import reduce_scene
+from potr_cl.quality.evaluator import Judge, JudgingViews
+from potr_cl.quality.ground_truth import Photographs, PhotographTargets
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.pruning.removal import SweepOptions
+from potr_cl.stages.refitting.refit import RefitOptions, Refitted, RenderedTargets, active_coefficients, refit_colours
 
 #: Coefficients that round to 0 at so many steps a unit are 0, but for what storing R, G and B leaves of them.
 _ZERO_SF = 1e5

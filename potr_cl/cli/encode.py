@@ -12,9 +12,6 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-from potr_cl.atomic_write import replacing
-from potr_cl.bitstream import ENTROPY_CODERS, EntropyCoder
-from potr_cl.cameras import Camera, test_views
 from potr_cl.cli.options import (
     Commands,
     add_compaction_options,
@@ -27,22 +24,25 @@ from potr_cl.cli.options import (
 )
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
-from potr_cl.decoder import PotrFile, decode
-from potr_cl.device import Device
-from potr_cl.encoder import Stopwatch, encode, needs_views
+from potr_cl.codec.container import ENTROPY_CODERS, EntropyCoder
+from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.codec.quantize import PRESETS
 from potr_cl.errors import DeviceError, UsageError
 from potr_cl.formats import load_scene
-from potr_cl.html_report import PicturePair, html_report, views_to_show
-from potr_cl.images import Colour, parse_colour
-from potr_cl.judging import Judge, JudgingViews
-from potr_cl.options import EncodeOptions
-from potr_cl.photographs import Photographs
-from potr_cl.quantize import PRESETS
-from potr_cl.rasterizer import Rasterizer
-from potr_cl.scene import Scene
-from potr_cl.search import Target, encode_to_target
-from potr_cl.summary import encode_report, format_encode_report, quality_report, search_report
-from potr_cl.threads import thread_pool
+from potr_cl.formats.images import Colour, parse_colour
+from potr_cl.host.atomic_write import replacing
+from potr_cl.host.threads import thread_pool
+from potr_cl.model.camera import Camera, test_views
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import Stopwatch, encode, needs_views
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.search import Target, encode_to_target
+from potr_cl.quality.evaluator import Judge, JudgingViews
+from potr_cl.quality.ground_truth import Photographs
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.report.html import PicturePair, html_report, views_to_show
+from potr_cl.report.summary import encode_report, format_encode_report, quality_report, search_report
 
 
 def _options(args: argparse.Namespace) -> EncodeOptions:

@@ -8,9 +8,9 @@ import time
 from pathlib import Path
 from typing import TYPE_CHECKING
 
-from potr_cl.decoder import PotrFile, decode
-from potr_cl.formats import ply
-from potr_cl.report import file_report, format_report
+from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.formats.scenes import ply
+from potr_cl.report.file import file_report, format_report
 
 if TYPE_CHECKING:
     from potr_cl.cli.options import Commands

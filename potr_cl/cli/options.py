@@ -7,12 +7,12 @@ import contextlib
 import re
 from typing import Any, TypeAlias, get_args
 
-from potr_cl.compaction import ColourModel, CompactionOptions, Weighting
-from potr_cl.device import DEVICE_VARIABLE
 from potr_cl.errors import UsageError
-from potr_cl.pruning import PruningOptions
-from potr_cl.rasterizer import GSPLAT, INRIA
-from potr_cl.removal import SweepOptions
+from potr_cl.opencl.device import DEVICE_VARIABLE
+from potr_cl.raster.rasterizer import GSPLAT, INRIA
+from potr_cl.stages.compaction.ridge import ColourModel, CompactionOptions, Weighting
+from potr_cl.stages.pruning.removal import SweepOptions
+from potr_cl.stages.pruning.schedule import PruningOptions
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 

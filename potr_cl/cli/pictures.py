@@ -8,11 +8,15 @@ import json
 import sys
 from pathlib import Path
 
-from potr_cl.atomic_write import replacing
-from potr_cl.cameras import Camera, test_views, train_views
 from potr_cl.cli.options import CAMERAS_HELP, RULES, Commands, add_rendering_options, add_view_options
 from potr_cl.cli.progress import Progress
-from potr_cl.compare import (
+from potr_cl.errors import DataError, UsageError
+from potr_cl.formats import load_cameras, load_scene
+from potr_cl.formats.images import parse_colour, to_8_bits, write_png
+from potr_cl.host.atomic_write import replacing
+from potr_cl.model.camera import Camera, test_views, train_views
+from potr_cl.opencl.device import Device
+from potr_cl.quality.compare import (
     SceneFile,
     compare,
     comparison_report,
@@ -22,12 +26,8 @@ from potr_cl.compare import (
     side_by_side,
     size_report,
 )
-from potr_cl.device import Device
-from potr_cl.errors import DataError, UsageError
-from potr_cl.formats import load_cameras, load_scene
-from potr_cl.images import parse_colour, to_8_bits, write_png
-from potr_cl.metrics import Lpips
-from potr_cl.rasterizer import Rasterizer
+from potr_cl.quality.metrics import Lpips
+from potr_cl.raster.rasterizer import Rasterizer
 
 
 def _select(cameras: list[Camera], wanted: list[str] | None, split: str | None) -> list[Camera]:

@@ -6,12 +6,12 @@ import argparse
 import sys
 from pathlib import Path
 
-from potr_cl.cameras import Camera
 from potr_cl.cli.options import CAMERAS_HELP
 from potr_cl.formats import load_cameras
-from potr_cl.reduction import Progress
-from potr_cl.scene import Scene
-from potr_cl.virtual_cameras import FEWEST, MOST, describe, place_cameras
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+from potr_cl.model.virtual_cameras import FEWEST, MOST, describe, place_cameras
+from potr_cl.pipeline.reduction import Progress
 
 
 def add_cameras_options(p: argparse.ArgumentParser) -> None:

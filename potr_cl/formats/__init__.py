@@ -7,12 +7,13 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from potr_cl.cameras import Camera
-from potr_cl.decoder import decode
+from potr_cl.codec.decoder import decode
 from potr_cl.errors import DataError, UsageError
-from potr_cl.formats import cameras_json, colmap, compressed_ply, ply, sog, spz, transforms
-from potr_cl.formats.view_files import read_json
-from potr_cl.scene import Scene
+from potr_cl.formats.cameras import cameras_json, colmap, transforms
+from potr_cl.formats.cameras.view_files import read_json
+from potr_cl.formats.scenes import compressed_ply, ply, sog, spz
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
 
 
 def load_scene(path: str | os.PathLike[str]) -> Scene:

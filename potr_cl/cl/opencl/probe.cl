@@ -1,0 +1,30 @@
+/* Small kernels by which device.py finds out what a device does right. Macros: LANES. */
+
+#include "include/lanes.clh"
+
+kernel void probe_rows(global const float *in, global float *out)
+{
+    const size_t i = get_global_id(0);
+    VSTORE(exp2_polynomial(VLOAD(i, in)), i, out);
+}
+
+#if LANES == 1
+kernel void probe_native_exp2(global const float *in, global float *out)
+{
+    const size_t i = get_global_id(0);
+    out[i] = native_exp2(in[i]);
+}
+
+kernel __attribute__((reqd_work_group_size(64, 1, 1)))
+void probe_integers(volatile global uint *counters, global ulong *keys)
+{
+    local uint near[64];
+    const uint i = get_global_id(0), lid = get_local_id(0);
+    near[63 - lid] = lid;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    atomic_inc(&counters[0]);
+    if (lid == 0)
+        atomic_add(&counters[1], near[0]);
+    keys[i] = ((ulong)i << 32) | 7;
+}
+#endif

@@ -1,0 +1,258 @@
+/* Removal effects for CPUs: one tile a work-item, patch by patch, one walk forward and one back over a patch's list.
+
+   Forward as in composite_cpu.cl, for the pixels' colours; each splat's alphas and weights w = T alpha are remembered.
+   Then from the last splat to the first: B, the colour behind a splat as seen with nothing in front, is a convex sum that
+   grows by one splat at a time. So nothing cancels, however many layers hide a splat. Per splat and tile the sweep leaves
+   the sums over the tile's pixels of
+
+       PD^2 + 2 PD (c - c_t),  PD = T alpha (B - c_k)      and      T alpha
+
+   (paper, section "Effect of a splat's removal"), in the slot of the splat's entry.
+
+   A list of more than SEGMENT splats is walked segment by segment: forward through all of them, the transmittances before
+   each kept, then from the last segment to the first, each walked forward once more for its alphas and weights.
+
+   Lists are compacted on the way: entries of splats that are not alive, or that the last sweep marked, are dropped, in
+   place; a tile's list begins at begins[tile] and has lengths[tile] entries.
+
+   Macros: LANES, ALPHA_CAP, STOP, TIGHTEN (whether to mark entries that touch no pixel). */
+
+#include "include/lanes.clh"
+#include "include/splat.clh"
+#include "include/patch_vectors.clh"
+#include "include/patch_walk.clh"
+#include "prune/removal.clh"
+
+/* Where a list's transmittances are kept at the most; of the segments between two of them those before are walked again. */
+#define CHECKPOINTS 16
+
+/* A patch's walk forward: its transmittances and colours move on, memory[2 j] and memory[2 j + 1] become the j-th splat's
+   alphas and weights. Returns the number of splats before the last pixel's end. */
+inline uint walk(
+    const Splat *splats,
+    const ushort *list,
+    uint length,
+    float2 first,
+    vfloat t[1],
+    vfloat rgb[3],
+    float *memory,
+    uchar *touching)
+{
+    vfloat through = t[0], r = rgb[0], g = rgb[1], b = rgb[2];
+    uint j = 0;
+    while (j < length && (TIGHTEN || VANY(through > 0.0f))) {
+        const uint stop = min(j + PAIRS_AT_ONCE, length);
+        for (; j < stop; ++j) {
+            const Splat *splat = &splats[list[j]];
+            const vfloat power = splat_power(splat, first);
+            BLEND(weight, power, through);
+            r = MAD(weight, (vfloat)(splat->red), r);
+            g = MAD(weight, (vfloat)(splat->green), g);
+            b = MAD(weight, (vfloat)(splat->blue), b);
+            VSTORE(goes_on ? alpha : (vfloat)(0.0f), 2 * j, memory);
+            VSTORE(weight, 2 * j + 1, memory);
+            if (TIGHTEN && VANY(power >= LOG2_ALPHA_MIN))
+                touching[list[j]] = 1;
+        }
+    }
+    t[0] = through;
+    rgb[0] = r;
+    rgb[1] = g;
+    rgb[2] = b;
+    return j;
+}
+
+/* A patch's walk back over what the walk forward remembers; `twice` is twice the colour's difference to the target,
+   `behind` the colour behind. sums[list[j]] += the j-th splat's sums over the pixels. */
+inline void walk_back(
+    const Splat *splats,
+    const ushort *list,
+    uint length,
+    const vfloat twice[3],
+    vfloat behind[3],
+    float *memory,
+    float2 *sums)
+{
+    const vfloat r = twice[0], g = twice[1], b = twice[2];
+    vfloat br = behind[0], bg = behind[1], bb = behind[2];
+    for (uint j = length; j-- > 0;) {
+        const Splat *splat = &splats[list[j]];
+        const vfloat alpha = VLOAD(2 * j, memory), weight = VLOAD(2 * j + 1, memory);
+        const vfloat gap_r = br - splat->red, gap_g = bg - splat->green, gap_b = bb - splat->blue;
+        const vfloat pd_r = weight * gap_r, pd_g = weight * gap_g, pd_b = weight * gap_b;
+        VSTORE(MAD(pd_r, pd_r + r, MAD(pd_g, pd_g + g, pd_b * (pd_b + b))), 2 * j, memory);
+        br = MAD(-alpha, gap_r, br);
+        bg = MAD(-alpha, gap_g, bg);
+        bb = MAD(-alpha, gap_b, bb);
+    }
+    behind[0] = br;
+    behind[1] = bg;
+    behind[2] = bb;
+
+    for (uint j = length; j % LANES; ++j) {
+        VSTORE((vfloat)(0.0f), 2 * j, memory);
+        VSTORE((vfloat)(0.0f), 2 * j + 1, memory);
+    }
+    for (uint j = 0; j < length; j += LANES) {
+        vfloat effects[LANES], importances[LANES];
+        for (int k = 0; k < LANES; ++k) {
+            effects[k] = VLOAD(2 * (j + k), memory);
+            importances[k] = VLOAD(2 * (j + k) + 1, memory);
+        }
+        const vfloat effect = sum_each(effects), importance = sum_each(importances);
+        float pairs[2 * LANES];
+        VSTORE(ZIP_LOW(effect, importance), 0, pairs);
+        VSTORE(ZIP_HIGH(effect, importance), 1, pairs);
+        const uint count = min(length - j, (uint)LANES);
+        for (uint k = 0; k < count; ++k)
+            sums[list[j + k]] += vload2(k, pairs);
+    }
+}
+
+/* Work-item i handles tile tiles[start + i]. */
+kernel void removal(
+    uint start,
+    global const uint *tiles,
+    global const float4 *shapes,
+    global const float4 *colours,
+    global const uchar *alive,
+    global const uint *begins,
+    global uint *lengths,
+    global uint *entries,
+    global uint *patches,
+    View view,
+    float red,
+    float green,
+    float blue,
+    int first_time,
+    float scale,
+    float bound,
+    global float *target,
+    global float2 *sums,
+    volatile global uint *totals)
+{
+    const int tile = tiles[start + get_global_id(0)];
+    const int2 origin = (int2)(tile % view.columns, tile / view.columns) * TILE;
+    const uint begin = begins[tile];
+    const uint end = begin + lengths[tile];
+
+    uint kept = begin;
+    for (uint read = begin; read < end; ++read) {
+        const uint number = entries[read];
+        if (!alive[number] || sums[read].y < 0.0f)
+            continue;
+        if (kept < read) {
+            entries[kept] = number;
+            sums[kept] = sums[read];
+            patches[kept] = patches[read];
+        }
+        ++kept;
+    }
+    lengths[tile] = kept - begin;
+    for (uint e = kept; e < end; ++e)
+        sums[e] = (float2)(0.0f, 0.0f);
+
+    Splat splats[SEGMENT];
+    ushort lists[PATCHES][SEGMENT];
+    uint listed[PATCHES];
+    uchar touching[SEGMENT];
+    float memory[2 * (SEGMENT + LANES) * LANES];
+    float2 fresh[SEGMENT];
+    vfloat t[PATCHES], rgb[PATCHES][3], twice[PATCHES][3], behind[PATCHES][3];
+    vfloat checkpoints[CHECKPOINTS][PATCHES];
+    for (int i = 0; i < PATCHES; ++i) {
+        t[i] = patch_transmittance(i, origin, view.width, view.height);
+        rgb[i][0] = rgb[i][1] = rgb[i][2] = (vfloat)(0.0f);
+        behind[i][0] = (vfloat)(red);
+        behind[i][1] = (vfloat)(green);
+        behind[i][2] = (vfloat)(blue);
+    }
+
+    const uint segments = max((kept - begin + SEGMENT - 1) / SEGMENT, 1u);
+    const uint apart = (segments + CHECKPOINTS - 1) / CHECKPOINTS;
+    uint last = 0; /* the last segment in which a pixel goes on */
+    for (; last + 1 < segments && living_patches(t); ++last) {
+        if (last % apart == 0)
+            for (int i = 0; i < PATCHES; ++i)
+                checkpoints[last / apart][i] = t[i];
+        gather_splats(shapes, colours, entries, patches, begin + last * SEGMENT, kept, splats, lists, listed);
+        for (int i = 0; i < PATCHES; ++i)
+            walk(splats, lists[i], listed[i], patch_centre(origin, i), &t[i], rgb[i], memory, touching);
+    }
+
+    for (uint segment = last + 1; segment-- > 0;) {
+        const uint from = begin + segment * SEGMENT;
+        if (segment < last) {
+            const uint checkpoint = segment / apart;
+            for (int i = 0; i < PATCHES; ++i)
+                t[i] = checkpoints[checkpoint][i];
+            for (uint before = checkpoint * apart; before < segment; ++before) {
+                gather_splats(shapes, colours, entries, patches, begin + before * SEGMENT, kept, splats, lists, listed);
+                for (int i = 0; i < PATCHES; ++i)
+                    walk(splats, lists[i], listed[i], patch_centre(origin, i), &t[i], rgb[i], memory, touching);
+            }
+        }
+        const uint count = gather_splats(shapes, colours, entries, patches, from, kept, splats, lists, listed);
+        for (uint k = 0; k < count; ++k) {
+            fresh[k] = (float2)(0.0f, 0.0f);
+            touching[k] = 0;
+        }
+        for (int i = 0; i < PATCHES; ++i) {
+            const uint walked =
+                walk(splats, lists[i], listed[i], patch_centre(origin, i), &t[i], rgb[i], memory, touching);
+            if (segment == last) {
+                const vfloat through = fabs(t[i]);
+                float differences[3][LANES];
+                VSTORE(MAD(through, (vfloat)(red), rgb[i][0]), 0, differences[0]);
+                VSTORE(MAD(through, (vfloat)(green), rgb[i][1]), 0, differences[1]);
+                VSTORE(MAD(through, (vfloat)(blue), rgb[i][2]), 0, differences[2]);
+                for (int lane = 0; lane < LANES; ++lane) {
+                    const int column = origin.x + PATCH_COLUMN(i) + lane % PATCH_WIDTH;
+                    const int row = origin.y + PATCH_ROW(i) + lane / PATCH_WIDTH;
+                    if (column >= view.width || row >= view.height)
+                        continue;
+                    const size_t place = 3 * ((size_t)row * view.width + column);
+                    for (int channel = 0; channel < 3; ++channel) {
+                        if (first_time)
+                            target[place + channel] = differences[channel][lane];
+                        differences[channel][lane] = 2.0f * (differences[channel][lane] - target[place + channel]);
+                    }
+                }
+                for (int channel = 0; channel < 3; ++channel)
+                    twice[i][channel] = VLOAD(0, differences[channel]);
+            }
+            walk_back(splats, lists[i], walked, twice[i], behind[i], memory, fresh);
+        }
+        for (uint k = 0; k < count; ++k) {
+            if (k + AHEAD < count)
+                PREFETCH_TO_WRITE(totals + TOTAL_WORDS * entries[from + k + AHEAD]);
+            replace_sums(totals + TOTAL_WORDS * entries[from + k], sums[from + k], fresh[k], scale, bound);
+            sums[from + k] = TIGHTEN && !touching[k] ? NEVER : fresh[k];
+        }
+    }
+    /* What lies behind the last pixel's end has no effect any more. */
+    for (uint e = begin + (last + 1) * SEGMENT; e < kept; ++e) {
+        replace_sums(totals + TOTAL_WORDS * entries[e], sums[e], (float2)(0.0f, 0.0f), scale, bound);
+        sums[e] = (float2)(0.0f, 0.0f);
+    }
+}
+
+/* Adds to each tile's staleness how much of its area the splats that have just gone (alive == 2) covered when it was last
+   swept. */
+kernel void staleness(
+    global const uchar *alive,
+    global const uint *begins,
+    global const uint *lengths,
+    global const uint *entries,
+    global const float2 *sums,
+    uint first,
+    global float *stale)
+{
+    const uint tile = get_global_id(0);
+    const uint begin = begins[tile], end = begin + lengths[tile];
+    float gone = 0.0f;
+    for (uint e = begin; e < end; ++e)
+        if (alive[entries[e]] == 2 && sums[e].y >= 0.0f)
+            gone += fmax(sums[e].y, LEAST_STALENESS);
+    stale[first + tile] += gone * (1.0f / (TILE * TILE));
+}

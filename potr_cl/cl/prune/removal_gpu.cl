@@ -1,0 +1,325 @@
+/* Removal effects for GPUs, all views of a set in one launch: one work-group a tile. See removal_cpu.cl for the method, and
+   patch_lists.clh for how a tile's work is shared out.
+
+   Macros: ALPHA_CAP, STOP, TIGHTEN, NATIVE_EXP2, INT64_ATOMICS. */
+
+#define ROUND 8
+#include "include/patch_lists.clh"
+#include "prune/removal.clh"
+
+/* From one patch's parts to the next: a little more than they need, so that patches lie in different banks. */
+#define NEXT_PARTS (PARTS + SHARE)
+
+/* Work-items that go through a tile's list together. */
+#define LISTERS 128
+
+kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
+void removal(
+    uint start,
+    global const uint *tiles,
+    global const SetView *views,
+    uint view_count,
+    uint stride,
+    global const float4 *shapes,
+    global const float4 *colours,
+    global const uint *offsets,
+    global const uint *lengths,
+    global const uint *entries,
+    global const ushort *patches,
+    float red,
+    float green,
+    float blue,
+    int first_time,
+    float scale,
+    float most_pixels,
+    float bound,
+    global float *target,
+    global float2 *sums,
+    volatile global uint *totals)
+{
+    local State state;
+    local Batch near;
+    local float behind_r[TILE * TILE], behind_g[TILE * TILE], behind_b[TILE * TILE];
+    local float2 all_parts[PATCHES * NEXT_PARTS];
+    local int levels[2 * LEVELS * BATCH];
+    local int unfinished[2], end_of_patch[PATCHES], rounds[2];
+#if TIGHTEN
+    local int reached[BATCH];
+#endif
+
+    const int lid = get_local_id(0), share = lid % SHARE;
+    const uint set_tile = tiles[start + get_group_id(0)];
+    const uint number = view_of_tile(views, view_count, set_tile);
+    views += number;
+    const int2 picture = (int2)(views->view.width, views->view.height);
+    const int columns = views->view.columns;
+    const uint tile = set_tile - views->first_tile;
+    shapes += 2 * (size_t)stride * number;
+    colours += (size_t)stride * number;
+    const uint begin = views->first_entry + offsets[views->first_offset + tile];
+    const uint length = lengths[set_tile];
+    entries += begin;
+    patches += begin;
+    sums += begin;
+    const float weight = most_pixels / ((float)picture.x * picture.y);
+    const float view_scale = scale * weight, view_bound = bound / weight;
+
+    for (int patch = lid; patch < PATCHES; patch += ITEMS)
+        end_of_patch[patch] = 0;
+    const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
+    uint batch;
+    const uint swept = forward(
+        &state, &near, unfinished, origin, picture, shapes, colours, entries, patches, length, lid, &batch);
+    /* What lies behind the last pixel's end has no effect any more. */
+    for (uint e = swept + lid; e < length; e += ITEMS) {
+        replace_sums(totals + TOTAL_WORDS * (size_t)entries[e], sums[e], (float2)(0.0f), view_scale, view_bound);
+        sums[e] = (float2)(0.0f);
+    }
+
+    /* From here on r, g, b are twice the difference of the colour to the target. */
+    Mine mine = pixels_of(lid / SHARE, origin, lid);
+    int end = 0;
+    for (int p = 0; p < PIXELS; ++p) {
+        const int i = mine.first + p * SHARE;
+        const float t = fabs(state.t[i]);
+        if (inside(mine, p, picture)) {
+            global float *pixel = target + 3 * (views->first_pixel + pixel_number(mine, p, picture));
+            const float r = MAD(t, red, state.r[i]), g = MAD(t, green, state.g[i]), b = MAD(t, blue, state.b[i]);
+            if (first_time) {
+                pixel[0] = r;
+                pixel[1] = g;
+                pixel[2] = b;
+            }
+            state.r[i] = 2.0f * (r - pixel[0]);
+            state.g[i] = 2.0f * (g - pixel[1]);
+            state.b[i] = 2.0f * (b - pixel[2]);
+        }
+        state.t[i] = t;
+        behind_r[i] = red;
+        behind_g[i] = green;
+        behind_b[i] = blue;
+        end = max(end, state.last[i] + 1);
+    }
+    if (swept == 0)
+        return;
+#if TIGHTEN
+    end = INT_MAX; /* every entry shows whether it touches a pixel */
+#endif
+    atomic_max(&end_of_patch[mine.patch], end);
+    if (lid == 0)
+        rounds[0] = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+
+    /* Back, from the last splat to the first. */
+    local float2 *parts = all_parts + lid / SHARE * NEXT_PARTS;
+    int parity = 0;
+    for (;;) {
+        const int size = min(swept - batch, (uint)BATCH);
+        mine = pixels_of(near.dealt[lid / SHARE], origin, lid);
+        local const uchar *list = near.lists + mine.patch * LIST_ROOM;
+        const int count = near.counts[mine.patch];
+        const int place = near.places[mine.patch] - places(count);
+        int left = clamp(end_of_patch[mine.patch] - place, 0, count);
+        if (share == 0)
+            atomic_max(&rounds[parity], (left + ROUND - 1) / ROUND);
+        float t[PIXELS], r[PIXELS], g[PIXELS], b[PIXELS], br[PIXELS], bg[PIXELS], bb[PIXELS];
+        int last[PIXELS];
+        for (int p = 0; p < PIXELS; ++p) {
+            const int i = mine.first + p * SHARE;
+            t[p] = state.t[i];
+            r[p] = state.r[i];
+            g[p] = state.g[i];
+            b[p] = state.b[i];
+            last[p] = state.last[i];
+            br[p] = behind_r[i];
+            bg[p] = behind_g[i];
+            bb[p] = behind_b[i];
+        }
+        for (int i = lid; i < BATCH; i += ITEMS) {
+            for (int level = 0; level < 2 * LEVELS; ++level)
+                levels[level * BATCH + i] = 0;
+#if TIGHTEN
+            reached[i] = 0;
+#endif
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+        const int all_rounds = rounds[parity];
+        parity ^= 1;
+        if (lid == 0)
+            rounds[parity] = 0;
+        if (share == 0)
+            near.places[mine.patch] = place;
+        for (int round = 0; round < all_rounds; ++round, left -= ROUND) {
+            const int now = min(left, ROUND);
+#pragma unroll 2
+            for (int j = 0; j < now; ++j) {
+                const int i = left - 1 - j;
+                const int k = list[i];
+                local const float4 *splat = near.shapes + 3 * k;
+                const float4 s0 = splat[0], s1 = splat[1];
+                const float blue_k = splat[2].x;
+                const float u0 = s0.z * (mine.x - s0.x);
+                float effect = 0.0f, importance = 0.0f;
+#pragma unroll
+                for (int p = 0; p < PIXELS; ++p) {
+                    const float power = power_at(mine, p, u0, s0, s1);
+#if TIGHTEN
+                    if (power >= LOG2_ALPHA_MIN)
+                        atomic_or(&reached[k], 1);
+#endif
+                    const int takes = power >= LOG2_ALPHA_MIN && place + i <= last[p];
+                    const float most = fmin(EXP2(power), ALPHA_CAP);
+                    const float alpha = takes ? most : 0.0f;
+                    const float front = t[p] / (1.0f - alpha);
+                    t[p] = takes ? front : t[p];
+                    const float weight_k = t[p] * alpha;
+                    const float gap_r = br[p] - s1.z, gap_g = bg[p] - s1.w, gap_b = bb[p] - blue_k;
+                    const float squares = MAD(gap_r, gap_r, MAD(gap_g, gap_g, gap_b * gap_b));
+                    const float products = MAD(gap_r, r[p], MAD(gap_g, g[p], gap_b * b[p]));
+                    effect = MAD(weight_k, MAD(weight_k, squares, products), effect);
+                    importance += weight_k;
+                    br[p] = MAD(-alpha, gap_r, br[p]);
+                    bg[p] = MAD(-alpha, gap_g, bg[p]);
+                    bb[p] = MAD(-alpha, gap_b, bb[p]);
+                }
+                parts[j * SHARE + share] = (float2)(effect, importance);
+            }
+            barrier(CLK_LOCAL_MEM_FENCE);
+            const int summed = share / (SHARE / ROUND);
+            if (summed < now) {
+                float2 sum = (float2)(0.0f);
+                for (int j = 0; j < ROUND; ++j)
+                    /* Turned by the work-item's number, so that neighbours read from different banks. */
+                    sum += parts[share * ROUND + ((j + summed) & (ROUND - 1))];
+                sum = clamp(sum, -view_bound / PATCHES, view_bound / PATCHES);
+                const int k = list[left - 1 - summed];
+                add_parts(levels + k, BATCH, sum.x);
+                add_parts(levels + LEVELS * BATCH + k, BATCH, sum.y);
+            }
+            barrier(CLK_LOCAL_MEM_FENCE);
+        }
+        for (int p = 0; p < PIXELS; ++p) {
+            const int i = mine.first + p * SHARE;
+            state.t[i] = t[p];
+            behind_r[i] = br[p];
+            behind_g[i] = bg[p];
+            behind_b[i] = bb[p];
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (int i = lid; i < size; i += ITEMS) {
+            const float2 after =
+                (float2)(whole_sum(levels + i, BATCH), whole_sum(levels + LEVELS * BATCH + i, BATCH));
+            const float2 before = sums[batch + i];
+            replace_sums(totals + TOTAL_WORDS * (size_t)near.splats[i], before, after, view_scale, view_bound);
+#if TIGHTEN
+            sums[batch + i] = reached[i] ? after : NEVER;
+#else
+            sums[batch + i] = after;
+#endif
+        }
+        if (batch == 0)
+            break;
+        batch -= BATCH;
+        fetch(&near, shapes, colours, entries + batch, patches + batch, BATCH, lid);
+        barrier(CLK_LOCAL_MEM_FENCE);
+        make_lists(&near, lid);
+    }
+}
+
+/* Adds to each tile's staleness how much of its area the splats that have just gone (alive == 2) covered when it was last
+   swept. On the way the tile's list loses, in place, those that are not alive (!= 1) and those that the last sweep marked.
+   A tile that is staler than the tolerance is listed to be swept, and is fresh then. */
+kernel __attribute__((reqd_work_group_size(LISTERS, 1, 1)))
+void staleness(
+    global const uchar *alive,
+    global const SetView *views,
+    uint view_count,
+    global const uint *offsets,
+    global uint *lengths,
+    global uint *entries,
+    global ushort *patches,
+    global float2 *sums,
+    uint first,
+    global float *stale,
+    float tolerance,
+    global uint *tiles,
+    uint set,
+    volatile global uint *listed)
+{
+    local float parts[LISTERS];
+    /* A bit an entry that goes. Three in turn: one in use, one still being read, one that is cleared. */
+    local uint going[3][LISTERS / 32];
+    const uint set_tile = get_group_id(0), lid = get_local_id(0);
+    const uint number = view_of_tile(views, view_count, set_tile);
+    const uint begin = views[number].first_entry
+        + offsets[views[number].first_offset + set_tile - views[number].first_tile];
+    const uint length = lengths[set_tile];
+    entries += begin;
+    patches += begin;
+    sums += begin;
+    if (lid < LISTERS / 32)
+        going[0][lid] = going[1][lid] = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    float gone = 0.0f;
+    uint kept = 0, turn = 0;
+    for (uint batch = 0; batch < length; batch += LISTERS) {
+        const uint e = batch + lid;
+        uint splat = 0, stays = 0;
+        if (e < length) {
+            splat = entries[e];
+            const uchar state = alive[splat];
+            stays = state == 1;
+#if TIGHTEN
+            stays = stays && sums[e].y >= 0.0f;
+#endif
+            if (state == 2) {
+                const float area = sums[e].y;
+                gone += area >= 0.0f ? fmax(area, LEAST_STALENESS) : 0.0f;
+            }
+            if (!stays)
+                atomic_or(&going[turn][lid / 32], 1u << lid % 32);
+        }
+        barrier(CLK_LOCAL_MEM_FENCE);
+        uint before = 0, all = 0;
+        for (uint w = 0; w < LISTERS / 32; ++w) {
+            const uint word = going[turn][w];
+            all += popcount(word);
+            before += popcount(w < lid / 32 ? word : w == lid / 32 ? word & ((1u << lid % 32) - 1) : 0);
+        }
+        if (lid < LISTERS / 32)
+            going[(turn + 2) % 3][lid] = 0;
+        const uint moves = stays && (all > 0 || kept < batch);
+        float2 sum = (float2)(0.0f);
+        ushort touched = 0;
+        if (moves) {
+            sum = sums[e];
+            touched = patches[e];
+        }
+        barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
+        if (moves) {
+            const uint place = kept + lid - before;
+            entries[place] = splat;
+            sums[place] = sum;
+            patches[place] = touched;
+        }
+        kept += min(length - batch, (uint)LISTERS) - all;
+        turn = (turn + 1) % 3;
+    }
+    parts[lid] = gone;
+    barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
+    for (uint e = kept + lid; e < length; e += LISTERS)
+        sums[e] = (float2)(0.0f);
+    for (uint step = LISTERS / 2; step > 0; step /= 2) {
+        if (lid < step)
+            parts[lid] += parts[lid + step];
+        barrier(CLK_LOCAL_MEM_FENCE);
+    }
+    if (lid == 0) {
+        const float staleness = stale[first + set_tile] + parts[0] * (1.0f / (TILE * TILE));
+        const int wanted = staleness > tolerance;
+        stale[first + set_tile] = wanted ? 0.0f : staleness;
+        if (wanted)
+            tiles[first + atomic_inc(&listed[set])] = set_tile;
+        lengths[set_tile] = kept;
+    }
+}

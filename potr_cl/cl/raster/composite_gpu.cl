@@ -1,0 +1,58 @@
+/* Compositing for GPUs: one work-group a tile; get_group_id(1) is the view's number in its set. See patch_lists.clh for how
+   a tile's work is shared out.
+
+   Macros: ALPHA_CAP, STOP, NATIVE_EXP2. */
+
+#define ROUND 1 /* there is nothing to sum */
+#include "include/patch_lists.clh"
+
+kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
+void composite(
+    global const SetView *views,
+    uint stride,
+    global const float4 *shapes,
+    global const float4 *colours,
+    global const uint *offsets,
+    global const uint *entries,
+    global const ushort *patches,
+    uint capacity,
+    float red,
+    float green,
+    float blue,
+    global float *image,
+    global float *transmittance)
+{
+    local State state;
+    local Batch near;
+    local int unfinished[2];
+
+    const int lid = get_local_id(0);
+    const uint tile = get_group_id(0), number = get_group_id(1);
+    views += number;
+    const int2 picture = (int2)(views->view.width, views->view.height);
+    const int columns = views->view.columns;
+    if (tile >= (uint)(columns * views->view.rows))
+        return;
+    shapes += 2 * (size_t)stride * number;
+    colours += (size_t)stride * number;
+    offsets += views->first_offset + tile;
+    const uint room = capacity - min(capacity, views->first_entry);
+    const uint begin = min(offsets[0], room), end = min(offsets[1], room);
+    entries += views->first_entry + begin;
+    patches += views->first_entry + begin;
+    const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
+    uint last_batch;
+    forward(
+        &state, &near, unfinished, origin, picture, shapes, colours, entries, patches, end - begin, lid, &last_batch);
+    const Mine mine = pixels_of(lid / SHARE, origin, lid);
+    for (int p = 0; p < PIXELS; ++p)
+        if (inside(mine, p, picture)) {
+            const int i = mine.first + p * SHARE;
+            const size_t pixel = views->first_pixel + pixel_number(mine, p, picture);
+            const float t = fabs(state.t[i]);
+            image[3 * pixel] = MAD(t, red, state.r[i]);
+            image[3 * pixel + 1] = MAD(t, green, state.g[i]);
+            image[3 * pixel + 2] = MAD(t, blue, state.b[i]);
+            transmittance[pixel] = t;
+        }
+}

@@ -1,0 +1,159 @@
+/* Projection of every splat into each view of a set, LANES splats a work-item, and the colour of those that can be seen;
+   get_global_id(1) is the view's number.
+
+   Parameters come as structure of arrays, each `stride` splats long, already activated: standard deviations, unit
+   quaternions, log2 of the opacity. Padding splats have log2 opacity -INFINITY.
+
+   Macros: LANES, SH_COUNT, NEAR, SQUARE_EXTENT (1: the original's square of three standard deviations). */
+
+#include "include/lanes.clh"
+#include "include/splat.clh"
+#include "include/view_set.clh"
+#include "include/sh.clh"
+
+/* sqrt(log2(e) / 2): turns exp(-q / 2) into exp2(-q'). */
+#define EXPONENT_SCALE 0.84932180f
+/* Projected axes are clamped to this many pixels: far more than any image has, and its fourth power is finite. */
+#define AXIS_LIMIT 1e8f
+
+/* Half-open range of tiles along one axis of `size` pixels, in whole numbers: those with a pixel centre within reach of
+   the position and, with the square extent, that touch the square around it. The original numbers pixel centres from 0,
+   half a pixel less than here. */
+inline void tile_range(vfloat position, vfloat reach, vfloat radius, int size, vfloat *first, vfloat *end)
+{
+    const float tiles = (size + TILE - 1) / TILE;
+    vfloat first_pixel = ceil(position - reach - 0.5f);
+    vfloat last_pixel = floor(position + reach - 0.5f);
+    vint none = first_pixel > last_pixel || last_pixel < 0.0f || first_pixel >= (float)size;
+    *first = floor(fmin(fmax(first_pixel, 0.0f), (float)size) / TILE);
+    *end = floor(fmin(fmax(last_pixel, 0.0f), (float)(size - 1)) / TILE) + 1.0f;
+#if SQUARE_EXTENT
+    *first = fmax(*first, floor(fmin(fmax(position - 0.5f - radius, 0.0f), (float)size) / TILE));
+    *end = fmin(*end, floor(fmin(fmax(position - 0.5f + radius + (TILE - 1), 0.0f), tiles * TILE) / TILE));
+#endif
+    *end = none ? *first : *end;
+}
+
+kernel void project(
+    global const float *means,
+    global const float *scales,
+    global const float *quaternions,
+    global const float *log2_opacities,
+    global const float *sh,
+    uint stride_,
+    global const SetView *views,
+    global float4 *shapes,
+    global float4 *colours,
+    global ushort4 *bounds)
+{
+    const size_t index = get_global_id(0);
+    const size_t stride = stride_;
+    global const View *view = &views[get_global_id(1)].view;
+    shapes += 2 * stride * get_global_id(1);
+    colours += stride * get_global_id(1);
+    bounds += stride * get_global_id(1);
+
+    vfloat lo = VLOAD(index, log2_opacities);
+    /* Relative to the eye first: both are large where a scene is far from the origin, their difference is not. */
+    vfloat dx = (VLOAD(index, means) - view->eye_high[0]) - view->eye_low[0];
+    vfloat dy = (VLOAD(index, means + stride) - view->eye_high[1]) - view->eye_low[1];
+    vfloat dz = (VLOAD(index, means + 2 * stride) - view->eye_high[2]) - view->eye_low[2];
+    global const float *w = view->rotation;
+    vfloat tx = w[0] * dx + w[1] * dy + w[2] * dz;
+    vfloat ty = w[3] * dx + w[4] * dy + w[5] * dz;
+    vfloat tz = w[6] * dx + w[7] * dy + w[8] * dz;
+    vint drawn = (tz > NEAR) && (lo >= LOG2_ALPHA_MIN);
+
+    vfloat inverse_z = 1.0f / tz;
+    vfloat ratio_x = tx * inverse_z;
+    vfloat ratio_y = ty * inverse_z;
+    vfloat x = view->fx * ratio_x + view->cx;
+    vfloat y = view->fy * ratio_y + view->cy;
+    ratio_x = fmin(fmax(ratio_x, -view->limit_x), view->limit_x);
+    ratio_y = fmin(fmax(ratio_y, -view->limit_y), view->limit_y);
+
+    /* Columns of the rotation, times the scale, through the view's rotation and the Jacobian: the axes on screen. */
+    vfloat qw = VLOAD(index, quaternions);
+    vfloat qx = VLOAD(index, quaternions + stride);
+    vfloat qy = VLOAD(index, quaternions + 2 * stride);
+    vfloat qz = VLOAD(index, quaternions + 3 * stride);
+    vfloat axes[9] = {
+        1.0f - 2.0f * (qy * qy + qz * qz), 2.0f * (qx * qy + qw * qz), 2.0f * (qx * qz - qw * qy),
+        2.0f * (qx * qy - qw * qz), 1.0f - 2.0f * (qx * qx + qz * qz), 2.0f * (qy * qz + qw * qx),
+        2.0f * (qx * qz + qw * qy), 2.0f * (qy * qz - qw * qx), 1.0f - 2.0f * (qx * qx + qy * qy)};
+    vfloat mx[3], my[3];
+    for (int k = 0; k < 3; ++k) {
+        vfloat *axis = axes + 3 * k;
+        vfloat ux = w[0] * axis[0] + w[1] * axis[1] + w[2] * axis[2];
+        vfloat uy = w[3] * axis[0] + w[4] * axis[1] + w[5] * axis[2];
+        vfloat uz = w[6] * axis[0] + w[7] * axis[1] + w[8] * axis[2];
+        vfloat scale = VLOAD(index, scales + k * stride) * inverse_z;
+        mx[k] = view->fx * scale * (ux - ratio_x * uz);
+        my[k] = view->fy * scale * (uy - ratio_y * uz);
+        vfloat shrink = fmin(AXIS_LIMIT / fmax(fmax(fabs(mx[k]), fabs(my[k])), 1.0f), 1.0f);
+        mx[k] *= shrink;
+        my[k] *= shrink;
+    }
+    /* Covariance with the dilation, and its determinant by Lagrange's identity: a sum of squares, no cancellation. */
+    vfloat sxx = mx[0] * mx[0] + mx[1] * mx[1] + mx[2] * mx[2];
+    vfloat sxy = mx[0] * my[0] + mx[1] * my[1] + mx[2] * my[2];
+    vfloat syy = my[0] * my[0] + my[1] * my[1] + my[2] * my[2];
+    vfloat n0 = mx[1] * my[2] - mx[2] * my[1];
+    vfloat n1 = mx[2] * my[0] - mx[0] * my[2];
+    vfloat n2 = mx[0] * my[1] - mx[1] * my[0];
+    vfloat determinant = n0 * n0 + n1 * n1 + n2 * n2 + 0.3f * (sxx + syy) + 0.09f;
+    sxx += 0.3f;
+    syy += 0.3f;
+
+    vfloat a = EXPONENT_SCALE * sqrt(syy / determinant);
+    vfloat b = -a * (sxy / syy);
+    vfloat c = EXPONENT_SCALE / sqrt(syy);
+    drawn = drawn && (fabs(x) + fabs(y) + a + fabs(b) + c < 1e30f);
+
+    vfloat radius = 0.0f;
+#if SQUARE_EXTENT
+    vfloat half_trace = 0.5f * (sxx + syy);
+    vfloat half_gap = 0.5f * (sxx - syy);
+    radius = ceil(3.0f * sqrt(half_trace + sqrt(fmax(half_gap * half_gap + sxy * sxy, 0.1f))));
+#endif
+    vfloat level = fmax(lo - LOG2_ALPHA_MIN, 0.0f) + LEVEL_SLACK;
+    vfloat reach_x = sqrt(level * sxx) / EXPONENT_SCALE + PIXEL_SLACK + RELATIVE_SLACK * fabs(x);
+    vfloat reach_y = sqrt(level * syy) / EXPONENT_SCALE + PIXEL_SLACK + RELATIVE_SLACK * fabs(y);
+    vfloat first_column, end_column, first_row, end_row;
+    tile_range(x, reach_x, radius, view->width, &first_column, &end_column);
+    tile_range(y, reach_y, radius, view->height, &first_row, &end_row);
+    drawn = drawn && (first_column < end_column) && (first_row < end_row);
+
+    vfloat rgb[3] = {(vfloat)(0.0f), (vfloat)(0.0f), (vfloat)(0.0f)};
+    if (VANY(drawn)) {
+        vfloat inverse_length = 1.0f / sqrt(dx * dx + dy * dy + dz * dz);
+        sh_colour(sh, stride, index, dx * inverse_length, dy * inverse_length, dz * inverse_length, rgb);
+    }
+
+#if LANES == 1
+    shapes[2 * index] = (float4)(x, y, a, b);
+    shapes[2 * index + 1] = (float4)(c, lo, tz, 0.0f);
+    ushort4 tiles = (ushort4)(0);
+    if (drawn)
+        tiles = (ushort4)((ushort)first_column, (ushort)end_column, (ushort)first_row, (ushort)end_row);
+    bounds[index] = tiles;
+    if (drawn)
+        colours[index] = (float4)(rgb[0], rgb[1], rgb[2], 0.0f);
+#else
+    vfloat zero = 0.0f;
+    float columns[14][LANES];
+    vfloat values[14] = {
+        x, y, a, b, c, lo, tz, rgb[0], rgb[1], rgb[2],
+        drawn ? first_column : zero, drawn ? end_column : zero, drawn ? first_row : zero, drawn ? end_row : zero};
+    for (int k = 0; k < 14; ++k)
+        VSTORE(values[k], 0, columns[k]);
+    for (int lane = 0; lane < LANES; ++lane) {
+        size_t splat = index * LANES + lane;
+        shapes[2 * splat] = (float4)(columns[0][lane], columns[1][lane], columns[2][lane], columns[3][lane]);
+        shapes[2 * splat + 1] = (float4)(columns[4][lane], columns[5][lane], columns[6][lane], 0.0f);
+        colours[splat] = (float4)(columns[7][lane], columns[8][lane], columns[9][lane], 0.0f);
+        bounds[splat] = (ushort4)(
+            (ushort)columns[10][lane], (ushort)columns[11][lane], (ushort)columns[12][lane], (ushort)columns[13][lane]);
+    }
+#endif
+}

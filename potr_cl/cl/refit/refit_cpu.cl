@@ -1,0 +1,149 @@
+/* The picture's dependence on the splats' colours, for CPUs: one tile a work-item, patch by patch.
+
+   The picture is linear in the colours: pixel = sum of w_k c_k + rest of the background, w_k = T alpha. A walk over a
+   patch's list makes its pixels' values v, less the target if there is one, and remembers the weights; they then give each
+   splat's sum over the pixels of w_k v, three channels, and with WEIGHTS of w_k^2. A tile's sums go to exact totals
+   (totals.clh). Lists of more than SEGMENT splats are walked twice.
+
+   Macros: LANES, ALPHA_CAP, STOP, WEIGHTS. */
+
+#include "include/lanes.clh"
+#include "include/splat.clh"
+#include "include/patch_vectors.clh"
+#include "include/patch_walk.clh"
+#include "refit/refit.clh"
+
+/* A patch's walk over its list: its transmittances and colours move on, weights[j] becomes the j-th splat's. Returns the
+   number of splats before the last pixel's end. */
+inline uint blend(
+    const Splat *splats, const ushort *list, uint length, float2 first, vfloat t[1], vfloat rgb[3], float *weights)
+{
+    vfloat through = t[0], r = rgb[0], g = rgb[1], b = rgb[2];
+    uint j = 0;
+    while (j < length && VANY(through > 0.0f)) {
+        const uint stop = min(j + PAIRS_AT_ONCE, length);
+        for (; j < stop; ++j) {
+            const Splat *splat = &splats[list[j]];
+            const vfloat power = splat_power(splat, first);
+            BLEND(weight, power, through);
+            r = MAD(weight, (vfloat)(splat->red), r);
+            g = MAD(weight, (vfloat)(splat->green), g);
+            b = MAD(weight, (vfloat)(splat->blue), b);
+            VSTORE(weight, j, weights);
+        }
+    }
+    t[0] = through;
+    rgb[0] = r;
+    rgb[1] = g;
+    rgb[2] = b;
+    return j;
+}
+
+/* sums[list[j]] += the sums over the pixels of weights[j] x values, and of its square. */
+inline void sum_pairs(const ushort *list, uint length, float *weights, const float values[3][LANES], float4 *sums)
+{
+    for (uint j = length; j % LANES; ++j)
+        VSTORE((vfloat)(0.0f), j, weights);
+    for (uint j = 0; j < length; j += LANES) {
+        vfloat w[LANES];
+        for (int k = 0; k < LANES; ++k)
+            w[k] = VLOAD(j + k, weights);
+        transpose(w);
+        vfloat r = (vfloat)(0.0f), g = (vfloat)(0.0f), b = (vfloat)(0.0f), squares = (vfloat)(0.0f);
+        for (int k = 0; k < LANES; ++k) {
+            r = MAD(w[k], (vfloat)(values[0][k]), r);
+            g = MAD(w[k], (vfloat)(values[1][k]), g);
+            b = MAD(w[k], (vfloat)(values[2][k]), b);
+#if WEIGHTS
+            squares = MAD(w[k], w[k], squares);
+#endif
+        }
+        vfloat four[4];
+        interleave(r, g, b, squares, four);
+        float vectors[4 * LANES];
+        for (int k = 0; k < 4; ++k)
+            VSTORE(four[k], k, vectors);
+        const uint count = min(length - j, (uint)LANES);
+        for (uint k = 0; k < count; ++k)
+            sums[list[j + k]] += vload4(k, vectors);
+    }
+}
+
+kernel void refit_sweep(
+    global const float4 *shapes,
+    global const float4 *colours,
+    global const uint *offsets,
+    global const uint *entries,
+    global const uint *patches,
+    View view,
+    float red,
+    float green,
+    float blue,
+    global const float *target,
+    int has_target,
+    float scale,
+    global float *errors,
+    volatile global uint *totals)
+{
+    const int tile = get_global_id(0);
+    const int2 origin = (int2)(tile % view.columns, tile / view.columns) * TILE;
+    const uint begin = offsets[tile], end = offsets[tile + 1];
+
+    Splat splats[SEGMENT];
+    ushort lists[PATCHES][SEGMENT];
+    uint lengths[PATCHES];
+    float weights[(SEGMENT + LANES) * LANES];
+    float4 sums[SEGMENT];
+    vfloat t[PATCHES], rgb[PATCHES][3];
+    float values[PATCHES][3][LANES];
+    float error = 0.0f;
+    const int twice = end - begin > SEGMENT;
+    for (int pass = twice ? 0 : 1; pass < 2; ++pass) {
+        for (int i = 0; i < PATCHES; ++i) {
+            t[i] = patch_transmittance(i, origin, view.width, view.height);
+            rgb[i][0] = rgb[i][1] = rgb[i][2] = (vfloat)(0.0f);
+        }
+        for (uint from = begin; pass == 1 || from < end; from += SEGMENT) {
+            const uint count = from < end ?
+                gather_splats(shapes, colours, entries, patches, from, end, splats, lists, lengths) : 0;
+            for (uint k = 0; k < count; ++k)
+                sums[k] = (float4)(0.0f);
+            for (int i = 0; i < PATCHES; ++i) {
+                const uint length = count ? lengths[i] : 0;
+                const uint walked = blend(splats, lists[i], length, patch_centre(origin, i), &t[i], rgb[i], weights);
+                if (from + count >= end && pass == (twice ? 0 : 1)) {
+                    /* The pixels' values are known. */
+                    const vfloat through = fabs(t[i]);
+                    VSTORE(MAD(through, (vfloat)(red), rgb[i][0]), 0, values[i][0]);
+                    VSTORE(MAD(through, (vfloat)(green), rgb[i][1]), 0, values[i][1]);
+                    VSTORE(MAD(through, (vfloat)(blue), rgb[i][2]), 0, values[i][2]);
+                    for (int lane = 0; lane < LANES; ++lane) {
+                        const int column = origin.x + PATCH_COLUMN(i) + lane % PATCH_WIDTH;
+                        const int row = origin.y + PATCH_ROW(i) + lane / PATCH_WIDTH;
+                        const int inside = column < view.width && row < view.height;
+                        const size_t pixel = 3 * ((size_t)row * view.width + column);
+                        for (int channel = 0; channel < 3; ++channel) {
+                            float value = inside ? values[i][channel][lane] : 0.0f;
+                            if (has_target && inside)
+                                value -= target[pixel + channel];
+                            value = clamp(value, -LARGEST_VALUE, LARGEST_VALUE);
+                            error += value * value;
+                            values[i][channel][lane] = value;
+                        }
+                    }
+                }
+                if (pass == 1)
+                    sum_pairs(lists[i], walked, weights, values[i], sums);
+            }
+            if (pass == 1)
+                for (uint k = 0; k < count; ++k) {
+                    if (k + AHEAD < count)
+                        PREFETCH_TO_WRITE(totals + 2 * TOTALS * entries[from + k + AHEAD]);
+                    add_sums(totals, entries[from + k], sums[k], scale);
+                }
+            if (from + count >= end)
+                break;
+        }
+    }
+    errors[tile] = error;
+}

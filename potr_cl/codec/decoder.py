@@ -1,0 +1,357 @@
+"""Decoder: from the bytes of a .potr file back to a scene, in order. Nothing in a file is trusted."""
+
+from __future__ import annotations
+
+import json
+import os
+from collections.abc import Callable, Iterator
+from concurrent.futures import FIRST_EXCEPTION, Future, wait
+from dataclasses import dataclass
+from functools import partial
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec import container, context_coder, octree, quantize
+from potr_cl.codec.container import Coder, Header, Property, Section
+from potr_cl.errors import DataError, UsageError
+from potr_cl.host.threads import thread_pool
+from potr_cl.model.scene import SH_COEFFICIENTS, Scene
+
+#: Splats dequantised at a time: few enough that temporaries stay in a cache, many enough that threads seldom wait.
+_BLOCK = 1 << 15
+#: More threads would find nothing to do.
+_MOST_THREADS = 16
+
+_EMPTY = np.empty(0, np.uint8)
+
+
+@dataclass(frozen=True)
+class PotrFile:
+    """An opened .potr file. Its properties can be decoded one by one, in any order and from several threads.
+
+    Attributes:
+        header: verified.
+        data: the whole file.
+    """
+
+    header: Header
+    data: bytes
+
+    @staticmethod
+    def from_bytes(data: bytes) -> PotrFile:
+        """Verify the header of a file in memory.
+
+        Raises:
+            DataError: not a .potr file, or a damaged one.
+        """
+        return PotrFile(container.read_header(data, len(data)), data)
+
+    @staticmethod
+    def open(path: str | os.PathLike[str]) -> PotrFile:
+        """Read a file and verify its header.
+
+        Raises:
+            UsageError: the path cannot be read.
+            DataError: not a .potr file, or a damaged one.
+        """
+        path = Path(path)
+        try:
+            with path.open("rb") as file:
+                size = os.fstat(file.fileno()).st_size
+                # The header must be sound before the rest is worth its memory.
+                start = file.read(len(container.MAGIC))
+                if start == container.MAGIC or size == 0:
+                    start += file.read()
+            return PotrFile(container.read_header(start, max(len(start), size)), start)
+        except OSError as error:
+            raise UsageError(f"cannot read '{path}': {error.strerror}") from None
+        except DataError as error:
+            raise DataError(f"'{path}': {error}") from None
+
+    @property
+    def metadata(self) -> dict[str, Any]:
+        """What the encoder noted of itself; empty if it noted nothing.
+
+        Raises:
+            DataError: damaged.
+        """
+        try:
+            facts = json.loads(bytes(self._raw(Property.METADATA)) or b"{}")
+        except (ValueError, RecursionError):
+            facts = None
+        if not isinstance(facts, dict):
+            raise DataError("section 'metadata' is not a JSON object")
+        return facts
+
+    def means(self) -> NDArray[np.float32]:
+        """(N, 3) float32 centres, world units.
+
+        Raises:
+            DataError: damaged.
+        """
+        header = self.header
+        planes = self._planes(Property.MULTIPLICITY)
+        raw = self._raw(Property.MULTIPLICITY)
+        count = len(raw) // planes if planes else 0
+        if planes and len(raw) != planes * count:
+            raise DataError("section 'multiplicity' does not hold whole integers")
+        tree = octree.OctreeStreams(
+            origin=header.origin,
+            side=header.side,
+            depth=header.depth,
+            occupancy=self._raw(Property.OCCUPANCY),
+            several=self._raw(Property.SEVERAL),
+            multiplicities=container.unpack_integers(raw, planes, False, 0, count).astype(np.uint64),
+            tail_lengths=self._raw(Property.TAIL_LENGTH),
+            tails=self._raw(Property.TAIL),
+            absolute=header.version > 1,
+        )
+        return octree.parse(tree, header.splats)
+
+    def log_scales(self) -> NDArray[np.float32]:
+        """(N, 3) float32 natural logarithms of standard deviations. Raises DataError if damaged."""
+        out = np.empty((self.header.splats, 3), np.float32)
+        self._dequantize_scales(self._streams(Property.SCALE), out)
+        return out
+
+    def quaternions(self) -> NDArray[np.float32]:
+        """(N, 4) float32 unit quaternions w, x, y, z. Raises DataError if damaged."""
+        out = np.empty((self.header.splats, 4), np.float32)
+        scales = self._streams(Property.SCALE) if self.header.version > 1 else []
+        self._dequantize_rotations(self._streams(Property.ROTATION), scales, out)
+        return out
+
+    def opacity_logits(self) -> NDArray[np.float32]:
+        """(N,) float32 logits. Raises DataError if damaged."""
+        out = np.empty(self.header.splats, np.float32)
+        self._decode_opacities(out, _now)
+        return out
+
+    def sh(self) -> NDArray[np.float32]:
+        """(N, M, 3) float32 SH coefficients, each contiguous in memory. Raises DataError if damaged."""
+        planar = self._empty_sh()
+        for _, job in self._sh_jobs(planar):
+            job(_now)
+        return planar.transpose(2, 0, 1)
+
+    def scene(self, threads: int = 0) -> Scene:
+        """Decode everything.
+
+        Args:
+            threads: 0: one a processor.
+
+        Raises:
+            DataError: damaged.
+        """
+        header = self.header
+        try:
+            planar = self._empty_sh()
+            log_scales = np.empty((header.splats, 3), np.float32)
+            quaternions = np.empty((header.splats, 4), np.float32)
+            opacity_logits = np.empty(header.splats, np.float32)
+            shapes: _Job = partial(self._decode_shapes, log_scales, quaternions)
+            opacities: _Job = partial(self._decode_opacities, opacity_logits)
+            # The longest first: a pool that ends with a long one ends late.
+            jobs = [
+                *self._sh_jobs(planar),
+                (self._contextual(Property.SCALE) or self._contextual(Property.ROTATION), shapes),
+                (self._contextual(Property.OPACITY), opacities),
+            ]
+            means = self._run(jobs, threads or min(os.cpu_count() or 1, _MOST_THREADS))
+        except MemoryError:
+            needed = header.splats * (11 + 3 * SH_COEFFICIENTS[header.sh_degree]) * 4
+            raise DataError(f"the scene needs {needed / 1e9:.1f} GB of memory, more than there is") from None
+        return Scene(means, log_scales, quaternions, opacity_logits, planar.transpose(2, 0, 1))
+
+    def _run(self, jobs: list[tuple[bool, _Job]], threads: int) -> NDArray[np.float32]:
+        """Do some jobs, each with whether it takes the context coder, and decode the centres.
+
+        The context coder makes many short calls, in which threads would only wait for each other: one makes them all,
+        and leaves what else is to be done with the integers to others.
+        """
+        left: list[Future[None]] = []
+
+        def leave(work: Callable[[], None]) -> None:
+            left.append(pool.submit(work))
+
+        def one_by_one() -> None:
+            for contextual, job in jobs:
+                if contextual:
+                    job(_now if threads == 1 else leave)
+
+        with thread_pool(threads) as pool:
+            coded = pool.submit(one_by_one)
+            means = pool.submit(self.means)
+            others = [pool.submit(job, _now) for contextual, job in jobs if not contextual]
+            first: list[Future[Any]] = [coded, means, *others]
+            for futures in (first, left):
+                wait(futures, return_when=FIRST_EXCEPTION)
+                for future in futures:
+                    if future.done() and (error := future.exception()) is not None:
+                        raise error
+            return means.result()
+
+    # ------------------------------------------------------------------------------------------ inside
+
+    def _raw(self, prop: Property, index: int = 0) -> NDArray[np.uint8]:
+        section = self.header.find(prop, index)
+        return _EMPTY if section is None else container.read_section(self.data, section)
+
+    def _planes(self, prop: Property, index: int = 0) -> int:
+        section = self.header.find(prop, index)
+        return 0 if section is None else section.planes
+
+    def _contextual(self, prop: Property, index: int = 0) -> bool:
+        section = self.header.find(prop, index)
+        return section is not None and section.coder == Coder.CONTEXT
+
+    def _context_streams(
+        self, section: Section, history: context_coder.Sizes | None = None
+    ) -> Iterator[context_coder.Stream]:
+        """The streams of a section of coder CONTEXT, one after another."""
+        yield from context_coder.Reader(
+            container.stored_bytes(self.data, section),
+            section.raw_bytes // section.planes,
+            section.planes,
+            container.is_signed(section.kind),
+            container.is_predicted(section.kind, section.index),
+            history,
+            section.name,
+        )
+
+    def _streams(self, prop: Property, indices: range | None = None) -> list[_Stream]:
+        """Some streams of one integer a splat, all of a property's by default."""
+        indices = range(container.indices(prop)) if indices is None else indices
+        section = self.header.find(prop, indices[0])
+        if section is not None and section.coder == Coder.CONTEXT:
+            return [stream.part for stream in self._context_streams(section)]
+        signed = container.is_signed(prop)
+        return [
+            partial(container.unpack_integers, self._raw(prop, index), self._planes(prop, index), signed)
+            for index in indices
+        ]
+
+    def _blocks(self, streams: list[_Stream]) -> Iterator[tuple[slice, list[NDArray[np.integer]]]]:
+        """The integers of some streams side by side, block by block."""
+        for start in range(0, self.header.splats, _BLOCK):
+            stop = min(start + _BLOCK, self.header.splats)
+            yield slice(start, stop), [stream(start, stop) for stream in streams]
+
+    def _decode_shapes(
+        self, log_scales: NDArray[np.float32], quaternions: NDArray[np.float32], submit: _Submit
+    ) -> None:
+        scales = self._streams(Property.SCALE)
+        submit(partial(self._dequantize_scales, scales, log_scales))
+        submit(partial(self._dequantize_rotations, self._streams(Property.ROTATION), scales, quaternions))
+
+    def _decode_opacities(self, out: NDArray[np.float32], submit: _Submit) -> None:
+        dequantize = quantize.dequantize_opacities if self.header.version == 1 else quantize.dequantize_logits
+
+        def finish(streams: list[_Stream]) -> None:
+            for block, steps in self._blocks(streams):
+                out[block] = dequantize(steps[0], self.header.sf_opacity)
+
+        submit(partial(finish, self._streams(Property.OPACITY)))
+
+    def _dequantize_scales(self, streams: list[_Stream], out: NDArray[np.float32]) -> None:
+        for axis, stream in enumerate(streams):
+            for block, steps in self._blocks([stream]):
+                out[block, axis] = quantize.dequantize_scales(steps[0], self.header.sf_scale)
+
+    def _dequantize_rotations(self, streams: list[_Stream], scales: list[_Stream], out: NDArray[np.float32]) -> None:
+        """Quaternions; ``scales`` matter in format version 2 only."""
+        if self.header.version == 1:
+            for block, steps in self._blocks(streams):
+                quantize.dequantize_rotations(steps, self.header.sf_rotation, out[block])
+        else:
+            for block, steps in self._blocks([*streams, *scales]):
+                factors = quantize.rotation_factors(steps[3:], self.header.sf_rotation)
+                quantize.dequantize_rotations(steps[:3], factors, out[block])
+
+    def _empty_sh(self) -> NDArray[np.float32]:
+        return np.empty((SH_COEFFICIENTS[self.header.sh_degree], 3, self.header.splats), np.float32)
+
+    def _sh_jobs(self, planar: NDArray[np.float32]) -> list[tuple[bool, _Job]]:
+        """What decodes all SH coefficients into ``planar`` (M, 3, N), and whether it takes the context coder."""
+        chained = [s for s in self.header.sections if s.kind == Property.SH and s.coder == Coder.CONTEXT and s.index]
+        in_chain = {s.index // 3 + m for s in chained for m in range(s.planes // 3)}
+        alone = [m for m in range(len(planar)) if m not in in_chain]
+        jobs: list[tuple[bool, _Job]] = [(True, partial(self._decode_chain, chained, planar))] if chained else []
+        return jobs + [
+            (self._contextual(Property.SH, 3 * m), partial(self._decode_coefficient, m, planar[m])) for m in alone
+        ]
+
+    def _decode_chain(self, sections: list[Section], planar: NDArray[np.float32], submit: _Submit) -> None:
+        """AC coefficients whose contexts are made of those before."""
+        history = context_coder.Sizes(context_coder.Lanes(self.header.splats))
+        for section in sorted(sections, key=lambda s: s.index):
+            streams = self._context_streams(section, history)
+            for m, channels in enumerate(zip(streams, streams, streams, strict=True), start=section.index // 3):
+                submit(partial(self._finish_coefficient, [s.part for s in channels], m, False, planar[m]))
+
+    def _decode_coefficient(self, m: int, out: NDArray[np.float32], submit: _Submit) -> None:
+        """One SH coefficient into ``out`` (3, N): R, G, B."""
+        streams = self._streams(Property.SH, range(3 * m, 3 * m + 3))
+        differences = m == 0 and not self._contextual(Property.SH)
+        submit(partial(self._finish_coefficient, streams, m, differences, out))
+
+    def _finish_coefficient(self, streams: list[_Stream], m: int, differences: bool, out: NDArray[np.float32]) -> None:
+        last = [0, 0, 0]
+        for block, steps in self._blocks(streams):
+            if differences:
+                channels = [s.astype(np.int64) for s in steps]
+                for c, channel in enumerate(channels):
+                    channel[0] += last[c]
+                    np.cumsum(channel, out=channel)
+                    last[c] = channel[-1]
+            else:
+                channels = _wider(steps)
+            _to_rgb(channels, self.header.sf_dc if m == 0 else self.header.sf_ac, out[:, block])
+
+
+#: Gives the integers from one splat to another of a stream.
+_Stream = Callable[[int, int], NDArray[np.integer]]
+#: Takes what needs no more than what is at hand, to be done now or by another thread.
+_Submit = Callable[[Callable[[], None]], None]
+#: Decodes some of a file.
+_Job = Callable[[_Submit], None]
+
+
+def _now(work: Callable[[], None]) -> None:
+    work()
+
+
+def _wider(steps: list[NDArray[np.integer]]) -> list[NDArray[Any]]:
+    """Integers of a type that holds the sums of three of them."""
+    most = max(s.dtype.itemsize for s in steps)
+    dtype: type[np.signedinteger] = np.int16 if most == 1 else np.int32 if most == 2 else np.int64
+    return [s.astype(dtype) for s in steps]
+
+
+def _to_rgb(channels: list[NDArray[Any]], factor: float, out: NDArray[np.float32]) -> None:
+    """Steps of Y, Co, Cg to R, G, B in ``out`` (3, n)."""
+    divisor = np.float32(factor)
+    y, co, cg = channels
+    r = y - cg
+    np.divide(r + co, divisor, out=out[0], dtype=np.float32, casting="unsafe")
+    np.divide(y + cg, divisor, out=out[1], dtype=np.float32, casting="unsafe")
+    np.divide(r - co, divisor, out=out[2], dtype=np.float32, casting="unsafe")
+
+
+def decode(source: bytes | str | os.PathLike[str]) -> Scene:
+    """Decode a .potr file, given as bytes or as a path.
+
+    Raises:
+        UsageError: the path cannot be read.
+        DataError: damaged.
+    """
+    if isinstance(source, bytes):
+        return PotrFile.from_bytes(source).scene()
+    try:
+        return PotrFile.open(source).scene()
+    except DataError as error:
+        where = os.fspath(source)
+        raise error if where in str(error) else DataError(f"'{where}': {error}") from None

@@ -1,0 +1,247 @@
+"""From a scene to the bytes of a .potr file: octree, quantised streams, entropy coding; the threads do not matter."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import partial
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec import container, context_coder, octree, quantize
+from potr_cl.codec.container import EntropyCoder, Header, Property, Section
+from potr_cl.codec.geometry import Geometry, quantise_geometry
+from potr_cl.host.threads import Run, thread_pool
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+
+#: Splats worked on at a time where a stage needs large temporaries.
+_BLOCK = 1 << 14
+#: Splats whose SH coefficients are quantised at a time, for the same reason.
+_BLOCK = 1 << 14
+#: Of fewer splats the models of the context coder may weigh more than they save.
+_FEW = 1 << 15
+#: Streams of bytes, whose length means something.
+_BYTES = {Property.METADATA, Property.OCCUPANCY, Property.SEVERAL, Property.TAIL_LENGTH, Property.TAIL}
+
+
+@dataclass(frozen=True)
+class Coded:
+    """A scene as the bytes of a file.
+
+    Attributes:
+        pieces: the file's bytes, to be written one after another.
+        order: (N,) index in the scene of each splat of the file.
+    """
+
+    pieces: list[bytes]
+    order: NDArray[np.int64]
+
+    @property
+    def nbytes(self) -> int:
+        return sum(map(len, self.pieces))
+
+
+def code_scene(
+    scene: Scene,
+    parameters: quantize.HyperParameters,
+    views: Sequence[Camera] = (),
+    metadata: bytes = b"",
+    entropy: EntropyCoder | None = None,
+    threads: int = 0,
+    progress: Callable[[str, float], None] | None = None,
+    geometry: Geometry | None = None,
+) -> Coded:
+    """Quantise and code a scene as it is.
+
+    Args:
+        scene: clean, at least one splat.
+        parameters: γ, β and the scale factors count.
+        views: they decide how coarse centres may be; without any, γ alone does.
+        metadata: for the file's section of that name.
+        entropy: the entropy stage.
+        threads: to work with; the bytes do not depend on it. 0: one a processor.
+        progress: told how far each stage is.
+        geometry: of the scene, with these parameters and views, where it was quantised before.
+
+    Raises:
+        DataError: a value too large to quantise.
+    """
+    report = progress or (lambda stage, done: None)
+    coder = entropy or EntropyCoder()
+    with thread_pool(threads) as pool:
+        report("octree", 0.0)
+        geometry = geometry or quantise_geometry(scene, parameters, views, pool.map)
+        parameters, tree, order = geometry.parameters, geometry.tree, geometry.order
+        report("octree", 1.0)
+        stage = "quantise and code"
+        report(stage, 0.0)
+        groups = [*_octree_groups(tree), _Group(Property.METADATA, 0, [np.frombuffer(metadata, np.uint8)])]
+        plain = pool.map(partial(_plain_sections, coder=coder), groups)
+        chains = _chains(geometry, _coefficients(scene, order, parameters, pool.map))
+        report(stage, 0.2)
+        coded = _code_chains(chains, coder, parameters.version, pool, lambda done: report(stage, 0.2 + 0.7 * done))
+        coded += [section for sections in plain for section in sections]
+        report(stage, 1.0)
+    coded.sort(key=lambda pair: (pair[0].kind, pair[0].index))
+    pieces = container.assemble(
+        Header(
+            version=parameters.version,
+            splats=len(scene),
+            sh_degree=scene.sh_degree,
+            origin=tree.origin,
+            side=tree.side,
+            depth=tree.depth,
+            sf_scale=parameters.sf_scale,
+            sf_rotation=parameters.sf_rotation,
+            sf_opacity=parameters.sf_opacity,
+            sf_dc=parameters.sf_dc,
+            sf_ac=parameters.sf_sh,
+        ),
+        coded,
+    )
+    return Coded(pieces, order)
+
+
+@dataclass(frozen=True)
+class _Group:
+    """Streams of one property, with consecutive indices from ``index`` on."""
+
+    prop: Property
+    index: int
+    streams: Sequence[NDArray[np.integer]]
+
+    @property
+    def contextual(self) -> bool:
+        return bool(container.context_groups(self.prop, 0))
+
+
+def _plain_sections(group: _Group, coder: EntropyCoder) -> list[tuple[Section, bytes]]:
+    """A section a stream; none where all integers are 0, but for opacity, whose length vouches for that of others."""
+    signed = container.is_signed(group.prop)
+    sections = []
+    for index, stream in enumerate(group.streams, start=group.index):
+        if group.prop == Property.SH and index < 3:
+            stream = stream.astype(np.int64)
+            stream[1:] -= stream[:-1].copy()
+        if group.prop in _BYTES:
+            raw, planes = stream.astype(np.uint8).tobytes(), 1
+        else:
+            raw, planes = container.pack_integers(stream, signed)
+        if group.prop == Property.OPACITY and not raw:
+            raw, planes = bytes(len(stream)), 1
+        if raw:
+            sections.append(coder.section(group.prop, index, raw, planes))
+    return sections
+
+
+def _code_chains(
+    chains: list[list[_Group]],
+    coder: EntropyCoder,
+    version: int,
+    pool: ThreadPoolExecutor,
+    progress: Callable[[float], None],
+) -> list[tuple[Section, bytes]]:
+    """Sections of some groups: those of a chain tell each other's contexts, where there are contexts."""
+    plain = partial(_plain_sections, coder=coder)
+    coded: list[tuple[Section, bytes]] = []
+    if coder.name != "context" or version == 1:
+        # Each stream by itself, so that there is something to do for every thread.
+        groups = [_Group(g.prop, g.index + k, [s]) for chain in chains for g in chain for k, s in enumerate(g.streams)]
+        for done, sections in enumerate(pool.map(plain, groups), start=1):
+            coded += sections
+            progress(done / len(groups))
+        return coded
+    kept = [[g for g in chain if g.prop == Property.OPACITY or any(s.any() for s in g.streams)] for chain in chains]
+    # For few splats one has to try.
+    few = len(chains[-1][0].streams[0]) < _FEW
+    alternatives = [[pool.submit(plain, group) for group in chain] if few else [] for chain in kept]
+    stored = context_coder.encode(
+        [
+            [
+                context_coder.Streams(g.streams, container.is_signed(g.prop), container.is_predicted(g.prop, g.index))
+                for g in chain
+            ]
+            for chain in kept
+        ],
+        pool.map,
+        progress,
+    )
+    for chain, groups, data, others in zip(chains, kept, stored, alternatives, strict=True):
+        made = None if data is None else _context_sections(groups, data, [other.result() for other in others])
+        coded += [section for group in chain for section in plain(group)] if made is None else made
+    return coded
+
+
+def _context_sections(
+    groups: list[_Group], stored: list[bytes], others: list[list[tuple[Section, bytes]]]
+) -> list[tuple[Section, bytes]] | None:
+    """A section a group; None where one of the others, which are plain, is smaller, or the format does not allow it."""
+    sections = []
+    for group, data in zip(groups, stored, strict=True):
+        integers = len(group.streams) * len(group.streams[0])
+        if integers > len(data) << 15:
+            return None
+        sections.append(container.context_section(group.prop, group.index, len(group.streams), integers, data))
+    for (_, data), plain in zip(sections, others, strict=False):
+        if sum(len(p) for _, p in plain) + 24 * (len(plain) - 1) < len(data):
+            return None
+    return sections
+
+
+def _octree_groups(tree: octree.OctreeStreams) -> list[_Group]:
+    streams: list[tuple[Property, NDArray[np.unsignedinteger]]] = [
+        (Property.TAIL, tree.tails),
+        (Property.OCCUPANCY, tree.occupancy),
+        (Property.SEVERAL, tree.several),
+        (Property.TAIL_LENGTH, tree.tail_lengths),
+        (Property.MULTIPLICITY, tree.multiplicities),
+    ]
+    return [_Group(prop, 0, [stream]) for prop, stream in streams if len(stream)]
+
+
+def _coefficients(
+    scene: Scene, order: NDArray[np.int64], parameters: quantize.HyperParameters, run: Run
+) -> NDArray[np.signedinteger]:
+    """(M, 3, N) integers of the SH coefficients' Y, Co, Cg."""
+    count = scene.sh.shape[1]
+    steps: NDArray[np.signedinteger] = np.empty((count, 3, len(scene)), np.int16)
+    wide: list[tuple[tuple[int, int, slice], quantize.Integers]] = []
+
+    def take(start: int) -> None:
+        rows = order[start : start + _BLOCK]
+        block = slice(start, start + len(rows))
+        planar = np.ascontiguousarray(scene.sh[rows].transpose(1, 2, 0))
+        for m, rgb in enumerate(planar):
+            factor = parameters.sf_dc if m == 0 else parameters.sf_sh
+            for c, values in enumerate(quantize.to_ycocg(rgb.astype(np.float64).T)):
+                made = quantize.quantize_sh(values, factor)
+                if made.dtype == steps.dtype:
+                    steps[m, c, block] = made
+                else:
+                    wide.append(((m, c, block), made))
+
+    list(run(take, range(0, len(scene), _BLOCK)))
+    if wide:
+        steps = steps.astype(np.result_type(*{made.dtype for _, made in wide}))
+        for where, made in wide:
+            steps[where] = made
+    return steps
+
+
+def _chains(geometry: Geometry, coefficients: NDArray[np.signedinteger]) -> list[list[_Group]]:
+    """All integers of splats; the groups of a chain tell each other's contexts, the longest chain comes first."""
+    degree = round(len(coefficients) ** 0.5) - 1
+    bands = [
+        _Group(Property.SH, 3 * first, list(coefficients[first:end].reshape(-1, coefficients.shape[2])))
+        for first, end in ((band**2, (band + 1) ** 2) for band in range(degree + 1))
+    ]
+    return [
+        bands[1:],
+        [_Group(Property.ROTATION, 0, geometry.rotations)],
+        [_Group(Property.SCALE, 0, geometry.scales)],
+        bands[:1],
+        [_Group(Property.OPACITY, 0, [geometry.opacities])],
+    ]

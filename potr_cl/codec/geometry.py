@@ -1,0 +1,161 @@
+"""Where a scene's splats are, how large, how turned and how opaque: as the integers of a file, and as decoded again.
+
+That is all but the colours: a re-fit solves for these on the geometry that a decoder will see, and what is coded in the
+end is the same geometry.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec import octree, quantize
+from potr_cl.host.threads import Run
+from potr_cl.model.camera import Camera, camera_centres
+from potr_cl.model.scene import Scene
+
+#: Splats worked on at a time: a few arrays of them fit a second-level cache.
+_BLOCK = 1 << 14
+
+
+@dataclass(frozen=True)
+class Geometry:
+    """A scene's quantised geometry, in the order of the file.
+
+    Attributes:
+        asked: the parameters that it was quantised with.
+        parameters: those in world units.
+        tree: the centres.
+        order: (N,) index in the scene of each splat of the file.
+        scales, rotations: of the three axes, (N,) each.
+        opacities: (N,).
+    """
+
+    asked: quantize.HyperParameters
+    parameters: quantize.HyperParameters
+    tree: octree.OctreeStreams
+    order: NDArray[np.int64]
+    scales: list[quantize.Integers]
+    rotations: list[quantize.Integers]
+    opacities: quantize.Integers
+
+    def decoded(self, sh: NDArray[np.float32]) -> Scene:
+        """What a decoder makes of it, bit for bit, in the order of the scene, with colours (N, M, 3) of that order."""
+        parameters, n = self.parameters, len(self.order)
+        log_scales, quaternions = np.empty((n, 3), np.float32), np.empty((n, 4), np.float32)
+        for axis, steps in enumerate(self.scales):
+            log_scales[self.order, axis] = quantize.dequantize_scales(steps, parameters.sf_scale)
+        turned = np.empty((n, 4), np.float32)
+        sf = parameters.sf_rotation
+        factors = sf if parameters.version == 1 else quantize.rotation_factors(self.scales, sf)
+        quantize.dequantize_rotations(self.rotations, factors, turned)
+        quaternions[self.order] = turned
+        dequantize = quantize.dequantize_opacities if parameters.version == 1 else quantize.dequantize_logits
+        opacity_logits = np.empty(n, np.float32)
+        opacity_logits[self.order] = dequantize(self.opacities, parameters.sf_opacity)
+        means = np.empty((n, 3), np.float32)
+        means[self.order] = octree.parse(self.tree, n)
+        return Scene(means, log_scales, quaternions, opacity_logits, sh)
+
+    def with_colour_steps(self, parameters: quantize.HyperParameters) -> Geometry:
+        """The same for parameters that differ in the steps of colours alone, which geometry does not depend on."""
+        world = replace(self.parameters, sf_dc=parameters.sf_dc, sf_sh=parameters.sf_sh)
+        return replace(self, asked=parameters, parameters=world)
+
+
+def quantise_geometry(
+    scene: Scene, parameters: quantize.HyperParameters, views: Sequence[Camera], run: Run = map
+) -> Geometry:
+    """Quantise a scene's geometry.
+
+    Args:
+        scene: clean, at least one splat.
+        parameters: γ, β and the scale factors of scales, rotations and opacities count.
+        views: they decide how coarse centres may be; without any, γ alone does.
+        run: in place of :func:`map`, to work with several threads.
+
+    Raises:
+        DataError: a value too large to quantise.
+    """
+    nearest = _nearest(scene.means, views, run)
+    world = _in_world_units(parameters, scene, nearest)
+    tolerance = np.maximum(world.gamma, world.beta * nearest)
+    tree, order = octree.build(scene.means, tolerance, absolute=world.version > 1)
+    imaginary, log_scales = _canonical(scene, order, run)
+    scales = list(run(lambda part: quantize.quantize_scales(part.astype(np.float64), world.sf_scale), log_scales.T))
+    logits = scene.opacity_logits[order].astype(np.float64)
+    if world.version == 1:
+        rotations = run(lambda part: quantize.quantize_rotations(part, world.sf_rotation), imaginary.T)
+        opacities = quantize.quantize_opacities(logits, world.sf_opacity)
+    else:
+        factors = quantize.rotation_factors(scales, world.sf_rotation)
+        # A splat that is decoded as a ball has no direction.
+        ball = (scales[0] == scales[1]) & (scales[1] == scales[2])
+        rotations = run(lambda part: np.where(ball, 0, quantize.quantize_rotations(part, factors)), imaginary.T)
+        opacities = quantize.quantize_logits(logits, world.sf_opacity)
+    return Geometry(parameters, world, tree, order, scales, list(rotations), opacities)
+
+
+def _nearest(means: NDArray[np.float32], views: Sequence[Camera], run: Run) -> NDArray[np.float64]:
+    """(N,) distance to the nearest view; without views 0, which leaves the tolerance to γ."""
+    nearest = np.zeros(len(means))
+    if not views:
+        return nearest
+    eyes = camera_centres(views)
+
+    def find(start: int) -> None:
+        axes = means[start : start + _BLOCK].T.astype(np.float64)
+        least = nearest[start : start + _BLOCK]
+        squared, part = np.empty_like(least), np.empty_like(least)
+        least[:] = np.inf
+        for eye in eyes:
+            for axis, (coordinates, at) in enumerate(zip(axes, eye, strict=True)):
+                to = part if axis else squared
+                np.subtract(coordinates, at, out=to)
+                np.square(to, out=to)
+                if axis:
+                    np.add(squared, part, out=squared)
+            np.minimum(least, squared, out=least)
+        np.sqrt(least, out=least)
+
+    list(run(find, range(0, len(means), _BLOCK)))
+    return nearest
+
+
+def _in_world_units(
+    parameters: quantize.HyperParameters, scene: Scene, nearest: NDArray[np.float64]
+) -> quantize.HyperParameters:
+    """β, γ and SF_scale, which version 2 takes in sizes of a typical splat, so that the unit of length does not matter.
+
+    A splat's size is its largest standard deviation, the typical one their median; seen from the views, the median of
+    size over distance.
+    """
+    if parameters.version == 1:
+        return parameters
+    sizes = np.exp(np.clip(scene.log_scales.max(axis=1).astype(np.float64), -60, 60))
+    size = float(np.median(sizes))
+    sf_scale = min(max(parameters.sf_scale / size, 1e-3), 1e9)
+    seen = nearest > 0
+    if seen.any():
+        beta = parameters.beta * float(np.median(sizes[seen] / nearest[seen]))
+        return replace(parameters, beta=beta, sf_scale=sf_scale)
+    return replace(parameters, gamma=max(parameters.gamma, parameters.beta * size), sf_scale=sf_scale)
+
+
+def _canonical(scene: Scene, order: NDArray[np.int64], run: Run) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
+    """:func:`potr_cl.codec.quantize.canonical_rotations` in the order of the file."""
+    imaginary = np.empty((len(scene), 3))
+    log_scales = np.empty((len(scene), 3), np.float32)
+
+    def turn(start: int) -> None:
+        rows = order[start : start + _BLOCK]
+        block = slice(start, start + len(rows))
+        imaginary[block], log_scales[block] = quantize.canonical_rotations(
+            scene.quaternions[rows], scene.log_scales[rows]
+        )
+
+    list(run(turn, range(0, len(scene), _BLOCK)))
+    return imaginary, log_scales

@@ -1,0 +1,98 @@
+"""Pictures in files: photographs to judge against, PNG files to look at, and names of background colours."""
+
+from __future__ import annotations
+
+import contextlib
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any, BinaryIO
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, ImageColor, PngImagePlugin, UnidentifiedImageError
+
+from potr_cl.errors import DataError, UsageError
+from potr_cl.model.scene import FloatArray
+
+Colour = tuple[float, float, float]
+
+#: More than 8 bits in one channel: Pillow would clip them on the way to R, G, B.
+_DEEP_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
+
+
+def parse_colour(text: str) -> Colour:
+    """A colour from ``R,G,B`` (0 to 1 each), a name ("white") or hexadecimal digits ("#fff", "#20a0ff").
+
+    Raises:
+        UsageError: it is none of these.
+    """
+    with contextlib.suppress(ValueError):
+        values = [float(value) for value in text.split(",")]
+        if len(values) == 3 and all(0 <= value <= 1 for value in values):
+            return values[0], values[1], values[2]
+    with contextlib.suppress(ValueError):
+        red, green, blue = ImageColor.getrgb(text.strip())[:3]
+        return red / 255, green / 255, blue / 255
+    raise UsageError(f"'{text}' is no colour: give R,G,B from 0 to 1, a name such as white, or #rrggbb")
+
+
+@contextlib.contextmanager
+def _reading(path: Path) -> Iterator[None]:
+    """Turn Pillow's many errors for a bad file into ours."""
+    try:
+        yield
+    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        raise UsageError(f"cannot read '{path}': {error.strerror}") from None
+    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
+        reason = "not an image that can be read" if isinstance(error, UnidentifiedImageError) else error
+        raise DataError(f"'{path}' is damaged or of another kind: {reason}") from None
+
+
+def image_size(path: Path) -> tuple[int, int]:
+    """Width and height of an image file, from its header alone.
+
+    Raises:
+        UsageError: it cannot be opened.
+        DataError: it is no image.
+    """
+    with _reading(path), Image.open(path) as image:
+        return image.size
+
+
+def read_photograph(path: Path, background: Colour = (0.0, 0.0, 0.0)) -> FloatArray:
+    """Read an image with 8 bits a channel.
+
+    Args:
+        path: of the file.
+        background: colour behind an image with (straight) alpha, 0 to 1.
+
+    Returns:
+        (H, W, 3) float32, 0 to 1, as stored: neither turned by an orientation tag nor linearised.
+
+    Raises:
+        UsageError: it cannot be opened.
+        DataError: it is no image, is damaged, or has other than 8 bits a channel.
+    """
+    with _reading(path), Image.open(path) as image:
+        if image.mode in _DEEP_MODES:
+            raise DataError(f"'{path}' has more than 8 bits a channel: convert it to an 8-bit image")
+        transparent = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info
+        pixels = np.asarray(image.convert("RGBA" if transparent else "RGB"), dtype=np.float32) / np.float32(255)
+    if not transparent:
+        return pixels
+    alpha = pixels[..., 3:]
+    return pixels[..., :3] * alpha + np.asarray(background, np.float32) * (1 - alpha)
+
+
+def to_8_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
+    """Colours clamped to [0, 1] and rounded to 0 … 255."""
+    pixels: NDArray[np.uint8] = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
+    return pixels
+
+
+def write_png(file: BinaryIO, pixels: NDArray[np.uint8], description: str = "") -> None:
+    """Write (H, W, 3) 8-bit colours as PNG, with ``description`` as the text that PNG files can carry."""
+    text = PngImagePlugin.PngInfo()
+    if description:
+        text.add_text("Description", description)
+    Image.fromarray(pixels).save(file, format="PNG", pnginfo=text)

@@ -1,0 +1,341 @@
+"""Scenes as PLY files: every layout in use is read, the original one (Kerbl et al. 2023) is written."""
+
+from __future__ import annotations
+
+import collections
+import io
+import itertools
+import logging
+import os
+import stat
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+from plyfile import PlyData, PlyElement, PlyListProperty
+
+from potr_cl.errors import DataError, UsageError
+from potr_cl.host.atomic_write import replacing
+from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
+
+_log = logging.getLogger("potr_cl")
+
+# Rows that stay in the cache of a core while their columns are gathered or scattered.
+_BLOCK_BYTES = 1 << 20
+_MAX_HEADER_BYTES = 1 << 20
+_NORMALS = ("nx", "ny", "nz")
+
+
+@dataclass(frozen=True)
+class _Header:
+    """What stands before the values of a PLY file.
+
+    Attributes:
+        text: whether the values are ASCII.
+        byte_order: "<" or ">"; of no meaning for text.
+        elements: with their number of rows, in file order.
+        size: bytes up to the first value.
+    """
+
+    text: bool
+    byte_order: str
+    elements: list[tuple[PlyElement, int]]
+    size: int
+
+
+def load(path: str | os.PathLike[str]) -> Scene:
+    """Read a trained scene from a PLY file.
+
+    Accepted are binary files of either byte order and ASCII ones, properties in any order and of any numeric type,
+    with or without normals, SH degree 0 to 3 with ``f_rest_*`` channel after channel. Further properties and
+    elements are dropped. What had to be dropped or mended is reported once to the logger "potr_cl".
+
+    Args:
+        path: of the PLY file.
+
+    Returns:
+        The scene, finite throughout, every array contiguous.
+
+    Raises:
+        UsageError: there is no such file, or it cannot be opened.
+        DataError: it is no PLY file, is truncated, or holds no splats.
+    """
+    try:
+        # Unbuffered: the blocks are as large as a buffer should be.
+        stream = open(path, "rb", buffering=0)  # noqa: SIM115
+    except IsADirectoryError as error:
+        raise UsageError(f"'{path}' is a directory, not a PLY file") from error
+    except (OSError, ValueError) as error:
+        raise UsageError(f"cannot open '{path}': {getattr(error, 'strerror', None) or error}") from error
+    with stream:
+        status = os.fstat(stream.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise UsageError(f"'{path}' is not a regular file")
+        try:
+            scene = _read(path, stream, status.st_size)
+        except OSError as error:
+            raise DataError(f"cannot read '{path}': {error.strerror or error}") from error
+    try:
+        scene, report = scene.cleaned()
+    except DataError as error:
+        raise DataError(f"'{path}': {error}") from error
+    if report.non_finite:
+        _log.warning("'%s': dropped %d splats with non-finite values", path, report.non_finite)
+    if report.infinite_opacities:
+        _log.warning("'%s': made %d infinite opacity logits finite", path, report.infinite_opacities)
+    if report.zero_quaternions:
+        _log.warning("'%s': turned %d quaternions of length zero into no rotation", path, report.zero_quaternions)
+    return scene
+
+
+def save(path: str | os.PathLike[str], scene: Scene) -> None:
+    """Write a scene in the original layout, which every viewer opens.
+
+    Binary little-endian float32: x y z, nx ny nz (zero), f_dc_*, f_rest_* (all red, all green, all blue), opacity,
+    scale_*, rot_*. The file appears under its name only when it is whole.
+
+    Args:
+        path: of the file to write.
+        scene: of any SH degree; its arrays may have any strides.
+
+    Raises:
+        UsageError: ``path`` cannot be written to.
+        PotrError: the system failed to write.
+    """
+    rest = scene.sh.shape[1] - 1
+    names = ["x", "y", "z", *_NORMALS, *_property_names(rest * 3)[3:]]
+    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(scene)}"]
+    header += [f"property float {name}" for name in names]
+    header += ["end_header", ""]
+    height = _BLOCK_BYTES // (4 * len(names))
+    rows = np.zeros((min(height, len(scene)), len(names)), dtype="<f4")
+    with replacing(path) as file:
+        file.write("\n".join(header).encode("ascii"))
+        for start in range(0, len(scene), height):
+            span = slice(start, min(start + height, len(scene)))
+            block = rows[: span.stop - start]
+            block[:, 0:3] = scene.means[span]
+            block[:, 6:9] = scene.sh[span, 0]
+            for channel in range(3):
+                block[:, 9 + channel * rest : 9 + (channel + 1) * rest] = scene.sh[span, 1:, channel]
+            block[:, -8] = scene.opacity_logits[span]
+            block[:, -7:-4] = scene.log_scales[span]
+            block[:, -4:] = scene.quaternions[span]
+            file.write(block.data)
+
+
+def _property_names(rest: int) -> list[str]:
+    """The properties that hold a splat with ``rest`` AC coefficients, in the original order, without normals."""
+    return [
+        *("x", "y", "z"),
+        *(f"f_dc_{i}" for i in range(3)),
+        *(f"f_rest_{i}" for i in range(rest)),
+        "opacity",
+        *(f"scale_{i}" for i in range(3)),
+        *(f"rot_{i}" for i in range(4)),
+    ]
+
+
+def _read(path: str | os.PathLike[str], stream: io.FileIO, size: int) -> Scene:
+    header = _read_header(path, stream)
+    vertex, count = _vertex_element(path, header)
+    rest = _check_properties(path, header, vertex)
+    offset = _check_size(path, header, size)
+    if count == 0:
+        raise DataError(f"'{path}' holds no splat")
+    _report_dropped(path, header, vertex, rest)
+
+    scene = Scene(
+        np.empty((count, 3), dtype=np.float32),
+        np.empty((count, 3), dtype=np.float32),
+        np.empty((count, 4), dtype=np.float32),
+        np.empty(count, dtype=np.float32),
+        np.empty((count, 1 + rest // 3, 3), dtype=np.float32),
+    )
+    columns = _columns(scene)
+    start = 0
+    stream.seek(offset)
+    blocks = _text_blocks if header.text else _binary_blocks
+    # A float64 beyond float32 becomes infinite, and its splat is dropped with the other non-finite ones.
+    with np.errstate(over="ignore"):
+        for block in blocks(path, stream, header, vertex, count):
+            for name, column in columns.items():
+                column[start : start + len(block)] = block[name]
+            start += len(block)
+    return scene
+
+
+def _columns(scene: Scene) -> dict[str, FloatArray]:
+    """Where in the scene's arrays each property belongs: views of N values."""
+    columns = {name: scene.means[:, i] for i, name in enumerate("xyz")}
+    rest = scene.sh.shape[1] - 1
+    for channel in range(3):
+        columns[f"f_dc_{channel}"] = scene.sh[:, 0, channel]
+        for i in range(rest):
+            columns[f"f_rest_{channel * rest + i}"] = scene.sh[:, 1 + i, channel]
+    columns["opacity"] = scene.opacity_logits
+    columns |= {f"scale_{i}": scene.log_scales[:, i] for i in range(3)}
+    columns |= {f"rot_{i}": scene.quaternions[:, i] for i in range(4)}
+    return columns
+
+
+def _read_header(path: str | os.PathLike[str], stream: io.FileIO) -> _Header:
+    """Parse the header alone: nothing is believed about the values yet."""
+    head = stream.read(_MAX_HEADER_BYTES)
+    if not head:
+        raise DataError(f"'{path}' is empty")
+    newline = next((n for n in (b"\r\n", b"\n", b"\r") if head.startswith(b"ply" + n)), None)
+    if newline is None:
+        raise DataError(f"'{path}' is not a PLY file: it does not start with the line 'ply'")
+    lines: list[bytes] = []
+    counts = []
+    position = 0
+    while not (lines and lines[-1] == b"end_header"):
+        end = head.find(newline, position)
+        if end < 0:
+            raise DataError(f"'{path}' is damaged: its PLY header does not end")
+        line = head[position:end].strip()
+        position = end + len(newline)
+        fields = line.split()
+        if fields[:1] in ([b"comment"], [b"obj_info"]):
+            continue  # may be in any encoding
+        if fields[:1] == [b"element"] and len(fields) == 3:
+            counts.append(_count(path, fields[2]))
+            line = b"element %s 0" % fields[1]
+        lines.append(line)
+    # With counts of zero the library parses the header and has no values to read.
+    try:
+        ply = PlyData.read(io.BytesIO(b"\n".join([*lines, b""])))
+        return _Header(ply.text, ply.byte_order, list(zip(ply.elements, counts, strict=True)), position)
+    except Exception as error:  # the library raises what its parts happen to raise
+        raise DataError(f"'{path}' has a damaged PLY header: {_one_line(error)}") from error
+
+
+def _count(path: str | os.PathLike[str], digits: bytes) -> int:
+    if not digits.isdigit() or len(digits) > 18:
+        raise DataError(f"'{path}' has a damaged PLY header: {digits[:40]!r} is not a number of elements")
+    return int(digits)
+
+
+def _vertex_element(path: str | os.PathLike[str], header: _Header) -> tuple[PlyElement, int]:
+    for element, count in header.elements:
+        if element.name == "vertex":
+            return element, count
+    found = ", ".join(element.name for element, _ in header.elements) or "none"
+    raise DataError(f"'{path}' is no 3DGS scene: it has no element 'vertex' (its elements: {_shortened(found)})")
+
+
+def _check_properties(path: str | os.PathLike[str], header: _Header, vertex: PlyElement) -> int:
+    """Check that the properties of a splat are all there; return the number of f_rest_* among them."""
+    names = {p.name for p in vertex.properties}
+    if "packed_position" in names:
+        raise DataError(
+            f"'{path}' is a compressed PLY of SuperSplat: export it from SuperSplat as uncompressed PLY, "
+            "or run 'splat-transform IN.compressed.ply OUT.ply'"
+        )
+    rest = sum(str(name).startswith("f_rest_") for name in names)
+    accepted = [3 * (m - 1) for m in SH_COEFFICIENTS]
+    missing = [name for name in _property_names(rest) if name not in names]
+    if missing:
+        message = f"'{path}' is no 3DGS scene: its vertices lack the properties {_shortened(', '.join(missing))}"
+        if "opacity" in names and {"red", "green", "blue"} <= names:
+            message += "; it stores RGB colours: export it with SH (nerfstudio: --ply-color-mode sh_coeffs)"
+        elif "opacity" not in names:
+            message += "; this is a mesh or a point cloud"
+        raise DataError(message)
+    if rest not in accepted:
+        hint = " (SH degree 4: export at most 3 bands)" if rest == 72 else ""
+        raise DataError(f"'{path}': {rest} f_rest properties{hint}, expected one of {accepted}")
+    before = itertools.takewhile(lambda entry: entry[0] is not vertex, header.elements)
+    if any(isinstance(p, PlyListProperty) for element in (vertex, *(e for e, _ in before)) for p in element.properties):
+        raise DataError(f"'{path}': list properties in or before the element 'vertex' are not supported")
+    return rest
+
+
+def _check_size(path: str | os.PathLike[str], header: _Header, size: int) -> int:
+    """Check the header's counts against the file's size, before any memory is taken on their word.
+
+    Returns:
+        Where the values of the vertices start (for text: where the values of all elements start).
+    """
+    offset = end = header.size
+    for element, count in header.elements:
+        if header.text:
+            end += count * max(1, 2 * len(element.properties))  # a digit and a separator each
+            slack = 1  # the last line may lack its end
+        else:
+            if element.name == "vertex":
+                offset = end
+            end += count * sum(
+                np.dtype(p.len_dtype if isinstance(p, PlyListProperty) else p.val_dtype).itemsize
+                for p in element.properties
+            )
+            slack = 0
+        if end > size + slack:
+            raise DataError(
+                f"'{path}' is truncated: its header announces {count} of element '{element.name}', "
+                f"which takes a file of {end - slack} bytes or more, and it has {size}"
+            )
+    return offset
+
+
+def _report_dropped(path: str | os.PathLike[str], header: _Header, vertex: PlyElement, rest: int) -> None:
+    known = {*_property_names(rest), *_NORMALS}
+    extra = [p.name for p in vertex.properties if p.name not in known]
+    if extra:
+        _log.warning("'%s': dropped %d unknown properties: %s", path, len(extra), _shortened(", ".join(extra)))
+    others = [element.name for element, _ in header.elements if element.name != "vertex"]
+    if others:
+        _log.warning("'%s': dropped %d unknown elements: %s", path, len(others), _shortened(", ".join(others)))
+
+
+def _binary_blocks(
+    path: str | os.PathLike[str], stream: io.FileIO, header: _Header, vertex: PlyElement, count: int
+) -> Iterator[NDArray[np.void]]:
+    """The rows of the vertices, a block at a time; a block is valid until the next one."""
+    dtype = vertex.dtype(header.byte_order)
+    height = max(1, _BLOCK_BYTES // dtype.itemsize)
+    rows = np.empty(min(height, count), dtype=dtype)
+    raw = rows.view(np.uint8).data
+    for start in range(0, count, height):
+        wanted = min(height, count - start) * dtype.itemsize
+        got = 0
+        while got < wanted:
+            n = stream.readinto(raw[got:wanted])
+            if not n:
+                raise DataError(f"'{path}' is truncated: it ends within splat {start + got // dtype.itemsize}")
+            got += n
+        yield rows[: wanted // dtype.itemsize]
+
+
+def _text_blocks(
+    path: str | os.PathLike[str], stream: io.FileIO, header: _Header, vertex: PlyElement, count: int
+) -> Iterator[NDArray[np.void]]:
+    """The same for ASCII, where the rows of earlier elements have to be skipped line by line."""
+    # Every byte has a meaning in Latin-1, so a stray one is found where it stands, as a value that is no number.
+    with io.TextIOWrapper(io.BufferedReader(stream), encoding="latin-1") as text:
+        lines = (line for line in text if not line.isspace())
+        for element, rows in header.elements:
+            if element.name == "vertex":
+                break
+            collections.deque(itertools.islice(lines, rows), maxlen=0)
+        dtype = np.dtype([(p.name, np.float32) for p in vertex.properties])
+        height = max(1, _BLOCK_BYTES // dtype.itemsize)
+        for start in range(0, count, height):
+            wanted = min(height, count - start)
+            block = list(itertools.islice(lines, wanted))
+            if len(block) < wanted:
+                raise DataError(f"'{path}' is truncated: it ends before splat {start + len(block)}")
+            try:
+                yield np.loadtxt(block, dtype=dtype, comments=None, ndmin=1)
+            except ValueError as error:
+                raise DataError(f"'{path}': splats {start} to {start + wanted - 1}: {_one_line(error)}") from error
+
+
+def _one_line(error: Exception) -> str:
+    return _shortened(" ".join(str(error).split())) or type(error).__name__
+
+
+def _shortened(text: str) -> str:
+    return text if len(text) <= 200 else text[:197] + "..."

@@ -1,0 +1,1 @@
+"""OpenCL devices: which there are, one opened, its kernels and its memory. Knows nothing of splats."""

@@ -1,0 +1,68 @@
+"""What to do when a scene does not fit a device: keep less on it, then let a CPU do the work."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from collections.abc import Callable
+from typing import TypeVar
+
+from potr_cl.errors import DeviceError, DeviceMemoryError
+from potr_cl.opencl.device import Device, choose_device
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.stages.pruning.removal import default_memory
+
+logger = logging.getLogger("potr_cl")
+
+T = TypeVar("T")
+
+#: After a failure views get the memory that they had divided by this; after another nothing is kept of them.
+_LESS = 8
+
+
+def on_device(device: Device, options: EncodeOptions, work: Callable[[Device, EncodeOptions], T]) -> tuple[T, Device]:
+    """Do work that may not fit a device, again with less memory and in the end on a CPU; each is said by a warning.
+
+    Args:
+        device: to begin with.
+        options: those whose memory budget (``sweep.memory``) is made smaller.
+        work: called with the device and the options to take; called again after a DeviceMemoryError.
+
+    Returns:
+        What ``work`` returned, and the device that it was done on.
+
+    Raises:
+        DeviceMemoryError: it fits no device that there is.
+        DeviceError: the device failed for another reason.
+    """
+    try:
+        return _with_less(device, options, work), device
+    except DeviceMemoryError:
+        if device.info.kind == "cpu":
+            raise
+        try:
+            other = choose_device("cpu")
+        except DeviceError:
+            other = None
+        if other is None:
+            raise
+    logger.warning("device %s has too little memory for this scene: going on with %s", device.info, other)
+    device = Device(other)
+    return _with_less(device, options, work), device
+
+
+def _with_less(device: Device, options: EncodeOptions, work: Callable[[Device, EncodeOptions], T]) -> T:
+    given = options.sweep.memory
+    less = (default_memory(device) if given is None else given) // _LESS
+    for memory, smaller in ((given, less), (less, 0), (0, None)):
+        sweep = dataclasses.replace(options.sweep, memory=memory)
+        try:
+            # A failure may leave buffers behind that nobody owns any more.
+            with device.all_or_nothing(), device.errors("failed while encoding"):
+                return work(device, dataclasses.replace(options, sweep=sweep))
+        except DeviceMemoryError:
+            if smaller is None:
+                raise
+            megabytes = smaller // 1_000_000
+            logger.warning("device %s ran out of memory: again with %d MB to keep views in", device.info, megabytes)
+    raise AssertionError("the last budget returns or raises")

@@ -1,0 +1,532 @@
+"""Encode to a size or to a quality: the q whose file just meets a target, in about three encodes' time.
+
+Size and PSNR grow with q, in most scenes at about the same rate, if from another height. So:
+
+1. A rough encode, with fewer looks at the views, of the q that a typical scene would need tells the height.
+2. The q that follows is encoded in full.
+3. Its splats are kept, and all else is done again as a q close by would have it: re-fit and steps, or without a re-fit
+   the steps alone.
+4. What is still missing, a per cent perhaps, is made up by the steps of colours. Their re-fit has not seen these, so
+   that nothing that it made up for changes.
+
+Where 2 is too far off for 3, another q is encoded in full. What is found after a re-fit is what a plain encode makes of
+the options that come with it.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import itertools
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from potr_cl.codec.container import EntropyCoder
+from potr_cl.codec.decoder import decode
+from potr_cl.codec.quantize import Preset
+from potr_cl.errors import UnreachableError, UsageError
+from potr_cl.model.camera import Camera, train_views
+from potr_cl.model.scene import Scene
+from potr_cl.model.virtual_cameras import place_cameras
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import Encoded, Reduced, Stopwatch, code, needs_views, refit, thin
+from potr_cl.pipeline.fallback import on_device
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.reduction import Progress
+from potr_cl.quality.evaluator import Judge, JudgingViews
+
+#: Qualities, and what they give in a typical scene: bytes a splat of the source, and PSNR in decibels. Means of two
+#: scenes (docs/benchmarks.md, "Rate and distortion"), less sure below 0.1. Above all the rate of growth matters.
+_TYPICAL_Q = (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1)
+_TYPICAL: dict[Preset, tuple[tuple[float, ...], tuple[float, ...]]] = {
+    "paper": (
+        (0.77, 2.01, 2.97, 4.1, 6.2, 8.3, 10.1, 11.9, 13.7, 15.3, 17.0, 18.7, 20.4),
+        (9.7, 29.7, 34.2, 35.7, 38.2, 39.7, 41.2, 42.8, 44.3, 45.6, 46.6, 47.9, 48.6),
+    ),
+    "fast": (
+        (2.23, 2.34, 2.52, 2.83, 3.58, 4.52, 5.56, 6.76, 8.21, 9.82, 11.63, 13.81, 16.19),
+        (35.3, 35.7, 36.2, 37.2, 38.8, 40.5, 42.3, 44.0, 45.7, 47.5, 49.4, 51.2, 53.0),
+    ),
+    "best": (
+        (1.91, 2.00, 2.15, 2.42, 3.08, 3.90, 4.83, 5.90, 7.21, 8.66, 10.26, 12.19, 14.28),
+        (35.7, 36.1, 36.7, 37.6, 39.3, 41.0, 42.7, 44.5, 46.3, 48.0, 49.7, 51.5, 53.3),
+    ),
+}
+#: A scout's pruning iterations and steps of the re-fit, and by how much what it finds is smaller than a full encode's:
+#: the logarithm of bytes, and decibels; about, and where there is a re-fit.
+_SCOUT_ITERATIONS, _SCOUT_STEPS = 12, 2
+_SCOUT_MISSES = (-0.02, -0.55)
+#: The highest q of a scout, and 1 less the lowest: the scene may be far from typical.
+_SCOUT_END = 0.9
+#: The value's way from a scout, in windows, from which on it tells how fast the value grows.
+_FAR = 20
+#: By how much the fineness (:class:`_Axis`) may differ from that of the q that the splats are of: with a re-fit, which
+#: does what else there is to do again (a tenth costs 0.06 dB), and without, where steps are all that changes.
+_NEAR, _MOST_STEPS = 0.1, math.log(4 / 3)
+#: How fast the value then grows, as a part of how it grows with q.
+_NEAR_RATE, _STEPS_RATE = 0.7, 0.5
+#: By how much the logarithm of the fineness of colours alone may differ (a tenth is 0.06 dB), and where all else has
+#: been tried: in scenes so small that values leap.
+_MOST_COLOUR_STEPS, _LAST_COLOUR_STEPS = 0.12, 0.5
+#: How fast the size's logarithm and decibels grow with it.
+_COLOUR_RATES = (0.12, 0.45)
+#: Full encodes at most; one is the rule. And where there is nothing to prune or fit.
+_ENCODES, _CHEAP_ENCODES = 5, 12
+#: Tries of one kind with what a full encode has kept.
+_TRIES = 3
+#: Bounds of a measured rate, as parts of the typical one, beyond the places that are known.
+_SLOWEST, _FASTEST = 0.25, 3.0
+#: What is only judged is coded so, which costs no time.
+_QUICK_CODER = EntropyCoder("zstd", 1)
+#: Stands for the infinite PSNR of identical pictures, decibels.
+_IDENTICAL = 200.0
+#: The kinds of tries (:class:`Try`), and what is said of each; to be followed by a value.
+KINDS = {
+    "scout": "quality {}, roughly:",
+    "encode": "quality {}:",
+    "refit": "re-fitted for quality {}:",
+    "steps": "steps of quality {}:",
+    "colours": "quality {}, other steps of colours:",
+}
+
+
+@dataclass(frozen=True)
+class Target:
+    """What to reach; one of the two.
+
+    Attributes:
+        max_bytes: the file shall have at most so many bytes, and at least 98 % of them.
+        min_psnr: the mean PSNR in decibels over the judging views, against the uncompressed scene's renders, shall be
+            this at least, and at most 0.1 more.
+
+    Raises:
+        UsageError: not exactly one, or out of range.
+    """
+
+    max_bytes: int | None = None
+    min_psnr: float | None = None
+
+    def __post_init__(self) -> None:
+        if (self.max_bytes is None) == (self.min_psnr is None):
+            raise UsageError("give either a size or a PSNR to reach")
+        if self.max_bytes is not None and self.max_bytes < 1:
+            raise UsageError(f"a file of at most {self.max_bytes} bytes: at least 1 is needed")
+        if self.min_psnr is not None and not 0 < self.min_psnr < math.inf:
+            raise UsageError(f"a PSNR of at least {self.min_psnr:g} dB: it must be a positive number")
+
+    @property
+    def window(self) -> tuple[float, float]:
+        """The values with which the search is content: logarithms of sizes, or decibels."""
+        if self.max_bytes is not None:
+            return math.log(0.98 * self.max_bytes), math.log(self.max_bytes)
+        assert self.min_psnr is not None
+        return self.min_psnr, self.min_psnr + 0.1
+
+    @property
+    def aim(self) -> float:
+        """The value to aim at: the middle of the window."""
+        return sum(self.window) / 2
+
+    def met(self, value: float) -> bool:
+        """Whether a value keeps the promise, if not by how little."""
+        low, high = self.window
+        return value <= high if self.max_bytes is not None else value >= low
+
+    def inside(self, value: float) -> bool:
+        """Whether the search is content with a value."""
+        low, high = self.window
+        return low <= value <= high
+
+    def plain(self, value: float) -> float:
+        """A value as bytes or decibels."""
+        return round(math.exp(value)) if self.max_bytes is not None else value
+
+    def describe(self, value: float) -> str:
+        """A value for people."""
+        return f"{self.plain(value):,} bytes" if self.max_bytes is not None else f"{value:.2f} dB"
+
+    def __str__(self) -> str:
+        return f"at most {self.max_bytes:,} bytes" if self.max_bytes is not None else f"at least {self.min_psnr:g} dB"
+
+
+@dataclass(frozen=True)
+class Try:
+    """One step of a search.
+
+    Attributes:
+        kind: "scout" (a rough encode), "encode" (in full), "refit" (the splats of the last full encode, re-fitted and
+            quantised for another q), "steps" (other quantiser steps alone), or "colours" (of colours alone).
+        q: of the encode, the re-fit or the steps.
+        value: see :meth:`Target.plain`.
+    """
+
+    kind: str
+    q: float
+    value: float
+
+
+@dataclass(frozen=True)
+class Found:
+    """What a search found.
+
+    Attributes:
+        encoded: the file that meets the target.
+        options: that it was encoded with: q, and parameters of their own where they differ from that q's. Without
+            compaction :func:`potr_cl.pipeline.encode.encode` makes the same file of them.
+        value: that was reached; see :meth:`Target.plain`.
+        tries: all steps, in order.
+    """
+
+    encoded: Encoded
+    options: EncodeOptions
+    value: float
+    tries: list[Try]
+
+
+def encode_to_target(
+    scene: Scene,
+    cameras: Sequence[Camera] | None,
+    target: Target,
+    options: EncodeOptions | None = None,
+    progress: Progress | None = None,
+    device: Device | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> Found:
+    """Encode a scene so that it meets a target, as well (or as small) as that allows.
+
+    Args:
+        scene, cameras, progress, device: as :func:`potr_cl.pipeline.encode.encode` takes them.
+        target: what to reach.
+        options: its q is not looked at; single parameters that are given stay as they are.
+        tell: told a line for every step.
+
+    Raises:
+        UnreachableError: no q meets the target.
+        UsageError: options out of range, or a PSNR is asked for without cameras.
+        DataError: a value too large to quantise.
+        DeviceError: no device does the work.
+    """
+    options = options or EncodeOptions.for_preset("best")
+    watch = Stopwatch(progress)
+    if cameras is None and needs_views(scene, options):
+        watch("place cameras", 0.0)
+        cameras = place_cameras(scene)
+        watch("place cameras", 1.0)
+    if target.min_psnr is not None and not cameras:
+        raise UsageError("a PSNR can be reached with cameras only: without them there is no view to judge by")
+
+    def work(device: Device, options: EncodeOptions) -> Found:
+        search = _Search(scene, cameras or [], target, options, watch, device, tell or (lambda _line: None))
+        try:
+            return search.run()
+        finally:
+            search.free()
+
+    found, _ = on_device(device or Device(), options, work)
+    return found
+
+
+@dataclass(frozen=True)
+class _Candidate:
+    """Something that may be what is searched for.
+
+    Attributes:
+        thinned: the scene before the re-fit.
+        reduced: and after it.
+        options: that lead there.
+        value: of the file that they give.
+        encoded: that file, if the value needed all of it.
+    """
+
+    thinned: Reduced
+    reduced: Reduced
+    options: EncodeOptions
+    value: float
+    encoded: Encoded | None
+
+
+class _Search:
+    def __init__(
+        self,
+        scene: Scene,
+        cameras: Sequence[Camera],
+        target: Target,
+        options: EncodeOptions,
+        watch: Stopwatch,
+        device: Device,
+        tell: Callable[[str], None],
+    ) -> None:
+        self._scene = scene
+        self._cameras = cameras
+        self._views = train_views(cameras) if cameras else []
+        self._target = target
+        self._options = options
+        self._watch = watch
+        self._device = device
+        self._tell = tell
+        self._tries: list[Try] = []
+        self._encoded: dict[float, float] = {}  # values of full encodes
+        self._typical = _Typical(target, options, len(scene))
+        self._axis = _Axis(options)
+        self._scouted: tuple[float, float] | None = None  # where, and the value of a full encode, about
+        self._judge: Judge | None = None
+
+    def run(self) -> Found:
+        target = self._target
+        if target.min_psnr is not None:
+            self._judge = Judge(self._device, self._scene, JudgingViews.of(self._cameras), self._options.background)
+        q = self._scout(self._typical.quality(target.aim))
+        reduces = bool(self._views) and needs_views(self._scene, self._options)
+        best: _Candidate | None = None
+        for left in reversed(range(_ENCODES if reduces else _CHEAP_ENCODES)):
+            found = self._encode(q)
+            end = (q == 0 and found.value > target.aim) or (q == 1 and found.value < target.aim)
+            if reduces and not end:
+                found = self._approach(found, left == 0)
+            if target.met(found.value) and (best is None or self._distance(found) < self._distance(best)):
+                best = found
+            if end or target.inside(found.value):
+                break
+            q = self._next()
+            if best is None and (left == 1 or q in self._encoded):  # the last hope
+                q = 0.0 if target.max_bytes is not None else 1.0
+            if q in self._encoded:
+                break
+        if best is None:
+            raise UnreachableError(f"{target} cannot be reached: {self._extremes()}")
+        encoded = best.encoded or code(self._scene, best.reduced, self._views, best.options, self._watch)
+        return Found(encoded, best.options, best.value, self._tries)
+
+    # ------------------------------------------------------------------------------------------ steps of the search
+
+    def _scout(self, q: float) -> float:
+        """The q to begin with, by a rough encode of one, if that takes less time than a full one."""
+        rough = min(max(q, 1 - _SCOUT_END), _SCOUT_END)
+        options = dataclasses.replace(
+            self._options,
+            q=rough,
+            iterations=min(self._options.iterations, _SCOUT_ITERATIONS),
+            refit=min(self._options.refit, _SCOUT_STEPS),
+            refit_at=(),
+        )
+        looks = self._options.prune and options.iterations < self._options.iterations
+        if not self._views or not (looks or options.refit < self._options.refit):
+            return q
+        thinned = self._thin(options)
+        value = self._evaluate("scout", rough, thinned, self._refit(thinned, options), options).value
+        if options.refit < self._options.refit:
+            size, psnr = _SCOUT_MISSES
+            value -= size if self._target.max_bytes is not None else psnr
+        self._scouted = self._typical.value(rough), value
+        return self._typical.quality(self._scouted[0] + self._target.aim - value)
+
+    def _encode(self, q: float) -> _Candidate:
+        """A full encode."""
+        options = dataclasses.replace(self._options, q=q)
+        thinned = self._thin(options)
+        found = self._evaluate("encode", q, thinned, self._refit(thinned, options), options)
+        self._encoded[q] = found.value
+        return found
+
+    def _next(self) -> float:
+        """The q to encode in full next, by what is known of others."""
+        points = {self._typical.value(q): value for q, value in self._encoded.items()}
+        return self._typical.quality(_meet(points, self._target.aim, self._rate()))
+
+    def _rate(self) -> float:
+        """How fast the value grows with the typical one, as far as a scout that went far enough away can tell."""
+        if self._scouted is None:
+            return 1.0
+        place, value = self._scouted
+        other = max(self._encoded, key=lambda q: abs(self._typical.value(q) - place))
+        way = self._typical.value(other) - place
+        low, high = self._target.window
+        if abs(way) < _FAR * (high - low):
+            return 1.0
+        return min(max((self._encoded[other] - value) / way, _SLOWEST), _FASTEST)
+
+    def _approach(self, found: _Candidate, last: bool) -> _Candidate:
+        """Come nearer to the aim with what a full encode has kept, unless that is too far, and not the last one."""
+        target, typical = self._target, self._typical
+        fitted = self._options.refit > 0
+        reach, rate = (_NEAR, _NEAR_RATE) if fitted else (_MOST_STEPS, _STEPS_RATE)
+        rate *= self._rate()
+        start, best, q = found, found, found.options.q
+        ends = [self._axis.quality(self._axis.fineness(q) + sign * reach) for sign in (-1, 1)]
+        points = {typical.value(q): found.value}
+        for _ in range(_TRIES):
+            if self._colours_suffice(best.value):
+                best = self._with_other_colours(best, _MOST_COLOUR_STEPS)
+            if target.inside(best.value):
+                return best
+            wanted = typical.quality(_meet(points, target.aim, rate))
+            q = min(max(wanted, ends[0]), ends[1])
+            known = typical.value(q) in points
+            if q != wanted and (len(points) == 1 or known) and not last:
+                return best
+            if known:
+                break
+            near = self._again(start, q) if fitted else self._with_other_steps(start, q)
+            points[typical.value(q)] = near.value
+            best = min(best, near, key=self._distance)
+        return self._with_other_colours(best, _LAST_COLOUR_STEPS)
+
+    def _again(self, start: _Candidate, q: float) -> _Candidate:
+        """The splats of a candidate, re-fitted and quantised as another q would have it."""
+        parameters = start.options.parameters
+        names = ["delta_mse_max", *(["lam", "alpha"] if self._options.compact else [])]
+        kept = {name: getattr(parameters, name) for name in names}
+        options = dataclasses.replace(self._options, q=q, **kept)
+        return self._evaluate("refit", q, start.thinned, self._refit(start.thinned, options), options)
+
+    def _with_other_steps(self, start: _Candidate, q: float) -> _Candidate:
+        """A candidate that was not re-fitted, with the quantiser steps of another q."""
+        return self._evaluate("steps", q, start.thinned, start.reduced, _with_steps(start.options, q))
+
+    def _with_other_colours(self, start: _Candidate, most: float) -> _Candidate:
+        """A candidate with steps of colours up to so much finer or coarser: the nearest to the aim of a few."""
+        points, best = {0.0: start.value}, start
+        for _ in range(_TRIES):
+            finer = _meet(points, self._target.aim, self._colour_rate)
+            finer = round(min(max(finer, -most), most), 4)
+            options = _with_colour_steps(start.options, self._options, finer)
+            if finer in points or options == start.options or self._target.inside(best.value):
+                break
+            reduced, geometry = start.reduced, start.reduced.geometry
+            if geometry is not None:
+                reduced = dataclasses.replace(reduced, geometry=geometry.with_colour_steps(options.parameters))
+            found = self._evaluate("colours", start.options.q, start.thinned, reduced, options)
+            points[finer] = found.value
+            best = min(best, found, key=self._distance)
+        return best
+
+    def _colours_suffice(self, value: float) -> bool:
+        """Whether other steps of colours will probably do."""
+        given = self._options.sf_dc is not None and self._options.sf_sh is not None
+        low, high = self._target.window
+        spare = (high - low) / 4
+        reach = self._colour_rate * _MOST_COLOUR_STEPS
+        return not given and not low <= value <= high and low + spare - reach <= value <= high - spare + reach
+
+    @property
+    def _colour_rate(self) -> float:
+        return _COLOUR_RATES[self._target.max_bytes is None]
+
+    # ------------------------------------------------------------------------------------------ parts of an encode
+
+    def _thin(self, options: EncodeOptions) -> Reduced:
+        thinned = thin(self._scene, self._views, options, self._watch, self._device)
+        self._device = thinned.device or self._device
+        return thinned
+
+    def _refit(self, thinned: Reduced, options: EncodeOptions) -> Reduced:
+        reduced = refit(self._scene, thinned, self._views, options, self._watch)
+        self._device = reduced.device or self._device
+        return reduced
+
+    def _evaluate(self, kind: str, q: float, thinned: Reduced, reduced: Reduced, options: EncodeOptions) -> _Candidate:
+        encoded: Encoded | None
+        if self._judge is None:
+            encoded = code(self._scene, reduced, self._views, options, self._watch)
+            value = math.log(encoded.nbytes)
+        else:
+            encoded = None
+            quick = dataclasses.replace(options, entropy=_QUICK_CODER)
+            pieces = code(self._scene, reduced, self._views, quick, self._watch).pieces
+            self._watch("judge tries", 0.0)
+            value = min(self._judge.psnr(decode(b"".join(pieces))), _IDENTICAL)
+            self._watch("judge tries", 1.0)
+        self._tries.append(Try(kind, q, value))
+        self._tell(f"{KINDS[kind].format(f'{q:g}')} {self._target.describe(value)}")
+        return _Candidate(thinned, reduced, options, value, encoded)
+
+    # ------------------------------------------------------------------------------------------ comparing
+
+    def _distance(self, found: _Candidate) -> tuple[bool, float]:
+        return not self._target.met(found.value), abs(found.value - self._target.aim)
+
+    def _extremes(self) -> str:
+        """What the lowest and the highest quality give, encoded if need be."""
+        values = (self._encoded[q] if q in self._encoded else self._encode(q).value for q in (0.0, 1.0))
+        low, high = map(self._target.describe, values)
+        return f"quality 0 gives {low}, quality 1 gives {high}"
+
+    def free(self) -> None:
+        """Give all device memory back."""
+        if self._judge is not None:
+            self._judge.free()
+
+
+class _Typical:
+    """What a target's value is in a typical scene, by quality."""
+
+    def __init__(self, target: Target, options: EncodeOptions, splats: int) -> None:
+        nbytes, psnr = _TYPICAL[options.preset]
+        self._values = np.log(nbytes) + math.log(splats) if target.max_bytes is not None else np.array(psnr)
+
+    def value(self, q: float) -> float:
+        """Of a quality from 0 to 1."""
+        return float(np.interp(q, _TYPICAL_Q, self._values))
+
+    def quality(self, value: float) -> float:
+        """The nearest q from 0 to 1, rounded to what matters."""
+        return round(float(np.interp(value, self._values, _TYPICAL_Q)), 5)
+
+
+class _Axis:
+    """Qualities by the logarithm of the quantiser's fineness."""
+
+    def __init__(self, options: EncodeOptions) -> None:
+        self._options = dataclasses.replace(options, sf_sh=None)
+
+    def fineness(self, q: float) -> float:
+        """Of a quality from 0 to 1."""
+        return math.log(dataclasses.replace(self._options, q=q).parameters.sf_sh)
+
+    def quality(self, fineness: float) -> float:
+        """The nearest q from 0 to 1, rounded to what matters."""
+        low, high = 0.0, 1.0
+        for _ in range(20):
+            middle = (low + high) / 2
+            low, high = (middle, high) if self.fineness(middle) < fineness else (low, middle)
+        return round(high if fineness > self.fineness(0) else 0.0, 5)
+
+
+def _with_steps(options: EncodeOptions, q: float) -> EncodeOptions:
+    """The options with the quantiser's parameters of another q, as far as they are not given on their own."""
+    parameters = dataclasses.replace(options, q=q).parameters
+    names = [field.name for field in dataclasses.fields(parameters)]
+    steps = [name for name in names if name.startswith("sf_") or name in ("beta", "gamma")]
+    return dataclasses.replace(options, **{name: getattr(parameters, name) for name in steps})
+
+
+def _with_colour_steps(options: EncodeOptions, given: EncodeOptions, finer: float) -> EncodeOptions:
+    """The options with steps of colours that are finer by a factor, given by its logarithm, unless they are given."""
+    parameters = options.parameters
+    names = [name for name in ("sf_dc", "sf_sh") if getattr(given, name) is None]
+    return dataclasses.replace(options, **{name: getattr(parameters, name) * math.exp(finer) for name in names})
+
+
+def _meet(points: dict[float, float], aim: float, rate: float) -> float:
+    """Where a growing function of which some points are known probably meets the aim.
+
+    Args:
+        points: at least one, values by places.
+        rate: at which the function typically grows; it counts while the aim does not lie between known values, and
+            those that there are leave it open.
+    """
+    places = sorted(points)
+    rising = [(b - a, a, b) for a, b in itertools.pairwise(places) if points[a] < aim <= points[b]]
+    if rising:
+        _, a, b = min(rising)
+        return a + (b - a) * (aim - points[a]) / (points[b] - points[a])
+    # Beyond all that is known; values that do not grow everywhere may lie on both sides.
+    if points[places[0]] < aim:
+        places.reverse()
+    edge, *others = places
+    if others:
+        measured = (points[others[0]] - points[edge]) / (others[0] - edge)
+        rate *= min(max(measured / rate, _SLOWEST), _FASTEST)
+    return edge + (aim - points[edge]) / rate

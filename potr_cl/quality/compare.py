@@ -1,0 +1,341 @@
+"""Judge a compressed scene: render it and the uncompressed one from the same views and compare the pictures.
+
+A is the reference scene (uncompressed), B the candidate. With photographs, both are also judged against those.
+"""
+
+from __future__ import annotations
+
+import math
+from collections import deque
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.errors import UsageError
+from potr_cl.formats.cameras.view_files import IMAGE_SUFFIXES, stem
+from potr_cl.formats.images import Colour, image_size, read_photograph, to_8_bits
+from potr_cl.host.threads import thread_pool
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.quality.metrics import Lpips
+from potr_cl.quality.metrics_device import Picture, Similarity, in_batches, place_pictures, rendered
+from potr_cl.raster.rasterizer import Rasterizer
+
+_TITLES = {
+    "b_against_a": "B against A",
+    "a_against_photograph": "A against photo",
+    "b_against_photograph": "B against photo",
+    "loss": "loss by photo",
+}
+
+#: Photographs read before they are needed.
+_READ_AHEAD = 32
+
+#: Factors by which an error map may be amplified.
+_FACTORS = (1, 2, 5, 10, 20, 50, 100, 200, 500, 1000)
+
+
+@dataclass(frozen=True)
+class SceneFile:
+    """What there is to say of a scene without rendering it."""
+
+    path: Path
+    nbytes: int
+    splats: int
+    sh_degree: int
+
+    @staticmethod
+    def of(path: Path, scene: Scene) -> SceneFile:
+        """The facts of a scene that was read from ``path``."""
+        return SceneFile(path, path.stat().st_size, len(scene), scene.sh_degree)
+
+
+@dataclass(frozen=True)
+class Figures:
+    """How close two pictures are; ``psnr`` is infinite for identical ones, ``lpips`` None where it was not computed."""
+
+    psnr: float
+    ssim: float
+    lpips: float | None
+
+
+@dataclass(frozen=True)
+class ViewFigures:
+    """The figures of one view, or their means.
+
+    Attributes:
+        name: of the view.
+        figures: by what was compared: "b_against_a" always; with photographs also "a_against_photograph",
+            "b_against_photograph" and "loss", what B loses to A against the photograph (A's PSNR and SSIM minus B's,
+            B's LPIPS minus A's: positive where B is worse).
+    """
+
+    name: str
+    figures: dict[str, Figures]
+
+    @property
+    def identical(self) -> bool:
+        """Whether A's and B's pictures are the same in every pixel."""
+        return math.isinf(self.figures["b_against_a"].psnr)
+
+
+@dataclass(frozen=True)
+class Comparison:
+    """All views' figures.
+
+    Attributes:
+        views: in the order of the cameras.
+        worst: index of the view with the lowest PSNR of B against A.
+    """
+
+    views: list[ViewFigures]
+    worst: int
+
+
+def find_photographs(folder: Path, cameras: Sequence[Camera]) -> dict[str, Path]:
+    """The photograph of each view: the image in ``folder`` that is named after it.
+
+    Raises:
+        UsageError: there is no such folder, a view has no photograph or several, or one is not of the camera's size.
+        DataError: a photograph is damaged.
+    """
+    found: dict[str, Path] = {}
+    listings: dict[Path, dict[str, list[Path]]] = {}
+    for camera in cameras:
+        wanted = folder / camera.name
+        if wanted.parent not in listings:
+            listings[wanted.parent] = _images_by_name(wanted.parent)
+        images = listings[wanted.parent].get(stem(wanted.name), [])
+        exact = [image for image in images if image.name == wanted.name]
+        images = exact or images
+        if not images:
+            raise UsageError(f"the folder '{wanted.parent}' has no photograph of view '{camera.name}'")
+        if len(images) > 1:
+            names = ", ".join(image.name for image in images)
+            raise UsageError(f"several photographs of view '{camera.name}' in '{wanted.parent}': {names}; keep one")
+        width, height = image_size(images[0])
+        if (width, height) != (camera.width, camera.height):
+            raise UsageError(
+                f"'{images[0]}' is {width} x {height} pixels, view '{camera.name}' of the cameras is {camera.width} x "
+                f"{camera.height}: give photographs and cameras of the same size"
+            )
+        found[camera.name] = images[0]
+    return found
+
+
+def _images_by_name(folder: Path) -> dict[str, list[Path]]:
+    try:
+        files = sorted(folder.iterdir())
+    except OSError as error:
+        raise UsageError(f"cannot read the folder of photographs '{folder}': {error.strerror}") from None
+    images: dict[str, list[Path]] = {}
+    for file in files:
+        if file.suffix.lower() in IMAGE_SUFFIXES:
+            images.setdefault(stem(file.name), []).append(file)
+    return images
+
+
+def compare(
+    a: Rasterizer,
+    b: Rasterizer,
+    cameras: Sequence[Camera],
+    photographs: Mapping[str, Path] | None = None,
+    lpips: Lpips | None = None,
+    progress: Callable[[str, float], None] = lambda _stage, _done: None,
+) -> Comparison:
+    """Render every view of both scenes and compare.
+
+    Args:
+        a, b: the reference scene and the candidate, on one device, with the same rules and background.
+        cameras: at least one.
+        photographs: by view name, see :func:`find_photographs`.
+        lpips: the metric, where it is installed.
+        progress: called with the stage and the part of it that is done.
+
+    Raises:
+        UsageError: no camera, or a photograph cannot be opened.
+        DataError: a photograph is damaged.
+        DeviceError: a view does not fit the device.
+    """
+
+    stage = f"comparing {len(cameras)} view{'s' if len(cameras) > 1 else ''}"
+    device, similarity = a.device, Similarity(a.device)
+    views: list[ViewFigures] = []
+
+    def figures(pairs: list[tuple[Picture, Picture]]) -> list[Figures]:
+        distances = [lpips(*(picture.download(device) for picture in pair)) if lpips else None for pair in pairs]
+        return [Figures(*found, distance) for found, distance in zip(similarity(pairs), distances, strict=True)]
+
+    def judge(some: Sequence[Camera], of_a: list[Picture], of_b: list[Picture]) -> Iterator[ViewFigures]:
+        found = [figures(list(zip(of_b, of_a, strict=True)))]
+        names = ["b_against_a"]
+        if photographs is not None:
+            buffer = device.upload(np.concatenate([next(read).reshape(-1) for _ in some]), "the photographs")
+            try:
+                truths = place_pictures(buffer, some)
+                found += [figures(list(zip(of, truths, strict=True))) for of in (of_a, of_b)]
+            finally:
+                device.free(buffer)
+            found.append([_loss(*losses) for losses in zip(*found[1:], strict=True)])
+            names += ["a_against_photograph", "b_against_photograph", "loss"]
+        for camera, of_view in zip(some, zip(*found, strict=True), strict=True):
+            yield ViewFigures(camera.name, dict(zip(names, of_view, strict=True)))
+
+    progress(stage, 0.0)
+    with thread_pool() as pool:
+        read = _photographs(pool, [photographs[camera.name] for camera in cameras] if photographs else [], a.background)
+        for some in in_batches(device, cameras):
+            with rendered(a, some) as of_a, rendered(b, some) as of_b:
+                for view in judge(some, of_a, of_b):
+                    views.append(view)
+                    progress(stage, len(views) / len(cameras))
+    if not views:
+        raise UsageError("there is no view to compare")
+    worst = min(range(len(views)), key=lambda number: views[number].figures["b_against_a"].psnr)
+    return Comparison(views, worst)
+
+
+def _photographs(pool: ThreadPoolExecutor, paths: Sequence[Path], background: Colour) -> Iterator[FloatArray]:
+    """The photographs in order, some read ahead."""
+    pending: deque[Future[FloatArray]] = deque()
+    for path in paths:
+        pending.append(pool.submit(read_photograph, path, background))
+        if len(pending) > _READ_AHEAD:
+            yield pending.popleft().result()
+    while pending:
+        yield pending.popleft().result()
+
+
+def _loss(a: Figures, b: Figures) -> Figures:
+    lpips = b.lpips - a.lpips if a.lpips is not None and b.lpips is not None else None
+    return Figures(0.0 if a.psnr == b.psnr else a.psnr - b.psnr, a.ssim - b.ssim, lpips)
+
+
+def mean_view(views: Sequence[ViewFigures]) -> ViewFigures:
+    """Means over the views; identical pictures are left out of a mean PSNR, which is infinite if all are identical."""
+
+    def mean(values: Sequence[float]) -> float:
+        finite = [value for value in values if math.isfinite(value)]
+        return sum(finite) / len(finite) if finite else math.inf
+
+    means = {}
+    for pair in views[0].figures:
+        all_views = [view.figures[pair] for view in views]
+        distances = [f.lpips for f in all_views if f.lpips is not None]
+        means[pair] = Figures(
+            mean([f.psnr for f in all_views]),
+            mean([f.ssim for f in all_views]),
+            mean(distances) if distances else None,
+        )
+    return ViewFigures("mean", means)
+
+
+# ------------------------------------------------------------------------------------------ for programs
+
+
+def size_report(a: SceneFile, b: SceneFile) -> dict[str, Any]:
+    """Sizes and splats of both files, for JSON."""
+
+    def entry(scene: SceneFile) -> dict[str, Any]:
+        return {
+            "file": str(scene.path),
+            "bytes": scene.nbytes,
+            "splats": scene.splats,
+            "sh_degree": scene.sh_degree,
+        }
+
+    return {"a": entry(a), "b": entry(b), "size_ratio": a.nbytes / b.nbytes}
+
+
+def comparison_report(comparison: Comparison) -> dict[str, Any]:
+    """The figures of all views and their means, for JSON.
+
+    JSON knows no infinity: a PSNR of null means that the pictures are identical.
+    """
+
+    def entry(view: ViewFigures) -> dict[str, dict[str, float | None]]:
+        result = {}
+        for pair, figures in view.figures.items():
+            result[pair] = {"psnr": figures.psnr if math.isfinite(figures.psnr) else None, "ssim": figures.ssim}
+            if figures.lpips is not None:
+                result[pair]["lpips"] = figures.lpips
+        return result
+
+    return {
+        "mean": entry(mean_view(comparison.views)),
+        "identical_views": sum(view.identical for view in comparison.views),
+        "worst_view": comparison.views[comparison.worst].name,
+        "views": [{"name": view.name, **entry(view)} for view in comparison.views],
+    }
+
+
+# ------------------------------------------------------------------------------------------ for people
+
+
+def format_sizes(a: SceneFile, b: SceneFile) -> str:
+    """Sizes and splats of both files as lines."""
+    width = max(len(str(a.path)), len(str(b.path)), 4)
+    lines = [f"   {'file':<{width}}{'bytes':>12}{'splats':>10}{'SH degree':>11}"]
+    for name, scene in (("A", a), ("B", b)):
+        lines.append(f"{name}  {scene.path!s:<{width}}{scene.nbytes:>12}{scene.splats:>10}{scene.sh_degree:>11}")
+    if a.nbytes >= b.nbytes:
+        lines.append(f"B is {a.nbytes / b.nbytes:.1f} times smaller")
+    else:
+        lines.append(f"B is {b.nbytes / a.nbytes:.1f} times larger")
+    return "\n".join(lines)
+
+
+def _cells(figures: Figures, lpips: bool) -> str:
+    decibels = f"{figures.psnr:.2f}" if math.isfinite(figures.psnr) else "identical"
+    cells = f"{decibels:>11}{figures.ssim:>9.4f}"
+    if lpips:
+        cells += f"{'-':>9}" if figures.lpips is None else f"{figures.lpips:>9.4f}"
+    return cells
+
+
+def format_comparison(comparison: Comparison) -> str:
+    """The figures of all views and their means as a table."""
+    views = comparison.views
+    lpips = any(view.figures["b_against_a"].lpips is not None for view in views)
+    width = max(4, *(len(view.name) for view in views))
+    columns = f"{'PSNR dB':>11}{'SSIM':>9}" + (f"{'LPIPS':>9}" if lpips else "")
+    titles = [_TITLES[pair] for pair in views[0].figures]
+    lines = [
+        " " * width + "".join(f"{title:>{len(columns)}}" for title in titles),
+        f"{'view':<{width}}" + columns * len(titles),
+    ]
+    for view in (*views, mean_view(views)):
+        cells = "".join(_cells(figures, lpips) for figures in view.figures.values())
+        lines.append(f"{view.name:<{width}}{cells}")
+    identical = sum(view.identical for view in views)
+    if 0 < identical < len(views):
+        lines.append(f"{identical} of {len(views)} views are identical in A and B and left out of their mean PSNR")
+    worst = views[comparison.worst]
+    if not worst.identical:
+        lines.append(f"worst view: {worst.name}, {worst.figures['b_against_a'].psnr:.2f} dB")
+    return "\n".join(lines)
+
+
+def side_by_side(a: NDArray[Any], b: NDArray[Any]) -> tuple[NDArray[np.uint8], int]:
+    """A, B and their :func:`difference_map` in one picture, (H, 3 W, 3) uint8, and the map's factor."""
+    heat, factor = difference_map(a, b)
+    return to_8_bits(np.concatenate([a, b, heat], axis=1)), factor
+
+
+def difference_map(a: NDArray[Any], b: NDArray[Any]) -> tuple[FloatArray, int]:
+    """Each pixel's largest difference of a channel, amplified, from black over red and yellow to white.
+
+    Returns:
+        (H, W, 3) float32, and the factor: the largest of 1, 2, 5, 10 … that leaves all but a thousandth of the pixels
+        below full white.
+    """
+    difference = np.abs(np.clip(a, 0, 1) - np.clip(b, 0, 1)).max(axis=-1)
+    largest = float(np.quantile(difference, 0.999))
+    factor = max(f for f in _FACTORS if f == 1 or f * largest <= 1)
+    heat = np.clip(3 * factor * difference[..., None] - np.array([0, 1, 2]), 0, 1)
+    return heat.astype(np.float32), factor

@@ -1,0 +1,1 @@
+"""The rasterizer: projection, tile lists, depth order, compositing, and prepared views that are kept."""

@@ -1,0 +1,1 @@
+"""What people and programs are told: summaries, pages, what a file or a device is."""

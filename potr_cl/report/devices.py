@@ -1,0 +1,80 @@
+"""The OpenCL devices there are and what matters about them, as numbers and as a table."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Any
+
+from potr_cl.errors import DeviceError
+from potr_cl.opencl.device import Device, DeviceInfo, compiler_fault, fitting_devices, list_devices
+
+
+def device_report(check: bool) -> list[dict[str, Any]]:
+    """One entry a device, in the order of their indices; "fault" says why a device can compile nothing, or is None.
+
+    Args:
+        check: run each device's self-check; the entry's "check" is then "passed" or says what failed.
+
+    Raises:
+        DeviceError: there is no device at all, or the environment variable names one that there is not.
+    """
+    chosen = next((info.index for info in fitting_devices() if compiler_fault(info) is None), None)
+    return [_entry(info, info.index == chosen, check) for info in list_devices()]
+
+
+def _entry(info: DeviceInfo, chosen: bool, check: bool) -> dict[str, Any]:
+    entry = {
+        "index": info.index,
+        "chosen": chosen,
+        "name": info.name,
+        "platform": info.platform,
+        "version": info.version,
+        "kind": info.kind,
+        "integrated": info.integrated,
+        "memory_bytes": info.memory,
+        "largest_buffer_bytes": info.largest_buffer,
+        "local_memory_bytes": info.local_memory,
+        "compute_units": info.compute_units,
+        "vector_width": info.vector_width,
+        "kernels": info.family,
+        "fault": compiler_fault(info),
+    }
+    if check:
+        try:
+            Device(info).self_check()
+            entry["check"] = "passed"
+        except DeviceError as error:
+            entry["check"] = str(error)
+    return entry
+
+
+def format_devices(report: Sequence[dict[str, Any]]) -> str:
+    """The report as lines for people.
+
+    ``*`` marks the device that is taken without ``--device``, ``!`` those that do not work, as far as was looked.
+    """
+    lines = [
+        f"{'':<2}{'index':<7}{'kind':<6}{'kernels':<9}{'memory':>9}{'buffer':>9}{'local':>8}{'units':>7}{'vector':>8}"
+        "  name (platform)"
+    ]
+    for entry in report:
+        lines.append(
+            f"{_mark(entry):<2}{entry['index']:<7}{entry['kind']:<6}{entry['kernels']:<9}"
+            f"{entry['memory_bytes'] / 1e9:>6.1f} GB{entry['largest_buffer_bytes'] / 1e9:>6.1f} GB"
+            f"{entry['local_memory_bytes'] / 1024:>5.0f} KB{entry['compute_units']:>7}{entry['vector_width']:>8}"
+            f"  {entry['name']} ({entry['platform']})"
+        )
+        if entry["fault"] is not None:
+            lines.append(f"  cannot compile anything: {entry['fault']}")
+        elif "check" in entry:
+            lines.append(f"  self-check: {entry['check']}")
+    return "\n".join(lines)
+
+
+def works(entry: dict[str, Any]) -> bool:
+    """Whether a device can compile and, where it was checked, passed."""
+    return entry["fault"] is None and entry.get("check", "passed") == "passed"
+
+
+def _mark(entry: dict[str, Any]) -> str:
+    return ("*" if entry["chosen"] else "") + ("" if works(entry) else "!")

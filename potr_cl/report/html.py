@@ -1,0 +1,332 @@
+"""One self-contained web page about an encode: sizes, quality view by view, pictures to compare, the course of pruning.
+
+Made of the document of :func:`potr_cl.report.summary.encode_report`. The page loads nothing, and is the same for the
+same encode apart from the times.
+"""
+
+from __future__ import annotations
+
+import base64
+import io
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+from html import escape
+from string import Template
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+from PIL import Image, features
+
+from potr_cl.formats.images import to_8_bits
+from potr_cl.model.scene import FloatArray
+from potr_cl.quality.compare import difference_map
+from potr_cl.report.summary import decibels
+
+_COLOURS = ("#4269d0", "#efb118", "#ff725c", "#6cc5b0", "#3ca951", "#ff8ab7", "#a463f2", "#97bbf5", "#9c6b4e")
+
+
+@dataclass(frozen=True)
+class PicturePair:
+    """One view of both scenes.
+
+    Attributes:
+        title: why it is shown.
+        view: its name.
+        psnr: decibels; None for identical pictures.
+        before, after: (H, W, 3) float32, uncompressed and compressed.
+    """
+
+    title: str
+    view: str
+    psnr: float | None
+    before: FloatArray
+    after: FloatArray
+
+
+def views_to_show(quality: dict[str, Any], chosen: str | None) -> list[tuple[str, dict[str, Any]]]:
+    """The worst, the median and a chosen view of a report's quality, with titles; the first view if none is chosen."""
+    views = quality["views"]
+    by_psnr = sorted(views, key=lambda view: math.inf if view["psnr"] is None else view["psnr"])
+    wanted = {"worst view": by_psnr[0], "median view": by_psnr[(len(views) - 1) // 2]}
+    named = [view for view in views if view["name"] == chosen]
+    wanted["chosen view" if named else "first view"] = (named or views)[0]
+    shown: dict[str, tuple[str, dict[str, Any]]] = {}
+    for title, view in wanted.items():
+        if view["name"] in shown:
+            title = f"{shown[view['name']][0]}, {title}"
+        shown[view["name"]] = (title, view)
+    return list(shown.values())
+
+
+def html_report(report: dict[str, Any], pictures: Sequence[PicturePair]) -> str:
+    """The page.
+
+    Args:
+        report: of :func:`potr_cl.report.summary.encode_report`.
+        pictures: to compare; none where the encode was not judged.
+    """
+    source = report["source"]
+    sections = [
+        _headline(report),
+        _section("Where the bytes are", _sizes(report)),
+        _section("Pictures", "".join(map(_pair, pictures))) if pictures else "",
+        _section("Quality by view", _quality(report["quality"])),
+        _section("Pruning", _pruning(report)) if report["pruning"] is not None else "",
+        _section("Search", _search(report["search"])) if report.get("search") is not None else "",
+        _section("Settings", _settings(report)),
+        _section("Time, device, versions", _circumstances(report)),
+    ]
+    title = f"{escape(source['file'])} → {escape(report['file'])}"
+    return _PAGE.substitute(title=title, body="\n".join(filter(None, sections)))
+
+
+def _section(title: str, content: str) -> str:
+    return f"<section><h2>{escape(title)}</h2>\n{content}\n</section>"
+
+
+def _headline(report: dict[str, Any]) -> str:
+    source, quality = report["source"], report["quality"]
+    ratio = report["ratio"]
+    facts = [
+        (f"{_megabytes(source['bytes'])} → {_megabytes(report['bytes'])}", "size"),
+        (f"{ratio:.1f} ×" if ratio >= 1 else f"1 / {1 / ratio:.1f}", "smaller"),
+        (f"{report['splats']:,}", f"of {source['splats']:,} splats"),
+    ]
+    if not isinstance(quality, str):
+        facts += [
+            (decibels(quality["psnr"]), "mean PSNR against the uncompressed scene"),
+            (f"{quality['ssim']:.4f}", "mean SSIM"),
+        ]
+    cards = "".join(f"<div><b>{escape(value)}</b><span>{escape(name)}</span></div>" for value, name in facts)
+    names = f"{escape(source['file'])} → {escape(report['file'])}"
+    return f'<header><h1>{names}</h1><div class="cards">{cards}</div></header>'
+
+
+def _megabytes(nbytes: int) -> str:
+    return f"{nbytes / 1e6:.2f} MB" if nbytes >= 1e5 else f"{nbytes / 1e3:.2f} kB"
+
+
+def _sizes(report: dict[str, Any]) -> str:
+    total, splats = report["bytes"], report["splats"]
+    bar, rows = [], []
+    left = 0.0
+    for colour, (name, nbytes) in zip(_COLOURS, report["properties"].items(), strict=False):
+        width = 100 * nbytes / total
+        tip = f"<title>{escape(name)}: {nbytes:,} bytes</title>"
+        bar.append(f'<rect x="{left:.3f}" width="{width:.3f}" height="6" fill="{colour}">{tip}</rect>')
+        swatch = f'<i style="background:{colour}"></i>{escape(name)}'
+        rows.append([swatch, f"{nbytes:,}", f"{nbytes / splats:.2f}", f"{width:.1f} %"])
+        left += width
+    rows.append(["all", f"{total:,}", f"{total / splats:.2f}", "100 %"])
+    svg = f'<svg class="bar" viewBox="0 0 100 6" preserveAspectRatio="none" role="img">{"".join(bar)}</svg>'
+    return svg + _table(["property", "bytes", "bytes a splat", "share"], rows)
+
+
+def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
+    """A table of cells that are HTML already."""
+    top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
+    lines = "\n".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
+    return f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>\n{lines}\n</tbody></table></div>'
+
+
+def _pair(pair: PicturePair) -> str:
+    heat, factor = difference_map(pair.before, pair.after)
+    height, width = pair.before.shape[:2]
+    name = escape(pair.view)
+    size = f'width="{width}" height="{height}"'
+    return (
+        f"<h3>{escape(pair.title)}: {name}, {decibels(pair.psnr)}</h3>\n"
+        '<div class="pair"><figure><div class="slider">\n'
+        f'<img {size} src="{_data_uri(pair.before)}" alt="{name}, uncompressed">\n'
+        f'<img {size} class="after" src="{_data_uri(pair.after)}" alt="{name}, compressed">\n'
+        '<input type="range" min="0" max="100" value="50" step="any" aria-label="uncompressed to the left, compressed '
+        "to the right\" oninput=\"this.parentNode.style.setProperty('--at', this.value + '%')\"></div>\n"
+        "<figcaption>uncompressed | compressed</figcaption></figure>\n"
+        f'<figure><img {size} src="{_data_uri(heat)}" alt="{name}, difference">\n'
+        f"<figcaption>difference × {factor}</figcaption></figure></div>"
+    )
+
+
+def _data_uri(picture: FloatArray) -> str:
+    """The picture without loss: what is to be compared may differ by little."""
+    pixels: NDArray[np.uint8] = to_8_bits(picture)
+    kind, options = ("webp", {"lossless": True, "method": 2}) if features.check("webp") else ("png", {})
+    file = io.BytesIO()
+    Image.fromarray(pixels).save(file, format=kind, **options)
+    return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
+
+
+def _quality(quality: dict[str, Any] | str) -> str:
+    if isinstance(quality, str):
+        return f"<p>{escape(quality)}</p>"
+    views = quality["views"]
+    most = max((view["psnr"] for view in views if view["psnr"] is not None), default=1.0)
+    rows = []
+    for view in views:
+        length = 100.0 if view["psnr"] is None else 100 * max(view["psnr"], 0) / max(most, 1e-9)
+        worst = " (worst)" if view["name"] == quality["worst"]["name"] else ""
+        bar = f'<span class="meter" style="width:{length:.1f}%"></span>'
+        rows.append([escape(view["name"]) + worst, decibels(view["psnr"]), bar, f"{view['ssim']:.4f}"])
+    rows.append(["<b>mean</b>", f"<b>{decibels(quality['psnr'])}</b>", "", f"<b>{quality['ssim']:.4f}</b>"])
+    said = f"<p>Against {escape(quality['against'])}, judged by {escape(quality['judged_by'])}.</p>"
+    return said + _table(["view", "PSNR", "", "SSIM"], rows)
+
+
+def _pruning(report: dict[str, Any]) -> str:
+    history = report["pruning"]["history"]
+    if not history:
+        return "<p>No splat was removed.</p>"
+    left = [report["source"]["splats"], *(entry["left"] for entry in history)]
+    growth = np.cumsum([entry["effect"] for entry in history]).tolist()
+    largest = [entry["largest_effect"] for entry in history]
+    return (
+        f"<p>{left[0] - left[-1]:,} of {left[0]:,} splats removed in {len(history)} iterations.</p>\n"
+        '<div class="charts">'
+        + _chart("splats left", [("", left)], first=0)
+        + _chart(
+            "mean squared error",
+            [("estimated growth so far", growth), ("largest ΔMSE of a removed splat", largest)],
+            logarithmic=True,
+        )
+        + "</div>"
+    )
+
+
+def _chart(title: str, series: Sequence[tuple[str, Sequence[float]]], logarithmic: bool = False, first: int = 1) -> str:
+    """Lines over the iterations, which count from ``first``; a logarithmic chart leaves out what is not above 0."""
+    width, height, margin_left, margin = 420, 240, 64, 28
+    points = [
+        (name, [(first + k, float(v)) for k, v in enumerate(values) if v > 0 or not logarithmic])
+        for name, values in series
+    ]
+    every = [value for _, line in points for _, value in line]
+    if not every:
+        return ""
+    scale = math.log10 if logarithmic else float
+    low, high = (scale(min(every)), scale(max(every))) if logarithmic else (0.0, max(every))
+    if high - low < 1e-12:
+        low, high = low - 1, high + 1
+    last = max(first + len(values) - 1 for _, values in series)
+
+    def x(iteration: float) -> float:
+        return margin_left + (width - margin_left - 10) * (iteration - first) / max(last - first, 1)
+
+    def y(value: float) -> float:
+        return height - margin - (height - 2 * margin) * (scale(value) - low) / (high - low)
+
+    parts = [f'<text x="{margin_left}" y="16" class="title">{escape(title)}</text>']
+    for k in range(5):
+        level = low + (high - low) * k / 4
+        value = 10**level if logarithmic else level
+        label = f"{value:.1e}" if logarithmic else f"{value:,.0f}"
+        at = y(value)
+        parts.append(
+            f'<line x1="{margin_left}" x2="{width - 10}" y1="{at:.1f}" y2="{at:.1f}" class="grid"/>'
+            f'<text x="{margin_left - 6}" y="{at + 4:.1f}" text-anchor="end">{label}</text>'
+        )
+    for iteration in sorted({first, round((first + last) / 2), last}):
+        at = x(iteration)
+        parts.append(f'<text x="{at:.1f}" y="{height - 8}" text-anchor="middle">{iteration}</text>')
+    for (name, line), colour in zip(points, _COLOURS[::2], strict=False):
+        path = " ".join(f"{x(iteration):.1f},{y(value):.1f}" for iteration, value in line)
+        parts.append(f'<polyline points="{path}" stroke="{colour}" class="line"/>')
+        if name:
+            place = height - margin - 8 - 14 * [label for label, _ in points].index(name)
+            style = f'text-anchor="end" style="fill:{colour}"'
+            parts.append(f'<text x="{width - 14}" y="{place}" {style}>{escape(name)}</text>')
+    return f'<svg viewBox="0 0 {width} {height}" role="img">{"".join(parts)}</svg>'
+
+
+def _search(search: dict[str, Any]) -> str:
+    kinds = {
+        "scout": "rough encode",
+        "encode": "full encode",
+        "refit": "its splats, re-fitted",
+        "steps": "other quantiser steps",
+        "colours": "other steps of colours",
+    }
+    rows = [[kinds[step["kind"]], f"{step['q']:g}", escape(step["said"])] for step in search["tries"]]
+    said = f"<p>Asked for: {escape(search['target'])}. Reached: {escape(search['reached'])}.</p>"
+    return said + _table(["step", "q", "result"], rows)
+
+
+def _settings(report: dict[str, Any]) -> str:
+    rows = [[escape(name), f"{value:.6g}"] for name, value in report["parameters"].items()]
+    others = {name: value for name, value in report["options"].items() if name not in report["parameters"]}
+    return (
+        '<div class="columns">'
+        + _table(["parameter", "value"], rows)
+        + _table(["option", "value"], [[escape(name), _value(value)] for name, value in others.items()])
+        + "</div>"
+    )
+
+
+def _value(value: Any) -> str:
+    if isinstance(value, dict):
+        return "<br>".join(f"{escape(str(name))}: {_value(entry)}" for name, entry in value.items())
+    if isinstance(value, list | tuple):
+        return ", ".join(_value(entry) for entry in value)
+    return "–" if value is None else escape(f"{value:.6g}" if isinstance(value, float) else str(value))
+
+
+def _circumstances(report: dict[str, Any]) -> str:
+    times = [[escape(stage), f"{seconds:.1f} s"] for stage, seconds in report["seconds"].items()]
+    facts = dict(report["versions"])
+    if report["device"] is not None:
+        device = report["device"]
+        facts = {"device": device["name"], "platform": f"{device['platform']}, {device['version']}"} | facts
+    rows = [[escape(name), escape(value)] for name, value in facts.items()]
+    return f'<div class="columns">{_table(["stage", "time"], times)}{_table(["", ""], rows)}</div>'
+
+
+_PAGE = Template("""<!DOCTYPE html>
+<html lang="en">
+<head>
+<meta charset="utf-8">
+<meta name="viewport" content="width=device-width, initial-scale=1">
+<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; style-src 'unsafe-inline'; \
+script-src 'unsafe-inline'">
+<title>$title</title>
+<style>
+:root { color-scheme: light dark; --line: #8884; --soft: #8882; }
+body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 0 auto; padding: 1rem; }
+h1 { font-size: 1.2rem; overflow-wrap: anywhere; }
+h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; border-bottom: 1px solid var(--line); }
+h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; overflow-wrap: anywhere; }
+.cards { display: flex; flex-wrap: wrap; gap: .8rem; }
+.cards div { background: var(--soft); border-radius: .5rem; padding: .6rem 1rem; }
+.cards b { display: block; font-size: 1.5rem; }
+.bar { width: 100%; height: 2.2rem; border-radius: .3rem; }
+.wide { overflow-x: auto; }
+table { border-collapse: collapse; margin: .6rem 0; }
+th, td { text-align: left; padding: .15rem 1.2rem .15rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
+td { font-variant-numeric: tabular-nums; }
+td i { display: inline-block; width: .8em; height: .8em; border-radius: .2em; margin-right: .5em; }
+td:has(.meter) { min-width: 12rem; }
+.meter { display: inline-block; height: .6em; background: #4269d0; border-radius: .2em; }
+.pair, .columns, .charts { display: grid; gap: 1rem;
+  grid-template-columns: repeat(auto-fit, minmax(min(100%, 22rem), 1fr)); }
+.columns, .charts { align-items: start; }
+figure { margin: 0; }
+figcaption { opacity: .75; }
+img { display: block; max-width: 100%; height: auto; }
+.slider { position: relative; --at: 50%; width: fit-content; max-width: 100%; }
+.slider .after { position: absolute; inset: 0; clip-path: inset(0 0 0 var(--at)); }
+.slider input { position: absolute; inset: 0; width: 100%; height: 100%; margin: 0; opacity: 0; cursor: ew-resize; }
+.slider::after { content: ""; position: absolute; top: 0; bottom: 0; left: var(--at); width: 2px; background: #fff;
+  box-shadow: 0 0 3px #000; pointer-events: none; }
+.slider:focus-within { outline: 2px solid #4269d0; }
+.charts svg { width: 100%; }
+svg text { font-size: 11px; fill: currentColor; }
+svg .title { font-size: 13px; font-weight: 600; }
+svg .grid { stroke: var(--line); }
+svg .line { fill: none; stroke-width: 2; }
+</style>
+</head>
+<body>
+$body
+</body>
+</html>
+""")

@@ -1,0 +1,165 @@
+"""What an encode did, as one document for programs and as lines for people."""
+
+from __future__ import annotations
+
+import dataclasses
+import math
+import platform
+from importlib.metadata import version
+from pathlib import Path
+from typing import Any
+
+from potr_cl import __version__
+from potr_cl.codec.decoder import PotrFile
+from potr_cl.model.scene import Scene
+from potr_cl.pipeline.encode import Encoded
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.search import Found, Target
+from potr_cl.quality.compare import Comparison, Figures, mean_view
+from potr_cl.quality.evaluator import JudgingViews
+from potr_cl.report.file import file_report
+
+#: Sections of :func:`potr_cl.report.file.file_report` by the property that they belong to, as their names begin.
+_PROPERTIES = ("position", "scale", "rotation", "opacity", "colour: DC", "colour: AC")
+#: Packages whose version may change the bytes.
+_PACKAGES = ("numpy", "pyopencl", "zstandard")
+
+
+def encode_report(
+    source: Path,
+    scene: Scene,
+    target: Path,
+    file: PotrFile,
+    encoded: Encoded,
+    options: EncodeOptions,
+    search: dict[str, Any] | None,
+    quality: dict[str, Any] | str,
+    seconds: dict[str, float],
+) -> dict[str, Any]:
+    """The facts of an encode, ready for JSON.
+
+    Args:
+        source, target: paths of the uncompressed and the compressed file.
+        scene: the uncompressed scene.
+        file: what was written to ``target``.
+        encoded: how it came about.
+        options: that it was encoded with.
+        search: of :func:`search_report`, where ``options`` were found by a search.
+        quality: of :func:`quality_report`, or why it was not judged.
+        seconds: wall time by stage, in order; "total" last.
+    """
+    contents = file_report(file)
+    report: dict[str, Any] = {
+        "source": {
+            "file": str(source),
+            "bytes": source.stat().st_size,
+            "splats": len(scene),
+            "sh_degree": scene.sh_degree,
+        },
+        "file": str(target),
+        "bytes": len(file.data),
+        "ratio": source.stat().st_size / len(file.data),
+        "splats": file.header.splats,
+        "bytes_a_splat": len(file.data) / file.header.splats,
+        "properties": _properties(contents["sections"]),
+        "quality": quality,
+        "pruning": None,
+        "search": search,
+        "options": dataclasses.asdict(options),
+        "parameters": dataclasses.asdict(options.parameters),
+        "device": None,
+        "seconds": seconds,
+        "versions": {"potr_cl": __version__, "python": platform.python_version()}
+        | {package: version(package) for package in _PACKAGES},
+    }
+    if encoded.pruned is not None:
+        report["pruning"] = {
+            "iterations": encoded.pruned.iterations,
+            "history": [dataclasses.asdict(entry) for entry in encoded.pruned.history],
+        }
+    if encoded.device is not None:
+        info = encoded.device.info
+        report["device"] = {"name": info.name, "platform": info.platform, "version": info.version}
+    return report
+
+
+def _properties(sections: dict[str, dict[str, float]]) -> dict[str, int]:
+    """Bytes by property: all sections of one name's beginning together, the rest as "other"."""
+    sums = dict.fromkeys((*_PROPERTIES, "other"), 0)
+    for name, entry in sections.items():
+        sums[next((p for p in _PROPERTIES if name.startswith(p)), "other")] += int(entry["bytes"])
+    return {name: nbytes for name, nbytes in sums.items() if nbytes}
+
+
+def search_report(target: Target, found: Found) -> dict[str, Any]:
+    """What was searched for, and how it was found."""
+    return {
+        "target": str(target),
+        "max_bytes": target.max_bytes,
+        "min_psnr": target.min_psnr,
+        "reached": target.describe(found.value),
+        "tries": [
+            {"kind": step.kind, "q": step.q, "value": target.plain(step.value), "said": target.describe(step.value)}
+            for step in found.tries
+        ],
+    }
+
+
+def quality_report(views: JudgingViews, comparison: Comparison) -> dict[str, Any]:
+    """The figures of the views that an encode was judged by."""
+
+    def entry(name: str, figures: Figures) -> dict[str, Any]:
+        """JSON knows no infinity: a PSNR of null means identical pictures."""
+        return {"name": name, "psnr": figures.psnr if math.isfinite(figures.psnr) else None, "ssim": figures.ssim}
+
+    judged = [entry(view.name, view.figures["b_against_a"]) for view in comparison.views]
+    mean = entry("mean", mean_view(comparison.views).figures["b_against_a"])
+    return {
+        "against": "the uncompressed scene",
+        "kind": views.kind,
+        "judged_by": str(views),
+        "psnr": mean["psnr"],
+        "ssim": mean["ssim"],
+        "worst": judged[comparison.worst],
+        "views": judged,
+    }
+
+
+def decibels(value: float | None) -> str:
+    """A PSNR of a report, for people."""
+    return "identical" if value is None else f"{value:.2f} dB"
+
+
+def format_encode_report(report: dict[str, Any]) -> str:
+    """The report as lines for people."""
+    source = report["source"]
+    ratio = report["ratio"]
+    change = f"{ratio:.1f} times smaller" if ratio >= 1 else f"{1 / ratio:.1f} times larger"
+    lines = [
+        f"{report['file']}: {report['bytes']:,} bytes, {change} than {source['file']} ({source['bytes']:,} bytes)",
+        f"splats     {report['splats']:,} of {source['splats']:,}, {report['bytes_a_splat']:.2f} bytes each",
+    ]
+    for place, (name, nbytes) in enumerate(report["properties"].items()):
+        lines.append(f"{'' if place else 'bytes':<11}{name:<12}{nbytes:>13,}{100 * nbytes / report['bytes']:>7.1f} %")
+    quality = report["quality"]
+    if isinstance(quality, str):
+        lines.append(f"quality    {quality}")
+    else:
+        worst = quality["worst"]
+        lines += [
+            f"quality    PSNR {decibels(quality['psnr'])}, SSIM {quality['ssim']:.4f} against the uncompressed scene,",
+            f"           mean of {quality['judged_by']}",
+            f"           worst view {worst['name']}: PSNR {decibels(worst['psnr'])}, SSIM {worst['ssim']:.4f}",
+        ]
+    search = report["search"]
+    if search is not None:
+        encodes = sum(step["kind"] == "encode" for step in search["tries"])
+        full = f"{encodes} full encode{'s' if encodes > 1 else ''}"
+        q = report["options"]["q"]
+        lines.append(f"asked for  {search['target']}; reached {search['reached']} by quality {q:g} after {full}")
+    times = dict(report["seconds"])
+    total = times.pop("total")
+    lines.append(f"time       {total:.1f} s: " + ", ".join(f"{stage} {time:.1f}" for stage, time in times.items()))
+    if report["device"] is not None:
+        lines.append(f"device     {report['device']['name']} ({report['device']['platform']})")
+    return "\n".join(lines)

@@ -1,0 +1,1 @@
+"""What the stage "compact" computes with: a ridge regression a splat."""

@@ -1,0 +1,144 @@
+"""The pruning controller where the effects are: a GPU decides itself what goes, and what is to be measured again.
+
+Fetching the effects of every splat and sending back a decision would take a GPU longer than measuring them. The rules
+are those of :mod:`potr_cl.stages.pruning.schedule`, in float32; one difference: splats of the same score go together.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+
+import numpy as np
+import pyopencl as cl
+
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.schedule import Iteration, Pruned, PruningOptions, ascending, prune
+
+_SOURCE = "prune/choose_gpu.cl"
+#: Digits of a score in base 256, and the words of the state buffer (cl/prune/choose_gpu.cl): histograms, what is known
+#: after each digit, the counter of those that went.
+_DIGIT, _DIGITS = 256, 4
+_COUNTER = _DIGITS * 2 * _DIGIT + 4 * _DIGITS
+_STATE = _COUNTER + 1
+
+_REMOVED = np.dtype([("iteration", np.uint32), ("key", np.uint32), ("effect", np.float32), ("importance", np.float32)])
+
+
+def prune_scene(
+    removal: RemovalSweep,
+    options: PruningOptions,
+    progress: Callable[[int, int], None] | None = None,
+    after_iteration: Callable[[int], None] | None = None,
+) -> Pruned:
+    """Run the schedule, on the device if that can decide for itself.
+
+    Args:
+        removal: measures and removes.
+        options: thresholds and iterations.
+        progress: called with the iterations done and the number of splats left.
+        after_iteration: called with the iteration.
+    """
+    if not removal.steerable or options.count is not None or not np.isfinite(options.delta_mse_max):
+        return prune(removal, removal.splats, options, progress, after_iteration)
+    controller = _Controller(removal, options)
+    try:
+        return controller.run(progress, after_iteration)
+    finally:
+        controller.free()
+
+
+class _Controller:
+    def __init__(self, removal: RemovalSweep, options: PruningOptions) -> None:
+        self._removal, self._options = removal, options
+        self._device = device = removal.device
+        self._splats = removal.splats
+        self._groups = -(-self._splats // _DIGIT)
+        with device.all_or_nothing():
+            self._damped = device.allocate(4 * self._splats, "the damped effects")
+            self._keys = device.allocate(4 * self._splats, "the splats' scores")
+            self._removed = device.upload(np.zeros(self._splats, _REMOVED), "the removed splats")
+            self._state = device.allocate(4 * _STATE, "the pruning's state")
+        limits = removal.limits
+        self._rank, self._refine, self._mark = (device.kernel(_SOURCE, n, **limits) for n in ("rank", "refine", "mark"))
+        number, real, buffer = np.uint32, np.float32, None
+        self._rank.set_scalar_arg_dtypes([number, buffer, buffer, *[real] * 4, *[buffer] * 3])
+        self._refine.set_scalar_arg_dtypes([number, buffer, buffer, np.int32, number, buffer])
+        self._mark.set_scalar_arg_dtypes([number, buffer, buffer, real, real, number, number, *[buffer] * 3])
+
+    def run(self, progress: Callable[[int, int], None] | None, after_iteration: Callable[[int], None] | None) -> Pruned:
+        removal, options = self._removal, self._options
+        left, done, weight = self._splats, 0, 0.0
+        for iteration in range(options.iterations):
+            removal.measure_on_device()
+            weight = options.damping * weight + 1
+            gone = self._choose(iteration, weight)
+            done = iteration + 1
+            if gone == 0:
+                break  # no candidate is left, and measuring again would find the same
+            removal.remove_marked()
+            left -= gone
+            if progress is not None:
+                progress(done, max(left, 1))
+            if after_iteration is not None:
+                after_iteration(iteration)
+        return self._pruned(done)
+
+    def _choose(self, iteration: int, weight: float) -> int:
+        """Mark the splats that go in an iteration; how many."""
+        removal, options, n = self._removal, self._options, self._splats
+        remaining = options.iterations - iteration
+        totals, alive = removal.totals, removal.marks
+        effect_unit, importance_unit = removal.units
+        cl.enqueue_fill_buffer(self._device.queue, self._state, np.uint32(0), 0, 4 * _STATE)
+        numbers = (effect_unit, weight, options.delta_mse_max, options.a)
+        self._rank.set_args(n, totals, alive, *numbers, self._damped, self._keys, self._state)
+        self._launch(self._rank)
+        if remaining > 1:
+            for digit in range(1, _DIGITS):
+                self._refine.set_args(n, totals, self._keys, digit, remaining, self._state)
+                self._launch(self._refine)
+        units = (effect_unit, importance_unit)
+        self._mark.set_args(n, totals, self._keys, *units, iteration, remaining, alive, self._removed, self._state)
+        self._launch(self._mark)
+        gone = np.empty(1, np.uint32)
+        with self._device.errors("failed while computing"):
+            cl.enqueue_copy(self._device.queue, gone, self._state, src_offset=4 * _COUNTER, is_blocking=True)
+        return int(gone[0])
+
+    def _launch(self, kernel: cl.Kernel) -> None:
+        self._device.launch(kernel, (self._groups * _DIGIT,), (_DIGIT,))
+
+    def _pruned(self, done: int) -> Pruned:
+        device, n = self._device, self._splats
+        alive = self._removal.alive.copy()
+        damped = device.download(self._damped, (n,), np.float32)
+        removed = device.download(self._removed, (n,), _REMOVED)
+        iteration = removed["iteration"].astype(np.int32)
+        iteration[alive] = -1
+        gone = np.flatnonzero(~alive)
+        gone = gone[ascending(removed["iteration"][gone].astype(np.uint64) << np.uint64(32) | removed["key"][gone])]
+        if len(gone) == n:  # an empty scene is no scene
+            alive[gone[-1]], iteration[gone[-1]] = True, -1
+            gone = gone[:-1]
+        kept = np.flatnonzero(alive)
+        kept = kept[ascending(damped[kept])]
+        order = np.concatenate([gone, kept])
+        return Pruned(order, len(kept), iteration, done, self._history(removed[gone], iteration[gone]))
+
+    def _history(self, removed: np.ndarray, iteration: np.ndarray) -> tuple[Iteration, ...]:
+        """Of the splats that went, in their order."""
+        starts = np.flatnonzero(np.diff(iteration, prepend=-1))
+        if not len(starts):
+            return ()
+        effects = removed["effect"].astype(np.float64)
+        sums = [np.add.reduceat(values.astype(np.float64), starts) for values in (removed["importance"], effects)]
+        left = self._splats - np.append(starts[1:], len(removed))
+        columns = (left, *sums, np.maximum.reduceat(effects, starts))
+        return tuple(
+            Iteration(int(count), float(weight), float(effect), float(largest))
+            for count, weight, effect, largest in zip(*columns, strict=True)
+        )
+
+    def free(self) -> None:
+        for buffer in (self._damped, self._keys, self._removed, self._state):
+            self._device.free(buffer)

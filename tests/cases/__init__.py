@@ -1,0 +1,1 @@
+"""Scenes and cameras that tests build."""

@@ -1,0 +1,67 @@
+"""Scenes and cameras that the rasterizer is tested with."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import SH_COEFFICIENTS, Scene
+
+
+def camera(width: int = 64, height: int = 48, focal: float = 60.0, **other: float) -> Camera:
+    """At the origin, looking along +z."""
+    return Camera(
+        "view",
+        width,
+        height,
+        focal,
+        other.get("fy", focal * 1.1),
+        other.get("cx", width / 2),
+        other.get("cy", height / 2),
+        np.eye(3),
+        np.zeros(3),
+    )
+
+
+def tilted_camera(seed: int, width: int, height: int, offset: float = 0.0) -> Camera:
+    """Somewhere around the origin (or ``offset`` from it along x), looking at it, principal point off the centre."""
+    rng = np.random.default_rng(seed)
+    eye = rng.normal(size=3)
+    eye *= 4 / np.linalg.norm(eye)
+    forward = -eye / 4
+    right = np.cross(forward, rng.normal(size=3))
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    eye = eye + np.array([offset, 0, 0])
+    return Camera("tilted", width, height, 70, 75, width / 2 + 3, height / 2 - 2, rotation, -rotation @ eye)
+
+
+def random_splats(n: int, degree: int = 3, seed: int = 0) -> Scene:
+    """Splats around the origin, from less than a pixel to a third of the picture."""
+    rng = np.random.default_rng(seed)
+    sh = rng.normal(scale=0.2, size=(n, SH_COEFFICIENTS[degree], 3))
+    return Scene(
+        rng.normal(scale=0.8, size=(n, 3)).astype(np.float32),
+        rng.normal(-2.5, 1, size=(n, 3)).astype(np.float32),
+        (rng.normal(size=(n, 4)) * rng.uniform(0.1, 10, size=(n, 1))).astype(np.float32),
+        rng.normal(0, 3, size=n).astype(np.float32),
+        sh.astype(np.float32),
+    )
+
+
+def splats(means: object, sigma: object = 0.1, logit: object = 0.0, colour: object = (1.0, 0.5, 0.25)) -> Scene:
+    """Splats of degree 0 from what is given, the rest alike."""
+    centres = np.atleast_2d(np.asarray(means, np.float32))
+    n = len(centres)
+    quaternions = np.zeros((n, 4), np.float32)
+    quaternions[:, 0] = 1
+    with np.errstate(divide="ignore"):
+        log_scales = np.log(np.broadcast_to(np.asarray(sigma, np.float64), (n, 3)))
+    dc = (np.broadcast_to(np.asarray(colour, np.float64), (n, 3)) - 0.5) / 0.28209479177387814
+    return Scene(
+        centres,
+        np.maximum(log_scales, -200).astype(np.float32),
+        quaternions,
+        np.broadcast_to(np.asarray(logit, np.float32), (n,)).copy(),
+        dc[:, None].astype(np.float32),
+    )

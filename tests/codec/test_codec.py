@@ -1,0 +1,308 @@
+"""Encoder and decoder together: every attribute within its step, deterministic, sections apart, old files for ever."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from potr_cl.codec import quantize
+from potr_cl.codec.container import Coder, EntropyCoder, Property
+from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.errors import DataError, UsageError
+from potr_cl.model.camera import camera_centres, train_views
+from potr_cl.model.scene import SH_COEFFICIENTS, Scene
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from tests.cases.scenes import random_scene, ring_of_cameras
+from tests.oracles.decoder import decode as decode_independently
+
+FAST = EntropyCoder("zstd", 1)
+KEEP = EncodeOptions(prune=False, compact=False)
+DATA = Path(__file__).parents[1] / "data"
+
+
+def joined(encoded) -> bytes:
+    return b"".join(encoded.pieces)
+
+
+def check_within_steps(source: Scene, decoded: Scene, order, parameters, tolerance):
+    """Every attribute within half a step, every centre within its tolerance; float32 rounds each once more."""
+    original = source.subset(order)
+    assert len(decoded) == len(source)
+    assert np.all(np.isfinite(decoded.means))
+
+    rounding = np.abs(original.means.astype(np.float64)).max(axis=1) * 2.0**-23
+    distance = np.linalg.norm(decoded.means.astype(np.float64) - original.means, axis=1)
+    limit = np.maximum(tolerance[order] if np.ndim(tolerance) else tolerance, rounding)
+    assert (distance <= limit + rounding).all()
+
+    imaginary, log_scales = quantize.canonical_rotations(original.quaternions, original.log_scales)
+    assert (np.abs(decoded.quaternions[:, 1:] - imaginary) <= 0.5 / parameters.sf_rotation + 1e-6).all()
+    scales = np.exp(log_scales.astype(np.float64))
+    error = np.abs(np.exp(decoded.log_scales.astype(np.float64)) - scales)
+    assert (error <= 0.5 / parameters.sf_scale + 1e-5 * scales).all()
+
+    opacity_error = np.abs(decoded.opacities.astype(np.float64) - original.opacities)
+    assert (opacity_error <= 0.75 / parameters.sf_opacity + 1e-6).all()  # half a step and the quarter's shift
+
+    for m in range(source.sh.shape[1]):
+        wanted = quantize.to_ycocg(original.sh[:, m].astype(np.float64))
+        got = quantize.to_ycocg(decoded.sh[:, m].astype(np.float64))
+        # The largest of the three sets the size of float32's rounding in all of them.
+        size = np.abs(original.sh[:, m].astype(np.float64)).max(axis=1) + 1
+        for w, g in zip(wanted, got, strict=True):
+            assert (np.abs(w - g) <= 0.5 / parameters.sf_sh + 1e-6 * size).all()
+
+
+def check_within_balanced_steps(source: Scene, data: bytes, order, tolerance):
+    """The same for version 2: steps as the header and the decoded scales say."""
+    header, decoded, original = PotrFile.from_bytes(data).header, decode(data), source.subset(order)
+    assert header.version == 2
+
+    rounding = np.abs(original.means.astype(np.float64)).max(axis=1) * 2.0**-23
+    distance = np.linalg.norm(decoded.means.astype(np.float64) - original.means, axis=1)
+    assert (distance <= np.maximum(tolerance, rounding) + rounding).all()
+
+    imaginary, log_scales = quantize.canonical_rotations(original.quaternions, original.log_scales)
+    scales, scales_back = np.exp(log_scales.astype(np.float64)), np.exp(decoded.log_scales.astype(np.float64))
+    assert (np.abs(scales_back - scales) <= 0.5 / header.sf_scale + 1e-5 * scales).all()
+    steps = np.round(scales_back * header.sf_scale)
+    factor = header.sf_rotation * np.sqrt(np.maximum(steps.max(axis=1, keepdims=True), 1))
+    ball = (steps.max(axis=1) == steps.min(axis=1))[:, None]
+    assert ((np.abs(decoded.quaternions[:, 1:] - imaginary) <= 0.5 / factor + 1e-5) | ball).all()
+
+    logits = np.clip(original.opacity_logits, -8, 12)
+    assert (np.abs(decoded.opacity_logits - logits) <= 0.5 / header.sf_opacity + 1e-5).all()
+    for m in range(source.sh.shape[1]):
+        factor = header.sf_dc if m == 0 else header.sf_ac
+        wanted = quantize.to_ycocg(original.sh[:, m].astype(np.float64))
+        got = quantize.to_ycocg(decoded.sh[:, m].astype(np.float64))
+        size = np.abs(original.sh[:, m].astype(np.float64)).max(axis=1) + 1
+        for w, g in zip(wanted, got, strict=True):
+            assert (np.abs(w - g) <= 0.5 / factor + 1e-6 * size).all()
+
+
+def typical_size(scene: Scene) -> float:
+    return float(np.median(np.exp(scene.log_scales.max(axis=1).astype(np.float64))))
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("entropy", [FAST, EntropyCoder("npz"), EntropyCoder("context")])
+@pytest.mark.parametrize("q", [0.0, 0.5, 1.0])
+def test_within_balanced_steps(degree, entropy, q):
+    scene = random_scene(1500, degree, seed=degree)
+    options = dataclasses.replace(KEEP, preset="best", q=q, entropy=entropy)
+    encoded = encode(scene, options=options)
+    data = joined(encoded)
+    context = any(s.coder == Coder.CONTEXT for s in PotrFile.from_bytes(data).header.sections)
+    assert context == (entropy.name == "context")
+    check_within_balanced_steps(scene, data, encoded.order, options.parameters.beta * typical_size(scene))
+
+
+def test_balanced_steps_do_not_depend_on_the_unit_of_length():
+    scene = random_scene(1500, 1)
+    millimetres = dataclasses.replace(
+        scene, means=scene.means * np.float32(1024), log_scales=scene.log_scales + np.float32(np.log(1024))
+    )
+    options = dataclasses.replace(KEEP, preset="best")
+    sizes = [encode(s, options=options).nbytes for s in (scene, millimetres)]
+    assert abs(sizes[0] - sizes[1]) < 0.002 * sizes[0]
+    again = decode(joined(encode(millimetres, options=options)))
+    assert np.abs(again.log_scales.max() - millimetres.log_scales.max()) < 0.1
+
+
+def test_version_1_has_no_context_coder():
+    data = joined(encode(random_scene(200), options=dataclasses.replace(KEEP, entropy=EntropyCoder("context"))))
+    file = PotrFile.from_bytes(data)
+    assert file.header.version == 1
+    assert all(s.coder != Coder.CONTEXT for s in file.header.sections)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("entropy", [FAST, EntropyCoder("npz")])
+@pytest.mark.parametrize("q", [0.0, 0.5, 1.0])
+def test_within_steps(degree, entropy, q):
+    scene = random_scene(500, degree, seed=degree)
+    options = dataclasses.replace(KEEP, q=q, entropy=entropy)
+    encoded = encode(scene, options=options)
+    assert encoded.nbytes == len(joined(encoded))
+    decoded = decode(joined(encoded))
+    assert decoded.sh_degree == degree
+    check_within_steps(scene, decoded, encoded.order, options.parameters, options.parameters.gamma)
+
+
+def test_within_the_criterion_of_the_cameras():
+    scene = random_scene(2000, 0, extent=20)
+    cameras = ring_of_cameras(12)
+    options = dataclasses.replace(KEEP, entropy=FAST)
+    eyes = camera_centres(train_views(cameras))
+    nearest = np.linalg.norm(scene.means[:, None].astype(np.float64) - eyes, axis=2).min(axis=1)
+    p = options.parameters
+    tolerance = np.maximum(p.gamma, p.beta * nearest)
+    encoded = encode(scene, cameras, options)
+    check_within_steps(scene, decode(joined(encoded)), encoded.order, p, tolerance)
+    # Coarser far away, and so smaller than without cameras.
+    assert encoded.nbytes < encode(scene, None, options).nbytes
+
+
+def test_test_views_do_not_matter():
+    scene = random_scene(300, 0, extent=20)
+    cameras = ring_of_cameras(12)
+    assert joined(encode(scene, cameras, KEEP)) == joined(encode(scene, train_views(cameras), KEEP))
+
+
+def test_no_training_view_is_an_error():
+    cameras = [c for c in ring_of_cameras(4) if c.split == "test"]
+    with pytest.raises(UsageError, match="training view"):
+        encode(random_scene(5), cameras)
+
+
+EXTREME = st.one_of(st.floats(-80, 14, width=32), st.sampled_from([0.0, -80.0, 14.0]))
+
+
+@settings(max_examples=150, deadline=None)
+@given(st.data(), st.integers(0, 3), st.integers(1, 30), st.floats(0, 1), st.booleans())
+def test_any_scene(data, degree, splats, q, balanced):
+    def array(shape, elements):
+        return data.draw(hnp.arrays(np.float32, shape, elements=elements))
+
+    # One value in common at times: coincident splats, constant streams.
+    coordinates = st.one_of(st.just(1.5), st.floats(-1e6, 1e6, width=32))
+    quaternions = array((splats, 4), st.floats(-2, 2, width=32))
+    quaternions[np.linalg.norm(quaternions, axis=1) < 1e-3] = (1, 0, 0, 0)
+    scene = Scene(
+        array((splats, 3), coordinates),
+        array((splats, 3), EXTREME),
+        quaternions,
+        array(splats, st.floats(-50, 50, width=32)),
+        array((splats, SH_COEFFICIENTS[degree], 3), st.floats(-1000, 1000, width=32)),
+    )
+    options = dataclasses.replace(KEEP, q=q, entropy=FAST)
+    if balanced:
+        # Both coders; the steps themselves are checked on scenes that have a typical size.
+        for entropy in (FAST, EntropyCoder("context")):
+            encoded = encode(scene, options=dataclasses.replace(options, preset="best", entropy=entropy))
+            assert len(decode(joined(encoded))) == splats
+        return
+    encoded = encode(scene, options=options)
+    check_within_steps(scene, decode(joined(encoded)), encoded.order, options.parameters, options.parameters.gamma)
+
+
+@pytest.mark.parametrize("preset", ["paper", "best"])
+def test_same_input_same_bytes_whatever_the_threads(preset):
+    scene = random_scene(3000)
+    first = joined(encode(scene, options=dataclasses.replace(KEEP, preset=preset, threads=1)))
+    for threads in (1, 2, 5):
+        assert joined(encode(scene, options=dataclasses.replace(KEEP, preset=preset, threads=threads))) == first
+    a, b = decode(first), PotrFile.from_bytes(first).scene(threads=1)
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        assert np.array_equal(getattr(a, name), getattr(b, name))
+
+
+def test_strides_do_not_matter():
+    scene = random_scene(200)
+    strided = Scene(
+        np.asfortranarray(scene.means),
+        scene.log_scales[:, ::-1].copy()[:, ::-1],
+        scene.quaternions,
+        scene.opacity_logits,
+        scene.sh.transpose(1, 2, 0).copy().transpose(2, 0, 1),
+    )
+    assert joined(encode(scene, options=KEEP)) == joined(encode(strided, options=KEEP))
+
+
+def test_decoding_again_loses_nothing_more():
+    """A decoded scene, encoded with the same steps, comes back the same: re-encoding does not wear a scene out."""
+    options = dataclasses.replace(KEEP, entropy=FAST)
+    once = decode(joined(encode(random_scene(400), options=options)))
+    encoded = encode(once, options=options)
+    twice = decode(joined(encoded))
+    expected = once.subset(encoded.order)
+    assert np.abs(twice.sh - expected.sh).max() < 1e-5
+    assert np.abs(twice.opacities - expected.opacities).max() < 1e-5
+    assert np.abs(np.sort(twice.scales, axis=1) - np.sort(expected.scales, axis=1)).max() < 1e-5
+
+
+@pytest.mark.parametrize("preset", ["paper", "best"])
+def test_sections_decode_alone(preset):
+    scene = random_scene(2000)
+    data = joined(encode(scene, options=dataclasses.replace(KEEP, preset=preset)))
+    whole = decode(data)
+    assert np.array_equal(PotrFile.from_bytes(data).means(), whole.means)
+    assert np.array_equal(PotrFile.from_bytes(data).log_scales(), whole.log_scales)
+    assert np.array_equal(PotrFile.from_bytes(data).quaternions(), whole.quaternions)
+    assert np.array_equal(PotrFile.from_bytes(data).opacity_logits(), whole.opacity_logits)
+    assert np.array_equal(PotrFile.from_bytes(data).sh(), whole.sh)
+    # A damaged colour does not keep the positions from decoding.
+    section = next(s for s in PotrFile.from_bytes(data).header.sections if s.kind == Property.SH and s.index >= 3)
+    damaged = bytearray(data)
+    damaged[section.offset] ^= 1
+    file = PotrFile.from_bytes(bytes(damaged))
+    assert np.array_equal(file.means(), whole.means)
+    with pytest.raises(DataError, match=f"'{section.name}' is damaged"):
+        file.scene()
+
+
+def test_zero_streams_take_no_bytes():
+    scene = random_scene(300)
+    quiet = Scene(scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh.copy())
+    quiet.sh[:, 4:] = 0
+    encoded = encode(quiet, options=KEEP)
+    kinds = [(s.kind, s.index) for s in PotrFile.from_bytes(joined(encoded)).header.sections]
+    assert max(index for kind, index in kinds if kind == Property.SH) < 12
+    assert (decode(joined(encoded)).sh[:, 4:] == 0).all()
+
+
+def test_progress_reaches_the_end():
+    seen = []
+    encode(random_scene(50), options=KEEP, progress=lambda stage, done: seen.append((stage, done)))
+    assert [s for s, d in seen if d == 1.0] == ["octree", "quantise and code"]
+    assert all(0 <= d <= 1 for _, d in seen)
+
+
+def agree(decoded: Scene, expected: dict[str, np.ndarray]) -> None:
+    opacities = 1 / (1 + np.exp(-decoded.opacity_logits.astype(np.float64)))
+    assert np.allclose(decoded.means, expected["means"], rtol=2e-7, atol=0)
+    assert np.allclose(np.exp(decoded.log_scales.astype(np.float64)), expected["scales"], rtol=3e-6, atol=0)
+    assert np.allclose(decoded.quaternions, expected["quaternions"], rtol=0, atol=1e-4)  # the root near w = 0
+    assert np.allclose(decoded.quaternions[:, 1:], expected["quaternions"][:, 1:], rtol=0, atol=1e-6)
+    assert np.allclose(opacities, expected["opacities"], rtol=0, atol=1e-6)
+    assert np.allclose(decoded.sh, expected["sh"], rtol=1e-6, atol=1e-6)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("preset", ["paper", "fast", "best"])
+def test_independent_decoder_agrees(degree, preset):
+    scene = random_scene(600, degree)
+    scene = scene.subset(np.r_[np.arange(600), [0, 0, 7]])
+    refitted = EncodeOptions.for_preset(preset, prune=False, compact=False)
+    as_they_are = dataclasses.replace(refitted, refit=0)  # without cameras: a re-fit would place hundreds
+    for cameras, options in ((None, as_they_are), (ring_of_cameras(8), refitted)):
+        data = joined(encode(scene, cameras, options))
+        agree(decode(data), decode_independently(data))
+
+
+GOLDEN = sorted(DATA.glob("golden_v*.potr"))
+
+
+def test_there_are_golden_files():
+    assert len(GOLDEN) >= 6
+
+
+@pytest.mark.parametrize("path", GOLDEN, ids=lambda p: p.stem)
+def test_golden_files_decode_for_ever(path):
+    with np.load(path.with_suffix(".npz")) as expected:
+        agree(decode(path), dict(expected))
+
+
+@pytest.mark.parametrize("path", GOLDEN, ids=lambda p: p.stem)
+def test_golden_metadata(path):
+    assert isinstance(PotrFile.open(path).metadata, dict)
+    json.dumps(PotrFile.open(path).metadata)

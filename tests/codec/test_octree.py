@@ -1,0 +1,154 @@
+"""Octree: every centre within its tolerance, the order a permutation, damaged streams refused."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from potr_cl.codec import octree
+from potr_cl.errors import DataError
+
+
+def roundtrip(means, tolerance, absolute=False):
+    """Build, parse, and check what must hold for every scene."""
+    means = np.asarray(means, np.float32)
+    streams, order = octree.build(means, tolerance, absolute)
+    parsed = octree.parse(streams, len(means))
+    assert sorted(order) == list(range(len(means)))
+    source = means[order].astype(np.float64)
+    # The format cannot beat what float32 holds: one rounding in the limit, one in the result.
+    rounding = np.abs(source).max(axis=1) * 2.0**-23
+    limit = np.maximum(tolerance[order] if np.ndim(tolerance) else tolerance, rounding)
+    distance = np.linalg.norm(parsed.astype(np.float64) - source, axis=1)
+    assert (distance <= limit + rounding).all()
+    return streams, order, parsed
+
+
+RNG = np.random.default_rng(7)
+SHELL = RNG.normal(size=(500, 3))
+SHELL /= np.linalg.norm(SHELL, axis=1, keepdims=True)
+ADVERSARIAL = {
+    "one splat": (RNG.normal(size=(1, 3)), 1e-3),
+    "two far apart": ([[-1, 0, 0], [1, 0, 0]], 1e-6),
+    "two in one tolerance": ([[0, 0, 0], [1e-5, 0, 0]], 1e-3),
+    "all coincident": (np.full((50, 3), 3.7), 1e-4),
+    "groups of coincident": (np.repeat(RNG.normal(size=(20, 3)), 3, axis=0), 1e-4),
+    "on a line": (RNG.normal(size=(300, 1)) * [1, 0, 0], 1e-5),
+    "on a diagonal": (RNG.normal(size=(300, 1)) * [1, 1, 1], 1e-5),
+    "on a plane": (RNG.normal(size=(300, 3)) * [1, 1, 0], 1e-5),
+    "on a grid of cell corners": (np.stack(np.meshgrid(*[np.arange(8)] * 3), -1).reshape(-1, 3), 1e-3),
+    "coordinates of 1e6": (RNG.normal(size=(300, 3)) * 1e6, 1e-5),
+    "far from the origin": (RNG.normal(size=(300, 3)) + 1e6, 1e-6),
+    "clusters 1e-6 apart": (np.repeat(RNG.normal(size=(30, 3)), 10, 0) + RNG.normal(size=(300, 3)) * 1e-6, 1e-4),
+    "a cluster of 1e-6 and one at 1e6": (np.vstack([RNG.normal(size=(200, 3)) * 1e-6, [[1e6] * 3]]), 5e-8),
+    "24 levels": (np.vstack([RNG.uniform(0, 2.0**-22, size=(200, 3)), [[1, 1, 1]]]), 2.0**-25),
+    "52 levels and more": (np.vstack([RNG.uniform(0, 1e-6, size=(50, 3)), [[1e12, 0, 0]]]), 1e-9),
+    "denormal extent": (RNG.uniform(0, 1e-38, size=(20, 3)), 1e-9),
+    "largest floats": (RNG.uniform(-1, 1, size=(20, 3)) * 1e37, 1.0),
+    "a shell": (SHELL, 1e-4),
+    "a chain of halvings": (np.stack([2.0 ** -np.arange(40.0)] * 3, 1), 1e-13),
+}
+
+
+@pytest.mark.parametrize("name", ADVERSARIAL)
+def test_adversarial(name):
+    if name == "52 levels and more":
+        # 1e12 against 1e-9 asks for 71 levels; float64 tells 52 apart. Everything else must still hold.
+        means, tolerance = np.asarray(ADVERSARIAL[name][0], np.float32), ADVERSARIAL[name][1]
+        streams, order = octree.build(means, tolerance)
+        parsed = octree.parse(streams, len(means))
+        assert streams.depth == octree.DEEPEST_LEVEL
+        assert np.abs(parsed - means[order]).max() <= 1e12 * 2.0**-23
+        return
+    roundtrip(*ADVERSARIAL[name])
+    roundtrip(*ADVERSARIAL[name], absolute=True)
+
+
+def test_tolerance_for_each_splat():
+    means = RNG.normal(size=(2000, 3))
+    roundtrip(means, RNG.uniform(1e-5, 1e-1, size=2000))
+
+
+def test_deterministic_whatever_the_order_of_coincident_splats():
+    means = np.repeat(RNG.normal(size=(100, 3)), 2, axis=0).astype(np.float32)
+    first, order = octree.build(means, 1e-4)
+    again, order_again = octree.build(means.copy(), 1e-4)
+    assert np.array_equal(order, order_again)
+    for field in dataclasses.fields(first):
+        assert np.array_equal(getattr(first, field.name), getattr(again, field.name))
+
+
+def test_order_is_depth_first():
+    """Against a recursive walk of the paper's octree."""
+    means = RNG.uniform(-1, 1, size=(300, 3)).astype(np.float32)
+    streams, order = octree.build(means, 1e-3)
+
+    def walk(indices, corner, edge, level):
+        if len(indices) <= 1 or level == streams.depth:
+            return list(indices)
+        half = edge / 2
+        out = []
+        for child in range(8):
+            low = corner + half * np.array([child & 1, child >> 1 & 1, child >> 2 & 1])
+            inside = [
+                k for k in indices if all((means[k].astype(float) >= low) == [True] * 3) and
+                all(means[k].astype(float) < low + half + (low + half >= corner + edge) * 1e-9)
+            ]  # fmt: skip
+            out += walk(inside, low, half, level + 1)
+        return out
+
+    expected = walk(range(len(means)), np.array(streams.origin), streams.side, 0)
+    assert list(order) == expected
+
+
+COORDINATE = st.one_of(
+    st.floats(-1e6, 1e6, width=32), st.sampled_from([0.0, 1.0, -1.0, 1e6, -1e6, 1e-6, 2.0**-24, 0.5])
+)
+
+
+@settings(max_examples=300, deadline=None)
+@given(
+    hnp.arrays(np.float32, st.tuples(st.integers(1, 40), st.just(3)), elements=COORDINATE),
+    st.floats(1e-7, 1e3),
+)
+def test_any_scene(means, tolerance):
+    roundtrip(means, tolerance)
+
+
+@settings(max_examples=500, deadline=None)
+@given(st.data())
+def test_damaged_streams_are_refused_or_parse_to_the_right_count(data):
+    means = np.vstack([SHELL[:30], np.zeros((3, 3))]).astype(np.float32)
+    streams, _ = octree.build(means, 1e-3)
+    field = data.draw(st.sampled_from(["occupancy", "several", "multiplicities", "tail_lengths", "tails", "depth"]))
+    value = getattr(streams, field)
+    if field == "depth":
+        damaged = data.draw(st.integers(0, 52))
+    else:
+        damaged = value.copy()
+        how = data.draw(st.sampled_from(["change", "cut", "extend"]))
+        if how == "change" and len(damaged):
+            damaged[data.draw(st.integers(0, len(damaged) - 1))] = data.draw(st.integers(0, 255))
+        elif how == "cut":
+            damaged = damaged[: data.draw(st.integers(0, len(damaged)))]
+        else:
+            damaged = np.append(damaged, np.array(data.draw(st.integers(0, 255)), damaged.dtype))
+    hostile = dataclasses.replace(streams, **{field: damaged})
+    try:
+        parsed = octree.parse(hostile, len(means))
+    except DataError:
+        return
+    assert parsed.shape == (len(means), 3)
+    assert np.isfinite(parsed).all()
+
+
+def test_a_multiplicity_that_lies_takes_no_memory():
+    streams, _ = octree.build(np.zeros((5, 3), np.float32), 1e-3)
+    hostile = dataclasses.replace(streams, multiplicities=np.array([2**63], np.uint64))
+    with pytest.raises(DataError, match="the header says 5"):
+        octree.parse(hostile, 5)

@@ -1,0 +1,165 @@
+"""Quantiser: half a step at the most, rotations that leave the covariance as it is, hyper-parameters of the paper."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from hypothesis.extra import numpy as hnp
+
+from potr_cl.codec import quantize
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.errors import DataError, UsageError
+
+HALF = 0.5 + 1e-6  # steps; the float32 result adds its own rounding, checked apart
+
+
+def covariance(quaternions, log_scales):
+    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).T
+    rotation = np.array(
+        [
+            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+        ]
+    ).transpose(2, 0, 1)
+    half = rotation * np.exp(log_scales)[:, None, :]
+    return half @ half.transpose(0, 2, 1)
+
+
+def test_paper_values():
+    p = HyperParameters.from_quality(0.5)
+    assert (p.sf_sh, p.sf_opacity, p.sf_rotation, p.sf_scale) == (51, 101, 201, 2001)
+    assert p.beta == pytest.approx(7e-5)
+    assert p.gamma == pytest.approx(5e-3 * 10**-2.5)
+    assert p.lam == pytest.approx(10**-0.5)
+    assert p.alpha == pytest.approx(0.8175745)
+    assert p.delta_mse_max == pytest.approx(10**-9.8)
+    low = HyperParameters.from_quality(0)
+    assert (low.beta, low.gamma, low.sf_sh) == (0, 5e-3, 1)
+
+
+def test_single_values_replace():
+    p = HyperParameters.from_quality(0.5, sf_sh=20, beta=None)
+    assert p.sf_sh == 20
+    assert p.beta == pytest.approx(7e-5)
+
+
+def test_one_factor_for_all_of_sh_in_the_paper():
+    assert HyperParameters.from_quality(0.5, sf_sh=20).sf_dc == 20
+    assert HyperParameters.from_quality(0.5, sf_sh=20, sf_dc=30).sf_dc == 30
+    best = HyperParameters.from_quality(0.5, "best")
+    assert HyperParameters.from_quality(0.5, "best", sf_sh=20).sf_dc == best.sf_dc
+
+
+def test_presets():
+    assert HyperParameters.from_quality(0.5).version == 1
+    assert HyperParameters.from_quality(0.3, "best") == HyperParameters.from_quality(0.3, "fast")
+    coarse, fine = (HyperParameters.from_quality(q, "best") for q in (0.2, 0.7))
+    assert coarse.version == fine.version == 2
+    for name in ("sf_dc", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale"):
+        assert getattr(coarse, name) < getattr(fine, name)
+    assert coarse.beta > fine.beta
+    with pytest.raises(UsageError, match="preset"):
+        HyperParameters.from_quality(0.5, "smallest")
+
+
+def test_logits_come_back_within_half_a_step():
+    logits = np.linspace(-8, 12, 1001)
+    back = quantize.dequantize_logits(quantize.quantize_logits(logits, 5.5), 5.5)
+    assert np.abs(back - logits).max() <= 0.5 / 5.5 + 2e-6  # float32 rounds numbers up to 20
+    extremes = quantize.dequantize_logits(quantize.quantize_logits(np.array([-50.0, 50.0]), 5.5), 5.5)
+    assert np.allclose(extremes, (-8, 12), atol=HALF / 5.5)
+
+
+def test_long_splats_have_finer_rotations():
+    factors = quantize.rotation_factors([np.array([0, 1, 16]), np.array([0, 0, 3]), np.array([0, 1, 100])], 9.5)
+    assert np.allclose(factors, [9.5, 9.5, 95])
+
+
+@pytest.mark.parametrize("bad", [{"q": -0.1}, {"q": 1.1}, {"q": float("nan")}, {"gamma": 0}, {"sf_sh": 0},
+                                 {"sf_scale": float("inf")}, {"beta": -1}])  # fmt: skip
+def test_out_of_range(bad):
+    with pytest.raises(UsageError):
+        HyperParameters.from_quality(**{"q": 0.5, **bad})
+
+
+QUATERNIONS = hnp.arrays(
+    np.float32, st.tuples(st.integers(1, 30), st.just(4)), elements=st.floats(-1, 1, width=32)
+).filter(lambda q: (np.linalg.norm(q, axis=1) > 1e-3).all())
+
+
+@settings(deadline=None)
+@given(QUATERNIONS, st.integers(0, 2**32 - 1))
+def test_canonical_rotation_leaves_the_covariance(quaternions, seed):
+    log_scales = np.random.default_rng(seed).uniform(-8, 2, size=(len(quaternions), 3)).astype(np.float32)
+    imaginary, scales = quantize.canonical_rotations(quaternions, log_scales)
+    real = np.sqrt(np.maximum(0, 1 - (imaginary**2).sum(axis=1)))
+    assert (real >= 0.85).all()
+    canonical = np.concatenate([real[:, None], imaginary], axis=1)
+    expected = covariance(quaternions.astype(np.float64), log_scales.astype(np.float64))
+    got = covariance(canonical, scales.astype(np.float64))
+    size = np.abs(expected).max(axis=(1, 2), keepdims=True)
+    assert (np.abs(got - expected) <= 1e-6 * size).all()
+
+
+@given(hnp.arrays(np.float64, st.integers(1, 50), elements=st.floats(-20, 20)), st.floats(1, 4001))
+def test_scales(log_scales, sf):
+    back = quantize.dequantize_scales(quantize.quantize_scales(log_scales, sf), sf)
+    true = np.exp(log_scales)
+    assert back.dtype == np.float32
+    assert np.isfinite(back).all()
+    # A logarithm of size 20 in float32 is good to 1e-6 of the value.
+    assert (np.abs(np.exp(back.astype(np.float64)) - true) <= HALF / sf + 3e-6 * true).all()
+
+
+@given(hnp.arrays(np.float64, st.integers(1, 50), elements=st.floats(-60, 60)), st.floats(1, 201))
+def test_opacities(logits, sf):
+    back = quantize.dequantize_opacities(quantize.quantize_opacities(logits, sf), sf)
+    assert np.isfinite(back).all()
+    opacity = 1 / (1 + np.exp(-back.astype(np.float64)))
+    true = 1 / (1 + np.exp(-logits))
+    # Half a step, and the quarter by which the paper shifts the reconstruction.
+    assert (np.abs(opacity - true) <= (HALF + 0.25) / sf + 1e-6).all()
+
+
+@given(hnp.arrays(np.float64, (20, 3), elements=st.floats(-100, 100)), st.floats(1, 101))
+def test_sh(rgb, sf):
+    for values in quantize.to_ycocg(rgb):
+        steps = quantize.quantize_sh(values, sf)
+        assert (np.abs(steps / sf - values) <= HALF / sf).all()
+
+
+def test_ycocg_is_undone_by_the_formats_sums():
+    rgb = np.random.default_rng(0).normal(size=(100, 3))
+    y, co, cg = quantize.to_ycocg(rgb)
+    assert np.allclose(np.stack([y + co - cg, y + cg, y - co - cg], 1), rgb)
+
+
+def test_rotation_error_bounded_by_steps():
+    rng = np.random.default_rng(3)
+    quaternions = rng.normal(size=(5000, 4)).astype(np.float32)
+    imaginary, _ = quantize.canonical_rotations(quaternions, np.zeros((5000, 3), np.float32))
+    out = np.empty((5000, 4), np.float32)
+    steps = [quantize.quantize_rotations(imaginary[:, a], 201) for a in range(3)]
+    quantize.dequantize_rotations(steps, 201, out)
+    assert (np.abs(out[:, 1:] - imaginary) <= HALF / 201).all()
+    assert np.allclose(np.linalg.norm(out, axis=1), 1, atol=1e-6)
+
+
+def test_absurd_values_are_errors():
+    with pytest.raises(DataError, match="too large"):
+        quantize.quantize_sh(np.array([1e30]), 51)
+    with pytest.raises(DataError, match="too large"):
+        quantize.quantize_scales(np.array([1000.0]), 2001)
+
+
+def test_ac_sparsity():
+    sh = np.zeros((4, 4, 3), np.float32)
+    assert quantize.ac_sparsity(sh, 51) == 1
+    sh[0, 1] = 1  # a grey: Y only
+    assert quantize.ac_sparsity(sh, 51) == 35 / 36
+    sh[:, 0] = 5  # DC does not count
+    assert quantize.ac_sparsity(sh, 51) == 35 / 36
+    assert quantize.ac_sparsity(sh[:, :1], 51) == 1

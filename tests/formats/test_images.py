@@ -1,0 +1,124 @@
+"""Photographs of every kind and damage, PNG files, colours."""
+
+from __future__ import annotations
+
+import io
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from potr_cl.errors import DataError, UsageError
+from potr_cl.formats.images import image_size, parse_colour, read_photograph, to_8_bits, write_png
+
+
+def random_pixels(channels, seed=0):
+    return np.random.default_rng(seed).integers(0, 256, (7, 9, channels), dtype=np.uint8)
+
+
+def test_rgb(tmp_path):
+    pixels = random_pixels(3)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    image = read_photograph(tmp_path / "a.png", (1, 1, 1))
+    assert image.dtype == np.float32
+    assert np.array_equal(image, pixels.astype(np.float32) / np.float32(255))
+    assert image_size(tmp_path / "a.png") == (9, 7)
+
+
+def test_alpha_shows_the_background(tmp_path):
+    pixels = random_pixels(4)
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    background = np.array([1, 0.5, 0])
+    alpha = pixels[..., 3:] / 255
+    expected = pixels[..., :3] / 255 * alpha + background * (1 - alpha)
+    assert np.abs(read_photograph(tmp_path / "a.png", (1, 0.5, 0)) - expected).max() < 1e-6
+    assert np.abs(read_photograph(tmp_path / "a.png") - pixels[..., :3] / 255 * alpha).max() < 1e-6
+
+
+def test_palette_with_a_transparent_colour(tmp_path):
+    image = Image.new("P", (4, 4), 1)
+    image.putpalette([255, 0, 0, 0, 255, 0])
+    image.save(tmp_path / "a.png", transparency=1)
+    assert np.array_equal(read_photograph(tmp_path / "a.png", (0, 0, 1)), np.full((4, 4, 3), (0, 0, 1)))
+
+
+def test_grey_is_every_channel(tmp_path):
+    pixels = random_pixels(1)[..., 0]
+    Image.fromarray(pixels).save(tmp_path / "a.png")
+    assert np.array_equal(to_8_bits(read_photograph(tmp_path / "a.png")), np.stack([pixels] * 3, axis=-1))
+
+
+def test_deep_images_are_refused(tmp_path):
+    Image.fromarray(np.arange(63, dtype=np.uint16).reshape(7, 9)).save(tmp_path / "a.png")
+    Image.fromarray(np.ones((7, 9), np.float32)).save(tmp_path / "a.tif")
+    for name in ("a.png", "a.tif"):
+        with pytest.raises(DataError, match="more than 8 bits"):
+            read_photograph(tmp_path / name)
+
+
+@pytest.mark.parametrize("form", ["PNG", "JPEG"])
+def test_damaged_files(tmp_path, form):
+    path = tmp_path / "a"
+    buffer = io.BytesIO()
+    Image.fromarray(random_pixels(3).repeat(20, axis=0)).save(buffer, form)
+    whole = buffer.getvalue()
+    for content in (b"", b"not an image", whole[:10], whole[: len(whole) // 2], bytes(200)):
+        path.write_bytes(content)
+        with pytest.raises(DataError, match="damaged or of another kind"):
+            read_photograph(path)
+
+
+def test_a_size_that_would_not_fit_memory(tmp_path):
+    path = tmp_path / "a.bmp"
+    Image.fromarray(random_pixels(3)).save(path)
+    data = bytearray(path.read_bytes())
+    data[18:26] = (50_000).to_bytes(4, "little") * 2
+    path.write_bytes(data)
+    with pytest.raises(DataError, match="damaged or of another kind"):
+        read_photograph(path)
+
+
+def test_no_such_file(tmp_path):
+    for path in (tmp_path / "none.png", tmp_path):
+        with pytest.raises(UsageError, match="cannot read"):
+            image_size(path)
+
+
+def test_8_bits_are_clamped_and_rounded():
+    assert to_8_bits(np.array([-1, 0, 0.4999 / 255, 0.5001 / 255, 254.6 / 255, 1, 9])).tolist() == [
+        0,
+        0,
+        0,
+        1,
+        255,
+        255,
+        255,
+    ]
+
+
+def test_png_keeps_pixels_and_text():
+    pixels, file = random_pixels(3), io.BytesIO()
+    write_png(file, pixels, "what it shows")
+    with Image.open(file) as image:
+        assert np.array_equal(np.asarray(image), pixels)
+        assert image.text == {"Description": "what it shows"}
+
+
+@pytest.mark.parametrize(
+    ("text", "colour"),
+    [
+        ("0,0.5,1", (0, 0.5, 1)),
+        (" 1, 1, 1 ", (1, 1, 1)),
+        ("white", (1, 1, 1)),
+        ("#ff0033", (1, 0, 0.2)),
+        ("#fff", (1, 1, 1)),
+    ],
+)
+def test_colours(text, colour):
+    assert parse_colour(text) == pytest.approx(colour)
+
+
+@pytest.mark.parametrize("text", ["", "1,1", "2,0,0", "nan,0,0", "-1,0,0", "blurple", "#12", "1,1,1,1"])
+def test_no_colours(text):
+    with pytest.raises(UsageError, match="is no colour"):
+        parse_colour(text)

@@ -1,0 +1,112 @@
+"""Writing a file whole or not at all."""
+
+from __future__ import annotations
+
+import errno
+import os
+import stat
+from pathlib import Path
+
+import pytest
+
+from potr_cl.errors import PotrError, UsageError
+from potr_cl.host.atomic_write import replacing
+
+
+def _write_half_then_raise(target: Path, failure: BaseException) -> None:
+    with replacing(target) as file:
+        file.write(b"half")
+        raise failure
+
+
+def test_writes_a_new_file_with_the_umask(tmp_path: Path) -> None:
+    target = tmp_path / "out.bin"
+    old = os.umask(0o027)
+    try:
+        with replacing(target) as file:
+            file.write(b"head")
+            file.write(b"body")
+            file.seek(0)
+            file.write(b"HE")
+    finally:
+        os.umask(old)
+    assert target.read_bytes() == b"HEadbody"
+    assert stat.S_IMODE(target.stat().st_mode) == 0o640
+    assert os.listdir(tmp_path) == ["out.bin"]
+
+
+def test_replaces_and_keeps_the_permissions(tmp_path: Path) -> None:
+    target = tmp_path / "out.bin"
+    target.write_bytes(b"old")
+    target.chmod(0o604)
+    with replacing(str(target)) as file:
+        file.write(b"new")
+        assert target.read_bytes() == b"old"
+    assert target.read_bytes() == b"new"
+    assert stat.S_IMODE(target.stat().st_mode) == 0o604
+
+
+@pytest.mark.parametrize("failure", [KeyboardInterrupt(), ValueError("x"), SystemExit(3)])
+def test_a_failing_block_leaves_everything_as_it_was(tmp_path: Path, failure: BaseException) -> None:
+    target = tmp_path / "out.bin"
+    target.write_bytes(b"old")
+    with pytest.raises(type(failure)):
+        _write_half_then_raise(target, failure)
+    assert target.read_bytes() == b"old"
+    assert os.listdir(tmp_path) == ["out.bin"]
+
+
+def test_disk_full_is_one_clear_line(tmp_path: Path) -> None:
+    target = tmp_path / "out.bin"
+    with pytest.raises(PotrError, match=r"cannot write '.*out\.bin': No space left on device") as caught:
+        _write_half_then_raise(target, OSError(errno.ENOSPC, os.strerror(errno.ENOSPC)))
+    assert caught.value.exit_code == 1
+    assert os.listdir(tmp_path) == []
+
+
+@pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")
+def test_disk_full_while_closing(tmp_path: Path) -> None:
+    """The buffered bytes meet the full disk only when the file is closed."""
+
+    def write() -> None:
+        with replacing(tmp_path / "out.bin") as file:
+            full = os.open("/dev/full", os.O_WRONLY)
+            os.dup2(full, file.fileno())
+            os.close(full)
+            file.write(b"buffered")
+
+    with pytest.raises(PotrError, match="No space left"):
+        write()
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_symbolic_link_is_followed(tmp_path: Path) -> None:
+    (tmp_path / "real.bin").write_bytes(b"old")
+    (tmp_path / "link.bin").symlink_to("real.bin")
+    with replacing(tmp_path / "link.bin") as file:
+        file.write(b"new")
+    assert (tmp_path / "link.bin").is_symlink()
+    assert (tmp_path / "real.bin").read_bytes() == b"new"
+
+
+def test_refuses_what_is_no_file(tmp_path: Path) -> None:
+    os.mkfifo(tmp_path / "fifo")
+    (tmp_path / "file").write_bytes(b"")
+    for path, message in [
+        (tmp_path, "is a directory"),
+        (tmp_path / "fifo", "not a regular file"),
+        (Path(os.devnull), "not a regular file"),
+        (tmp_path / "missing" / "out.bin", "folder '.*missing' does not exist"),
+        (tmp_path / "file" / "out.bin", "folder '.*file' does not exist"),
+        (tmp_path / ("x" * 300), "File name too long"),
+    ]:
+        with pytest.raises(UsageError, match=message), replacing(path) as file:
+            file.write(b"x")
+    assert sorted(os.listdir(tmp_path)) == ["fifo", "file"]
+
+
+def test_a_name_as_long_as_the_file_system_allows(tmp_path: Path) -> None:
+    target = tmp_path / ("x" * 255)
+    with replacing(target) as file:
+        file.write(b"x")
+    assert target.read_bytes() == b"x"

@@ -1,0 +1,102 @@
+"""Scene: shapes that belong together, activation without overflow, cleaning that counts."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.errors import DataError
+from potr_cl.model.scene import Scene
+from tests.cases.scenes import random_scene
+
+
+def test_degrees_and_sizes():
+    for degree, coefficients in enumerate((1, 4, 9, 16)):
+        scene = random_scene(7, degree)
+        assert (len(scene), scene.sh_degree) == (7, degree)
+        assert scene.nbytes == 7 * 4 * (11 + 3 * coefficients)
+
+
+@pytest.mark.parametrize(
+    ("name", "array"),
+    [
+        ("log_scales", np.zeros((7, 2), np.float32)),
+        ("quaternions", np.zeros((6, 4), np.float32)),
+        ("opacity_logits", np.zeros((7, 1), np.float32)),
+        ("sh", np.zeros((7, 5, 3), np.float32)),
+        ("sh", np.zeros((7, 16, 4), np.float32)),
+        ("means", np.zeros((7, 3), np.float64)),
+    ],
+)
+def test_arrays_that_do_not_belong_together(name, array):
+    with pytest.raises(DataError, match=name if array.shape != (7, 5, 3) else "coefficients"):
+        dataclasses.replace(random_scene(7), **{name: array})
+
+
+def test_activation():
+    scene = random_scene(3, 0)
+    logits = np.array([-200, 0, 200], np.float32)
+    scene = dataclasses.replace(scene, opacity_logits=logits)
+    with np.errstate(all="raise", under="ignore"):
+        assert np.allclose(scene.opacities, [0, 0.5, 1])
+    assert np.allclose(scene.scales, np.exp(scene.log_scales))
+
+
+@pytest.mark.parametrize("splats", [1, 5, 40000])
+@pytest.mark.parametrize("value", [np.nan, np.inf, -np.inf])
+def test_non_finite_splats_are_dropped_and_counted(splats, value):
+    rng = np.random.default_rng(splats)
+    scene = random_scene(splats + 5, 2)
+    bad = rng.choice(splats + 5, 5, replace=False)
+    scene.means[bad[0], 1] = value
+    scene.log_scales[bad[1], 2] = value
+    scene.quaternions[bad[2], 3] = value
+    scene.opacity_logits[bad[3]] = np.nan
+    scene.sh[bad[4], 8, 2] = value
+    for strided in (scene, dataclasses.replace(scene, sh=np.asfortranarray(scene.sh))):
+        clean, report = strided.cleaned()
+        assert (len(clean), report.non_finite, report.zero_quaternions) == (splats, 5, 0)
+        kept = np.setdiff1d(np.arange(splats + 5), bad)
+        assert np.array_equal(clean.sh, scene.sh[kept])
+        assert np.array_equal(clean.means, scene.means[kept])
+
+
+def test_infinite_opacity_logits_become_finite():
+    scene = random_scene(4)
+    scene.opacity_logits[:3] = np.inf, -np.inf, 1
+    scene.means[3] = np.nan
+    clean, report = scene.cleaned()
+    assert (len(clean), report.non_finite, report.infinite_opacities) == (3, 1, 2)
+    assert np.isfinite(clean.opacity_logits).all()
+    assert clean.opacities[0] == 1
+    assert 0 <= clean.opacities[1] < 1e-8
+    assert clean.opacity_logits[2] == 1
+    assert np.isinf(scene.opacity_logits[:2]).all()
+
+
+def test_zero_quaternions_become_the_identity():
+    scene = random_scene(4)
+    scene.quaternions[1] = 0
+    scene.quaternions[2] = 1e-20
+    before = scene.quaternions.copy()
+    clean, report = scene.cleaned()
+    assert report.zero_quaternions == 2
+    assert clean.quaternions[1:3].tolist() == [[1, 0, 0, 0]] * 2
+    assert np.array_equal(scene.quaternions, before)
+
+
+def test_a_clean_scene_is_not_copied():
+    scene = random_scene(4)
+    assert scene.cleaned()[0] is scene
+
+
+def test_nothing_left_is_an_error():
+    scene = random_scene(2)
+    scene.means[:] = np.nan
+    with pytest.raises(DataError, match="no splat"):
+        scene.cleaned()
+    empty = Scene(*(getattr(scene, f.name)[:0] for f in dataclasses.fields(scene)))
+    with pytest.raises(DataError, match="no splat"):
+        empty.cleaned()

@@ -1,0 +1,300 @@
+"""Virtual cameras: they see what matters, from where it was made to be seen, and nothing upsets them."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.errors import UsageError
+from potr_cl.formats import load_cameras, load_scene
+from potr_cl.model import virtual_cameras
+from potr_cl.model.camera import camera_centres, test_views, train_views
+from potr_cl.model.scene import Scene
+from potr_cl.model.virtual_cameras import describe, is_virtual, place_cameras, standpoints
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.rasterizer import INRIA
+from tests.cases.scenes import random_scene
+from tests.cases.surfaces import box, flat_splats, sphere, together
+from tests.oracles.raster import sh_basis
+
+BALL = sphere(8000, 1.0, 0.03)
+ROOM = box(12000, (3, 4, 1.5), 0.08)
+INSIDE_ROOM = np.array([3, 4, 1.5])
+#: Outward normals of the room's splats.
+WALLS = np.sign(ROOM.means) * (np.abs(ROOM.means) > INSIDE_ROOM - 1e-3)
+
+
+def in_view(scene: Scene, camera) -> np.ndarray:
+    """(N,) whether each centre is in the picture and beyond the near plane."""
+    t = scene.means.astype(np.float64) @ camera.rotation.T + camera.translation
+    with np.errstate(divide="ignore", invalid="ignore"):
+        u, v = camera.fx * t[:, 0] / t[:, 2] + camera.cx, camera.fy * t[:, 1] / t[:, 2] + camera.cy
+    return (t[:, 2] > INRIA.near) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
+
+
+def times_seen(scene: Scene, normals: np.ndarray, cameras) -> np.ndarray:
+    """(N,) how many cameras see the side of each splat to which its normal points, of a surface that hides nothing."""
+    count = np.zeros(len(scene), int)
+    for camera in cameras:
+        facing = np.einsum("ij,ij->i", camera.centre - scene.means, normals) > 0
+        count += facing & in_view(scene, camera)
+    return count
+
+
+def outside_ball(cameras):
+    return [c for c in cameras if np.linalg.norm(c.centre) > 1]
+
+
+def inside_room(cameras):
+    return [c for c in cameras if (np.abs(c.centre) < INSIDE_ROOM).all()]
+
+
+def trained(scene: Scene, normals: np.ndarray, eyes: np.ndarray, degree: int = 3) -> Scene:
+    """The scene with coefficients that training from these eyes could give.
+
+    They are random sums of the basis functions in the directions of the eyes in front of a splat.
+    """
+    rng = np.random.default_rng(0)
+    sh = np.zeros((len(scene), (degree + 1) ** 2, 3))
+    for eye in eyes:
+        towards = scene.means - eye
+        facing = np.einsum("ij,ij->i", towards, normals) < 0
+        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
+        steps = facing[:, None, None] * rng.normal(0, 0.02, (len(scene), 1, 3))
+        sh += sh_basis(towards, degree)[:, :, None] * steps
+    return dataclasses.replace(scene, sh=sh.astype(np.float32))
+
+
+@pytest.fixture(scope="module")
+def around_ball():
+    return place_cameras(BALL)
+
+
+def test_an_object_is_seen_from_all_sides(around_ball):
+    outside = outside_ball(train_views(around_ball))
+    assert len(outside) >= 50
+    assert times_seen(BALL, BALL.means, outside).min() >= 4
+    # It fills a good part of the picture.
+    assert np.median([np.mean(in_view(BALL, c)) for c in outside]) > 0.7
+    assert max(np.linalg.norm(c.centre) for c in outside) < 5
+
+
+def test_names_and_splits(around_ball):
+    assert (len(train_views(around_ball)), len(test_views(around_ball))) == (300, 37)
+    assert len({c.name for c in around_ball}) == 337
+    assert {(c.width, c.height) for c in around_ball} == {(600, 600)}
+    assert is_virtual(around_ball)
+    assert not is_virtual([])
+    assert not is_virtual([dataclasses.replace(around_ball[0], name="photo")])
+    assert describe(around_ball).startswith("300 virtual views and 37 to judge by placed ")
+    few = place_cameras(BALL, 5, 64)
+    assert [c.split for c in few] == ["train"] * 5
+    assert few[0].width == 64
+    assert "judge" not in describe(few)
+
+
+@pytest.mark.slow
+def test_large_scenes_get_fewer_and_larger_views(monkeypatch):
+    def placed(splats_times_views: int) -> tuple[int, int]:
+        monkeypatch.setattr(virtual_cameras, "_SPLATS_TIMES_VIEWS", splats_times_views)
+        cameras = place_cameras(BALL)
+        return len(train_views(cameras)), cameras[0].width
+
+    assert placed(150 * len(BALL)) == (150, 849)
+    assert placed(20 * len(BALL)) == (100, 1000)
+
+
+def test_standpoints(around_ball):
+    given = [dataclasses.replace(c, name="photo") for c in around_ball]
+    assert np.array_equal(standpoints(given, BALL.means), camera_centres(given))
+    places = standpoints(around_ball, BALL.means)
+    assert places.shape == (337, 4, 3)
+    assert np.allclose(places.mean(axis=1), camera_centres(around_ball))
+    away = np.linalg.norm(places - camera_centres(around_ball)[:, None], axis=2)
+    # About the distance of the ball's surface on either side, near and far.
+    assert np.allclose(away, away[:, :1])
+    ratio = away[:, 0] / np.linalg.norm(camera_centres(around_ball), axis=1)
+    assert np.allclose(
+        ratio[np.linalg.norm(camera_centres(around_ball), axis=1) > 2], virtual_cameras._AROUND, rtol=0.15
+    )
+
+
+def test_the_same_every_time(around_ball):
+    again = place_cameras(BALL)
+    assert all(np.array_equal(a.rotation, b.rotation) for a, b in zip(again, around_ball, strict=True))
+    assert np.array_equal(camera_centres(again), camera_centres(around_ball))
+
+
+def floaters(count: int, spread: float) -> Scene:
+    rng = np.random.default_rng(5)
+    return flat_splats(spread * rng.normal(size=(count, 3)), np.tile([0.0, 0, 1], (count, 1)), 0.05)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(
+    "clutter",
+    [floaters(400, 10), sphere(1500, 60, 4, seed=1), flat_splats([[1e4, 0, 0]] * 80, [[0.0, 0, 1]] * 80, 1)],
+    ids=["floaters", "background shell", "far away clump"],
+)
+def test_clutter_does_not_draw_the_views_away(clutter):
+    outside = outside_ball(train_views(place_cameras(together(BALL, clutter))))
+    assert times_seen(BALL, BALL.means, outside).min() >= 4
+    assert np.mean(np.linalg.norm(camera_centres(outside), axis=1) < 6) > 0.9
+
+
+def test_no_camera_stands_in_matter():
+    scene = together(BALL, floaters(4000, 2))
+    eyes = camera_centres(place_cameras(scene))
+    blocked = [np.sum(np.linalg.norm(scene.means - eye, axis=1) < 0.1) for eye in eyes]
+    assert max(blocked) == 0
+
+
+def test_a_room_is_seen_from_inside():
+    views = train_views(place_cameras(ROOM))
+    inside = inside_room(views)
+    assert len(inside) >= 45
+    # Half of the views have to do for what someone in the room sees; corners are the hardest.
+    seen = times_seen(ROOM, -WALLS, inside)
+    assert np.quantile(seen, 0.01) >= 2
+    assert seen.min() >= 1
+
+
+def test_an_object_in_a_room():
+    thing = sphere(6000, 0.5, 0.02)
+    inside = inside_room(outside_ball(train_views(place_cameras(together(ROOM, thing)))))
+    assert len(inside) >= 30
+    seen = times_seen(thing, thing.means, inside)
+    assert np.quantile(seen, 0.01) >= 4
+    assert seen.min() >= 1
+
+
+def upper_eyes(count: int, distance: float) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    eyes = rng.normal(size=(count, 3))
+    eyes[:, 2] = np.abs(eyes[:, 2]) + 0.1
+    return distance * eyes / np.linalg.norm(eyes, axis=1, keepdims=True)
+
+
+@pytest.mark.parametrize("degree", [2, 3])
+def test_colours_tell_the_side_that_was_photographed(around_ball, degree):
+    eyes = camera_centres(place_cameras(trained(BALL, BALL.means, upper_eyes(60, 3), degree)))
+    elevation = np.degrees(np.arcsin(eyes[:, 2] / np.linalg.norm(eyes, axis=1)))
+    assert np.mean(elevation > -20) > 0.95
+    # Without that knowledge they are all around.
+    blind = camera_centres(around_ball)
+    assert np.mean(blind[:, 2] < 0) > 0.3
+
+
+def test_colours_tell_a_room_from_an_object():
+    rng = np.random.default_rng(4)
+    from_inside = trained(ROOM, -WALLS, rng.uniform(-0.6, 0.6, (60, 3)) * INSIDE_ROOM)
+    views = place_cameras(from_inside)
+    assert len(inside_room(views)) > 0.94 * len(views)
+    from_outside = trained(ROOM, WALLS, upper_eyes(60, 12))
+    views = place_cameras(from_outside)
+    assert len(inside_room(views)) < 0.0625 * len(views)
+
+
+def scaled(scene: Scene, factor: float) -> Scene:
+    return dataclasses.replace(
+        scene,
+        means=(scene.means * np.float32(factor)),
+        log_scales=scene.log_scales + np.float32(np.log(factor)),
+    )
+
+
+LINE = np.linspace(-1, 1, 300)[:, None] * [[1.0, 2, 3]]
+UP = np.tile([0.0, 0, 1], (300, 1))
+PLANE = np.random.default_rng(6).uniform(-1, 1, (300, 3)) * [1, 1, 0]
+DEGENERATE = {
+    "one splat": BALL.subset(np.arange(1)),
+    "two splats": BALL.subset(np.arange(2)),
+    "all coincident": BALL.subset(np.zeros(50, int)),
+    "coincident points": flat_splats(np.zeros((300, 3)), UP, 1e-30),
+    "line": flat_splats(LINE, UP, 0.01),
+    "plane": flat_splats(PLANE, UP, 0.05),
+    "tiny units": scaled(BALL, 1e-6),
+    "small units": scaled(BALL, 0.02),
+    "huge units": scaled(BALL, 1e9),
+    "far from the origin": dataclasses.replace(BALL, means=BALL.means + np.float32(1e5)),
+    "transparent": dataclasses.replace(BALL, opacity_logits=BALL.opacity_logits - 60),
+    "extreme values": dataclasses.replace(
+        random_scene(200, 3), means=random_scene(200, 3).means * np.float32([1e30, 1e-30, 1])
+    ),
+    "needles": dataclasses.replace(BALL, log_scales=BALL.log_scales * np.float32([30, 1, 1])),
+    "noise": random_scene(3000, 3, extent=3),
+}
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("name", DEGENERATE)
+def test_degenerate_scenes(name):
+    scene = DEGENERATE[name]
+    with np.errstate(all="raise", under="ignore"):
+        cameras = place_cameras(scene, 16, 100)
+    assert len(cameras) == 18
+    assert np.isfinite(camera_centres(cameras)).all()
+    if name != "extreme values":  # nothing but a few of its splats is anywhere near any of the others
+        assert all(in_view(scene, c).any() for c in cameras)
+
+
+@pytest.mark.parametrize(("count", "size"), [(0, 800), (10, 0), (-1, 800)])
+def test_wrong_numbers(count, size):
+    with pytest.raises(UsageError, match="at least 1"):
+        place_cameras(BALL, count, size)
+
+
+def test_the_basis_is_that_of_the_rasterizer():
+    directions = np.random.default_rng(0).normal(size=(50, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    assert np.allclose(virtual_cameras._ac_basis(directions), sh_basis(directions, 3)[:, 1:], atol=1e-12)
+
+
+def test_encode_places_them_itself(monkeypatch):
+    monkeypatch.setattr("potr_cl.pipeline.encode.place_cameras", lambda scene: place_cameras(scene, 6, 64))
+    scene, options = random_scene(150, 2), EncodeOptions(iterations=2)
+    given = encode(scene, place_cameras(scene, 6, 64), options)
+    assert b"".join(encode(scene, None, options).pieces) == b"".join(given.pieces)
+    assert given.pruned is not None
+
+
+@pytest.mark.parametrize("name", ["lego", "plush"])
+def test_trained_colours_remember_their_views(name, request):
+    folder = request.getfixturevalue(name)
+    scene, cameras = load_scene(folder / "point_cloud.ply"), load_cameras(folder / "cameras.json")
+    frame = virtual_cameras._frame(scene)
+    matter = virtual_cameras._matter(scene, frame)
+    places, _ = virtual_cameras._places(frame)
+    true = (camera_centres(cameras) - frame.centre) / frame.unit
+    shown, kept = [], []
+    for number, eye in enumerate(np.concatenate([true, places[::2]])):
+        horizon, blocked = virtual_cameras._surroundings(eye, matter)
+        if number < len(true) or blocked <= virtual_cameras._CROWDED:
+            kept.append(eye)
+            view = virtual_cameras._views_from(eye, virtual_cameras._HALF_VIEW, horizon, frame, matter)
+            shown.append(view[1].max(axis=0))
+    remembered = virtual_cameras._remembered(np.array(kept), shown, matter)
+    of_true, of_others = remembered[: len(true)], remembered[len(true) :]
+    assert of_true.min() > 0.65
+    assert np.quantile(of_true, 0.1) > 0.78
+    assert np.mean(of_others < 0.6) > 0.35
+
+
+def test_lego_is_looked_at_from_above(lego):
+    scene = load_scene(lego / "point_cloud.ply")
+    eyes = camera_centres(place_cameras(scene))
+    distance = np.linalg.norm(eyes, axis=1)
+    assert np.mean(np.degrees(np.arcsin(eyes[:, 2] / distance)) > -20) > 0.97  # the photographs: all above 0
+    assert 1.3 < np.median(distance) < 5
+
+
+def test_plush_is_looked_at_from_where_it_was_photographed(plush):
+    scene, cameras = load_scene(plush / "point_cloud.ply"), load_cameras(plush / "cameras.json")
+    eyes, true = camera_centres(place_cameras(scene)), camera_centres(cameras)
+    nearest = np.linalg.norm(eyes[:, None] - true, axis=2).min(axis=1)
+    # The photographs were taken from 2.6 to 7.3 units away from the toy, on a shell of about that radius.
+    assert np.median(nearest) < 1.8
+    assert np.quantile(nearest, 0.9) < 4

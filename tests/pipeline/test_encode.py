@@ -1,0 +1,138 @@
+"""The encoder's stages together: pruning and compaction on a real excerpt."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.codec.geometry import quantise_geometry
+from potr_cl.codec.quantize import ac_sparsity
+from potr_cl.errors import UsageError
+from potr_cl.pipeline.encode import Reduced, Stopwatch, code, encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.reduction import reduce_scene
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.pruning.removal import SweepOptions
+from tests.cases.scenes import random_scene, ring_of_cameras
+from tests.devices import KERNELS, open_device
+
+FEW = EncodeOptions(iterations=6)
+
+
+@pytest.fixture(scope="module", params=KERNELS)
+def device(request):
+    device = open_device(request.param)
+    yield device
+    assert device.allocated == 0, "the encoder did not give all its memory back"
+
+
+@pytest.fixture(scope="module")
+def views(lego_excerpt_cameras):
+    return [c for c in lego_excerpt_cameras if c.split == "train"][:4]
+
+
+def psnr(device, a, b, cameras):
+    """Mean over views of the second scene's pictures against the first's."""
+    first, second = Rasterizer(device, a), Rasterizer(device, b)
+    errors = [np.mean((first.render(c)[0] - second.render(c)[0]) ** 2) for c in cameras]
+    first.free()
+    second.free()
+    return float(np.mean(-10 * np.log10(errors)))
+
+
+def same(a, b):
+    return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
+
+
+def test_pruning_and_compaction(device, lego_excerpt, views):
+    reduced, pruned = reduce_scene(lego_excerpt, views, FEW, device=device)
+    assert len(reduced) == pruned.kept < 0.9 * len(lego_excerpt)
+    assert ac_sparsity(reduced.sh, 51) > ac_sparsity(lego_excerpt.sh[pruned.survivors], 51) + 0.1
+    assert psnr(device, lego_excerpt, reduced, views) > 40
+    # All but the colours comes through untouched.
+    assert np.array_equal(reduced.means, lego_excerpt.means[pruned.survivors])
+
+
+def test_each_on_its_own(device, lego_excerpt, views):
+    only_pruned, pruned = reduce_scene(lego_excerpt, views, dataclasses.replace(FEW, compact=False), device=device)
+    assert same(only_pruned, lego_excerpt.subset(pruned.survivors))
+    compacted, none = reduce_scene(lego_excerpt, views, dataclasses.replace(FEW, prune=False), device=device)
+    assert none is None
+    assert len(compacted) == len(lego_excerpt)
+    assert not np.array_equal(compacted.sh, lego_excerpt.sh)
+
+
+@pytest.mark.parametrize("compact_at", [0.0, EncodeOptions.compact_at, 1.0])
+def test_a_small_memory_budget_gives_the_same_scene(device, lego_excerpt, views, compact_at):
+    results = []
+    for memory in (None, 48 * 1600, 0):
+        # Views that are made anew each time are swept in full: so must those be that are kept.
+        options = dataclasses.replace(FEW, iterations=4, compact_at=compact_at, sweep=SweepOptions(0, 1, memory))
+        results.append(reduce_scene(lego_excerpt, views, options, device=device)[0])
+    assert same(results[0], results[1])
+    assert same(results[0], results[2])
+
+
+def test_degree_0_has_nothing_to_compact(device, monkeypatch):
+    monkeypatch.setattr("potr_cl.pipeline.reduction.Compactor", None)  # would fail if it were asked
+    scene = random_scene(100, 0)
+    reduced, _ = reduce_scene(scene, ring_of_cameras(4), dataclasses.replace(FEW, count=50), device=device)
+    assert len(reduced) == 50
+
+
+def test_nothing_to_do_needs_no_device(monkeypatch):
+    monkeypatch.setattr("potr_cl.pipeline.reduction.Device", None)
+    encode(random_scene(20, 0), ring_of_cameras(4), EncodeOptions(prune=False))
+    encode(random_scene(20, 3), None, EncodeOptions(prune=False, compact=False))
+
+
+def test_same_bytes_every_time(device, lego_excerpt, views):
+    files = {b"".join(encode(lego_excerpt, views, FEW, device=device).pieces) for _ in range(3)}
+    assert len(files) == 1
+
+
+def test_geometry_of_other_steps_is_not_coded():
+    """As a search codes a reduced scene again in other steps than the re-fit saw."""
+    scene, options = random_scene(300), EncodeOptions(preset="best")
+    known = (None, *(quantise_geometry(scene, EncodeOptions(preset="best", q=q).parameters, []) for q in (0.5, 0.2)))
+    files = {
+        b"".join(code(scene, Reduced(scene, None, None, None, geometry), [], options, Stopwatch()).pieces)
+        for geometry in known
+    }
+    assert len(files) == 1
+
+
+def test_order_names_the_splats_of_the_source(device, lego_excerpt, views):
+    encoded = encode(lego_excerpt, views, dataclasses.replace(FEW, count=300), device=device)
+    assert len(encoded.order) == 300
+    assert sorted(encoded.order) == encoded.pruned.survivors.tolist()
+
+
+def test_progress_comes_to_an_end(device, lego_excerpt, views):
+    seen = []
+    encode(lego_excerpt, views, FEW, lambda stage, done: seen.append((stage, done)), device)
+    assert [s for s, d in seen if d == 1] == ["prepare views", "compact", "prune", "octree", "quantise and code"]
+
+
+def test_a_stage_within_another_counts_for_itself(monkeypatch):
+    now = iter([0.0, 1.0, 2.0, 5.0, 9.0, 10.0, 20.0, 21.0])
+    monkeypatch.setattr("potr_cl.pipeline.encode.time.perf_counter", lambda: next(now))
+    watch = Stopwatch()
+    for stage, done in (("a", 0.0), ("a", 0.5), ("b", 0.0), ("b", 1.0), ("a", 0.7), ("a", 1.0), ("c", 1.0)):
+        watch(stage, done)
+    assert watch.seconds == {"a": 1 + 1 + 3 + 1 + 10, "b": 4, "c": 1}
+
+
+def test_views_that_see_nothing(device):
+    scene = random_scene(60, 1)
+    away = [dataclasses.replace(c, translation=np.array([0, 0, -50.0])) for c in ring_of_cameras(2)]
+    reduced, _ = reduce_scene(scene, [dataclasses.replace(c, split="train") for c in away], FEW, device=device)
+    assert len(reduced) == 1  # an empty scene is no scene
+
+
+@pytest.mark.parametrize("bad", [{"compact_at": -0.1}, {"compact_at": 1.1}, {"iterations": 0}, {"lam": -1}])
+def test_options_out_of_range(device, lego_excerpt, views, bad):
+    with pytest.raises(UsageError):
+        reduce_scene(lego_excerpt, views, dataclasses.replace(FEW, **bad), device=device)

@@ -1,0 +1,332 @@
+"""Encoding to a size or a PSNR: targets are met, never passed, and impossible ones are refused."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from potr_cl.codec.container import Coder
+from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.codec.quantize import PRESETS, HyperParameters
+from potr_cl.errors import UnreachableError, UsageError
+from potr_cl.formats.images import to_8_bits, write_png
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.search import (
+    KINDS,
+    Target,
+    _Axis,
+    _meet,
+    _Typical,
+    _with_colour_steps,
+    _with_steps,
+    encode_to_target,
+)
+from potr_cl.quality.compare import compare, mean_view
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.pruning.removal import SweepOptions
+from tests.cases.scenes import random_scene, ring_of_cameras
+from tests.devices import skip_without_cpu
+
+FEW = EncodeOptions(iterations=6)
+AXIS = _Axis(FEW)
+
+
+@pytest.fixture(scope="module")
+def device():
+    device = Device()
+    yield device
+    assert device.allocated == 0, "a search did not give all its memory back"
+
+
+@pytest.fixture(scope="module")
+def cameras(lego_excerpt_cameras):
+    return lego_excerpt_cameras
+
+
+def psnr(device, scene, file, cameras):
+    a, b = Rasterizer(device, scene), Rasterizer(device, decode(file))
+    views = compare(a, b, [camera for camera in cameras if camera.split == "test"]).views
+    a.free()
+    b.free()
+    return mean_view(views).figures["b_against_a"].psnr
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+@pytest.mark.parametrize("size", [18_000, 24_000])
+def test_a_size_is_filled_and_not_passed(device, lego_excerpt, cameras, size, preset):
+    lines = []
+    options = EncodeOptions.for_preset(preset, iterations=6)
+    found = encode_to_target(lego_excerpt, cameras, Target(max_bytes=size), options, device=device, tell=lines.append)
+    file = b"".join(found.encoded.pieces)
+    assert 0.98 * size <= len(file) <= size
+    assert len(file) == found.encoded.nbytes == round(math.exp(found.value))
+    assert len(decode(file)) == len(found.encoded.order) == found.encoded.pruned.kept
+    assert len(lines) == len(found.tries)
+    assert sum(step.kind == "encode" for step in found.tries) <= 4
+
+
+@pytest.mark.parametrize("target", [Target(max_bytes=24_000), Target(min_psnr=46)])
+def test_colours_may_be_refitted_in_any_preset(device, lego_excerpt, cameras, target):
+    options = dataclasses.replace(FEW, compact=False, refit=3, drop=1e-10)
+    found = encode_to_target(lego_excerpt, cameras, target, options, device=device)
+    low, high = target.window
+    assert low <= found.value <= high
+    assert found.encoded.refitted is not None
+
+
+@pytest.mark.parametrize(("preset", "wanted"), [("paper", 38.0), ("paper", 45.0), ("best", 46.0)])
+def test_a_psnr_is_reached_with_little_to_spare(device, lego_excerpt, cameras, preset, wanted):
+    options = EncodeOptions.for_preset(preset, iterations=6)
+    found = encode_to_target(lego_excerpt, cameras, Target(min_psnr=wanted), options, device=device)
+    reached = psnr(device, lego_excerpt, b"".join(found.encoded.pieces), cameras)
+    assert wanted <= reached <= wanted + 0.1
+    assert found.value == pytest.approx(reached)
+
+
+@pytest.mark.parametrize(
+    ("preset", "target"),
+    [("best", Target(max_bytes=size)) for size in (17_000, 22_000, 28_000)]
+    + [("fast", Target(min_psnr=psnr)) for psnr in (46, 49)],
+)
+def test_what_is_found_is_what_a_plain_encode_makes(device, lego_excerpt, cameras, preset, target):
+    """So it lies on the plain encodes' curve, as far as its parameters are those of one q."""
+    options = EncodeOptions.for_preset(preset, iterations=6)
+    found = encode_to_target(lego_excerpt, cameras, target, options, device=device)
+    assert encode(lego_excerpt, cameras, found.options, device=device).pieces == found.encoded.pieces
+    plain = dataclasses.replace(options, q=found.options.q)
+    for name in (field.name for field in dataclasses.fields(EncodeOptions)):
+        if name not in ("delta_mse_max", "sf_dc", "sf_sh"):
+            assert getattr(found.options, name) == getattr(plain, name), name
+    pruning = math.log10(found.options.parameters.delta_mse_max / plain.parameters.delta_mse_max)
+    assert abs(pruning) <= 2 * 0.12 / math.log(10) + 1e-4  # ΔMSE_MAX goes with the square of the steps
+    colours = {getattr(found.options.parameters, name) / getattr(plain.parameters, name) for name in ("sf_dc", "sf_sh")}
+    assert max(abs(math.log(factor)) for factor in colours) <= 0.5
+    assert max(colours) == pytest.approx(min(colours))
+
+
+def test_a_rough_encode_comes_first_where_it_saves_time(device, lego_excerpt, cameras):
+    target = Target(max_bytes=20_000)
+    for options, first in (
+        (FEW, "encode"),
+        (dataclasses.replace(FEW, iterations=48), "scout"),
+        (EncodeOptions.for_preset("fast"), "scout"),
+        (EncodeOptions.for_preset("best", iterations=6, refit=2), "encode"),
+        (dataclasses.replace(FEW, iterations=48, prune=False), "encode"),
+    ):
+        found = encode_to_target(lego_excerpt, cameras, target, options, device=device)
+        kinds = [step.kind for step in found.tries]
+        assert kinds[0] == first
+        assert "scout" not in kinds[1:]
+        assert target.inside(found.value)
+
+
+def test_a_try_is_not_what_is_found_by_it(device, lego_excerpt, cameras):
+    """A scout is never the result, nor is the file that a PSNR was judged by."""
+    options = EncodeOptions.for_preset("best", iterations=6)
+    found = encode_to_target(lego_excerpt, cameras, Target(min_psnr=45), options, device=device)
+    assert found.tries[0].kind == "scout"
+    assert found.value in [step.value for step in found.tries[1:]]
+    assert len(found.encoded.order) == found.encoded.pruned.kept
+    coders = {section.coder for section in PotrFile.from_bytes(b"".join(found.encoded.pieces)).header.sections}
+    assert Coder.CONTEXT in coders
+
+
+def test_without_a_refit_only_the_steps_of_the_quantiser_may_be_of_another_q(device, lego_excerpt, cameras):
+    runs = (
+        encode_to_target(lego_excerpt, cameras, Target(max_bytes=size), FEW, device=device)
+        for size in range(16_000, 30_000, 1_000)
+    )
+    found = next(run for run in runs if run.tries[-1].kind == "steps")
+    pruned = encode(lego_excerpt, cameras, dataclasses.replace(FEW, q=found.options.q), device=device).pruned
+    assert np.array_equal(pruned.survivors, found.encoded.pruned.survivors)
+    header = PotrFile.from_bytes(b"".join(found.encoded.pieces)).header
+    assert header.sf_ac == found.options.sf_sh == pytest.approx(1 + 100 * found.tries[-1].q)
+    parameters = HyperParameters.from_quality(found.options.q)
+    for name in ("lam", "alpha", "delta_mse_max"):
+        assert getattr(found.options.parameters, name) == getattr(parameters, name)
+
+
+def test_the_same_file_every_time(device, lego_excerpt, cameras):
+    target = Target(max_bytes=20_000)
+    runs = [encode_to_target(lego_excerpt, cameras, target, FEW, device=device) for _ in range(2)]
+    assert runs[0].encoded.pieces == runs[1].encoded.pieces
+    assert runs[0].tries == runs[1].tries
+
+
+@pytest.mark.parametrize(
+    ("target", "said"),
+    [
+        (
+            Target(max_bytes=1000),
+            "at most 1,000 bytes cannot be reached: quality 0 gives {} bytes, quality 1 gives {} bytes",
+        ),
+        (Target(min_psnr=90), "at least 90 dB cannot be reached: quality 0 gives .* dB, quality 1 gives 4.* dB"),
+    ],
+)
+def test_targets_out_of_reach(device, lego_excerpt, cameras, target, said):
+    ends = (encode(lego_excerpt, cameras, dataclasses.replace(FEW, q=q), device=device).nbytes for q in (0.0, 1.0))
+    with pytest.raises(UnreachableError, match=said.format(*(f"{nbytes:,}" for nbytes in ends))):
+        encode_to_target(lego_excerpt, cameras, target, FEW, device=device)
+
+
+def test_targets_that_every_quality_meets(device, lego_excerpt, cameras):
+    best = encode_to_target(lego_excerpt, cameras, Target(max_bytes=10**7), FEW, device=device)
+    assert best.options.q == 1
+    smallest = encode_to_target(lego_excerpt, cameras, Target(min_psnr=5), FEW, device=device)
+    assert smallest.options.q == 0
+
+
+def test_without_cameras_the_quantiser_alone_is_left(lego_excerpt):
+    options = dataclasses.replace(FEW, prune=False, compact=False)
+    found = encode_to_target(lego_excerpt, None, Target(max_bytes=25_000), options)
+    assert 24_500 <= found.encoded.nbytes <= 25_000
+    assert len(found.encoded.order) == len(lego_excerpt)
+    with pytest.raises(UsageError, match="cameras"):
+        encode_to_target(lego_excerpt, None, Target(min_psnr=40), options)
+
+
+def test_what_is_given_stays(device, lego_excerpt, cameras):
+    options = dataclasses.replace(FEW, count=500, sf_scale=777.0, sweep=SweepOptions(memory=0))
+    found = encode_to_target(lego_excerpt, cameras, Target(max_bytes=9_000), options, device=device)
+    assert len(found.encoded.order) == 500
+    assert found.options.parameters.sf_scale == 777
+    assert 8_820 <= found.encoded.nbytes <= 9_000
+
+
+def test_nothing_to_see(device):
+    """Identical pictures have an infinite PSNR."""
+    scene = random_scene(60, 1)
+    away = [dataclasses.replace(c, translation=np.array([0, 0, -50.0])) for c in ring_of_cameras(4)]
+    found = encode_to_target(scene, away, Target(min_psnr=40), FEW, device=device)
+    assert found.value == 200
+
+
+def test_colours_may_be_fitted_to_photographs(device, lego_excerpt, cameras, tmp_path):
+    """Which sets a bound to the PSNR against the renders that no quality passes."""
+    shown = Rasterizer(device, dataclasses.replace(lego_excerpt, sh=lego_excerpt.sh * np.float32(0.9)))
+    for camera in (camera for camera in cameras if camera.split == "train"):
+        with (tmp_path / f"{camera.name}.png").open("wb") as file:
+            write_png(file, to_8_bits(shown.render(camera)[0]))
+    shown.free()
+    options = EncodeOptions.for_preset("fast", iterations=6, photographs=tmp_path)
+    target = Target(min_psnr=42)
+    assert target.inside(encode_to_target(lego_excerpt, cameras, target, options, device=device).value)
+    with pytest.raises(UnreachableError, match="quality 1 gives 4"):
+        encode_to_target(lego_excerpt, cameras, Target(min_psnr=55), options, device=device)
+
+
+def test_a_cpu_takes_over(lego_excerpt, cameras, caplog):
+    """From a device whose memory does not hold the scene's views."""
+    skip_without_cpu()
+    options = EncodeOptions.for_preset("fast", iterations=3)
+    target = Target(max_bytes=20_000)
+    wanted = encode_to_target(lego_excerpt, cameras, target, options)
+    small = Device()
+    small.info = dataclasses.replace(small.info, memory=1 << 20, largest_buffer=1 << 20, kind="gpu")
+    with caplog.at_level(logging.WARNING, "potr_cl"):
+        found = encode_to_target(lego_excerpt, cameras, target, options, device=small)
+    assert found.encoded.pieces == wanted.encoded.pieces
+    assert found.encoded.device.info.kind == "cpu"
+    assert small.allocated == 0
+    # It is tried and given up once, not in every step of the search.
+    assert sum("going on with" in record.getMessage() for record in caplog.records) == 1
+
+
+@pytest.mark.parametrize("bad", [{}, {"max_bytes": 1, "min_psnr": 1.0}, {"max_bytes": 0}, {"min_psnr": math.nan}])
+def test_bad_targets(bad):
+    with pytest.raises(UsageError):
+        Target(**bad)
+
+
+@settings(deadline=None)
+@given(st.floats(0.3, 3), st.floats(-50, 50), st.floats(-5, 5))
+def test_lines_are_met_with_two_points(rate, root, first):
+    points = {first: rate * (first - root)}
+    for _ in range(2):
+        place = _meet(points, 0.0, 1.0)
+        points[place] = rate * (place - root)
+    assert min(abs(place - root) for place in points) < 1e-6
+
+
+@settings(deadline=None)
+@given(st.floats(-3, 3), st.floats(0.4, 2.5), st.floats(-0.2, 0.2), st.floats(-3, 3))
+def test_growing_functions_are_met(root, rate, bend, first):
+    """As size and PSNR grow: at about the typical rate, not along a line."""
+
+    def value(x):
+        return rate * (x - root) + bend * rate * (x - root) * abs(x - root) / 6
+
+    points, place = {first: value(first)}, first
+    while abs(value(place)) >= 0.01:
+        assert len(points) <= 6
+        place = _meet(points, 0.0, 1.0)
+        lower = [x for x in points if points[x] < 0]
+        upper = [x for x in points if points[x] >= 0]
+        if lower and upper:
+            assert max(lower) < place < min(upper)
+        points[place] = value(place)
+
+
+@pytest.mark.parametrize(
+    ("points", "side"),
+    [
+        ({1.0: 5.0, 2.0: 5.0, 3.0: 4.0}, -1),  # nowhere little enough: ever further down
+        ({1.0: -4.0, 2.0: -5.0, 3.0: -5.0}, 1),
+    ],
+)
+def test_where_values_do_not_grow_one_goes_on(points, side):
+    place = _meet(points, 0.0, 1.0)
+    assert place < min(points) if side < 0 else place > max(points)
+
+
+def test_typical_values_grow():
+    for preset in PRESETS:
+        for target in (Target(max_bytes=100), Target(min_psnr=40)):
+            typical = _Typical(target, EncodeOptions(preset=preset), 1000)
+            values = [typical.value(q) for q in np.linspace(0, 1, 50)]
+            assert np.all(np.diff(values) > 0)
+            for q in (0, 0.013, 0.3, 0.77, 1):
+                assert typical.quality(typical.value(q)) == pytest.approx(q, abs=1e-5)
+            assert typical.quality(values[0] - 1) == 0
+            assert typical.quality(values[-1] + 1) == 1
+
+
+def test_qualities_from_fineness():
+    for axis in (AXIS, _Axis(dataclasses.replace(FEW, sf_sh=7.0))):
+        for q in (0, 0.00123, 0.1, 0.5, 1):
+            assert axis.quality(axis.fineness(q)) == pytest.approx(q, abs=1e-5)
+        assert axis.quality(axis.fineness(0) - 1) == 0
+        assert axis.quality(axis.fineness(1) + 1) == 1
+
+
+def test_steps_of_another_quality():
+    some = dataclasses.replace(FEW, q=0.5, sf_scale=9.0)
+    mixed, finer = _with_steps(some, 0.7).parameters, dataclasses.replace(some, q=0.7).parameters
+    for field in dataclasses.fields(mixed):
+        source = finer if field.name.startswith("sf_") or field.name in ("beta", "gamma") else some.parameters
+        assert getattr(mixed, field.name) == getattr(source, field.name), field.name
+
+
+def test_steps_of_colours():
+    plain = dataclasses.replace(FEW, q=0.5, sf_dc=9.0)
+    finer = _with_colour_steps(plain, plain, 0.1)
+    assert finer == dataclasses.replace(plain, sf_sh=plain.parameters.sf_sh * math.exp(0.1))
+    both = dataclasses.replace(plain, sf_sh=7.0)
+    assert _with_colour_steps(both, both, 0.1) == both
+
+
+def test_every_try_is_called_by_its_name(device, lego_excerpt, cameras):
+    lines = []
+    options = EncodeOptions.for_preset("best", iterations=6)
+    found = encode_to_target(lego_excerpt, cameras, Target(min_psnr=47), options, device=device, tell=lines.append)
+    assert len(lines) == len(found.tries)
+    for line, step in zip(lines, found.tries, strict=True):
+        assert line == f"{KINDS[step.kind].format(f'{step.q:g}')} {step.value:.2f} dB"

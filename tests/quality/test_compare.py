@@ -1,0 +1,226 @@
+"""Comparing two scenes: the figures are those of the pictures, means and tables agree, photographs are found."""
+
+from __future__ import annotations
+
+import json
+import math
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from potr_cl.errors import DataError, UsageError
+from potr_cl.formats.images import to_8_bits
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.quality.compare import (
+    Comparison,
+    Figures,
+    SceneFile,
+    ViewFigures,
+    compare,
+    comparison_report,
+    find_photographs,
+    format_comparison,
+    format_sizes,
+    mean_view,
+    side_by_side,
+    size_report,
+)
+from potr_cl.quality.metrics import psnr, ssim
+from potr_cl.raster.rasterizer import Rasterizer
+from tests.cases.scenes import ring_of_cameras
+
+BACKGROUND = (0.25, 0.5, 1.0)
+
+
+@pytest.fixture(scope="module")
+def rasterizers(lego_excerpt):
+    """The excerpt, and the excerpt with other colours."""
+    device = Device()
+    s = lego_excerpt
+    other = Scene(s.means, s.log_scales, s.quaternions, s.opacity_logits, s.sh * np.float32(0.9))
+    return Rasterizer(device, s, background=BACKGROUND), Rasterizer(device, other, background=BACKGROUND)
+
+
+@pytest.fixture(scope="module")
+def views(lego_excerpt_cameras):
+    return [c for c in lego_excerpt_cameras if c.split == "test"]
+
+
+def comparison(*psnrs):
+    views = [ViewFigures(f"v{i}", {"b_against_a": Figures(p, 0.9, None)}) for i, p in enumerate(psnrs)]
+    worst = int(np.argmin(psnrs))
+    return Comparison(views, worst)
+
+
+def test_figures_are_those_of_the_pictures(rasterizers, views):
+    a, b = rasterizers
+    stages = []
+    result = compare(a, b, views, progress=lambda stage, done: stages.append((stage, done)))
+    assert [view.name for view in result.views] == [view.name for view in views]
+    for camera, view in zip(views, result.views, strict=True):
+        picture_a, picture_b = a.render(camera)[0], b.render(camera)[0]
+        figures = view.figures.pop("b_against_a")
+        assert figures.psnr == pytest.approx(psnr(picture_b, picture_a), abs=2e-6)
+        assert figures.ssim == pytest.approx(ssim(picture_b, picture_a), abs=1e-6)
+        assert figures.lpips is None
+        assert view.figures == {}
+    assert result.worst == np.argmin([psnr(b.render(camera)[0], a.render(camera)[0]) for camera in views])
+    assert stages[0] == ("comparing 3 views", 0)
+    assert [done for _, done in stages[1:]] == pytest.approx([1 / 3, 2 / 3, 1])
+    assert compare(a, b, views) == compare(a, b, views)
+
+
+def test_photographs(rasterizers, views, tmp_path):
+    """Photographs with alpha, made of A's own pictures: composited over the background they are A's pictures again."""
+    a, b = rasterizers
+    for camera in views:
+        image, transmittance = a.render(camera)
+        alpha = 1 - transmittance[..., None]
+        own = image - np.float32(BACKGROUND) * transmittance[..., None]
+        straight = own / np.where(alpha > 0, alpha, 1)
+        Image.fromarray(to_8_bits(np.concatenate([straight, alpha], axis=-1))).save(tmp_path / f"{camera.name}.png")
+    result = compare(a, b, views, find_photographs(tmp_path, views))
+    for view in result.views:
+        f = view.figures
+        assert f["a_against_photograph"].psnr > 45  # what 8 bits allow
+        assert f["b_against_photograph"].psnr == pytest.approx(f["b_against_a"].psnr, abs=0.5)
+        assert f["loss"].psnr == f["a_against_photograph"].psnr - f["b_against_photograph"].psnr > 0
+        assert f["loss"].ssim == f["a_against_photograph"].ssim - f["b_against_photograph"].ssim > 0
+    report = comparison_report(result)
+    assert report["mean"]["loss"]["psnr"] == pytest.approx(
+        np.mean([view["loss"]["psnr"] for view in report["views"]]), rel=1e-12
+    )
+    header = format_comparison(result).splitlines()[0]
+    assert header.split("  ")[-1].strip() == "loss by photo"
+
+
+def test_a_scene_against_itself(rasterizers, views):
+    a, _ = rasterizers
+    result = compare(a, a, views)
+    report = json.loads(json.dumps(comparison_report(result), allow_nan=False))
+    assert report["identical_views"] == 3
+    assert report["mean"]["b_against_a"] == {"psnr": None, "ssim": 1}
+    assert [view["b_against_a"]["psnr"] for view in report["views"]] == [None] * 3
+    text = format_comparison(result)
+    assert text.count("identical") == 4
+    assert "inf" not in text
+    assert "nan" not in text
+
+
+def test_lpips_column(rasterizers, views):
+    """The metric itself needs weights; any function shows that its figures arrive."""
+    a, b = rasterizers
+    distances = iter([0.5, None, 0.3])
+    result = compare(a, b, views, lpips=lambda _image, _reference: next(distances))
+    assert mean_view(result.views).figures["b_against_a"].lpips == pytest.approx(0.4)
+    report = comparison_report(result)
+    assert report["views"][0]["b_against_a"]["lpips"] == 0.5
+    assert "lpips" not in report["views"][1]["b_against_a"]
+    lines = format_comparison(result).splitlines()
+    assert lines[1].split()[-1] == "LPIPS"
+    assert [line.split()[-1] for line in lines[2:6]] == ["0.5000", "-", "0.3000", "0.4000"]
+
+
+def test_no_view(rasterizers):
+    with pytest.raises(UsageError, match="no view"):
+        compare(*rasterizers, [])
+
+
+def test_mean_psnr_is_the_mean_of_the_views():
+    result = comparison(30.0, 40.0, 35.0)
+    assert mean_view(result.views).figures["b_against_a"] == Figures(35, pytest.approx(0.9), None)
+    assert "worst view: v0, 30.00 dB" in format_comparison(result)
+
+
+def test_identical_views_are_left_out_of_the_mean_and_said():
+    result = comparison(math.inf, 40.0, 50.0)
+    assert mean_view(result.views).figures["b_against_a"].psnr == 45
+    report = comparison_report(result)
+    assert (report["identical_views"], report["mean"]["b_against_a"]["psnr"]) == (1, 45)
+    assert "1 of 3 views are identical" in format_comparison(result)
+
+
+def test_sizes():
+    a, b = SceneFile(Path("a.ply"), 5000, 20, 3), SceneFile(Path("b.potr"), 500, 10, 3)
+    assert size_report(a, b)["size_ratio"] == 10
+    assert size_report(a, b)["b"] == {"file": "b.potr", "bytes": 500, "splats": 10, "sh_degree": 3}
+    assert "B is 10.0 times smaller" in format_sizes(a, b)
+    assert "B is 10.0 times larger" in format_sizes(b, a)
+
+
+def test_side_by_side():
+    rng = np.random.default_rng(0)
+    a = rng.random((30, 40, 3)).astype(np.float32)
+    b = a.copy()
+    b[3, 4, 1] += 0.5 - a[3, 4, 1] + 0.03  # one pixel of 1200: more than a thousandth may not be white
+    a[3, 4, 1] = 0.5
+    b[10:20] = np.clip(a[10:20] + 0.012, 0, 1)
+    picture, factor = side_by_side(a, b)
+    assert picture.shape == (30, 120, 3)
+    assert np.array_equal(picture[:, :40], to_8_bits(a))
+    assert np.array_equal(picture[:, 40:80], to_8_bits(b))
+    assert factor == 50  # 0.012 times 50 stays below 1, times 100 would not
+    heat = picture[:, 80:].astype(int)
+    assert (heat[:3] == 0).all()
+    assert heat[3, 4].tolist() == [255, 255, 255]
+    assert heat[15, 5].tolist() == [255, pytest.approx(0.8 * 255, abs=1), 0]
+
+
+def test_side_by_side_of_equal_and_of_opposite_pictures():
+    black, white = np.zeros((5, 5, 3), np.float32), np.ones((5, 5, 3), np.float32)
+    picture, _ = side_by_side(black, black)
+    assert (picture == 0).all()
+    picture, factor = side_by_side(black, white)
+    assert factor == 1
+    assert (picture[:, 5:] == 255).all()
+
+
+# ------------------------------------------------------------------------------------------ photographs
+
+
+def save(path, width=64, height=64):
+    path.parent.mkdir(exist_ok=True)
+    Image.new("RGB", (width, height)).save(path)
+
+
+def test_photographs_are_found_by_name(tmp_path):
+    cameras = ring_of_cameras(4)
+    cameras[2] = replace(cameras[2], name="left/view.2")
+    cameras[3] = replace(cameras[3], name="view_3.png")  # views keep the extension where two differ only in it
+    paths = [
+        tmp_path / "view_0.JPG",
+        tmp_path / "view_1.png",
+        tmp_path / "left" / "view.2.png",
+        tmp_path / "view_3.png",
+    ]
+    for path in (*paths, tmp_path / "view_3.jpg"):
+        save(path)
+    (tmp_path / "view_0.txt").write_text("not a picture")
+    assert find_photographs(tmp_path, cameras) == {c.name: p for c, p in zip(cameras, paths, strict=True)}
+
+
+def test_photographs_missing_or_ambiguous(tmp_path):
+    cameras = ring_of_cameras(2)
+    with pytest.raises(UsageError, match=r"cannot read the folder of photographs .*nowhere"):
+        find_photographs(tmp_path / "nowhere", cameras)
+    save(tmp_path / "view_0.png")
+    with pytest.raises(UsageError, match="no photograph of view 'view_1'"):
+        find_photographs(tmp_path, cameras)
+    save(tmp_path / "view_1.png")
+    save(tmp_path / "view_1.jpg")
+    with pytest.raises(UsageError, match=r"several photographs of view 'view_1'.*view_1.jpg, view_1.png"):
+        find_photographs(tmp_path, cameras)
+
+
+def test_photographs_of_another_size_or_damaged(tmp_path):
+    cameras = ring_of_cameras(1)
+    save(tmp_path / "view_0.png", 80, 60)
+    with pytest.raises(UsageError, match=r"80 x 60 pixels, view 'view_0' of the cameras is 64 x 64"):
+        find_photographs(tmp_path, cameras)
+    (tmp_path / "view_0.png").write_bytes(b"\x89PNG damaged")
+    with pytest.raises(DataError, match=r"view_0.png' is damaged"):
+        find_photographs(tmp_path, cameras)

@@ -1,0 +1,88 @@
+"""Photographs as a judge and as targets of the re-fit."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.errors import DataError, UsageError
+from potr_cl.formats.images import to_8_bits, write_png
+from potr_cl.opencl.device import Device
+from potr_cl.quality.ground_truth import Photographs, PhotographTargets
+from potr_cl.quality.metrics import psnr
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.refitting.refit import RefitOptions, RenderedTargets, refit_colours
+from tests.cases.scenes import random_scene, ring_of_cameras
+
+
+@pytest.fixture(scope="module")
+def device():
+    device = Device()
+    yield device
+    assert device.allocated == 0
+
+
+@pytest.fixture
+def scene():
+    scene = random_scene(60, 1)
+    return dataclasses.replace(scene, log_scales=np.full((60, 3), -2, np.float32))
+
+
+@pytest.fixture
+def cameras():
+    cameras = ring_of_cameras(6, size=32)
+    return [*cameras[:5], dataclasses.replace(cameras[5], width=20, height=16, cx=10.0, cy=8.0)]
+
+
+@pytest.fixture
+def folder(tmp_path, device, scene, cameras):
+    """The scene's own pictures."""
+    rasterizer = Rasterizer(device, scene)
+    for camera in cameras:
+        with (tmp_path / f"{camera.name}.png").open("wb") as file:
+            write_png(file, to_8_bits(rasterizer.render(camera)[0]))
+    rasterizer.free()
+    return tmp_path
+
+
+def test_psnr_is_the_mean_over_the_views(device, scene, cameras, folder):
+    photographs = Photographs(folder, cameras)
+    rasterizer = Rasterizer(device, dataclasses.replace(scene, sh=scene.sh + np.float32(0.1)))
+    wanted = np.mean([psnr(rasterizer.render(c)[0], photographs.picture(c)) for c in cameras[:2]])
+    assert photographs.psnr(rasterizer, cameras[:2]) == pytest.approx(wanted)
+    rasterizer.free()
+
+
+def test_a_refit_to_photographs_is_one_to_what_they_show(device, scene, cameras, folder):
+    """8 bits are all that tells the photographs from the pictures."""
+    dimmed = dataclasses.replace(scene, sh=scene.sh * np.float32(0.5))
+    options = RefitOptions(steps=20, gain=0, prior=1)
+    targets = PhotographTargets(device, Photographs(folder, cameras), cameras)
+    refitted = refit_colours(device, dimmed, cameras, targets, options)
+    targets.free()
+    rasterizer = Rasterizer(device, scene)
+    wanted = refit_colours(device, dimmed, cameras, RenderedTargets(rasterizer, cameras), options)
+    rasterizer.free()
+    assert refitted.errors[1] < 0.1 * refitted.errors[0]
+    assert refitted.errors == pytest.approx(wanted.errors, abs=1e-4)
+    assert np.abs(refitted.sh - wanted.sh).mean() < 0.1 * np.abs(refitted.sh - dimmed.sh).mean()
+
+
+def test_photographs_that_are_not_there_or_of_another_size(cameras, folder):
+    larger = dataclasses.replace(cameras[0], width=64)
+    with pytest.raises(UsageError, match=r"is 32 x 32 pixels, view 'view_0' of the cameras is 64 x 32"):
+        Photographs(folder, [larger])
+    (folder / "view_3.png").unlink()
+    with pytest.raises(UsageError, match="no photograph of view 'view_3'"):
+        Photographs(folder, cameras)
+
+
+def test_a_damaged_photograph(device, scene, cameras, folder):
+    whole = (folder / "view_2.png").read_bytes()
+    (folder / "view_2.png").write_bytes(whole[: len(whole) // 2])
+    targets = PhotographTargets(device, Photographs(folder, cameras), cameras)
+    with pytest.raises(DataError, match=r"view_2\.png"):
+        refit_colours(device, scene, cameras, targets)
+    targets.free()

@@ -1,0 +1,174 @@
+"""A GPU's own pruning controller against the one in numpy."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.opencl.device import Device
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
+from potr_cl.stages.pruning.schedule import DampedEffects, PruningOptions, choose, prune
+from tests.cases.refit import visible_scene
+from tests.cases.scenes import ring_of_cameras
+from tests.devices import KERNELS, open_device
+
+OPTIONS = PruningOptions(2e-6, 8)
+
+
+@pytest.fixture
+def cameras(lego_excerpt_cameras):
+    return [c for c in lego_excerpt_cameras if c.split == "train"][:4]
+
+
+def run(device, scene, cameras, options, sweep=None, on_device=True, after_iteration=None):
+    rasterizer = Rasterizer(device, scene)
+    removal = RemovalSweep(rasterizer, cameras, sweep or SweepOptions())
+    assert removal.steerable
+    if on_device:
+        result = prune_scene(removal, options, after_iteration=after_iteration and after_iteration(removal))
+    else:
+        result = prune(removal, len(scene), options)
+    left, sweeps = removal.alive, removal.sweeps
+    removal.free()
+    rasterizer.free()
+    assert np.flatnonzero(left).tolist() == result.survivors.tolist() or result.kept == 1
+    return result, sweeps
+
+
+@pytest.fixture(params=[kernels for kernels in KERNELS if "gpu" in str(kernels)])
+def gpu(request):
+    return open_device(request.param)
+
+
+@pytest.mark.parametrize("damping", [0.8, 0.0])
+def test_the_same_splats_go_as_in_numpy(gpu, lego_excerpt, cameras, damping):
+    options = dataclasses.replace(OPTIONS, damping=damping)
+    found, sweeps = run(gpu, lego_excerpt, cameras, options)
+    expected, expected_sweeps = run(gpu, lego_excerpt, cameras, options, on_device=False)
+    assert 100 < expected.kept < 1400
+    # Rounding may send one splat more or less at the end of a budget.
+    assert abs(found.kept - expected.kept) <= 3
+    assert len(np.setxor1d(found.survivors, expected.survivors)) <= 6
+    assert (np.abs(found.iteration_of - expected.iteration_of) > 0).mean() < 0.01
+    assert sweeps == pytest.approx(expected_sweeps, rel=0.02)
+    for one, other in zip(found.history, expected.history, strict=True):
+        assert one.left == pytest.approx(other.left, abs=4)
+        assert one.importance == pytest.approx(other.importance, rel=0.02)
+        assert one.effect == pytest.approx(other.effect, rel=0.05, abs=1e-7)
+
+
+def test_each_iteration_spends_its_budget(gpu, lego_excerpt, cameras):
+    """Against the rules themselves: what went scores less than what stayed, and just reaches the budget."""
+    found, _ = run(gpu, lego_excerpt, cameras, OPTIONS)
+    rasterizer = Rasterizer(gpu, lego_excerpt)
+    removal = RemovalSweep(rasterizer, cameras, SweepOptions())
+    damped = DampedEffects(removal, OPTIONS.damping)
+    alive = np.arange(len(lego_excerpt))
+    start = 0
+    for iteration in range(3):
+        delta_mse, importance = damped.measure()
+        gone = found.order[start : start + (found.iteration_of == iteration).sum()]
+        expected = choose(delta_mse, importance, alive, OPTIONS.iterations - iteration, OPTIONS)
+        assert abs(len(gone) - len(expected)) <= 1
+        assert len(np.setxor1d(gone, expected)) <= 1
+        damped.remove(gone)
+        alive = np.setdiff1d(alive, gone)
+        start += len(gone)
+    removal.free()
+    rasterizer.free()
+
+
+def test_order_and_history_fit_the_iterations(gpu, lego_excerpt, cameras):
+    found, _ = run(gpu, lego_excerpt, cameras, OPTIONS)
+    assert np.sort(found.order).tolist() == list(range(1500))
+    removed = found.order[: 1500 - found.kept]
+    assert (np.diff(found.iteration_of[removed]) >= 0).all()
+    assert (found.iteration_of[found.survivors] == -1).all()
+    counts = np.bincount(found.iteration_of[removed])
+    assert [step.left for step in found.history] == (1500 - np.cumsum(counts[counts > 0])).tolist()
+
+
+def test_twice_the_same(gpu, lego_excerpt, cameras):
+    one, other = (run(gpu, lego_excerpt, cameras, OPTIONS)[0] for _ in range(2))
+    assert one.order.tobytes() == other.order.tobytes()
+    assert one.history == other.history
+
+
+@pytest.mark.parametrize("limit", [0.0, 1e9])
+def test_only_improvements_and_everything(gpu, lego_excerpt, cameras, limit):
+    options = PruningOptions(limit, 3)
+    found, _ = run(gpu, lego_excerpt, cameras, options)
+    expected, _ = run(gpu, lego_excerpt, cameras, options, on_device=False)
+    assert found.kept == pytest.approx(expected.kept, abs=2)
+    if limit:
+        assert found.kept == 1
+
+
+def test_nothing_to_remove(gpu):
+    scene = visible_scene(40)
+    found, sweeps = run(gpu, scene, ring_of_cameras(2, size=48), PruningOptions(1e-30, 5))
+    assert found.kept == 40
+    assert found.iterations == 1
+    assert sweeps == 1
+
+
+@pytest.mark.parametrize("tolerance", [-1.0, 0.0, 0.3])
+def test_tiles_are_swept_again_by_the_tolerance(gpu, lego_excerpt, cameras, tolerance):
+    sweep = SweepOptions(tolerance)
+    found, sweeps = run(gpu, lego_excerpt, cameras, OPTIONS, sweep)
+    expected, expected_sweeps = run(gpu, lego_excerpt, cameras, OPTIONS, sweep, on_device=False)
+    assert abs(found.kept - expected.kept) <= 8
+    assert sweeps == pytest.approx(expected_sweeps, rel=0.02)
+    if tolerance < 0:
+        assert sweeps == found.iterations
+
+
+def test_host_and_device_take_turns(gpu, lego_excerpt, cameras):
+    """Reading weights of views or giving new colours in between leaves the device's lists as they should be."""
+    seen = []
+
+    def looking(removal):
+        def look(iteration):
+            if iteration in (2, 5):
+                seen.append(sum(weights.sum() for _, _, weights in removal.view_importances()))
+                removal.replace_sh(lego_excerpt.sh)
+
+        return look
+
+    found, _ = run(gpu, lego_excerpt, cameras, OPTIONS, SweepOptions(0.0), after_iteration=looking)
+    plain, _ = run(gpu, lego_excerpt, cameras, OPTIONS, SweepOptions(0.0))
+    assert len(seen) == 2
+    assert found.order.tobytes() == plain.order.tobytes()
+
+
+def test_the_same_without_atomics_on_64_bits(gpu, lego_excerpt, cameras):
+    class Device32(Device):
+        def program(self, source, **defines):
+            asked.add(defines.get("INT64_ATOMICS"))
+            if "INT64_ATOMICS" in defines:
+                defines["INT64_ATOMICS"] = 0
+            return super().program(source, **defines)
+
+    asked: set[int | None] = set()
+    found, _ = run(gpu, lego_excerpt, cameras, OPTIONS)
+    other, _ = run(Device32(gpu.info, family="gpu"), lego_excerpt, cameras, OPTIONS)
+    assert asked & {0, 1}
+    assert other.order.tobytes() == found.order.tobytes()
+    assert other.history == found.history
+
+
+def test_options_that_only_the_host_knows(gpu, lego_excerpt, cameras):
+    rasterizer = Rasterizer(gpu, lego_excerpt)
+    for sweep in (SweepOptions(turns=2), SweepOptions(sample=0.5), SweepOptions(memory=0)):
+        removal = RemovalSweep(rasterizer, cameras, sweep)
+        assert not removal.steerable
+        assert prune_scene(removal, OPTIONS).kept < 1500
+        removal.free()
+    removal = RemovalSweep(rasterizer, cameras)
+    assert prune_scene(removal, PruningOptions(0, 3, count=700)).kept == 700
+    removal.free()
+    rasterizer.free()

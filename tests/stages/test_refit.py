@@ -1,0 +1,482 @@
+"""The joint re-fit of the colours against float64: the linear map, its transpose, the solution, the selection."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.errors import UsageError
+from potr_cl.model.camera import Camera
+from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS
+from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, active_coefficients
+from tests.cases.refit import Case, Linearised, Pictures, visible_scene
+from tests.cases.scenes import ring_of_cameras
+from tests.cases.splats import camera as straight_camera
+from tests.cases.splats import splats as plain_splats
+from tests.cases.splats import tilted_camera
+from tests.devices import KERNELS, open_device
+from tests.oracles.refit import LENGTHS, selection, to_rgb, to_ycocg
+
+
+@pytest.fixture(scope="module", params=KERNELS)
+def device(request):
+    device = open_device(request.param)
+    yield device
+    assert device.allocated == 0, "a re-fit did not give all its memory back"
+
+
+def of_size(camera: Camera, width: int, height: int) -> Camera:
+    factor = width / camera.width
+    return dataclasses.replace(
+        camera, width=width, height=height, fx=factor * camera.fx, fy=factor * camera.fy, cx=width / 2, cy=height / 2
+    )
+
+
+@pytest.fixture
+def case(device):
+    with Case(device, visible_scene(40), visible_scene(60, 2, seed=7), ring_of_cameras(4, size=40)) as case:
+        yield case
+
+
+def relative(a, b) -> float:
+    return float(np.linalg.norm(a - b) / np.linalg.norm(b))
+
+
+# ------------------------------------------------------------------------------------------ the map
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("dim", [0.0, 0.7])
+def test_the_transposed_map(device, degree, dim):
+    """<A d, r> = <d, Aᵀ r>, A written out in float64, for random coefficients and pictures; with ``dim``, half of the
+    colours are cut at 0."""
+    scene = visible_scene(40, degree, seed=degree)
+    scene.sh[:, 0] -= np.float32(dim / 0.28)
+    cameras = ring_of_cameras(3, size=40)
+    rng = np.random.default_rng(degree)
+    with Case(device, scene, scene, cameras) as case:
+        reference = case.reference()
+        cut = 1 - np.mean([free.mean() for free in reference.free])
+        assert (0.3 if dim else 0) < cut < (0.95 if dim else 0.3)
+        targets = [(p - rng.uniform(-1, 1, size=p.shape)).astype(np.float32) for p in case.pictures]
+        rendered = reference.pictures(reference.start)
+        images = [p - t.reshape(-1, 3) for p, t in zip(rendered, targets, strict=True)]
+        with Pictures(device, targets) as buffers, Linearised(case, buffers) as linear:
+            # The residual is minus the gradient.
+            transposed = -linear.vector(linear.refit._residual)
+        assert relative(transposed, reference.transposed(images)) < 1e-5
+        direction = rng.normal(size=scene.sh.shape)
+        forward = reference.forward(direction)
+        weights = [view.weight for view in reference.views]
+        left = sum(w * np.sum(a * b) for w, a, b in zip(weights, forward, images, strict=True))
+        norms = [
+            np.sqrt(sum(w * np.sum(a * a) for w, a in zip(weights, vectors, strict=True)))
+            for vectors in (forward, images)
+        ]
+        assert abs(np.sum(direction * transposed) - left) < 1e-5 * norms[0] * norms[1]
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+def test_the_normal_matrix(device, degree):
+    scene = visible_scene(40, degree, seed=degree)
+    rng = np.random.default_rng(degree)
+    with Case(device, scene, scene, ring_of_cameras(3, size=40)) as case:
+        reference = case.reference()
+        a, b = (rng.normal(size=scene.sh.shape) * 10.0**exponent for exponent in (0, -3))
+        with Linearised(case) as linear:
+            normal_a, normal_b = linear.normal(a), linear.normal(b)
+            wanted = reference.gram()
+            blocks = linear.gram()
+        assert relative(normal_a, reference.transposed(reference.forward(a))) < 1e-5
+        # Symmetric, and so A and its transpose belong together, cuts included.
+        size = np.sqrt(np.sum(a * normal_a) * np.sum(b * normal_b))
+        assert abs(np.sum(b * normal_a) - np.sum(a * normal_b)) < 1e-5 * size
+        assert np.abs(blocks - np.triu(wanted)).max() < 1e-5 * wanted.max()
+
+
+def test_lists_of_more_splats_than_are_walked_at_a_time(device):
+    """CPU kernels take 1024 at a time."""
+    scene = visible_scene(1400, 1)
+    scene.log_scales[:] = -4.5
+    scene.opacity_logits[:] = -3.5
+    rng = np.random.default_rng(0)
+    with Case(device, scene, visible_scene(60, 1, seed=7), ring_of_cameras(1, size=16)) as case:
+        reference = case.reference()
+        rendered = reference.pictures(reference.start)
+        images = [p - t.reshape(-1, 3) for p, t in zip(rendered, case.pictures, strict=True)]
+        direction = rng.normal(size=scene.sh.shape)
+        with Linearised(case) as linear:
+            transposed = -linear.vector(linear.refit._residual)
+            normal = linear.normal(direction)
+            blocks = linear.gram()
+        assert relative(transposed, reference.transposed(images)) < 1e-5
+        assert relative(normal, reference.transposed(reference.forward(direction))) < 1e-5
+        assert np.abs(blocks - np.triu(reference.gram())).max() < 1e-5 * blocks.max()
+
+
+def test_the_length_of_a_picture_is_the_product_with_the_normal_matrix(device):
+    """d · Aᵀ A d = |A d|², both from the kernels: the forward map's picture and the transposed map's sums."""
+    scene = visible_scene(60, 3, seed=2)
+    for camera in ring_of_cameras(3, size=50):
+        with Case(device, scene, scene, [camera]) as case, Linearised(case) as linear:
+            direction = np.random.default_rng(0).normal(size=scene.sh.shape)
+            normal = linear.normal(direction)
+            tiles = linear.refit.device.download(linear.refit._errors, (16,), np.float32)
+        squared = REFERENCE_PIXELS / 2500 * tiles.sum(dtype=np.float64) * np.abs(direction).max() ** 2
+        assert np.sum(direction * normal) == pytest.approx(squared, rel=1e-5)
+
+
+def test_errors_are_those_of_the_pictures(case):
+    refitted = case.solve(RefitOptions(steps=5))
+    reference = case.reference()
+    assert refitted.errors[0] == pytest.approx(reference.error(reference.start), rel=1e-5)
+    assert refitted.errors[1] == pytest.approx(reference.error(to_ycocg(refitted.sh)), rel=1e-4)
+
+
+# ------------------------------------------------------------------------------------------ the solution
+
+
+@pytest.mark.parametrize(
+    ("degree", "lam", "prior", "background"),
+    [(0, 0.0, 3.0, (0.0, 0.0, 0.0)), (1, 30.0, 3.0, (1.0, 0.5, 0.0)), (2, 30.0, 10.0, (0.0, 0.0, 0.0)),
+     (3, 100.0, 10.0, (0.0, 0.0, 0.0))],
+)  # fmt: skip
+def test_the_solution_is_the_least_squares_one(device, degree, lam, prior, background):
+    other = visible_scene(60, 2, seed=7)
+    with Case(device, visible_scene(40, degree), other, ring_of_cameras(3, size=40), background) as case:
+        refitted = case.solve(RefitOptions(steps=300, gain=0, lam=lam, prior=prior))
+        reference = case.reference(lam=lam, prior=prior)
+    solution = reference.solution()
+    x = to_ycocg(refitted.sh)
+    assert np.linalg.norm(x - solution) < 1e-3 * np.linalg.norm(solution - reference.start)
+    assert reference.objective(x) < 0.9 * reference.objective(reference.start)
+
+
+def test_inactive_coefficients_stay_zero_and_the_others_solve_their_own_problem(case):
+    active = np.random.default_rng(3).random(case.scene.sh.shape) < 0.5
+    active[:, 0] = True
+    refitted = case.solve(RefitOptions(steps=300, gain=0, lam=30, prior=10), active)
+    reference = case.reference(lam=30, prior=10, active=active)
+    x = to_ycocg(refitted.sh)
+    assert np.abs(x[~active]).max() < 1e-6
+    solution = reference.solution()
+    assert np.linalg.norm(x - solution) < 1e-3 * np.linalg.norm(solution - reference.start)
+
+
+def test_held_coefficients_keep_their_values(case):
+    active = np.zeros(case.scene.sh.shape, bool)
+    active[:20, 0] = True
+    refit = ColourRefit(case.device, case.scene, case.cameras, RefitOptions(steps=100, gain=0, prior=10))
+    refit.set_coefficients(case.scene.sh, active, hold=True)
+    x = to_ycocg(refit.solve(case.targets).sh)
+    refit.free()
+    reference = case.reference(prior=10, active=active, hold=True)
+    assert np.abs(x - reference.start)[~active].max() < 1e-6
+    solution = reference.solution()
+    assert np.linalg.norm(x - solution) < 1e-3 * np.linalg.norm(solution - reference.start)
+
+
+def test_each_step_takes_the_objective_down(device):
+    """Where no colour comes below 0: there the problem is the linear one."""
+    scene, other = visible_scene(40), visible_scene(40)
+    other.sh[:] += np.random.default_rng(0).normal(0, 0.3, size=other.sh.shape).astype(np.float32)
+    for lifted in (scene, other):
+        lifted.sh[:, 0] += 12
+    with Case(device, scene, other, ring_of_cameras(3, size=40)) as case:
+        reference = case.reference(prior=1)
+        objectives = [reference.objective(reference.start)]
+        for steps in (1, 2, 4, 8, 16, 32, 64):
+            refitted = case.solve(RefitOptions(steps=steps, gain=0, prior=1))
+            assert refitted.steps == steps
+            x = to_ycocg(refitted.sh)
+            assert all((view.colours(x) > 0).all() for view in reference.views)
+            objectives.append(reference.objective(x))
+    assert np.all(np.diff(objectives) < 0)
+
+
+def test_it_stops_when_a_step_gains_too_little(case):
+    assert case.solve(RefitOptions(steps=50, gain=0.05)).steps < 20
+    assert case.solve(RefitOptions(steps=0)).steps == 0
+
+
+@pytest.mark.parametrize("degree", [0, 2])
+def test_it_stops_where_single_precision_ends(device, degree):
+    other = visible_scene(60, 2, seed=7)
+    with Case(device, visible_scene(40, degree), other, ring_of_cameras(3, size=40)) as case:
+        refitted = case.solve(RefitOptions(steps=300, gain=0, lam=30, prior=10))
+        reference = case.reference(lam=30, prior=10)
+    assert refitted.steps < 100
+    solution = reference.solution()
+    assert np.linalg.norm(to_ycocg(refitted.sh) - solution) < 1e-4 * np.linalg.norm(solution - reference.start)
+
+
+def test_progress(case):
+    told = []
+    refit = ColourRefit(case.device, case.scene, case.cameras, RefitOptions(steps=3, gain=0))
+    refit.solve(case.targets, lambda done, total: told.append((done, total)))
+    refit.free()
+    assert told == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_the_target_itself_is_left_alone(device):
+    scene = visible_scene(40)
+    with Case(device, scene, scene, ring_of_cameras(3, size=40)) as case:
+        refitted = case.solve(RefitOptions())
+    assert refitted.errors[1] <= refitted.errors[0] < 1e-12
+    assert np.allclose(refitted.sh, scene.sh, atol=1e-4)
+
+
+# ------------------------------------------------------------------------------------------ same bits
+
+
+def test_same_bits_every_time(case):
+    options = RefitOptions(steps=6, gain=0, drop=1e-7)
+    results = [case.solve(options).sh.tobytes() for _ in range(3)]
+    assert len(set(results)) == 1
+
+
+@pytest.mark.parametrize("memory", [0, 40_000, 200_000])
+def test_a_small_memory_budget_changes_the_time_and_nothing_else(case, memory):
+    everything = case.solve(RefitOptions(steps=4, gain=0, drop=1e-7))
+    little = case.solve(RefitOptions(steps=4, gain=0, drop=1e-7, memory=memory))
+    assert np.array_equal(everything.sh, little.sh)
+    assert everything.errors == little.errors
+
+
+@pytest.mark.parametrize("share", [0.2, 0.4, 0.6, 0.9])
+def test_the_memory_budget_is_used_and_not_exceeded(device, share):
+    """What the device holds when views and targets are kept, above what it holds at most when none is."""
+    cameras = ring_of_cameras(60, size=32)
+    with Case(device, visible_scene(2000), visible_scene(60, 1, seed=7), cameras) as case:
+
+        def taken(memory):
+            seen = Linearised(case, options=RefitOptions(steps=0, memory=memory))
+            nbytes, room = device.allocated, seen.refit._keeper.room
+            seen.refit.free()
+            return nbytes, room
+
+        plenty = 10**9
+        wanted = plenty - taken(plenty)[1]
+        budget = int(share * wanted)
+        assert 0.88 * budget <= taken(budget)[0] - taken(0)[0] <= 1.1 * budget
+
+
+def test_more_views_than_are_swept_at_a_time(device):
+    """Some views kept, some made again, and more of both than a GPU's queues."""
+    with Case(device, visible_scene(30, 1), visible_scene(50, 1, 5), ring_of_cameras(37, size=20)) as case:
+        one, other = (case.solve(RefitOptions(steps=3, gain=0, memory=memory)) for memory in (None, 250_000))
+    assert np.array_equal(one.sh, other.sh)
+
+
+# ------------------------------------------------------------------------------------------ selection
+
+
+def test_active_coefficients_are_those_that_the_quantiser_keeps():
+    sh = to_rgb(np.array([[[0.0, 0, 0], [0.3, 0.012, -0.2], [0.009, 0.011, 0], [0, 0, 0]]])).astype(np.float32)
+    active = active_coefficients(sh, 50.0)
+    assert active[0].tolist() == [[True] * 3, [True, True, True], [False, True, False], [False] * 3]
+
+
+@pytest.mark.parametrize("degree", [1, 2, 3])
+def test_selection_keeps_what_costs_more(device, degree):
+    scene = visible_scene(50, degree, seed=degree)
+    cameras = [tilted_camera(seed, 48, 48) for seed in range(24)]
+    with Case(device, scene, visible_scene(60, 2, 7), cameras) as case:
+        options = RefitOptions(steps=0, selection_steps=0, prior=1.0, drop=1e-8)
+        active = np.random.default_rng(0).random(scene.sh.shape) < 0.9
+        active[:, 0] = True
+        with Linearised(case, options=options) as linear:
+            linear.refit.set_coefficients(scene.sh, active)
+            sh = linear.refit.solve(case.targets).sh
+            kept, blocks = linear.active(), linear.gram()
+    x = to_ycocg(sh)
+    blocks = blocks + np.triu(blocks, 1).transpose(0, 2, 1)
+    start = to_ycocg(scene.sh) * active
+    least = options.drop * 3 * REFERENCE_PIXELS * len(cameras)
+    clear = 0
+    for k in range(len(scene)):
+        for c, length in enumerate(LENGTHS):
+            wanted, values, margin = selection(blocks[k], start[k, :, c], active[k, :, c], length, options.prior, least)
+            if margin < 1e-2:
+                continue
+            clear += 1
+            assert kept[k, :, c].tolist() == wanted.tolist()
+            assert np.allclose(x[k, :, c], values, atol=2e-3 * np.abs(start[k, :, c]).max())
+    assert clear > 0.7 * 3 * len(scene)
+    assert 0.1 < kept[:, 1:].sum() / active[:, 1:].sum() < 0.9
+    assert not (kept & ~active).any()
+    assert np.abs(x[~kept]).max() < 1e-6
+
+
+def test_a_greater_price_keeps_fewer(case):
+    kept = []
+    for drop in (1e-9, 1e-7, 1e-5, 1e3):
+        refitted = case.solve(RefitOptions(drop=drop))
+        kept.append(int((np.abs(to_ycocg(refitted.sh)[:, 1:]) > 1e-6).sum()))
+        assert np.isfinite(refitted.sh).all()
+    assert kept == sorted(kept, reverse=True)
+    assert kept[0] > kept[-1] == 0
+
+
+@pytest.mark.parametrize(("seed", "steps", "dc"), [(0, 30, -3), (3, 8, -5), (7, 30, -3)])
+def test_a_selection_that_overshoots_is_taken_back(device, seed, steps, dc):
+    """Dark scenes without a prior: so many colours are cut at 0 on the way that the steps lead astray."""
+    scene = visible_scene(40, seed=seed)
+    scene.sh[:, 0] += dc
+    with Case(device, scene, visible_scene(60, 2, seed + 7), ring_of_cameras(3, size=40)) as case:
+        refitted = case.solve(RefitOptions(steps=steps, selection_steps=steps, gain=0, drop=1e-15, prior=0))
+    assert refitted.errors[1] <= refitted.errors[0] * (1 + 1e-6)
+
+
+# ------------------------------------------------------------------------------------------ stress
+
+
+def solve_and_check(case: Case, options: RefitOptions, active=None) -> np.ndarray:
+    """Finite, and by the float64 objective no worse than the start; the coefficients in Y, Co, Cg."""
+    refitted = case.solve(options, active)
+    assert np.isfinite(refitted.sh).all()
+    assert np.isfinite(refitted.errors).all()
+    x = to_ycocg(refitted.sh)
+    reference = case.reference(lam=options.lam, prior=options.prior, active=active)
+    before = reference.objective(reference.start)
+    assert reference.objective(x) <= before * (1 + 1e-6) + 1e-9
+    return x
+
+
+def test_splats_that_no_view_sees_stay_as_they_are(device):
+    scene = visible_scene(30)
+    scene.means[10:] += np.float32(1000)
+    with Case(device, scene, visible_scene(30, 2, 7), ring_of_cameras(3, size=40)) as case:
+        for prior in (0.0, 0.1):
+            x = solve_and_check(case, RefitOptions(prior=prior))
+            assert np.allclose(x[10:], to_ycocg(scene.sh)[10:], atol=1e-6)
+            assert not np.allclose(x[:10], to_ycocg(scene.sh)[:10], atol=1e-3)
+
+
+def test_no_splat_is_seen(device):
+    scene = visible_scene(30)
+    scene.means[:] += np.float32(1000)
+    with Case(device, scene, visible_scene(30, 2, 7), ring_of_cameras(3, size=40)) as case:
+        for options in (RefitOptions(), RefitOptions(lam=1, prior=0), RefitOptions(prior=0)):
+            solve_and_check(case, options)
+
+
+def test_one_view(device):
+    with Case(device, visible_scene(40), visible_scene(60, 2, 7), ring_of_cameras(5, size=40)[1:2]) as case:
+        solve_and_check(case, RefitOptions(steps=30, gain=0))
+        solve_and_check(case, RefitOptions(steps=30, gain=0, prior=0))
+
+
+def test_a_black_target(device):
+    black = visible_scene(20, 0)
+    black.sh[:] = -10
+    with Case(device, visible_scene(40), black, ring_of_cameras(3, size=40)) as case:
+        assert not any(p.any() for p in case.pictures)
+        solve_and_check(case, RefitOptions(steps=30, gain=0))
+
+
+def test_all_colours_cut_at_0(device):
+    scene = visible_scene(40)
+    scene.sh[:, 0] = -20
+    with Case(device, scene, visible_scene(60, 2, 7), ring_of_cameras(3, size=40)) as case:
+        x = solve_and_check(case, RefitOptions(steps=10))
+        assert np.allclose(x, to_ycocg(scene.sh), atol=1e-5)
+
+
+def test_no_regulariser_on_a_rank_deficient_system(device):
+    """16 coefficients, 2 views, and every splat twice in the same place."""
+    scene = visible_scene(20).subset(np.tile(np.arange(20), 2))
+    with Case(device, scene, visible_scene(60, 2, 7), ring_of_cameras(2, size=40)) as case:
+        for steps in (1, 8, 100):
+            x = solve_and_check(case, RefitOptions(steps=steps, gain=0, lam=0, prior=0))
+            assert np.abs(x).max() < 1e3
+
+
+def test_a_strong_pull_to_zero_is_no_better_than_what_it_costs(case):
+    for lam in (1e3, 1e6, 1e12):
+        solve_and_check(case, RefitOptions(steps=20, gain=0, lam=lam))
+    solve_and_check(case, RefitOptions(steps=20, gain=0, prior=1e12))
+
+
+@pytest.mark.parametrize("value", [1e4, 1e10, 1e30, 3e38])
+@pytest.mark.parametrize("where", ["dc", "ac", "both"])
+def test_absurd_coefficients(device, value, where):
+    scene = visible_scene(40)
+    rng = np.random.default_rng(0)
+    for k in range(0, 40, 7):
+        if where != "ac":
+            scene.sh[k, 0] = value * rng.choice([-1, 1], size=3)
+        if where != "dc":
+            scene.sh[k, 1:] = value * rng.choice([-1, 1], size=(15, 3))
+    with Case(device, scene, visible_scene(60, 2, 7), ring_of_cameras(3, size=40)) as case:
+        for options in (RefitOptions(), RefitOptions(lam=1), RefitOptions(prior=0), RefitOptions(drop=1e-7)):
+            refitted = case.solve(options)
+            assert np.isfinite(refitted.sh).all()
+            assert np.isfinite(refitted.errors).all()
+            if not options.drop:
+                assert refitted.errors[1] <= refitted.errors[0] or options.lam
+
+
+def test_absurd_targets(device):
+    bright = visible_scene(30, 0)
+    bright.sh[:] = 1e30
+    with Case(device, visible_scene(40), bright, ring_of_cameras(3, size=40)) as case:
+        refitted = case.solve(RefitOptions(steps=10))
+    assert np.isfinite(refitted.sh).all()
+
+
+def test_views_of_different_sizes(device):
+    cameras = ring_of_cameras(4, size=40)
+    cameras = [cameras[0], of_size(cameras[1], 61, 33), of_size(cameras[2], 16, 16), of_size(cameras[3], 7, 90)]
+    with Case(device, visible_scene(30, 1), visible_scene(60, 2, 7), cameras) as case:
+        options = RefitOptions(steps=200, gain=0, prior=10)
+        x = solve_and_check(case, options)
+        reference = case.reference(prior=10)
+        solution = reference.solution()
+    assert np.linalg.norm(x - solution) < 1e-3 * np.linalg.norm(solution - reference.start)
+
+
+@pytest.mark.parametrize(
+    "count", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)]
+)  # fmt: skip
+def test_overlapping_splats_on_one_pixel_column(device, count):
+    rng = np.random.default_rng(0)
+    centres = np.zeros((count, 3))
+    centres[:, 1] = rng.uniform(-0.3, 0.3, count)
+    centres[:, 2] = rng.uniform(1, 3, count)
+    # Alphas of 0.01 at most: hundreds of splats share a pixel.
+    scene = plain_splats(centres, sigma=2e-3, logit=-4.6, colour=rng.uniform(0, 1, (count, 3)))
+    target = plain_splats(centres[::2], sigma=2e-3, logit=-4.0, colour=(0.2, 0.9, 0.4))
+    with Case(device, scene, target, [straight_camera(1, 48), straight_camera(16, 16)]) as case:
+        for prior in (0.0, 0.1):
+            refitted = case.solve(RefitOptions(steps=4, gain=0, prior=prior))
+            assert np.isfinite(refitted.sh).all()
+            assert refitted.errors[1] < 0.5 * refitted.errors[0]
+
+
+def test_one_splat(device):
+    scene = plain_splats((0, 0, 2), sigma=0.3, logit=3, colour=(0.2, 0.2, 0.2))
+    target = plain_splats((0, 0, 2), sigma=0.3, logit=3, colour=(0.8, 0.5, 0.3))
+    with Case(device, scene, target, [straight_camera(33, 21)]) as case:
+        sh = case.solve(RefitOptions(prior=0)).sh
+    assert np.allclose(sh, target.sh, atol=1e-5)
+
+
+# ------------------------------------------------------------------------------------------ wrong calls
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [{"steps": -1}, {"selection_steps": -1}, {"gain": 1}, {"gain": -0.1}, {"lam": -1}, {"prior": np.nan},
+     {"drop": np.inf}, {"chroma_factor": -1}, {"selection_lam": 1e13}],
+)  # fmt: skip
+def test_options_out_of_range(bad):
+    with pytest.raises(UsageError, match="re-fit"):
+        RefitOptions(**bad)
+
+
+def test_no_view_is_an_error(device):
+    with pytest.raises(UsageError, match="at least one view"):
+        ColourRefit(device, visible_scene(3), [])

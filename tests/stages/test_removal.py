@@ -1,0 +1,438 @@
+"""Removal effects against brute force in float64: render with and without each splat."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.errors import UsageError
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+from potr_cl.raster.rasterizer import INRIA, Rasterizer
+from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions, default_memory
+from potr_cl.stages.pruning.schedule import PruningOptions, prune
+from tests.cases.scenes import random_scene, ring_of_cameras
+from tests.devices import KERNELS, open_device
+from tests.oracles import raster as reference
+from tools.study.removal_exactness import BruteForce
+
+
+@pytest.fixture(scope="module", params=KERNELS)
+def device(request):
+    device = open_device(request.param)
+    yield device
+    assert device.allocated == 0, "a sweep did not give all its memory back"
+
+
+def visible_scene(splats: int, degree: int = 0, seed: int = 0) -> Scene:
+    """Few layers, splats of several pixels: no pixel ends early, so that brute force measures the same thing."""
+    scene = random_scene(splats, degree, seed)
+    rng = np.random.default_rng(seed + 100)
+    return dataclasses.replace(
+        scene,
+        log_scales=rng.normal(-2, 0.5, size=(splats, 3)).astype(np.float32),
+        opacity_logits=rng.normal(-1, 1.5, size=splats).astype(np.float32),
+    )
+
+
+def without(scene: Scene, gone) -> Scene:
+    return scene.subset(np.setdiff1d(np.arange(len(scene)), gone))
+
+
+def renders(scene: Scene, cameras: list[Camera], background=(0.0, 0.0, 0.0)):
+    return [reference.render(scene, c, INRIA, background).image for c in cameras]
+
+
+def mean_squared(images, targets) -> float:
+    return float(np.mean([np.mean((a - b) ** 2) for a, b in zip(images, targets, strict=True)]))
+
+
+def brute_force(scene, cameras, targets, splats, gone=(), background=(0.0, 0.0, 0.0)):
+    """ΔMSE of removing each of ``splats`` from what is left after ``gone``."""
+    now = mean_squared(renders(without(scene, gone), cameras, background), targets)
+    return np.array(
+        [mean_squared(renders(without(scene, [*gone, k]), cameras, background), targets) - now for k in splats]
+    )
+
+
+def close(predicted, true):
+    """Relative to the effect, above a floor: thresholds at 1/255 flip, float32 ends."""
+    floor = 1e-4 * np.abs(true).max() * 1e-3
+    error = np.abs(predicted - true) / (np.abs(true) + floor)
+    assert np.median(error) <= 1e-4
+    assert np.quantile(error, 0.95) <= 1e-2
+
+
+def sweep(device, scene, cameras, tolerance=0.0, background=(0.0, 0.0, 0.0)):
+    rasterizer = Rasterizer(device, scene, background=background)
+    return rasterizer, RemovalSweep(rasterizer, cameras, SweepOptions(tolerance, turns=1))
+
+
+def finish(rasterizer, removal):
+    removal.free()
+    rasterizer.free()
+
+
+@pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 0.3, 0.0)])
+def test_single_removals(device, background):
+    scene = visible_scene(60, 1)
+    cameras = ring_of_cameras(3, size=48)
+    rasterizer, removal = sweep(device, scene, cameras, background=background)
+    effect, importance = removal.measure()
+    finish(rasterizer, removal)
+    targets = renders(scene, cameras, background)
+    close(effect, brute_force(scene, cameras, targets, range(60), background=background))
+    assert (effect >= 0).all()  # nothing is better than the target itself
+    transmittances = [reference.render(scene, c, INRIA).transmittance for c in cameras]
+    assert importance.sum() == pytest.approx(np.mean([1 - t.mean() for t in transmittances]), rel=1e-5)
+
+
+def test_single_removals_when_others_are_gone(device):
+    # Black twins in front of white splats; once they are gone, the picture is too bright.
+    scene = visible_scene(25, seed=3).subset(np.tile(np.arange(25), 2))
+    scene.sh[:, 0] = np.where(np.arange(50) < 25, -2, 2)[:, None]
+    scene.opacity_logits[:25] = 3
+    cameras = ring_of_cameras(2, size=48)
+    gone = np.arange(0, 25, 2)
+    left = np.setdiff1d(np.arange(50), gone)
+    rasterizer, removal = sweep(device, scene, cameras)
+    removal.measure()
+    removal.remove(gone)
+    effect, _ = removal.measure()
+    finish(rasterizer, removal)
+    targets = renders(scene, cameras)
+    true = brute_force(scene, cameras, targets, left, list(gone))
+    assert (true < 0).any()  # some removals improve the match
+    close(effect[left], true)
+
+
+def test_alpha_at_the_cap_behind_hundreds_of_layers(device):
+    """No digits are lost where the paper's formula divides by 1 - alpha and subtracts what the layers in front add."""
+    layers, opaque = 320, 300
+    logits = np.full(layers, -4.6, np.float32)  # alpha 0.01; a twentieth of the light is left at the opaque one
+    logits[opaque] = 12  # alpha 0.99
+    means = np.zeros((layers, 3), np.float32)
+    means[:, 0] = np.linspace(-2, 2, layers)
+    quaternions = np.zeros((layers, 4), np.float32)
+    quaternions[:, 0] = 1
+    dc = np.random.default_rng(0).normal(size=(layers, 1, 3)).astype(np.float32)
+    scene = Scene(means, np.full((layers, 3), 0.5, np.float32), quaternions, logits, dc)
+    eye = np.array([-8.0, 0, 0])
+    rotation = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
+    cameras = [Camera("along", 16, 16, 60, 60, 8, 8, rotation, -rotation @ eye)]
+    rasterizer, removal = sweep(device, scene, cameras)
+    effect, _ = removal.measure()
+    finish(rasterizer, removal)
+    splats = [0, 150, 299, opaque, 301, 310, 319]
+    true = brute_force(scene, cameras, renders(scene, cameras), splats)
+    assert np.abs(effect[splats] / true - 1).max() < 1e-3
+
+
+def test_same_bits_every_time(device, lego_excerpt, lego_excerpt_cameras):
+    results = []
+    for _ in range(3):
+        rasterizer, removal = sweep(device, lego_excerpt, lego_excerpt_cameras[:3])
+        removal.measure()
+        removal.remove(np.arange(0, 1500, 7))
+        results.append(np.concatenate(removal.measure()).tobytes())
+        finish(rasterizer, removal)
+    assert len(set(results)) == 1
+
+
+def test_sums_kept_over_removals_are_those_of_a_new_sweep(device, lego_excerpt, lego_excerpt_cameras):
+    """Exact totals: tiles that were skipped because nothing changed add up to what sweeping all of them gives."""
+    cameras = lego_excerpt_cameras[:2]
+    few = np.arange(0, 20)
+    rasterizer, removal = sweep(device, lego_excerpt, cameras)
+    removal.measure()
+    removal.remove(few)
+    skipping = removal.measure()
+    removal.sweep_everything()
+    everything = removal.measure()
+    finish(rasterizer, removal)
+    left = np.setdiff1d(np.arange(1500), few)
+    for a, b in zip(skipping, everything, strict=True):
+        assert np.array_equal(a[left], b[left])
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
+def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, lego_excerpt, lego_excerpt_cameras, share):
+    cameras = lego_excerpt_cameras[:4]
+    results = []
+    for memory in (None, int(share * 4 * 48 * 1536)):
+        rasterizer = Rasterizer(device, lego_excerpt)
+        removal = RemovalSweep(rasterizer, cameras, SweepOptions(0, 1, memory))
+        kept = removal.kept_views
+        removal.measure()
+        for start in (0, 5):
+            removal.remove(np.arange(start, 1500, 10))
+            effects = removal.measure()
+        results.append(np.stack(effects)[:, np.arange(1, 1500, 10)])
+        finish(rasterizer, removal)
+    assert kept == 0 if share == 0 else kept <= 4
+    assert np.array_equal(*results)
+
+
+def test_buffers_too_small_for_all_views_change_nothing(device, lego_excerpt, lego_excerpt_cameras, monkeypatch):
+    """A device that allows no large buffer has fewer views at a time, and keeps them all."""
+    cameras, results, sets = lego_excerpt_cameras[:7], [], []
+    for largest in (device.info.largest_buffer, 3 * 12 * cameras[0].width * cameras[0].height):
+        monkeypatch.setattr(device, "info", dataclasses.replace(device.info, largest_buffer=largest))
+        rasterizer = Rasterizer(device, lego_excerpt)
+        removal = RemovalSweep(rasterizer, cameras, SweepOptions(0))
+        removal.measure()
+        removal.remove(np.arange(0, 1500, 10))
+        results.append(np.stack(removal.measure())[:, np.arange(1, 1500, 10)])
+        assert removal.kept_views == 7
+        sets.append(len(removal._kept))
+        finish(rasterizer, removal)
+    assert np.array_equal(*results)
+    assert sets == ([7, 7] if device.family == "cpu" else [1, 4])  # of at most two views
+
+
+def test_views_in_turns(device, lego_excerpt, lego_excerpt_cameras):
+    rasterizer = Rasterizer(device, lego_excerpt)
+    removal = RemovalSweep(rasterizer, lego_excerpt_cameras[:4], SweepOptions(-1, turns=2))
+    for _ in range(3):
+        removal.measure()
+    assert removal.sweeps == pytest.approx(1 + 0.5 + 0.5)
+    finish(rasterizer, removal)
+
+
+def test_tolerance_saves_sweeps(device, lego_excerpt, lego_excerpt_cameras):
+    sweeps = []
+    for tolerance in (-1, 0, 0.05):
+        rasterizer, removal = sweep(device, lego_excerpt, lego_excerpt_cameras[:2], tolerance)
+        for start in range(4):
+            removal.measure()
+            removal.remove(np.arange(start, 1500, 100))
+        sweeps.append(removal.sweeps)
+        finish(rasterizer, removal)
+    assert sweeps[0] == pytest.approx(4)
+    assert sweeps[0] > sweeps[1] > sweeps[2] >= 1
+
+
+def entries_in_lists(removal: RemovalSweep) -> int:
+    lengths = [removal._device.download(s.lengths, (s.views.tiles,), np.uint32) for s in removal._kept]
+    return int(np.concatenate(lengths).sum())
+
+
+def test_tightened_lists_change_no_result(device, lego_excerpt, lego_excerpt_cameras):
+    results, entries = {}, {}
+    for tighten in (False, True):
+        rasterizer = Rasterizer(device, lego_excerpt)
+        removal = RemovalSweep(rasterizer, lego_excerpt_cameras[:3], SweepOptions(-1, tighten=tighten))
+        measured = [removal.measure()]
+        for start in (0, 3, 5):
+            removal.remove(np.arange(start, 1500, 7))
+            measured.append(removal.measure())
+        entries[tighten] = entries_in_lists(removal)
+        views = [np.concatenate([splats, weights]) for _, splats, weights in removal.view_importances()]
+        results[tighten] = np.concatenate([np.ravel(measured), *views])
+        finish(rasterizer, removal)
+    if device.family == "cpu":
+        assert np.array_equal(results[False], results[True])
+    else:  # the order in which the pixels of a tile are added depends on an entry's place in the list
+        assert np.allclose(results[False], results[True], rtol=1e-6, atol=1e-6 * results[False][:1500].max())
+    assert entries[True] < entries[False]
+
+
+def test_tightened_lists_keep_what_is_hidden(device):
+    """Behind the end of all pixels, entries stay: they come back when what hides them goes."""
+    scene = visible_scene(30, seed=4).subset(np.arange(60) % 30)
+    scene.log_scales[:30], scene.opacity_logits[:30] = 3, 12  # thirty walls
+    cameras = ring_of_cameras(2, size=32)
+    effects = {}
+    for tighten in (False, True):
+        rasterizer = Rasterizer(device, scene)
+        removal = RemovalSweep(rasterizer, cameras, SweepOptions(-1, tighten=tighten, stop=None))
+        hidden = removal.measure()[1][30:] == 0
+        removal.measure()
+        removal.remove(np.arange(30))
+        effects[tighten] = removal.measure()
+        finish(rasterizer, removal)
+    assert hidden.any()
+    assert np.array_equal(np.stack(effects[False])[:, 30:], np.stack(effects[True])[:, 30:])
+    assert (effects[True][1][30:][hidden] > 0).any()
+
+
+def test_a_removal_lets_pixels_go_on(device):
+    """Where pixels end early, effects are those of the same limit on transmittance; small limits leave no jump."""
+    scene = visible_scene(300, seed=2).subset(np.repeat(np.arange(300), 3))
+    scene.opacity_logits[:] = 2
+    cameras = ring_of_cameras(1, size=40)
+    some = np.arange(0, 900, 10)
+    shares = {}
+    for stop in (None, SweepOptions.stop):
+        rasterizer = Rasterizer(device, scene)
+        removal = RemovalSweep(rasterizer, cameras, SweepOptions(stop=stop))
+        effect, _ = removal.measure()
+        finish(rasterizer, removal)
+        exact = BruteForce(reference.project(scene, cameras[0], INRIA), cameras[0], INRIA)
+        true = exact.effects(some, [INRIA.stop if stop is None else stop])[1, 0] / (3 * 40 * 40)
+        strong = true > 1e-4 * true.max()
+        shares[stop] = np.mean(np.abs(effect[some[strong]] / true[strong] - 1) < 1e-2)
+    assert shares[None] < shares[SweepOptions.stop]
+    assert shares[SweepOptions.stop] > 0.98
+
+
+def test_a_random_sample_of_tiles(device, lego_excerpt, lego_excerpt_cameras):
+    """Reproducible, fewer sweeps, every tile when sampling is over."""
+    results, sweeps = [], []
+    for options in (
+        SweepOptions(0),
+        SweepOptions(0, sample=0.3, sampled=2),
+        SweepOptions(0, sample=0.3, sampled=2),
+        SweepOptions(0, sample=0.3, sampled=2, seed=1),
+    ):
+        rasterizer = Rasterizer(device, lego_excerpt)
+        removal = RemovalSweep(rasterizer, lego_excerpt_cameras[:3], options)
+        removal.measure()
+        measured = []
+        for start in range(2):
+            removal.remove(np.arange(start, 1500, 10))
+            measured.append(np.stack(removal.measure())[:, np.arange(5, 1500, 10)])
+        sweeps.append(removal.sweeps)
+        measured.append(np.stack(removal.measure())[:, np.arange(5, 1500, 10)])
+        results.append(measured)
+        finish(rasterizer, removal)
+    everything, first, again, other = results
+    assert sweeps[1] < sweeps[0]
+    assert np.array_equal(first, again)
+    assert not np.array_equal(first[0], other[0])
+    assert not np.array_equal(first[0], everything[0])
+    assert np.array_equal(first[2], everything[2])
+
+
+@pytest.mark.parametrize(
+    "bad",
+    [
+        {"tolerance": np.nan},
+        {"tolerance": np.inf},
+        {"turns": 0},
+        {"memory": -1},
+        {"stop": 0.0},
+        {"stop": 1.0},
+        {"stop": np.nan},
+        {"sample": 0.0},
+        {"sample": 1.5},
+        {"sampled": -1},
+    ],
+)
+def test_options_out_of_range(bad):
+    with pytest.raises(UsageError):
+        SweepOptions(**bad)
+
+
+def test_a_view_that_sees_nothing_changes_only_the_mean(device):
+    scene = visible_scene(30)
+    cameras = ring_of_cameras(1, size=48)
+    away = dataclasses.replace(cameras[0], name="away", translation=np.array([0, 0, -50.0]))
+    rasterizer, removal = sweep(device, scene, cameras)
+    one = removal.measure()
+    finish(rasterizer, removal)
+    rasterizer, removal = sweep(device, scene, [*cameras, away])
+    two = removal.measure()
+    finish(rasterizer, removal)
+    for a, b in zip(one, two, strict=True):
+        assert np.allclose(a, 2 * b, rtol=1e-6, atol=1e-14)
+
+
+def test_views_of_different_sizes_count_the_same(device):
+    scene = visible_scene(30)
+    large = ring_of_cameras(2, size=96)[0]
+    small = ring_of_cameras(2, size=48)[1]
+    separate = []
+    for camera in (large, small):
+        rasterizer, removal = sweep(device, scene, [camera])
+        separate.append(removal.measure())
+        finish(rasterizer, removal)
+    rasterizer, removal = sweep(device, scene, [large, small])
+    together = removal.measure()
+    finish(rasterizer, removal)
+    for i in range(2):
+        assert np.allclose(together[i], (separate[0][i] + separate[1][i]) / 2, rtol=1e-5, atol=1e-13)
+
+
+@pytest.mark.parametrize("share", [0.2, 0.3, 0.5, 0.7, 0.95])
+def test_the_memory_budget_is_used_and_not_exceeded(device, share):
+    """Lists first, then geometry of as many views as there is room for; the effects are the same whatever is kept."""
+    scene = visible_scene(3000)
+    cameras = ring_of_cameras(40, size=48)
+    rasterizer = Rasterizer(device, scene)
+
+    def measured(memory):
+        before = device.allocated
+        removal = RemovalSweep(rasterizer, cameras, SweepOptions(memory=memory))
+        taken = device.allocated - before
+        removal.measure()
+        removal.remove(np.arange(0, 3000, 3))
+        effects = np.stack(removal.measure())
+        removal.free()
+        return taken, effects
+
+    nothing, _ = measured(0)
+    everything, expected = measured(None)
+    budget = int(share * (everything - nothing))
+    taken, effects = measured(budget)
+    rasterizer.free()
+    assert 0.9 * budget <= taken - nothing <= 1.001 * budget
+    left = np.arange(3000) % 3 > 0
+    assert (effects[:, left] == expected[:, left]).all()
+
+
+def test_identical_splats_share_their_effect(device):
+    scene = visible_scene(1).subset(np.zeros(40, np.int64))
+    cameras = ring_of_cameras(2, size=48)
+    rasterizer, removal = sweep(device, scene, cameras)
+    effect, importance = removal.measure()
+    finish(rasterizer, removal)
+    assert np.isfinite(effect).all()
+    # Nearer by number: the first is in front of all others.
+    assert (np.diff(importance) <= 1e-12).all()
+
+
+def test_pruning_to_one_splat(device):
+    scene = visible_scene(40)
+    cameras = ring_of_cameras(2, size=48)
+    rasterizer, removal = sweep(device, scene, cameras)
+    pruned = prune(removal, 40, PruningOptions(np.inf, 5))
+    finish(rasterizer, removal)
+    assert pruned.kept == 1
+
+
+def test_pruning_keeps_the_picture_better_than_importance(device, lego_excerpt, lego_excerpt_cameras):
+    cameras = [c for c in lego_excerpt_cameras if c.split == "train"][:4]
+    rasterizer, removal = sweep(device, lego_excerpt, cameras)
+    _, importance = removal.measure()
+    pruned = prune(removal, 1500, PruningOptions(0, 12, count=750))
+    removal.free()
+    by_importance = np.sort(np.argsort(importance)[-750:])
+
+    def error(kept):
+        other = Rasterizer(device, lego_excerpt.subset(kept))
+        total = sum(np.mean((other.render(c)[0] - rasterizer.render(c)[0]) ** 2) for c in cameras)
+        other.free()
+        return total
+
+    assert error(pruned.survivors) < 0.5 * error(by_importance)
+    rasterizer.free()
+
+
+def test_no_view_is_an_error(device):
+    rasterizer = Rasterizer(device, visible_scene(3))
+    with pytest.raises(UsageError, match="at least one view"):
+        RemovalSweep(rasterizer, [])
+    rasterizer.free()
+
+
+@pytest.mark.parametrize(
+    ("kind", "integrated", "share"), [("gpu", False, 0.5), ("gpu", True, 0.3), ("cpu", True, 0.3), ("cpu", False, 0.3)]
+)
+def test_views_take_less_of_memory_that_is_the_hosts(device, kind, integrated, share):
+    before = device.info
+    device.info = dataclasses.replace(before, memory=10**10, kind=kind, integrated=integrated)
+    assert default_memory(device) == share * 10**10
+    device.info = before

@@ -1,0 +1,659 @@
+"""Run time against error of all stages and whole encodes, on every OpenCL device: python -m tools.bench.encode
+[options]
+
+For each stage the variants that exist: kernel family, compiler flags, formula, precision, sort, skips, iterations,
+steps, entropy coder, preset; each with its time and its error against float64 or against the full computation. A
+variant is on the Pareto front if no other of its stage is at least as good in time, error and bytes and better in one
+by more than the noise of 5 %.
+
+  python -m tools.bench.encode                           every device, the scenes lego and plush
+  python -m tools.bench.encode --quick                   the best device, the bundled excerpt; under two minutes
+  python -m tools.bench.encode --scenes FOLDER …         folders with point_cloud.ply and cameras.json
+  python -m tools.bench.encode --stages sort ridge       some stages only
+  python -m tools.bench.encode --from benchmark.json     tables and plots again
+
+Every device runs in a process of its own. Times of the rasterizer's kernels and of the ridge are the device's own, the
+others the clock's. Each is the best of some. Prints Markdown; --json keeps the figures, --plots draws them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import importlib.metadata
+import json
+import math
+import os
+import platform
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from pathlib import Path
+from typing import Any, get_args
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from potr_cl.codec.container import EntropyCoder
+from potr_cl.codec.decoder import decode
+from potr_cl.codec.encoder import code_scene
+from potr_cl.formats import load_cameras, load_scene
+from potr_cl.model.camera import Camera, camera_centres, test_views, train_views
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device, DeviceInfo, Family, choose_device, list_devices
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.quality.evaluator import Judge, JudgingViews
+from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
+from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
+from potr_cl.stages.refitting.refit import RefitOptions, RenderedTargets, refit_colours
+from tests.oracles import raster as reference
+from tools.bench.pruning import Bench, halved, skips
+from tools.study.compaction_curves import measured_weights
+from tools.study.removal_exactness import SCENES, BruteForce, choose_splats
+from tools.study.removal_formulas import PrefixSumsDevice
+
+F64 = NDArray[np.float64]
+
+DATA = Path(__file__).parents[2] / "tests" / "data"
+#: Compiler flags that trade accuracy for speed.
+FLAGS: Mapping[str, tuple[str, ...]] = {
+    "no flags": (),
+    "mad": ("-cl-mad-enable",),
+    "no signed zeros": ("-cl-no-signed-zeros",),
+    "flush denormals": ("-cl-denorms-are-zero",),
+    "unsafe": ("-cl-unsafe-math-optimizations",),
+    "fast relaxed": ("-cl-fast-relaxed-math",),
+}
+#: Keys that a GPU's work-group sorts in local memory at a time; 2048 is the default.
+CAPACITIES = (1024, 2048, 4096)
+#: Pixels of a view, and splats, that are computed in float64.
+PIXELS, SPLATS = 300, 150
+#: Part by which a time or an error must be lower to be lower.
+NOISE = 0.05
+#: As in the tests: pixels that come no nearer, relatively, to a threshold cannot flip, nor splats in another order.
+CLEAR, TIE = 1e-4, 1e-6
+
+
+@dataclasses.dataclass(frozen=True)
+class Row:
+    """One variant of one stage.
+
+    Attributes:
+        seconds: of the time that the stage's heading names.
+        error: of the kind that the stage's heading names.
+        default: whether this is what the package does on this device.
+        nbytes: of the result, where that is a matter of the variant.
+    """
+
+    stage: str
+    variant: str
+    seconds: float
+    error: float
+    default: bool = False
+    nbytes: int | None = None
+
+
+#: Every stage's time, and its error.
+STAGES = {
+    "project": ("a view's projection", "largest error of a centre, pixels"),
+    "tile lists": ("a view's tile lists", "entries that another variant has not"),
+    "sort": ("a view's depth sort", "entries out of order"),
+    "composite": ("a view's compositing", "largest error of a pixel"),
+    "removal": ("a sweep over all tiles of a view", "median relative error of ΔMSE"),
+    "prune": ("the schedule", "RMS error on test views at equal counts"),
+    "ridge": ("the kernel, a million splats", "colour error above the optimum, 99.99th percentile"),
+    "re-fit": ("the solver", "RMS error on training views"),
+    "code": ("coding without looking at views", "bytes"),
+    "decode": ("decoding", "bytes"),
+    "encode": ("the whole encode", "RMS error on test views"),
+}
+
+
+class VariantDevice(Device):
+    """A device on which macros of the kernels have other values than the package gives them."""
+
+    def __init__(self, info: DeviceInfo, family: Family, flags: Sequence[str] = (), **macros: int) -> None:
+        self._macros = macros
+        super().__init__(info, profiling=True, family=family, build_options=flags)
+
+    def program(self, source: str, **defines: str | int | float) -> cl.Program:
+        changed = {name: value for name, value in self._macros.items() if name in defines}
+        return super().program(source, **{**defines, **changed})
+
+
+@dataclasses.dataclass
+class Workload:
+    """A scene and how much of it is enough.
+
+    Attributes:
+        train, test: views.
+        views: of those, how many the kernels are measured on.
+        repeats: of every measurement; the best counts.
+        pruning: iterations of the schedule.
+    """
+
+    folder: Path
+    scene: Scene
+    train: list[Camera]
+    test: list[Camera]
+    views: int
+    repeats: int
+    pruning: int
+
+    @staticmethod
+    def of(folder: Path, quick: bool) -> Workload:
+        """A scene's folder, or the excerpt's files put into one."""
+        cameras = load_cameras(folder / "cameras.json")
+        if quick:
+            cameras = [halved(camera) for camera in cameras]
+        train, test = train_views(cameras), test_views(cameras)
+        scene = load_scene(folder / "point_cloud.ply")
+        return Workload(folder, scene, train, test, 2 if quick else 5, 3 if quick else 7, 8 if quick else 48)
+
+    @property
+    def some(self) -> list[Camera]:
+        """The views that kernels are measured on."""
+        return self.train[:: max(len(self.train) // self.views, 1)][: self.views]
+
+
+def families(info: DeviceInfo) -> tuple[Family, ...]:
+    """The device's own kernel family first."""
+    return ("cpu", "gpu") if info.family == "cpu" else ("gpu",)
+
+
+def best_of(repeats: int, work: Callable[[], Any]) -> float:
+    """Seconds by the clock, after one run that is not counted."""
+    work()
+    times = []
+    for _ in range(repeats):
+        started = time.perf_counter()
+        work()
+        times.append(time.perf_counter() - started)
+    return min(times)
+
+
+# ------------------------------------------------------------------------------------------ stages
+
+
+def rasterizer_times(device: Device, load: Workload) -> dict[str, float]:
+    """Seconds a view of every kernel: the best of some passes over the views."""
+    rasterizer = Rasterizer(device, load.scene, GSPLAT)
+    best: dict[str, float] = {}
+    for number in range(load.repeats + 1):
+        device.stage_times()
+        for camera in load.some:
+            rasterizer.render_device(camera)
+        times = device.stage_times()
+        if number:
+            best = {name: min(seconds / len(load.some), best.get(name, math.inf)) for name, seconds in times.items()}
+    rasterizer.free()
+    return best
+
+
+def kernel_variants(info: DeviceInfo, quick: bool) -> Iterator[tuple[str, bool, Device]]:
+    """Family and flags; on GPU kernels also the sort's capacity and their own exponential."""
+    for family in families(info):
+        for name, flags in FLAGS.items():
+            if quick and name not in ("no flags", "mad", "fast relaxed"):
+                continue
+            yield f"{family}, {name}", family == info.family and not flags, VariantDevice(info, family, flags)
+        if family == "gpu":
+            for capacity in CAPACITIES:
+                if capacity != 2048 and 8 * capacity <= info.local_memory:
+                    device = VariantDevice(info, family, SORT_CAPACITY=capacity)
+                    yield f"{family}, sorts {capacity} at a time", False, device
+            default = VariantDevice(info, family).native_exp2
+            name = "polynomial" if default else "native exponential"
+            yield f"{family}, {name}", False, VariantDevice(info, family, NATIVE_EXP2=int(not default))
+
+
+class RasterizerTruth:
+    """One view in float64: splats on screen, and some pixels."""
+
+    def __init__(self, load: Workload) -> None:
+        self.camera = load.some[0]
+        self.projected = reference.project(load.scene, self.camera, GSPLAT)
+        rng = np.random.default_rng(0)
+        self.pixels: list[tuple[int, int, F64]] = []
+        for _ in range(4 * PIXELS):
+            column, row = int(rng.integers(self.camera.width)), int(rng.integers(self.camera.height))
+            pixel = reference.composite_pixel(self.projected, column, row, GSPLAT)
+            if pixel.margin > CLEAR and pixel.gap > TIE:
+                self.pixels.append((column, row, np.append(pixel.colour, pixel.transmittance)))
+            if len(self.pixels) == PIXELS:
+                break
+
+    def errors(self, device: Device, scene: Scene) -> tuple[float, float, float, set[bytes]]:
+        """Of centres, of order, of pixels; and the tile lists as a set."""
+        rasterizer = Rasterizer(device, scene, GSPLAT)
+        view = rasterizer.prepare(self.camera)
+        shapes = device.download(view.shapes, (rasterizer.stride, 8), np.float32)
+        offsets = device.download(view.offsets, (view.tiles + 1,), np.uint32).astype(np.int64)
+        entries = device.download(view.entries, (view.entry_count,), np.uint32)
+        image, transmittance = rasterizer.composite(view)
+        view.free()
+        rasterizer.free()
+        listed = np.isin(self.projected.index, entries)
+        centres = np.abs(shapes[self.projected.index[listed], :2] - self.projected.centre[listed])
+        inside = (self.projected.centre[listed] >= 0).all(axis=1)
+        inside &= (self.projected.centre[listed] < (self.camera.width, self.camera.height)).all(axis=1)
+        tiles = np.repeat(np.arange(view.tiles), np.diff(offsets))
+        order = np.lexsort((entries, shapes[entries, 6], tiles))
+        wrong = int(np.count_nonzero(entries[order] != entries))
+        ours = np.concatenate([image, transmittance[..., None]], axis=2).astype(np.float64)
+        pixel = max((float(np.abs(ours[row, column] - true).max()) for column, row, true in self.pixels), default=0.0)
+        pairs = {pair.tobytes() for pair in np.stack([tiles, entries], axis=1)}
+        return float(centres[inside].max(initial=0)), wrong, pixel, pairs
+
+
+def rasterizer_rows(info: DeviceInfo, load: Workload, quick: bool, stages: Sequence[str]) -> Iterator[Row]:
+    """All kernels of the rasterizer."""
+    truth = RasterizerTruth(load)
+    first: set[bytes] | None = None
+    kernels = {
+        "project": ("project",),
+        "tile lists": ("count_tiles", "scan_tiles", "fill_tiles"),
+        "sort": ("sort_tiles",),
+        "composite": ("composite", "composite_frame"),
+    }
+    for name, default, device in kernel_variants(info, quick):
+        times = rasterizer_times(device, load)
+        centre, wrong, pixel, pairs = truth.errors(device, load.scene)
+        first = pairs if first is None else first
+        errors = {"project": centre, "tile lists": len(first ^ pairs), "sort": wrong, "composite": pixel}
+        for stage, parts in kernels.items():
+            # A variant stands in the tables of the kernels that it changes.
+            about = {"sorts": "sort", "polynomial": "composite", "native exponential": "composite"}
+            only = next((kernel for word, kernel in about.items() if word in name), stage)
+            if stage in stages and stage == only:
+                yield Row(
+                    stage, name, sum(times[part] for part in parts if part in times), float(errors[stage]), default
+                )
+
+
+def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
+    """Formula, family, flags, and where pixels end."""
+    camera = load.some[0]
+    flags = ("no flags", "mad", "fast relaxed") if quick else tuple(FLAGS)
+    default = SweepOptions()
+    # What each sweep is compared with ends its pixels in the same place.
+    stops = sorted({INRIA.stop, default.stop or INRIA.stop}, reverse=True)
+    variants: list[tuple[str, bool, Device, SweepOptions]] = []
+    for family in families(info):
+        own = family == info.family
+        for name in flags:
+            flagged = VariantDevice(info, family, FLAGS[name])
+            variants.append((f"{family}, {name}", own and name == "no flags", flagged, default))
+        prefix_sums = PrefixSumsDevice(info, profiling=True, family=family)
+        variants.append((f"{family}, prefix sums", False, prefix_sums, default))
+        plain = VariantDevice(info, family)
+        other = dataclasses.replace(default, tighten=not default.tighten)
+        variants.append((f"{family}, {'not ' if default.tighten else ''}tightened", False, plain, other))
+        for stop in stops:
+            if stop != (default.stop or INRIA.stop):
+                ends = dataclasses.replace(default, stop=stop)
+                variants.append((f"{family}, pixels end at {stop:.0e}", False, plain, ends))
+    rasterizer = Rasterizer(variants[0][2], load.scene)
+    removal = RemovalSweep(rasterizer, [camera])
+    chosen = choose_splats(removal.measure()[1], SPLATS // 3 if quick else SPLATS)
+    removal.free()
+    rasterizer.free()
+    brute = BruteForce(reference.project(load.scene, camera, INRIA), camera, INRIA)
+    truths = dict(zip(stops, brute.effects(chosen, stops)[0], strict=True))
+    for label, is_default, device, options in variants:
+        rasterizer = Rasterizer(device, load.scene)
+        removal = RemovalSweep(rasterizer, [camera], options)
+        effect = removal.measure()[0][chosen]
+        best = math.inf
+        for _ in range(load.repeats):
+            removal.sweep_everything()
+            started = time.perf_counter()
+            removal.measure()
+            best = min(best, time.perf_counter() - started)
+        removal.free()
+        rasterizer.free()
+        true = truths[options.stop or INRIA.stop] / (3 * camera.width * camera.height)
+        seen = true > 0
+        error = float(np.median(np.abs(effect[seen] / true[seen] - 1)))
+        yield Row("removal", label, best, error, is_default)
+
+
+def prune_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
+    """What the schedule may skip, see tools.bench.pruning."""
+    bench = Bench(load.folder, Device(info), quick, truth=False)
+    default = SweepOptions()
+    for row in skips(bench, (load.pruning, load.pruning // 2)):
+        is_default = row["skipped"] == f"tolerance {default.tolerance:g}"
+        error = 10 ** (-row["psnr_at_equal_count"] / 20)
+        yield Row("prune", row["skipped"], row["seconds"], error, is_default)
+    bench.free()
+
+
+def ridge_errors(scene: Scene, compacted: Scene, centres: F64, weights: Any, options: CompactionOptions) -> F64:
+    """(K, 3) weighted colour errors above the optimum over the coefficients left free, of the splats that are seen.
+
+    Relative to the largest coefficient or 1.
+    """
+    from tests.oracles.ridge import YCOCG, Ridges, triangles  # needs scipy
+
+    before, after = scene.sh @ YCOCG.T, compacted.sh @ YCOCG.T
+    largest = np.maximum(np.abs(before).max(axis=1), 1)
+    squares = np.add.reduceat(np.append(weights.weights.astype(np.float64) ** 2, 0), weights.offsets[:-1])
+    errors = []
+    for splats, triangle in triangles(scene.means.astype(np.float64), centres, weights, scene.sh_degree):
+        found = np.zeros((len(splats), 3))
+        for c in range(3):
+            used = np.abs(after[splats, :, c]) > 1e-6 * np.abs(compacted.sh[splats]).max(axis=(1, 2))[:, None]
+            used[:, 0] = True
+            lam = options.lam * (options.chroma_factor if c else 1)
+            excess = Ridges(triangle, before[splats, :, c], used, lam).excess(after[splats, :, c])[0]
+            kept = np.isclose(after[splats, 1:, c], before[splats, 1:, c], rtol=1e-5, atol=1e-7).all(axis=1)
+            found[:, c] = np.where(kept, 0, np.sqrt(excess / squares[splats]) / largest[splats, c])
+        errors.append(found)
+    return np.concatenate(errors)
+
+
+def ridge_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
+    """Precision of the least squares, and family."""
+    views = load.train if quick else load.train[::2]
+    chosen = np.random.default_rng(0).permutation(len(load.scene))[: 500 if quick else 20_000]
+    scene, centres = load.scene.subset(np.sort(chosen)), camera_centres(views)
+    weights = measured_weights(Device(info), scene, views)
+    for family in families(info):
+        device = VariantDevice(info, family)
+        doubles = "cl_khr_fp64" in info.handle.extensions.split()
+        for precision in get_args(Precision):
+            if precision == "fp64" and not doubles:
+                continue
+            # λ 0.01 and no column dropped: as hard as it gets.
+            options = CompactionOptions(lam=0.01, alpha=1, precision=precision)
+            compactor = Compactor(device)
+            best = math.inf
+            for _ in range(load.repeats + 1):
+                device.stage_times()
+                compacted = compactor.compact(scene, centres, weights, options)
+                best = min(best, device.stage_times()["compact"])
+            errors = ridge_errors(scene, compacted, centres, weights, options)
+            default = precision == CompactionOptions.precision and family == info.family
+            seconds = best * 1e6 / len(scene)
+            yield Row("ridge", f"{family}, {precision}", seconds, float(np.quantile(errors, 0.9999)), default)
+
+
+def refit_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
+    """Steps of conjugate gradients, and family, on the more important half of the splats."""
+    views = load.train if quick else load.train[:: max(len(load.train) // 16, 1)]
+    device = Device(info)
+    rasterizer = Rasterizer(device, load.scene)
+    removal = RemovalSweep(rasterizer, views)
+    importance = removal.measure()[1]
+    removal.free()
+    rasterizer.free()
+    kept = load.scene.subset(np.sort(np.argsort(importance)[len(importance) // 2 :]))
+    default = EncodeOptions.for_preset("best").refit
+    for family in families(info)[: 1 if quick else 2]:
+        device = Device(info, family=family)
+        rasterizer = Rasterizer(device, load.scene)
+        targets = RenderedTargets(rasterizer, views)
+        for steps in (0, 1, 2, 4, 8, 16) if quick else (0, 1, 2, 4, 8, 16, 32, 64):
+            options = RefitOptions(steps=steps, gain=0)
+            times = []
+            for _ in range(2):  # the first builds the kernels
+                started = time.perf_counter()
+                refitted = refit_colours(device, kept, views, targets, options)
+                times.append(time.perf_counter() - started)
+            error = math.sqrt(refitted.errors[1])
+            yield Row(
+                "re-fit", f"{family}, {steps} steps", times[-1], error, family == info.family and steps == default
+            )
+        rasterizer.free()
+
+
+def code_rows(load: Workload, quick: bool) -> Iterator[Row]:
+    """Entropy coders and levels, and decoding what they made."""
+    coders = [EntropyCoder("npz"), *(EntropyCoder("zstd", level) for level in (1, 9, 19, 22)), EntropyCoder("context")]
+    for coder in coders:
+        parameters = EncodeOptions.for_preset("best" if coder.name == "context" else "paper").parameters
+        coded = code_scene(load.scene, parameters, load.train, entropy=coder)
+        data = b"".join(coded.pieces)
+        name = f"{coder.name} {coder.level}" if coder.name == "zstd" else coder.name
+        if coder.name == "context":
+            name += " (format 2)"
+        for stage, work in (
+            ("code", lambda c=coder, p=parameters: code_scene(load.scene, p, load.train, entropy=c)),
+            ("decode", lambda d=data: decode(d)),
+        ):
+            seconds = best_of(1 if stage == "code" else load.repeats, work)
+            yield Row(stage, name, seconds, len(data), coder == EncodeOptions.for_preset("best").entropy)
+
+
+def encode_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
+    """Presets, iterations, stages left out: time, bytes and PSNR over the test views."""
+    device = Device(info)
+    judge = Judge(device, load.scene, JudgingViews.of([*load.train, *load.test]), (0.0, 0.0, 0.0))
+    variants: dict[str, dict[str, Any]] = {
+        "paper": {"preset": "paper"},
+        "fast": {"preset": "fast"},
+        "best": {"preset": "best"},
+        "paper, 12 iterations": {"preset": "paper", "iterations": 12},
+        "paper, 4 iterations": {"preset": "paper", "iterations": 4},
+        "paper, every removal effect anew": {"preset": "paper", "sweep": SweepOptions(tolerance=-1)},
+        "paper, no compaction": {"preset": "paper", "compact": False},
+        "paper, no pruning": {"preset": "paper", "prune": False},
+        "paper, neither": {"preset": "paper", "prune": False, "compact": False},
+        "paper, re-fit of 8 steps": {"preset": "paper", "refit": 8},
+        "best, re-fit of 4 steps": {"preset": "best", "refit": 4},
+        "best, re-fit of 16 steps": {"preset": "best", "refit": 16},
+    }
+    for number, (name, changes) in enumerate(variants.items()):
+        options = EncodeOptions.for_preset(**changes)
+        for _ in range(2 if quick or number == 0 else 1):  # the first builds the kernels
+            started = time.perf_counter()
+            encoded = encode(load.scene, load.train, options, device=device)
+            seconds = time.perf_counter() - started
+        psnr = judge.psnr(decode(b"".join(encoded.pieces)))
+        yield Row("encode", name, seconds, 10 ** (-psnr / 20), name == "best", encoded.nbytes)
+    judge.free()
+
+
+# ------------------------------------------------------------------------------------------ the run
+
+
+def measure(info: DeviceInfo, load: Workload, quick: bool, stages: Sequence[str]) -> Iterator[Row]:
+    """Every stage asked for, one after the other."""
+    work: dict[str, Callable[[], Iterator[Row]]] = {
+        "removal": lambda: removal_rows(info, load, quick),
+        "prune": lambda: prune_rows(info, load, quick),
+        "ridge": lambda: ridge_rows(info, load, quick),
+        "re-fit": lambda: refit_rows(info, load, quick),
+        "encode": lambda: encode_rows(info, load, quick),
+    }
+    if {"project", "tile lists", "sort", "composite"} & set(stages):
+        yield from rasterizer_rows(info, load, quick, stages)
+    if {"code", "decode"} & set(stages):
+        yield from (row for row in code_rows(load, quick) if row.stage in stages)
+    for stage, rows in work.items():
+        if stage in stages:
+            started = time.perf_counter()
+            yield from rows()
+            print(f"{stage}: {time.perf_counter() - started:.0f} s", file=sys.stderr, flush=True)
+
+
+def header(info: DeviceInfo) -> dict[str, str]:
+    """The machine and the versions."""
+    processor = platform.processor() or platform.machine()
+    cpuinfo = Path("/proc/cpuinfo")
+    if cpuinfo.exists():
+        models = [line.split(":")[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
+        processor = models[0] if models else processor
+    packages = ("potr-cl", "pyopencl", "numpy", "zstandard")
+    versions = []
+    for package in packages:
+        try:
+            versions.append(f"{package} {importlib.metadata.version(package)}")
+        except importlib.metadata.PackageNotFoundError:
+            versions.append(f"{package} not installed")
+    return {
+        "device": f"{info.name}, {info.platform}, {info.version}, driver {info.handle.driver_version}",
+        "machine": f"{processor}, {os.cpu_count()} processors, {platform.system()} {platform.release()}",
+        "versions": f"Python {platform.python_version()}, " + ", ".join(versions),
+        "date": time.strftime("%Y-%m-%d"),
+    }
+
+
+def on_front(row: Row, rows: Sequence[Row]) -> bool:
+    """Whether no other variant is at least as good in all and, beyond what is noise, better in one."""
+
+    def marks(r: Row) -> tuple[float, float, float]:
+        return r.seconds, r.error, r.nbytes or 0
+
+    def better(a: float, b: float) -> bool:
+        return a < b / (1 + NOISE)
+
+    mine = marks(row)
+    pairs = [list(zip(marks(other), mine, strict=True)) for other in rows]
+    return not any(all(a <= b for a, b in p) and any(better(a, b) for a, b in p) for p in pairs)
+
+
+def number(value: float) -> str:
+    """Three digits, whatever the size; whole numbers whole."""
+    return f"{value:,.0f}" if value == round(value) and abs(value) < 1e12 else f"{value:.3g}"
+
+
+def print_report(result: dict[str, Any]) -> None:
+    """A device's and scene's tables."""
+    rows = [Row(**row) for row in result["rows"]]
+    print(f"\n### {result['scene']}, {result['device'].split(',')[0]}\n")
+    print("; ".join(result[key] for key in ("device", "machine", "versions", "date")) + ".")
+    for stage, (what, error) in STAGES.items():
+        own = [row for row in rows if row.stage == stage]
+        if not own:
+            continue
+        sized = any(row.nbytes is not None for row in own)
+        print(f"\n#### {stage}: seconds of {what}, {error}\n")
+        print(f"| variant | seconds | {error} |" + (" bytes |" if sized else "") + " Pareto front |")
+        print("|---" * (5 if sized else 4) + "|")
+        for row in sorted(own, key=lambda r: r.seconds):
+            name = f"**{row.variant}** (default)" if row.default else row.variant
+            cells = [name, f"{row.seconds:.3g}", number(row.error)]
+            cells += [f"{row.nbytes:,}" if row.nbytes is not None else ""] if sized else []
+            print(f"| {' | '.join(cells)} | {'yes' if on_front(row, own) else ''} |")
+        for row in own:
+            if row.default and not on_front(row, own):
+                print(f"\nThe default, {row.variant}, is not on the front.")
+
+
+def plot(result: dict[str, Any], folder: Path) -> list[Path]:
+    """One picture a stage: time on one axis, error on the other, the front blue and joined, the default red."""
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    folder.mkdir(parents=True, exist_ok=True)
+    paths = []
+    for stage, (what, error) in STAGES.items():
+        own = [Row(**row) for row in result["rows"] if row["stage"] == stage]
+        if not own:
+            continue
+        figure, axes = plt.subplots(figsize=(10, 5), layout="constrained")
+        front = sorted((row for row in own if on_front(row, own)), key=lambda r: r.seconds)
+        # An error of 0 has no place on a logarithmic axis: it stands at the bottom.
+        least = min((row.error for row in own if row.error > 0), default=1.0) / 3
+        height = {row.variant: max(row.error, least) for row in own}
+        axes.plot([r.seconds for r in front], [height[r.variant] for r in front], "-", color="0.7", zorder=0)
+        listed = []
+        for place, row in enumerate(sorted(own, key=lambda r: r.seconds), 1):
+            colour = "C3" if row.default else ("C0" if row in front else "0.6")
+            axes.scatter(row.seconds, height[row.variant], s=30, color=colour)
+            axes.annotate(
+                str(place), (row.seconds, height[row.variant]), (4, 3), textcoords="offset points", fontsize=7
+            )
+            size = f", {row.nbytes / 1e6:.2f} MB" if row.nbytes is not None else ""
+            listed.append(f"{place}  {row.variant}{size}{' (default)' if row.default else ''}")
+        axes.annotate("\n".join(listed), (1.02, 1), xycoords="axes fraction", va="top", fontsize=7)
+        axes.set(xscale="log", yscale="log", xlabel=f"seconds of {what}", ylabel=error)
+        axes.set_title(f"{stage}: {result['scene']}, {result['device'].split(',')[0]}", fontsize=9)
+        slug = "".join(c if c.isalnum() else "_" for c in f"{result['scene']}_{result['device'].split(',')[0]}_{stage}")
+        paths.append(folder / f"benchmark_{slug}.png")
+        figure.savefig(paths[-1], dpi=110)
+        plt.close(figure)
+    return paths
+
+
+def run(info: DeviceInfo, folder: Path, name: str, quick: bool, stages: Sequence[str]) -> dict[str, Any]:
+    """One device on one scene."""
+    load = Workload.of(folder, quick)
+    rows = [dataclasses.asdict(row) for row in measure(info, load, quick, stages)]
+    return {**header(info), "scene": name, "splats": len(load.scene), "rows": rows}
+
+
+def excerpt(folder: Path) -> Path:
+    """The bundled excerpt as a scene's folder."""
+    folder.mkdir()
+    shutil.copy(DATA / "lego_excerpt.ply", folder / "point_cloud.ply")
+    shutil.copy(DATA / "lego_cameras.json", folder / "cameras.json")
+    return folder
+
+
+def in_process(info: DeviceInfo, folder: Path, name: str, quick: bool, stages: Sequence[str]) -> dict[str, Any]:
+    """The same in a process of its own, which a runtime that crashes takes down alone."""
+    with tempfile.TemporaryDirectory() as scratch:
+        path = Path(scratch) / "result.json"
+        command = [sys.executable, "-m", "tools.bench.encode", "--one", str(info.index), name, str(folder)]
+        command += ["--json", str(path), "--stages", *stages, *(["--quick"] if quick else [])]
+        done = subprocess.run(command, stdout=subprocess.DEVNULL, check=False)
+        if done.returncode:
+            return {**header(info), "scene": name, "rows": [], "failed": done.returncode}
+        result: dict[str, Any] = json.loads(path.read_text())
+        return result
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=Path, nargs="+", help="default: lego and plush, or the excerpt if quick")
+    parser.add_argument("--device", help="as everywhere; default: all, or the best one if quick")
+    parser.add_argument("--quick", action="store_true", help="the excerpt at half size, fewer variants")
+    parser.add_argument("--stages", nargs="+", choices=tuple(STAGES), default=list(STAGES))
+    parser.add_argument("--json", type=Path)
+    parser.add_argument("--plots", type=Path, metavar="FOLDER")
+    parser.add_argument("--from", dest="kept", type=Path, nargs="+", help="figures of earlier runs, instead of a run")
+    parser.add_argument("--one", nargs=3, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    if args.one:
+        index, name, folder = args.one
+        result = run(list_devices()[int(index)], Path(folder), name, args.quick, args.stages)
+        args.json.write_text(json.dumps(result))
+        return
+    if args.kept:
+        results = [result for path in args.kept for result in json.loads(path.read_text())]
+    else:
+        infos = [choose_device(args.device)] if args.device or args.quick else list_devices()
+        with tempfile.TemporaryDirectory() as scratch:
+            scenes = {folder.name: folder for folder in args.scenes or ()}
+            if not scenes and not args.quick:
+                scenes = {folder.name: folder for folder in (SCENES / "lego", SCENES / "plush") if folder.exists()}
+            scenes = scenes or {"excerpt": excerpt(Path(scratch) / "excerpt")}
+            results = [
+                in_process(info, folder, name, args.quick, args.stages)
+                for info in infos
+                for name, folder in scenes.items()
+            ]
+    if args.json:
+        args.json.write_text(json.dumps(results, indent=1))
+    for result in results:
+        print_report(result)
+        if "failed" in result:
+            print(f"\nFailed, exit code {result['failed']}.")
+        if args.plots:
+            for path in plot(result, args.plots):
+                print(f"\n![{path.stem}]({path})")
+
+
+if __name__ == "__main__":
+    main()

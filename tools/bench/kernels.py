@@ -1,0 +1,118 @@
+"""Processor time of each kernel of a pruning and of a re-fit: python -m tools.bench.kernels SCENE … --device NAME
+
+For CPU devices on machines that do other work too: a launch's time is that of the process, and of REPEATS runs of the
+same work the least. Each SCENE is a folder with point_cloud.ply and cameras.json. Prints Markdown: milliseconds a
+launch, which is one view or, of vectors, all of them.
+"""
+
+from __future__ import annotations
+
+import argparse
+import functools
+import time
+from collections import defaultdict
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pyopencl as cl
+
+from potr_cl.formats import load_cameras, load_scene
+from potr_cl.model.camera import Camera, train_views
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
+from potr_cl.stages.pruning.schedule import PruningOptions, prune
+from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, RenderedTargets
+
+ITERATIONS = 8
+DELTA_MSE_MAX = 1e-9
+STEPS = 4
+REPEATS = 3
+
+
+class TimedDevice(Device):
+    """A device that waits for each launch.
+
+    Attributes:
+        launches: kernel and seconds of the process, in their order.
+    """
+
+    def __init__(self, spec: str | None) -> None:
+        self.launches: list[tuple[str, float]] = []
+        super().__init__(spec)
+
+    def launch(
+        self,
+        kernel: cl.Kernel,
+        items: tuple[int, ...],
+        group: tuple[int, ...] | None = None,
+        queue: cl.CommandQueue | None = None,
+    ) -> None:
+        (queue or self.queue).finish()
+        start = time.process_time()
+        super().launch(kernel, items, group, queue)
+        (queue or self.queue).finish()
+        self.launches.append((kernel.function_name, time.process_time() - start))
+
+
+def pruning(device: Device, scene: Scene, cameras: list[Camera]) -> Scene:
+    """Prune; what is left."""
+    rasterizer = Rasterizer(device, scene)
+    removal = RemovalSweep(rasterizer, cameras, SweepOptions())
+    pruned = prune(removal, len(scene), PruningOptions(DELTA_MSE_MAX, ITERATIONS))
+    removal.free()
+    rasterizer.free()
+    return scene.subset(pruned.survivors)
+
+
+def refit(device: Device, scene: Scene, left: Scene, cameras: list[Camera]) -> None:
+    """Re-fit what is left to the whole scene's pictures."""
+    rasterizer = Rasterizer(device, scene)
+    solver = ColourRefit(device, left, cameras, RefitOptions(steps=STEPS, drop=1e-10, gain=0))
+    solver.solve(RenderedTargets(rasterizer, cameras))
+    solver.free()
+    rasterizer.free()
+
+
+def least_times(device: TimedDevice, work: Callable[[], object]) -> dict[str, tuple[int, float]]:
+    """Launches of each kernel and their seconds, each launch's least of all runs."""
+    runs = []
+    for _ in range(REPEATS):
+        device.launches = []
+        work()
+        runs.append(device.launches)
+    seconds = np.array([[taken for _, taken in run] for run in runs]).min(axis=0)
+    sums: dict[str, tuple[int, float]] = defaultdict(lambda: (0, 0.0))
+    for (name, _), taken in zip(runs[0], seconds, strict=True):
+        count, total = sums[name]
+        sums[name] = count + 1, total + float(taken)
+    return sums
+
+
+def main() -> None:
+    """Command line."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE")
+    parser.add_argument("--device")
+    parser.add_argument("--views", type=int, default=4, help="training views, spread evenly (default %(default)s)")
+    arguments = parser.parse_args()
+    device = TimedDevice(arguments.device)
+    print("| scene | stage | kernel | launches | ms of processors a launch |\n|---|---|---|---|---|")
+    for folder in arguments.scenes:
+        scene = load_scene(folder / "point_cloud.ply")
+        views = train_views(load_cameras(folder / "cameras.json"))
+        cameras = [views[k] for k in np.linspace(0, len(views) - 1, arguments.views).round().astype(int)]
+        left = pruning(device, scene, cameras)
+        stages: dict[str, Callable[[], object]] = {
+            "prune": functools.partial(pruning, device, scene, cameras),
+            "re-fit": functools.partial(refit, device, scene, left, cameras),
+        }
+        for stage, work in stages.items():
+            for name, (count, taken) in sorted(least_times(device, work).items(), key=lambda item: -item[1][1]):
+                print(f"| {folder.name} | {stage} | {name} | {count} | {1e3 * taken / count:.2f} |")
+
+
+if __name__ == "__main__":
+    main()

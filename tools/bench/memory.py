@@ -1,0 +1,84 @@
+"""Host memory of an encode, stage by stage: python -m tools.bench.memory SCENE.ply CAMERAS.json [--iterations N] …
+
+The peak of every stage is the kernel's own (Linux only): it is reset when a stage begins. On CPU devices the device's
+memory is the host's and counts. Prints Markdown. tools.make.large_scene makes scenes of any size.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import time
+from pathlib import Path
+
+from potr_cl.codec.quantize import PRESETS
+from potr_cl.formats import load_cameras, load_scene
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.stages.pruning.removal import SweepOptions
+
+
+def resident(field: str) -> float:
+    """Gigabytes of this process: "VmHWM", the peak since the last reset, or "VmRSS", now."""
+    for line in Path("/proc/self/status").read_text().splitlines():
+        if line.startswith(field + ":"):
+            return int(line.split()[1]) * 1024 / 1e9
+    raise OSError(f"/proc/self/status has no {field}")
+
+
+def reset_peak() -> None:
+    """Let "VmHWM" begin again at what is resident now."""
+    Path("/proc/self/clear_refs").write_text("5")
+
+
+class StagePeaks:
+    """Notes the peak of each stage; called as an encoder's progress.
+
+    Attributes:
+        rows: stage, its peak in gigabytes, what was resident when it ended, its seconds.
+    """
+
+    def __init__(self, first: str) -> None:
+        self.rows: list[tuple[str, float, float, float]] = []
+        self._stage, self._began = first, time.perf_counter()
+        reset_peak()
+
+    def __call__(self, stage: str, done: float = 0.0) -> None:
+        if stage != self._stage:
+            now = time.perf_counter()
+            self.rows.append((self._stage, resident("VmHWM"), resident("VmRSS"), now - self._began))
+            print("| {} | {:.2f} | {:.2f} | {:.0f} s |".format(*self.rows[-1]), flush=True)
+            self._stage, self._began = stage, now
+            reset_peak()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("scene", type=Path)
+    parser.add_argument("cameras", type=Path)
+    parser.add_argument("--iterations", type=int, default=EncodeOptions.iterations)
+    parser.add_argument("--preset", choices=PRESETS, default=EncodeOptions.preset)
+    parser.add_argument("--views", type=int, metavar="N", help="the first so many only")
+    parser.add_argument("--memory", type=float, metavar="GB", help="as encode's")
+    parser.add_argument("--device")
+    args = parser.parse_args()
+    device = Device(args.device)
+    print(f"{device.info}, {os.cpu_count()} processors\n\n| stage | peak GB | at its end | time |\n|---|---|---|---|")
+    peaks = StagePeaks("read")
+    scene = load_scene(args.scene)
+    cameras = load_cameras(args.cameras)[: args.views]
+    memory = None if args.memory is None else int(args.memory * 2**30)
+    sweep = SweepOptions(memory=memory)
+    options = EncodeOptions.for_preset(args.preset, iterations=args.iterations, sweep=sweep)
+    encoded = encode(scene, cameras, options, peaks, device)
+    peaks("end")
+    most = max(row[1] for row in peaks.rows)
+    print(
+        f"\n{len(scene)} splats, {len(cameras)} views of {cameras[0].width} x {cameras[0].height}, {args.iterations} "
+        f"iterations: {len(encoded.order)} splats in {encoded.nbytes} bytes, peak {most:.2f} GB"
+    )
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,391 @@
+"""What the joint re-fit of the colours brings and takes: python -m tools.bench.refit measure SCENE … --json OUT.json
+
+python -m tools.bench.refit measure SCENE … --json OUT.json [--removed PART …] [--drops X …] [--every N] [--quality Q]
+python -m tools.bench.refit report OUT.json [--images DIR]
+
+A SCENE is a folder with point_cloud.ply, cameras.json with test views and, if it has any, photographs in images.
+``measure`` looks at
+
+curves   bytes and PSNR after removing a part of the splats, for each way to treat the colours of those that are left
+         (WAYS); every re-fit is on the geometry and the opacities that a decoder sees
+steps    squared error on training views and PSNR on test views after 0 to 32 conjugate-gradient steps
+cuts     the same number of steps, with a new look at which colours are cut at 0 more or less often
+times    a step's time against a removal sweep's over the same views
+
+``--every N`` looks at every N-th view only, for machines that are slow. ``report`` prints Markdown and draws
+DIR/refit_SCENE.png from such a file.
+"""
+
+from __future__ import annotations
+
+import argparse
+import contextlib
+import dataclasses
+import json
+import math
+import sys
+import time
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.container import EntropyCoder
+from potr_cl.codec.decoder import decode
+from potr_cl.codec.encoder import code_scene
+from potr_cl.codec.quantize import ac_sparsity
+from potr_cl.formats import load_cameras, load_scene
+from potr_cl.model.camera import test_views, train_views
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.reduction import reduce_scene
+from potr_cl.quality.ground_truth import Photographs, PhotographTargets
+from potr_cl.quality.metrics import psnr
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
+from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, RenderedTargets, Targets, active_coefficients
+from tools.study.rate_distortion import size_at, write_json
+
+#: By name: whether splat by splat (the paper's compaction) comes first, and how the re-fit is done, if at all.
+WAYS = {
+    "as they were": (False, None),
+    "splat by splat": (True, None),
+    "joint": (False, "lambda"),
+    "splat by splat, then joint": (True, "active"),
+    "splat by splat, then joint, to photographs": (True, "photographs"),
+}
+PAPER = "splat by splat"
+REMOVED = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
+DROPS = (1e-11, 1e-10, 1e-9)
+STEPS = (0, 1, 2, 3, 4, 6, 8, 12, 16, 24, 32)
+#: Where in the schedule the parts on steps, cuts and times look.
+PART = 0.5
+CODER = EntropyCoder("zstd", 9)
+
+
+def log(text: str) -> None:
+    print(f"[{time.strftime('%H:%M:%S')}] {text}", file=sys.stderr, flush=True)
+
+
+class Bench:
+    """One scene on one device."""
+
+    def __init__(self, folder: Path, device: Device, options: EncodeOptions, refit: RefitOptions, every: int) -> None:
+        self.name, self.device, self.options, self.refit = folder.resolve().name, device, options, refit
+        self.scene = load_scene(folder / "point_cloud.ply")
+        cameras = load_cameras(folder / "cameras.json")
+        self.train, self.test = train_views(cameras)[::every], test_views(cameras)[::every]
+        self.rasterizer = Rasterizer(device, self.scene)
+        self.renders = [self.rasterizer.render(c)[0] for c in self.test]
+        self.photographs: Photographs | None = None
+        self.truths: list[FloatArray] = []
+        if (folder / "images").is_dir():
+            self.photographs = Photographs(folder / "images", [*self.train, *self.test])
+            self.truths = [self.photographs.picture(c) for c in self.test]
+        self.targets = RenderedTargets(self.rasterizer, self.train)
+
+    def free(self) -> None:
+        self.rasterizer.free()
+
+    def judge(self, candidate: Scene) -> dict[str, float]:
+        """Means over the test views."""
+        rasterizer = Rasterizer(self.device, candidate)
+        images = [rasterizer.render(c)[0] for c in self.test]
+        rasterizer.free()
+        values = [psnr(a, b) for a, b in zip(images, self.renders, strict=True)]
+        finite = [v for v in values if math.isfinite(v)]
+        figures = {"psnr": float(np.mean(finite))} if finite else {}
+        if self.truths:
+            figures["photo_psnr"] = float(np.mean([psnr(a, b) for a, b in zip(images, self.truths, strict=True)]))
+        return figures
+
+    def reduced(self, removed: float, compact: bool) -> Scene:
+        count = max(round((1 - removed) * len(self.scene)), 1)
+        options = dataclasses.replace(self.options, count=count, compact=compact)
+        return reduce_scene(self.scene, self.train, options, device=self.device)[0]
+
+    def decoded(self, scene: Scene) -> tuple[int, Scene, NDArray[np.int64]]:
+        """Bytes, the decoded scene, and the number in ``scene`` of each of its splats."""
+        coded = code_scene(scene, self.options.parameters, self.train, entropy=CODER)
+        return coded.nbytes, decode(b"".join(coded.pieces)), coded.order
+
+    def on_decoded_geometry(self, scene: Scene) -> Scene:
+        """The scene's colours on the geometry and the opacities that a decoder sees."""
+        _, decoded, order = self.decoded(dataclasses.replace(scene, sh=scene.sh[:, :1]))
+        place = np.empty(len(scene), np.int64)
+        place[order] = np.arange(len(scene))
+        return dataclasses.replace(decoded.subset(place), sh=scene.sh)
+
+    def active(self, scene: Scene) -> NDArray[np.bool_]:
+        return active_coefficients(scene.sh, self.options.parameters.sf_sh)
+
+    # -------------------------------------------------------------------------------------- curves
+
+    def point(self, scene: Scene, removed: float) -> dict[str, Any]:
+        """What coding a reduced scene takes, and what is left of it."""
+        nbytes, decoded, _ = self.decoded(scene)
+        sparsity = ac_sparsity(scene.sh, self.options.parameters.sf_sh)
+        return {"removed": removed, "splats": len(scene), "bytes": nbytes, "sparsity": sparsity, **self.judge(decoded)}
+
+    def refitted(
+        self, scene: Scene, targets: Targets, options: RefitOptions, active: NDArray[np.bool_] | None
+    ) -> tuple[Scene, dict[str, Any]]:
+        began = time.perf_counter()
+        refit = ColourRefit(self.device, self.on_decoded_geometry(scene), self.train, options)
+        try:
+            refit.set_coefficients(scene.sh, active)
+            result = refit.solve(targets)
+        finally:
+            refit.free()
+        facts = {"steps": result.steps, "errors": result.errors, "seconds": time.perf_counter() - began}
+        return dataclasses.replace(scene, sh=result.sh), facts
+
+    def curves(self, removed: tuple[float, ...], drops: tuple[float, ...], note: Callable[[Any], None]) -> None:
+        curves: dict[str, list[dict[str, Any]]] = {name: [] for name in WAYS}
+        curves |= {f"joint, drop {drop:g}": [] for drop in drops}
+        lam = self.options.parameters.lam
+        for part in removed:
+            scenes = {compact: self.reduced(part, compact) for compact in (False, True)}
+
+            def add(name: str, scene: Scene, facts: dict[str, Any], part: float = part) -> None:
+                curves[name].append({**self.point(scene, part), **facts})
+                p = curves[name][-1]
+                log(f"{self.name} {part:.0%} removed, {name}: {p['bytes']} bytes, {p.get('psnr', math.inf):.2f} dB")
+
+            for name, (compact, how) in WAYS.items():
+                scene = scenes[compact]
+                facts: dict[str, Any] = {}
+                with contextlib.ExitStack() as stack:
+                    targets: Targets = self.targets
+                    if how == "photographs":
+                        if self.photographs is None:
+                            continue
+                        photographs = PhotographTargets(self.device, self.photographs, self.train)
+                        stack.callback(photographs.free)
+                        targets = photographs
+                    if how is not None:
+                        options = dataclasses.replace(self.refit, lam=lam) if how == "lambda" else self.refit
+                        active = self.active(scene) if compact else None
+                        scene, facts = self.refitted(scene, targets, options, active)
+                add(name, scene, facts)
+            for drop in drops:
+                options = dataclasses.replace(self.refit, drop=drop)
+                add(f"joint, drop {drop:g}", *self.refitted(scenes[False], self.targets, options, None))
+            note({name: curve for name, curve in curves.items() if curve})
+
+    # -------------------------------------------------------------------------------------- the solver
+
+    def solver(self, scene: Scene, memory: int | None = None) -> ColourRefit:
+        return ColourRefit(self.device, scene, self.train, dataclasses.replace(self.refit, gain=0, memory=memory))
+
+    def steps(self, scene: Scene, most: int) -> list[dict[str, Any]]:
+        """Errors after so many steps, before the quantiser."""
+        active, rows = self.active(scene), []
+        refit = self.solver(scene)
+        for steps in (s for s in STEPS if s <= most):
+            refit.options = dataclasses.replace(refit.options, steps=steps)
+            refit.set_coefficients(scene.sh, active)
+            result = refit.solve(self.targets)
+            rows.append(self._row(scene, result.sh, result.errors[1], steps=result.steps))
+            log(f"{self.name} {rows[-1]}")
+        refit.free()
+        return rows
+
+    def cuts(self, scene: Scene, most: int) -> list[dict[str, Any]]:
+        """The same number of steps in runs of different lengths: each run begins with a new linearisation."""
+        active, rows = self.active(scene), []
+        refit = self.solver(scene)
+        for runs in (1, 2, 4, 8):
+            refit.options = dataclasses.replace(refit.options, steps=max(most // runs, 1))
+            sh = scene.sh
+            for _ in range(runs):
+                refit.set_coefficients(sh, active)
+                result = refit.solve(self.targets)
+                sh = result.sh
+            rows.append(self._row(scene, sh, result.errors[1], runs=runs, steps=max(most // runs, 1)))
+            log(f"{self.name} {rows[-1]}")
+        refit.free()
+        return rows
+
+    def _row(self, scene: Scene, sh: FloatArray, error: float, **facts: Any) -> dict[str, Any]:
+        return {**facts, "train_error": error, **self.judge(dataclasses.replace(scene, sh=sh))}
+
+    def times(self, scene: Scene) -> dict[str, float]:
+        """Seconds of a step and of a removal sweep of every tile; the shortest of three."""
+        rasterizer = Rasterizer(self.device, scene)
+        removal = RemovalSweep(rasterizer, self.train, SweepOptions(tolerance=-1))
+        removal.measure()
+        sweeps = [_seconds(removal.measure) for _ in range(3)]
+        removal.free()
+        rasterizer.free()
+        began = time.perf_counter()
+        refit = self.solver(scene)
+        prepared = time.perf_counter() - began
+        solves: dict[int, float] = {}
+        for steps in (2, 6):
+            refit.options = dataclasses.replace(refit.options, steps=steps)
+            runs = []
+            for _ in range(3):
+                refit.set_coefficients(scene.sh, self.active(scene))
+                runs.append(_seconds(lambda: refit.solve(self.targets)))
+            solves[steps] = min(runs)
+        refit.free()
+        step = (solves[6] - solves[2]) / 4
+        return {
+            "sweep": min(sweeps),
+            "step": step,
+            "ratio": step / min(sweeps),
+            "prepare": prepared,
+            "solve_6": solves[6],
+        }
+
+
+def _seconds(work: Callable[[], Any]) -> float:
+    began = time.perf_counter()
+    work()
+    return time.perf_counter() - began
+
+
+def _measure(args: argparse.Namespace) -> None:
+    device = Device(args.device)
+    options = EncodeOptions(q=args.quality, preset=args.preset, iterations=args.iterations)
+    refit = RefitOptions(steps=args.steps, prior=args.prior)
+    results: dict[str, Any] = {
+        "device": device.info.name, "q": args.quality, "preset": args.preset, "steps": args.steps,
+        "prior": args.prior, "every": args.every, "scenes": {},
+    }  # fmt: skip
+    for folder in args.scenes:
+        bench = Bench(folder, device, options, refit, args.every)
+        entry: dict[str, Any] = {
+            "splats": len(bench.scene),
+            "train_views": len(bench.train),
+            "test_views": len(bench.test),
+            "uncompressed": bench.judge(bench.scene),
+        }
+        results["scenes"][bench.name] = entry
+
+        def note(curves: Any, entry: dict[str, Any] = entry) -> None:
+            entry["curves"] = curves
+            write_json(args.json, results)
+
+        scene = bench.on_decoded_geometry(bench.reduced(PART, True))
+        entry["times"] = bench.times(scene)
+        entry["step_rows"] = bench.steps(scene, args.most_steps)
+        entry["cut_rows"] = bench.cuts(scene, args.most_steps)
+        write_json(args.json, results)
+        bench.curves(tuple(args.removed), tuple(args.drops), note)
+        bench.free()
+
+
+# ------------------------------------------------------------------------------------------------ report
+
+
+def _smaller(curves: dict[str, Any], name: str, key: str) -> str:
+    """How many bytes less than the paper's way a way takes at equal PSNR: the mean over its points within both."""
+    parts = []
+    for p in curves[name]:
+        paper = size_at(curves[PAPER], key, p[key])
+        if paper is not None:
+            parts.append(p["bytes"] / paper - 1)
+    return f"{100 * float(np.mean(parts)):+.0f} % ({len(parts)} points)" if parts else ""
+
+
+def _report(args: argparse.Namespace) -> None:
+    results = json.loads(args.results.read_text())
+    for name, entry in results["scenes"].items():
+        if "curves" not in entry:
+            continue
+        curves, photographs = entry["curves"], "photo_psnr" in entry["uncompressed"]
+        keys = ["psnr", "photo_psnr"] if photographs else ["psnr"]
+        print(
+            f"### {name}: {entry['splats']:,} splats, {entry['train_views']} training and {entry['test_views']} test "
+            f"views, preset {results['preset']}, q = {results['q']:g}, up to {results['steps']} steps, prior "
+            f"{results['prior']:g}, on {results['device']}\n"
+        )
+        print("Bytes against the paper's way at equal PSNR:\n")
+        heads = ["against uncompressed", "against photographs"][: len(keys)]
+        print("| colours | " + " | ".join(heads) + " |\n|---|" + "---|" * len(keys))
+        for way in curves:
+            if way != PAPER:
+                print(f"| {way} | " + " | ".join(_smaller(curves, way, key) for key in keys) + " |")
+        print("\n| removed | colours | MB | AC zeros | " + " | ".join(f"PSNR {h}" for h in heads) + " |")
+        print("|---|---|---|---|" + "---|" * len(keys))
+        for number, part in enumerate(p["removed"] for p in curves[PAPER]):
+            for way, points in curves.items():
+                p = points[number]
+                cells = " | ".join(f"{p[key]:.2f} dB" for key in keys)
+                print(f"| {part:.0%} | {way} | {p['bytes'] / 1e6:.3f} | {p['sparsity']:.1%} | {cells} |")
+        if photographs:
+            print(f"\nUncompressed against the photographs: {entry['uncompressed']['photo_psnr']:.2f} dB.")
+        print(f"\n{PART:.0%} removed, {PAPER}, then joint, before the quantiser of the colours:\n")
+        print("| steps | mean squared error, training views | PSNR, test views |\n|---|---|---|")
+        for row in entry["step_rows"]:
+            print(f"| {row['steps']} | {row['train_error']:.3e} | {row['psnr']:.2f} dB |")
+        print("\n| runs, each with a new look at the cuts | mean squared error | PSNR, test views |\n|---|---|---|")
+        for row in entry["cut_rows"]:
+            print(f"| {row['runs']} × {row['steps']} steps | {row['train_error']:.3e} | {row['psnr']:.2f} dB |")
+        t = entry["times"]
+        print(
+            f"\nA step {1e3 * t['step']:.1f} ms, a removal sweep {1e3 * t['sweep']:.1f} ms: {t['ratio']:.2f} times. "
+            f"Views prepared in {t['prepare']:.2f} s, six steps with all before and after {t['solve_6']:.2f} s.\n"
+        )
+        if args.images is not None:
+            _plot(name, entry, keys, args.images / f"refit_{name}.png")
+
+
+def _plot(name: str, entry: dict[str, Any], keys: list[str], path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    figure, axes = plt.subplots(1, len(keys), figsize=(6.4 * len(keys), 4.8), squeeze=False)
+    titles = {"psnr": "PSNR against the uncompressed renders, dB", "photo_psnr": "PSNR against the photographs, dB"}
+    for axis, key in zip(axes[0], keys, strict=True):
+        for way, points in entry["curves"].items():
+            axis.plot([p["bytes"] / 1e6 for p in points], [p[key] for p in points], marker="o", ms=4, label=way)
+        if key in entry["uncompressed"]:
+            axis.axhline(entry["uncompressed"][key], color="0.6", lw=1, ls="--", label="uncompressed")
+        axis.set_xscale("log")
+        axis.set_xlabel("MB")
+        axis.set_ylabel(titles[key])
+        axis.grid(alpha=0.3)
+    axes[0][-1].legend(loc="lower right", fontsize="small")
+    parts = [p["removed"] for p in entry["curves"][PAPER]]
+    figure.suptitle(f"{name}: {min(parts):.0%} to {max(parts):.0%} of {entry['splats']:,} splats removed")
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    measure = commands.add_parser("measure")
+    measure.add_argument("scenes", nargs="+", type=Path)
+    measure.add_argument("--json", type=Path, required=True)
+    measure.add_argument("--removed", nargs="+", type=float, default=REMOVED, help="parts of the splats")
+    measure.add_argument("--drops", nargs="*", type=float, default=DROPS, help="mean squared errors a coefficient")
+    measure.add_argument("--quality", type=float, default=0.5)
+    measure.add_argument("--preset", default="paper")
+    measure.add_argument("--iterations", type=int, default=48, help="of pruning")
+    measure.add_argument("--steps", type=int, default=RefitOptions.steps, help="of the curves' re-fits")
+    measure.add_argument("--prior", type=float, default=RefitOptions.prior)
+    measure.add_argument("--most-steps", type=int, default=max(STEPS), help="of the parts steps and cuts")
+    measure.add_argument("--every", type=int, default=1, help="look at every N-th view only")
+    measure.add_argument("--device")
+    measure.set_defaults(run=_measure)
+    report = commands.add_parser("report")
+    report.add_argument("results", type=Path)
+    report.add_argument("--images", type=Path)
+    report.set_defaults(run=_report)
+    args = parser.parse_args()
+    args.run(args)
+
+
+if __name__ == "__main__":
+    main()

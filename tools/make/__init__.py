@@ -1,0 +1,1 @@
+"""Makes what tests and benchmarks need: excerpts, golden files, large scenes."""

@@ -1,0 +1,286 @@
+"""The rasterizer on every OpenCL runtime of this machine: python -m tools.stress.platforms [--scenes FOLDER]
+
+Each device and kernel family runs in a process of its own, so that a runtime that crashes is one row of the table. What
+is checked: the device's self-check; small random scenes of every SH degree and both rules against the float64
+definition; the same bytes twice; SSIM, the re-fit's maps and its solution against float64; and, where FOLDER holds
+scenes with reference renders, PSNR against them.
+
+Oclgrind, where installed, simulates small scenes under its race, bounds and initialisation checks. pip's PoCL, Debian's
+PoCL (pocl-opencl-icd), Intel's (intel-opencl-rt) and Mesa's rusticl (mesa-opencl-icd) are found if they are there.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from potr_cl.errors import DeviceError
+from potr_cl.formats import load_cameras, load_scene
+from potr_cl.model.camera import camera_centres
+from potr_cl.opencl.device import Device, DeviceInfo, list_devices
+from potr_cl.quality.metrics import ssim
+from potr_cl.quality.metrics_device import Picture, Similarity
+from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.stages.compaction.ridge import Compactor, ViewWeights
+from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
+from potr_cl.stages.pruning.schedule import PruningOptions
+from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, RenderedTargets
+from tests.cases.refit import Case, Linearised, Pictures, visible_scene
+from tests.cases.scenes import ring_of_cameras
+from tests.cases.splats import camera, random_splats, splats, tilted_camera
+from tests.oracles import raster as reference
+from tests.oracles.refit import Array, to_ycocg
+
+#: As in the tests: pixels that come no nearer, relatively, to 1/255 and 1e-4 cannot flip.
+CLEAR = 1e-4
+TOLERANCE = 2e-5
+
+
+def check_definition(device: Device, sizes: tuple[int, ...] = (30, 400)) -> dict[str, Any]:
+    """Largest error clear of thresholds, and the pixels that flipped, over random scenes."""
+    worst, flips, pixels, same = 0.0, 0, 0, True
+    for degree in range(4):
+        for rules in (INRIA, GSPLAT):
+            for size in sizes:
+                scene, view = random_splats(size, degree, seed=degree), tilted_camera(degree, 83, 61)
+                rasterizer = Rasterizer(device, scene, rules)
+                image, transmittance = rasterizer.render(view)
+                same &= image.tobytes() == rasterizer.render(view)[0].tobytes()
+                rasterizer.free()
+                wanted = reference.render(scene, view, rules)
+                error = np.abs(image - wanted.image).max(axis=2)
+                error = np.maximum(error, np.abs(transmittance - wanted.transmittance))
+                worst = max(worst, float(error[wanted.margin > CLEAR].max()))
+                flips += int((error > TOLERANCE).sum())
+                pixels += error.size
+    return {"error": worst, "flips": flips, "pixels": pixels, "same_bytes": same}
+
+
+def check_similarity(device: Device) -> None:
+    """SSIM of noisy, flat and bright pictures against float64.
+
+    Raises:
+        DeviceError: it is more than 1e-6 away.
+    """
+    rng = np.random.default_rng(0)
+    for level, noise in ((0.5, 0.2), (0.98, 1e-3)):
+        a, b = (np.float32(level) + noise * rng.standard_normal((37, 50, 3), np.float32) for _ in range(2))
+        pair = Picture(device.upload(a, "a picture"), 0, 50, 37), Picture(device.upload(b, "a picture"), 0, 50, 37)
+        ((_, found),) = Similarity(device)([pair])
+        if abs(found - ssim(a, b)) > 1e-6:
+            raise DeviceError(f"SSIM is {found}, not {ssim(a, b)}")
+
+
+def check_refit(device: Device) -> dict[str, Any]:
+    """The re-fit's float32 against float64, relative errors: the worst of SH degrees 0 to 3.
+
+    Returns:
+        ``transposed``, of random pictures; ``normal``, of random coefficients through the map and back; ``blocks``,
+        the preconditioner's; ``adjoint``, <A d, r> - <d, Aᵀ r>; ``solution``, of the coefficients' change; and
+        whether two solves gave the same bytes.
+    """
+    worst = dict.fromkeys(("transposed", "normal", "blocks", "adjoint", "solution"), 0.0)
+    same = True
+    for degree in range(4):
+        rng = np.random.default_rng(degree)
+        with Case(device, visible_scene(40, degree), visible_scene(60, 2, seed=7), ring_of_cameras(3, size=40)) as case:
+            lam, prior = 30.0, 10.0
+            wanted = case.reference(lam=lam, prior=prior)
+            rendered = [p.reshape(*t.shape) for p, t in zip(wanted.pictures(wanted.start), case.pictures, strict=True)]
+            targets = [(p - rng.uniform(-1, 1, size=p.shape)).astype(np.float32) for p in rendered]
+            images = [(p - t).reshape(-1, 3) for p, t in zip(rendered, targets, strict=True)]
+            direction = rng.normal(size=case.scene.sh.shape)
+            with Pictures(device, targets) as pictures, Linearised(case, pictures, RefitOptions(lam=0)) as linear:
+                transposed = -linear.vector(linear.refit._residual)
+                normal, blocks = linear.normal(direction), linear.gram()
+            forward, back, gram = wanted.forward(direction), wanted.transposed(images), np.triu(wanted.gram())
+            weights = [view.weight for view in wanted.views]
+            product = sum(w * float(np.sum(a * b)) for w, a, b in zip(weights, forward, images, strict=True))
+            lengths = [
+                np.sqrt(sum(w * float(np.sum(a * a)) for w, a in zip(weights, vectors, strict=True)))
+                for vectors in (forward, images)
+            ]
+            options = RefitOptions(steps=300, gain=0, lam=lam, prior=prior)
+            solved = case.solve(options).sh
+            same &= solved.tobytes() == case.solve(options).sh.tobytes()
+            solution = wanted.solution()
+            errors = {
+                "transposed": _relative(transposed, back),
+                "normal": _relative(normal, wanted.transposed(forward)),
+                "blocks": float(np.abs(blocks - gram).max() / gram.max()),
+                "adjoint": abs(float(np.sum(direction * transposed)) - product) / (lengths[0] * lengths[1]),
+                "solution": _relative(to_ycocg(solved) - wanted.start, solution - wanted.start),
+            }
+            worst = {name: max(worst[name], error) for name, error in errors.items()}
+    return {**worst, "same_bytes": same}
+
+
+def _relative(value: Array, wanted: Array) -> float:
+    return float(np.linalg.norm(value - wanted) / np.linalg.norm(wanted))
+
+
+def check_scene(device: Device, folder: Path) -> dict[str, float]:
+    """Lowest PSNR against the reference renders, largest difference, and seconds a frame."""
+    rasterizer = Rasterizer(device, load_scene(folder / "point_cloud.ply"), GSPLAT)
+    cameras = {c.name: c for c in load_cameras(folder / "cameras.json")}
+    psnr, largest, times = np.inf, 0.0, []
+    for path in sorted((folder / "reference").glob("*.npz")):
+        image, _ = rasterizer.render(cameras[path.stem])
+        with np.load(path) as theirs:
+            error = image - theirs["rgb"]
+        psnr = min(psnr, float(-10 * np.log10(np.mean(np.square(error)))))
+        largest = max(largest, float(np.abs(error).max()))
+        for _ in range(5):
+            started = time.perf_counter()
+            rasterizer.render_device(cameras[path.stem])
+            times.append(time.perf_counter() - started)
+    rasterizer.free()
+    return {"psnr": psnr, "largest": largest, "seconds": min(times)}
+
+
+def check_device(index: int, family: str, scenes: Path | None) -> dict[str, Any]:
+    """Everything about one device and family."""
+    device = Device(list_devices()[index], family=family)  # type: ignore[arg-type]
+    device.self_check()
+    check_similarity(device)
+    result = {"vector_width": device.vector_width, **check_definition(device), "refit": check_refit(device)}
+    for name in ("lego", "plush"):
+        if scenes and (scenes / name / "reference").exists():
+            result[name] = check_scene(device, scenes / name)
+    return result
+
+
+def simulate(what: str) -> None:
+    """Inside Oclgrind: every kernel, every vector width, on scenes as small as it is slow.
+
+    Args:
+        what: the family of the kernels.
+
+    Nothing is freed: Oclgrind mistakes a new buffer in an old one's place for memory that no one has written. Nor does
+    it know that a filled buffer has been written.
+    """
+
+    def fill(queue: cl.CommandQueue, buffer: cl.Buffer, pattern: Any, offset: int, size: int) -> None:
+        cl.enqueue_copy(queue, buffer, np.full(size // pattern.itemsize, pattern), dst_offset=offset)
+
+    cl.enqueue_fill_buffer = fill
+    info = next(d for d in list_devices() if "oclgrind" in d.platform.lower())
+    kept: list[Rasterizer] = []
+    freed: list[cl.Buffer] = []
+    for family, width in (("gpu", 1), ("cpu", 4), ("cpu", 8), ("cpu", 16)):
+        if what != family:
+            continue
+        simulated = dataclasses.replace(info, vector_width=width)
+        device = Device(simulated, family=family, build_options=["-DNO_PREFETCH"])  # type: ignore[arg-type]
+        device.free = freed.append  # type: ignore[method-assign, assignment]
+        for rules in (INRIA, GSPLAT):
+            for size in (60, 400):
+                scene, view = random_splats(size, 3, seed=1), tilted_camera(1, 40, 24)
+                kept.append(Rasterizer(device, scene, rules))
+                image, _ = kept[-1].render(view)
+                wanted = reference.render(scene, view, rules)
+                error = np.abs(image - wanted.image)[wanted.margin > CLEAR].max()
+                assert error <= TOLERANCE, f"{family}: {error}"
+        scene, views = random_splats(60, 3, seed=2), [tilted_camera(seed, 40, 24) for seed in range(2)]
+        kept.append(Rasterizer(device, scene))
+        removal = RemovalSweep(kept[-1], views, SweepOptions(0, 1))
+        removal.measure()
+        removal.remove(np.arange(0, 60, 5))
+        removal.measure()
+        prune_scene(RemovalSweep(kept[-1], views, SweepOptions(0)), PruningOptions(1e-4, 3))
+        refit = ColourRefit(device, scene, views, RefitOptions(steps=2, gain=0, drop=1e-9))
+        refit.solve(RenderedTargets(kept[-1], views))
+        weights = ViewWeights.from_importances(len(scene), removal.view_importances())
+        for degree in (1, 2, 3):
+            Compactor(device).compact(random_splats(60, degree, seed=2), camera_centres(views), weights)
+        centres = np.random.default_rng(0).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (5000, 3))
+        kept.append(Rasterizer(device, splats(centres, sigma=1e-3, logit=1)))
+        kept[-1].render(camera(16, 16))  # a list longer than local memory
+        check_similarity(device)
+
+
+def run_oclgrind() -> str:
+    """One line: what Oclgrind found."""
+    # Looking for uninitialised values it crashes where vectors are loaded from a work-item's own array, and where a
+    # vector is made of shorter ones.
+    for what, checks in (("gpu", ["--data-races", "--uninitialized"]), ("cpu", ["--data-races"])):
+        with tempfile.TemporaryDirectory() as folder:
+            log = Path(folder) / "log"
+            # Its optimiser breaks stores of vectors; programs from pyopencl's cache lose their sources.
+            command = ["oclgrind", "--build-options", "-cl-opt-disable", *checks, "--log", str(log)]
+            run = subprocess.run(
+                [*command, sys.executable, "-m", "tools.stress.platforms", "--simulate", what],
+                env=os.environ | {"PYOPENCL_NO_CACHE": "1"}, capture_output=True, text=True, check=False,
+            )  # fmt: skip
+            found = log.read_text().strip() if log.exists() else ""
+        if run.returncode:
+            return f"the run failed: {[f'exit code {run.returncode}', *run.stderr.strip().splitlines()][-1]}"
+        if found:
+            return found.splitlines()[0]
+    return "no race, no access out of bounds, no uninitialised read (that of GPU kernels only)"
+
+
+def row(info: DeviceInfo, family: str, scenes: Path | None) -> str:
+    """One line of the table."""
+    command = [sys.executable, "-m", "tools.stress.platforms", "--device", str(info.index), "--family", family]
+    run = subprocess.run(
+        [*command, *(["--scenes", str(scenes)] if scenes else [])], capture_output=True, text=True, check=False
+    )
+    head = f"| {info.name} | {info.platform}, {info.version} | {family}"
+    if run.returncode:
+        message = run.stderr.strip().splitlines()[-1] if run.stderr.strip() else f"exit code {run.returncode}"
+        return f"{head} | failed: {message}" + " |" * 11
+    r = json.loads(run.stdout.splitlines()[-1])
+    real = [
+        f"{r[n]['psnr']:.1f} dB, {r[n]['largest']:.1e}, {1e3 * r[n]['seconds']:.1f} ms" if n in r else ""
+        for n in ("lego", "plush")
+    ]
+    same = r["same_bytes"] and r["refit"]["same_bytes"]
+    refit = " | ".join(f"{r['refit'][n]:.0e}" for n in ("adjoint", "transposed", "normal", "blocks", "solution"))
+    return (
+        f"{head} | {r['vector_width'] if family == 'cpu' else ''} | {r['error']:.1e} | "
+        f"{r['flips']} of {r['pixels']:,} | {'yes' if same else 'NO'} | {refit} | {real[0]} | {real[1]} |"
+    )
+
+
+def main() -> None:
+    """Command line."""
+    os.environ.setdefault("RUSTICL_ENABLE", "llvmpipe")
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--scenes", type=Path, help="folder with lego and plush")
+    parser.add_argument("--device", type=int, help=argparse.SUPPRESS)
+    parser.add_argument("--family", help=argparse.SUPPRESS)
+    parser.add_argument("--simulate", choices=("gpu", "cpu"), help=argparse.SUPPRESS)
+    arguments = parser.parse_args()
+    if arguments.simulate is not None:
+        simulate(arguments.simulate)
+        return
+    if arguments.device is not None:
+        print(json.dumps(check_device(arguments.device, arguments.family, arguments.scenes)))
+        return
+    print(
+        "| device | runtime | family | vector | largest error | flipped pixels | same bytes twice | re-fit: "
+        "<A d, r> − <d, Aᵀ r> | Aᵀ r | Aᵀ A d | blocks | solution | lego | plush |\n" + "|---" * 14 + "|"
+    )
+    for info in list_devices():
+        for family in ("gpu", "cpu") if info.family == "cpu" else ("gpu",):
+            print(row(info, family, arguments.scenes), flush=True)
+    if shutil.which("oclgrind"):
+        print(f"\nOclgrind: {run_oclgrind()}")
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,1 @@
+"""Experiments: what a choice costs or brings, against the alternatives."""

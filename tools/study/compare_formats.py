@@ -1,0 +1,163 @@
+"""What people would use instead: other formats and codecs on the same scenes, against our rate-distortion curve.
+
+python -m tools.study.compare_formats measure SCENE … --json OUT.json [--transform COMMAND] [--formats spz …] [--timeout
+S] python -m tools.study.compare_formats report OUT.json RATE_DISTORTION.json
+
+``measure`` writes each scene in each format with splat-transform (npm's @playcanvas/splat-transform), lets the same
+tool decode it to a PLY, and judges that by all test views. A format that does not finish in time is left out.
+The rows of :data:`EARLIER` are added. ``report`` prints Markdown: our size at their PSNR and our PSNR at their size,
+interpolated along the curve that tools.study.rate_distortion measured, linearly in the logarithm of the size.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from potr_cl.errors import UsageError
+from potr_cl.formats import load_scene
+from potr_cl.opencl.device import Device
+from tools.study.judging import JudgedScene
+from tools.study.rate_distortion import size_at, value_at, write_json
+
+FORMATS = ("compressed.ply", "spz", "sog")
+
+#: Measured earlier on the same scenes and test views, each with its authors' code on an NVIDIA GPU: size in MB, dB lost
+#: against the photographs, PSNR against the uncompressed renders. No fine-tuning unless said.
+EARLIER: dict[str, dict[str, tuple[float, float, float]]] = {
+    "lego": {
+        "SOG": (6.00, 0.46, 45.0),
+        "MesonGS": (3.30, 1.28, 40.4),
+        "C3DGS": (3.98, 1.16, 41.8),
+        "C3DGS, fine-tuned": (4.06, 0.28, 43.2),
+        "FlexGaussian": (6.24, 1.95, 38.8),
+        "LightGaussian": (9.03, 2.53, 36.9),
+    },
+    "plush": {
+        "SOG": (6.87, 0.15, 40.9),
+        "MesonGS": (5.17, 0.47, 36.2),
+        "C3DGS": (6.15, 0.06, 40.9),
+        "C3DGS, fine-tuned": (6.22, 0.06, 40.0),
+        "FlexGaussian": (6.74, 0.48, 36.5),
+        "LightGaussian": (12.4, 0.25, 38.4),
+    },
+}
+
+
+# ------------------------------------------------------------------------------------------- measurement
+
+
+def _run(command: list[str], timeout: float) -> None:
+    try:
+        subprocess.run(command, check=True, capture_output=True, text=True, timeout=timeout)
+    except FileNotFoundError as error:
+        raise UsageError(f"there is no command '{command[0]}': npm install @playcanvas/splat-transform") from error
+    except subprocess.CalledProcessError as error:
+        raise UsageError(f"'{shlex.join(command)}' failed: {error.stderr.strip()[-300:]}") from error
+
+
+def _through(
+    judge: JudgedScene, source: Path, suffix: str, transform: list[str], timeout: float
+) -> dict[str, Any] | None:
+    """Write a scene in one format, decode it, judge it; None if that did not finish."""
+    with tempfile.TemporaryDirectory() as folder:
+        coded, decoded = Path(folder) / f"scene.{suffix}", Path(folder) / "decoded.ply"
+        began = time.perf_counter()
+        try:
+            _run([*transform, str(source), str(coded)], timeout)
+        except subprocess.TimeoutExpired:
+            print(f"{judge.name} {suffix}: did not finish in {timeout:g} s", file=sys.stderr)
+            return None
+        seconds = time.perf_counter() - began
+        _run([*transform, str(coded), str(decoded)], timeout)
+        row = {"format": f".{suffix}", "bytes": coded.stat().st_size, "seconds": seconds, "measured": True}
+        return row | judge(load_scene(decoded))
+
+
+def _measure(args: argparse.Namespace) -> None:
+    transform = shlex.split(args.transform)
+    version = subprocess.run([*transform, "--version"], capture_output=True, text=True, check=True)
+    device = Device(args.device)
+    results: dict[str, Any] = {"tool": (version.stdout + version.stderr).strip(), "scenes": {}}
+    for folder in args.scenes:
+        judge = JudgedScene(folder, device)
+        rows = [_through(judge, folder / "point_cloud.ply", f, transform, args.timeout) for f in args.formats]
+        measured = [row for row in rows if row is not None]
+        for name, (size, lost, psnr) in EARLIER.get(judge.name, {}).items():
+            if f".{name.lower()}" not in {row["format"] for row in measured}:
+                row = {"format": name, "bytes": round(size * 1e6), "psnr": psnr, "psnr_loss": lost}
+                measured.append({**row, "measured": False})
+        results["scenes"][judge.name] = {**judge.facts(), "formats": measured}
+        write_json(args.json, results)
+        judge.free()
+
+
+# ------------------------------------------------------------------------------------------------ report
+
+
+def _cells(points: list[dict[str, Any]], row: dict[str, Any], key: str) -> str:
+    """Our size at their value, how many times smaller, and our value at their size."""
+    if row.get(key) is None:
+        return " | |"
+    size, value = size_at(points, key, row[key]), value_at(points, key, row["bytes"])
+    values, sizes = [p[key] for p in points], [p["bytes"] for p in points]
+    worst, best = (max(values), min(values)) if key == "psnr_loss" else (min(values), max(values))
+    if size is not None:
+        smaller = f"{size / 1e6:.2f} MB, {row['bytes'] / size:.1f} ×"
+    elif (row[key] > best) != (key == "psnr_loss"):
+        smaller = f"beyond our best, {best:.2f} dB"
+    else:
+        smaller = f"below {min(sizes) / 1e6:.2f} MB ({worst:.2f} dB), more than {row['bytes'] / min(sizes):.1f} ×"
+    ours = f"{value:.2f} dB" if value is not None else f"{best:.2f} dB at {max(sizes) / 1e6:.2f} MB"
+    return f" {smaller} | {ours} |"
+
+
+def _report(args: argparse.Namespace) -> None:
+    results = json.loads(args.results.read_text())
+    curves = json.loads(args.curves.read_text())["scenes"]
+    print(f"{results['tool']}; rows with * were measured earlier with their authors' code.\n")
+    for name, entry in results["scenes"].items():
+        for series, curve in curves[name]["series"].items():
+            points = curve["encodes"]
+            print(f"### {name}: other formats, and {series} on the curve\n")
+            print(
+                "| | MB | PSNR against uncompressed | ours at that PSNR | ours at that size | lost on photographs "
+                "| ours at that loss | ours at that size |\n|---|---|---|---|---|---|---|---|"
+            )
+            for row in entry["formats"]:
+                lost = f"{row['psnr_loss']:.2f} dB" if row.get("psnr_loss") is not None else ""
+                print(
+                    f"| {row['format']}{'' if row['measured'] else ' *'} | {row['bytes'] / 1e6:.2f} "
+                    f"| {row['psnr']:.2f} dB |{_cells(points, row, 'psnr')} {lost} |{_cells(points, row, 'psnr_loss')}"
+                )
+            print()
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    measure = commands.add_parser("measure")
+    measure.add_argument("scenes", nargs="+", type=Path)
+    measure.add_argument("--json", type=Path, required=True)
+    measure.add_argument("--transform", default="npx splat-transform", metavar="COMMAND")
+    measure.add_argument("--formats", nargs="+", choices=FORMATS, default=FORMATS)
+    measure.add_argument("--timeout", type=float, default=3600, metavar="S", help="a format; default an hour")
+    measure.add_argument("--device")
+    measure.set_defaults(run=_measure)
+    report = commands.add_parser("report")
+    report.add_argument("results", type=Path)
+    report.add_argument("curves", type=Path, help="what tools.study.rate_distortion measured")
+    report.set_defaults(run=_report)
+    args = parser.parse_args()
+    args.run(args)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,81 @@
+"""What the benchmarks of compression share: a trained scene with its test views, and what a candidate loses to it."""
+
+from __future__ import annotations
+
+import math
+from pathlib import Path
+from typing import Any
+
+from potr_cl.errors import DataError
+from potr_cl.formats import load_cameras, load_scene
+from potr_cl.model.camera import Camera, test_views
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.quality.compare import compare, find_photographs, mean_view
+from potr_cl.raster.rasterizer import Rasterizer
+
+
+class JudgedScene:
+    """An uncompressed scene on the device, ready to be compared with others.
+
+    Args:
+        folder: holds point_cloud.ply, cameras.json with test views, and photographs in ``images`` if there are any.
+        device: to render on.
+
+    Attributes:
+        source: the uncompressed scene.
+        cameras: all of them.
+        views: the test views among them; every comparison is over these.
+        source_bytes: of the PLY file.
+    """
+
+    def __init__(self, folder: Path, device: Device) -> None:
+        path = folder / "point_cloud.ply"
+        self.name = folder.resolve().name
+        self.source: Scene = load_scene(path)
+        self.source_bytes = path.stat().st_size
+        self.cameras: list[Camera] = load_cameras(folder / "cameras.json")
+        self.views = test_views(self.cameras)
+        if not self.views:
+            raise DataError(f"'{folder / 'cameras.json'}' has no test views")
+        images = folder / "images"
+        self._photographs = find_photographs(images, self.views) if images.is_dir() else None
+        self._device = device
+        self._rasterizer = Rasterizer(device, self.source)
+
+    def __call__(self, candidate: Scene) -> dict[str, float | None]:
+        """Means over the test views.
+
+        Returns:
+            ``psnr`` and ``ssim`` against the uncompressed scene's renders; with photographs also ``photo_psnr`` and
+            ``photo_ssim`` against those, and ``psnr_loss`` and ``ssim_loss``, what the uncompressed scene has more.
+            A PSNR of None means identical pictures.
+        """
+        rasterizer = Rasterizer(self._device, candidate)
+        try:
+            mean = mean_view(compare(self._rasterizer, rasterizer, self.views, self._photographs).views).figures
+        finally:
+            rasterizer.free()
+        names = {"b_against_a": ("psnr", "ssim")}
+        if self._photographs is not None:
+            names["b_against_photograph"] = ("photo_psnr", "photo_ssim")
+            names["loss"] = ("psnr_loss", "ssim_loss")
+        figures: dict[str, float | None] = {}
+        for pair, (psnr, ssim) in names.items():
+            figures[psnr] = mean[pair].psnr if math.isfinite(mean[pair].psnr) else None
+            figures[ssim] = mean[pair].ssim
+        return figures
+
+    def facts(self) -> dict[str, Any]:
+        """The uncompressed scene, for JSON."""
+        return {
+            "scene": self.name,
+            "source_bytes": self.source_bytes,
+            "source_splats": len(self.source),
+            "test_views": len(self.views),
+            "uncompressed": self(self.source),
+        }
+
+    def free(self) -> None:
+        """Give the device's memory back."""
+        self._rasterizer.free()

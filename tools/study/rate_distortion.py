@@ -1,0 +1,265 @@
+"""Size against quality: encode at many qualities, decode, judge by all test views; then tables and plots.
+
+python -m tools.study.rate_distortion measure SCENE … --json OUT.json [--qualities Q …] [--series NAME[:OPTION=VALUE,…]
+…] python -m tools.study.rate_distortion report OUT.json [--formats FORMATS.json] [--images DIR] [--against NAME --at Q]
+
+A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photographs in images. A series is a curve:
+the name it gets and the fields of EncodeOptions in which it differs from the defaults, as in best:preset=best; those of
+its SweepOptions too, as in exact:preset=best,sweep.tolerance=0. ``measure`` writes its results after every encode and
+goes on where an existing file stops. ``report`` prints Markdown and draws DIR/rate_distortion_SCENE.png; the points of
+other formats come from tools.study.compare_formats. With --against it prints instead how many bytes more or fewer each
+series takes at the PSNR that the series NAME has at quality Q, by interpolation, and how long its encodes take.
+"""
+
+from __future__ import annotations
+
+import argparse
+import ast
+import dataclasses
+import json
+import statistics
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+
+from potr_cl.codec.decoder import PotrFile
+from potr_cl.errors import UsageError
+from potr_cl.host.atomic_write import replacing
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.report.file import file_report
+from potr_cl.stages.pruning.removal import SweepOptions
+from tools.study.judging import JudgedScene
+
+QUALITIES = tuple(round(0.1 * step, 1) for step in range(1, 11))
+
+
+# ------------------------------------------------------------------------------------------- measurement
+
+
+def parse_series(text: str) -> tuple[str, dict[str, Any]]:
+    """``NAME:OPTION=VALUE,…`` to the name and the options.
+
+    Raises:
+        UsageError: an option is no field of :class:`EncodeOptions`.
+    """
+    name, _, rest = text.partition(":")
+    options: dict[str, Any] = {}
+    fields = {field.name for field in dataclasses.fields(EncodeOptions)} - {"sweep"}
+    fields |= {f"sweep.{field.name}" for field in dataclasses.fields(SweepOptions)}
+    for part in filter(None, rest.split(",")):
+        key, _, value = part.partition("=")
+        if key not in fields or key == "q":
+            raise UsageError(f"--series {text}: '{key}' is no option, expected one of {', '.join(sorted(fields))}")
+        try:
+            options[key] = ast.literal_eval(value)
+        except (ValueError, SyntaxError):
+            options[key] = value
+    return name, options
+
+
+def encode_options(changes: dict[str, Any]) -> EncodeOptions:
+    """The options of a series, quality included."""
+    sweep = {key.removeprefix("sweep."): value for key, value in changes.items() if key.startswith("sweep.")}
+    plain = {key: value for key, value in changes.items() if not key.startswith("sweep.")}
+    return EncodeOptions.for_preset(**{"preset": EncodeOptions.preset, **plain, "sweep": SweepOptions(**sweep)})
+
+
+def measure_encode(judge: JudgedScene, options: EncodeOptions, device: Device) -> dict[str, Any]:
+    """One encode with everything that it costs and keeps."""
+    encoded = encode(judge.source, judge.cameras, options, device=device)
+    file = PotrFile.from_bytes(b"".join(encoded.pieces))
+    report = file_report(file)
+    return {
+        "q": options.q,
+        "bytes": encoded.nbytes,
+        "splats": len(encoded.order),
+        "sections": {name: section["bytes"] for name, section in report["sections"].items()},
+        "seconds": encoded.seconds,
+        **judge(file.scene()),
+    }
+
+
+def write_json(path: Path, content: Any) -> None:
+    with replacing(path) as file:
+        file.write(json.dumps(content, indent=1, allow_nan=False).encode())
+
+
+def _measure(args: argparse.Namespace) -> None:
+    series = dict(parse_series(text) for text in args.series)
+    device = Device(args.device)
+    results: dict[str, Any] = {"scenes": {}}
+    if args.json.exists():
+        results = json.loads(args.json.read_text())
+    results["device"] = device.info.name
+    for folder in args.scenes:
+        judge = JudgedScene(folder, device)
+        entry = results["scenes"].setdefault(judge.name, {**judge.facts(), "series": {}})
+        for name, options in series.items():
+            curve = entry["series"].setdefault(name, {"options": options, "encodes": []})
+            done = {point["q"] for point in curve["encodes"]}
+            for q in args.qualities:
+                if q in done:
+                    continue
+                point = measure_encode(judge, encode_options({**options, "q": q}), device)
+                curve["encodes"].append(point)
+                curve["encodes"].sort(key=lambda p: p["q"])
+                write_json(args.json, results)
+                print(f"{judge.name} {name} q {q:g}: {point['bytes']} bytes, {point['psnr']:.2f} dB", flush=True)
+        judge.free()
+
+
+# ------------------------------------------------------------------------------------------------ report
+
+
+def _table(entry: dict[str, Any]) -> str:
+    photographs = "photo_psnr" in entry["uncompressed"]
+    head = "| series | q | splats | MB | times smaller | bytes a splat | PSNR, SSIM against uncompressed |"
+    rule = "|---|---|---|---|---|---|---|"
+    if photographs:
+        head += " PSNR, SSIM against photographs | lost |"
+        rule += "---|---|"
+    lines = [head, rule]
+    plain = entry["uncompressed"]
+    row = f"| uncompressed | | {entry['source_splats']:,} | {entry['source_bytes'] / 1e6:.1f} | 1 | "
+    row += f"{entry['source_bytes'] / entry['source_splats']:.0f} | |"
+    if photographs:
+        row += f" {plain['photo_psnr']:.2f} dB, {plain['photo_ssim']:.4f} | |"
+    lines.append(row)
+    for name, curve in entry["series"].items():
+        for p in curve["encodes"]:
+            row = f"| {name} | {p['q']:g} | {p['splats']:,} | {p['bytes'] / 1e6:.3f} | "
+            row += f"{entry['source_bytes'] / p['bytes']:.1f} | {p['bytes'] / p['splats']:.2f} | "
+            row += f"{p['psnr']:.2f} dB, {p['ssim']:.4f} |"
+            if photographs:
+                row += f" {p['photo_psnr']:.2f} dB, {p['photo_ssim']:.4f} | {p['psnr_loss']:.2f} dB |"
+            lines.append(row)
+    return "\n".join(lines)
+
+
+def _plot(entry: dict[str, Any], formats: list[dict[str, Any]], path: Path) -> None:
+    import matplotlib
+
+    matplotlib.use("Agg")
+    import matplotlib.pyplot as plt
+
+    panels = [("psnr", "PSNR against the uncompressed renders, dB")]
+    if "photo_psnr" in entry["uncompressed"]:
+        panels.append(("photo_psnr", "PSNR against the photographs, dB"))
+    figure, axes = plt.subplots(1, len(panels), figsize=(6.4 * len(panels), 4.8), squeeze=False)
+    for axis, (key, title) in zip(axes[0], panels, strict=True):
+        for name, curve in entry["series"].items():
+            points = curve["encodes"]
+            axis.plot([p["bytes"] / 1e6 for p in points], [p[key] for p in points], marker="o", ms=4, label=name)
+        for row in formats:
+            value = row.get(key)
+            if value is None and key == "photo_psnr" and row.get("psnr_loss") is not None:
+                value = entry["uncompressed"]["photo_psnr"] - row["psnr_loss"]
+            if value is not None:
+                axis.plot(row["bytes"] / 1e6, value, marker="s", ms=5, ls="", color="0.4")
+                axis.annotate(row["format"], (row["bytes"] / 1e6, value), xytext=(4, -9), textcoords="offset points")
+        if key == "photo_psnr":
+            axis.axhline(entry["uncompressed"][key], color="0.6", lw=1, ls="--", label="uncompressed")
+        axis.set_xscale("log")
+        ticks = [t for t in (0.5, 1, 2, 3, 4, 6, 8, 12, 20, 40) if _within(axis.get_xlim(), t)]
+        axis.set_xticks(ticks, [f"{t:g}" for t in ticks])
+        axis.minorticks_off()
+        axis.set_xlabel("MB")
+        axis.set_ylabel(title)
+        axis.grid(alpha=0.3)
+        axis.legend(loc="lower right")
+    figure.suptitle(f"{entry['scene']}: {entry['source_splats']:,} splats, {entry['source_bytes'] / 1e6:.1f} MB as PLY")
+    figure.tight_layout()
+    path.parent.mkdir(parents=True, exist_ok=True)
+    figure.savefig(path, dpi=110)
+    plt.close(figure)
+
+
+def _within(limits: tuple[float, float], value: float) -> bool:
+    return limits[0] <= value <= limits[1]
+
+
+def size_at(points: list[dict[str, Any]], key: str, value: float) -> float | None:
+    """Bytes at which a curve reaches ``value`` of ``key``; None beyond its ends."""
+    ordered = sorted(points, key=lambda p: float(p[key]))
+    values = [p[key] for p in ordered]
+    if not values[0] <= value <= values[-1]:
+        return None
+    return float(np.exp(np.interp(value, values, np.log([p["bytes"] for p in ordered]))))
+
+
+def value_at(points: list[dict[str, Any]], key: str, size: float) -> float | None:
+    """What a curve has of ``key`` at ``size`` bytes; None beyond its ends."""
+    ordered = sorted(points, key=lambda p: int(p["bytes"]))
+    sizes = np.log([p["bytes"] for p in ordered])
+    if not sizes[0] <= np.log(size) <= sizes[-1]:
+        return None
+    return float(np.interp(np.log(size), sizes, [p[key] for p in ordered]))
+
+
+def print_gaps(scenes: dict[str, Any], against: str, q: float) -> None:
+    """Bytes at equal PSNR, a row a series."""
+    print(
+        "| | "
+        + " | ".join(f"{name}: bytes | encode" for name in scenes)
+        + " |\n"
+        + "|---" * (2 * len(scenes) + 1)
+        + "|"
+    )
+    for series in next(iter(scenes.values()))["series"]:
+        cells = []
+        for entry in scenes.values():
+            points = entry["series"][series]["encodes"]
+            reference = entry["series"][against]["encodes"]
+            (at,) = (point["psnr"] for point in reference if point["q"] == q)
+            size, usual = size_at(points, "psnr", at), size_at(reference, "psnr", at)
+            gap = f"{100 * size / usual - 100:+.1f} %" if size and usual else "beyond its ends"
+            seconds = statistics.median(sum(point["seconds"].values()) for point in points)
+            cells.append(f"{gap} | {seconds:.2f} s")
+        print(f"| {series} | " + " | ".join(cells) + " |")
+
+
+def _report(args: argparse.Namespace) -> None:
+    results = json.loads(args.results.read_text())
+    if args.against is not None:
+        for name, entry in results["scenes"].items():
+            measured = {point["q"] for point in entry["series"].get(args.against, {"encodes": []})["encodes"]}
+            if args.at not in measured:
+                raise UsageError(f"{args.results}: {name} has no encode of '{args.against}' at quality {args.at:g}")
+        print_gaps(results["scenes"], args.against, args.at)
+        return
+    formats = json.loads(args.formats.read_text())["scenes"] if args.formats is not None else {}
+    for name, entry in results["scenes"].items():
+        views = entry["test_views"]
+        print(f"### {name}, {entry['source_splats']:,} splats, {views} test views, encoded on {results['device']}\n")
+        print(_table(entry), end="\n\n")
+        if args.images is not None:
+            rows = formats[name]["formats"] if name in formats else []
+            _plot(entry, rows, args.images / f"rate_distortion_{name}.png")
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    measure = commands.add_parser("measure")
+    measure.add_argument("scenes", nargs="+", type=Path)
+    measure.add_argument("--json", type=Path, required=True)
+    measure.add_argument("--qualities", nargs="+", type=float, default=QUALITIES, metavar="Q")
+    measure.add_argument("--series", nargs="+", default=["default"], metavar="NAME[:OPTION=VALUE,…]")
+    measure.add_argument("--device")
+    measure.set_defaults(run=_measure)
+    report = commands.add_parser("report")
+    report.add_argument("results", type=Path)
+    report.add_argument("--formats", type=Path, help="what tools.study.compare_formats measured")
+    report.add_argument("--images", type=Path, metavar="DIR", help="draw the curves too")
+    report.add_argument("--against", metavar="NAME")
+    report.add_argument("--at", type=float, default=0.5, metavar="Q")
+    report.set_defaults(run=_report)
+    args = parser.parse_args()
+    args.run(args)
+
+
+if __name__ == "__main__":
+    main()
