@@ -37,8 +37,8 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.reduction import reduce_scene
-from potr_cl.quality.evaluator import Judge, JudgingViews
-from potr_cl.quality.ground_truth import Photographs, PhotographTargets
+from potr_cl.quality.evaluator import EvaluationViews, Evaluator
+from potr_cl.quality.ground_truth import GroundTruth, GroundTruthTargets
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import SweepOptions
 from potr_cl.stages.refitting.refit import RefitOptions, Refitted, RenderedTargets, active_coefficients, refit_colours
@@ -138,10 +138,10 @@ def _refit(args: argparse.Namespace) -> None:
     if args.photos is not None and args.cameras is None:
         raise UsageError("--photos needs --cameras, the views that the photographs show")
     cameras = given_cameras(args)
-    photographs = None
+    ground_truth = None
     if args.photos is not None:
         assert cameras is not None
-        photographs = Photographs(args.photos, cameras, background)
+        ground_truth = GroundTruth(args.photos, cameras, background)
     scene, reference = load_scene(args.scene), load_scene(args.reference)
     device = Device(args.device)
     with contextlib.closing(Progress()) as progress:
@@ -151,13 +151,13 @@ def _refit(args: argparse.Namespace) -> None:
         def work(device: Device, budget: EncodeOptions) -> Refitted:
             how = dataclasses.replace(options, memory=budget.sweep.memory)
             with contextlib.ExitStack() as stack:
-                targets: RenderedTargets | PhotographTargets
-                if photographs is None:
+                targets: RenderedTargets | GroundTruthTargets
+                if ground_truth is None:
                     rasterizer = Rasterizer(device, reference, background=background)
                     stack.callback(rasterizer.free)
                     targets = RenderedTargets(rasterizer, views)
                 else:
-                    targets = PhotographTargets(device, photographs, views)
+                    targets = GroundTruthTargets(device, ground_truth, views)
                     stack.callback(targets.free)
                 active = active_coefficients(scene.sh, _ZERO_SF)
                 return refit_colours(
@@ -177,26 +177,26 @@ def _refit(args: argparse.Namespace) -> None:
             f"PSNR {_decibels(before)} before, {_decibels(after)} after"
         )
         held_out = test_views(cameras)
-        if photographs is not None:
-            _tell_of_photographs(device, (reference, scene, result), held_out, photographs, background)
+        if ground_truth is not None:
+            _tell_of_ground_truth(device, (reference, scene, result), held_out, ground_truth, background)
         elif held_out:
-            judge = Judge(device, reference, JudgingViews.of(held_out), background)
+            evaluator = Evaluator(device, reference, EvaluationViews.of(held_out), background)
             try:
-                psnrs = [judge.psnr(candidate) for candidate in (scene, result)]
+                psnrs = [evaluator.psnr(candidate) for candidate in (scene, result)]
             finally:
-                judge.free()
-            print(f"{judge.views}: PSNR {psnrs[0]:.2f} dB before, {psnrs[1]:.2f} dB after, mean over views")
+                evaluator.free()
+            print(f"{evaluator.views}: PSNR {psnrs[0]:.2f} dB before, {psnrs[1]:.2f} dB after, mean over views")
 
 
 def _decibels(error: float) -> str:
     return f"{-10 * math.log10(error):.2f} dB" if error > 0 else "infinite"
 
 
-def _tell_of_photographs(
+def _tell_of_ground_truth(
     device: Device,
     scenes: tuple[Scene, Scene, Scene],
     held_out: list[Camera],
-    photographs: Photographs,
+    ground_truth: GroundTruth,
     background: tuple[float, float, float],
 ) -> None:
     """What the reference, the scene before and the scene after come to on photographs that the re-fit did not see."""
@@ -210,7 +210,7 @@ def _tell_of_photographs(
     for scene in scenes:
         rasterizer = Rasterizer(device, scene, background=background)
         try:
-            psnrs.append(photographs.psnr(rasterizer, held_out))
+            psnrs.append(ground_truth.psnr(rasterizer, held_out))
         finally:
             rasterizer.free()
     reference, before, after = psnrs

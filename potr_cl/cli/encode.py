@@ -38,8 +38,8 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import Stopwatch, encode, needs_views
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.search import Target, encode_to_target
-from potr_cl.quality.evaluator import Judge, JudgingViews
-from potr_cl.quality.ground_truth import Photographs
+from potr_cl.quality.evaluator import EvaluationViews, Evaluator
+from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.report.html import PicturePair, html_report, views_to_show
 from potr_cl.report.summary import encode_report, format_encode_report, quality_report, search_report
@@ -64,7 +64,7 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
         compact_at=args.compact_at,
         drop=args.drop,
         refit_at=tuple(args.refit_at),
-        photographs=args.photos,
+        ground_truth=args.photos,
         sweep=sweep_options(args),
         background=parse_colour(args.background),
         beta=args.beta,
@@ -105,7 +105,7 @@ def _target(args: argparse.Namespace) -> Target | None:
 def _encode(args: argparse.Namespace) -> None:
     began = time.perf_counter()
     options, target = _options(args), _target(args)
-    if options.photographs is not None and not (args.cameras and options.refit):
+    if options.ground_truth is not None and not (args.cameras and options.refit):
         raise UsageError("--photos needs --cameras, the views that the photographs show, and a re-fit")
     if args.report is None and args.report_view is not None:
         raise UsageError("--report-view needs --report, the page that shows it")
@@ -115,9 +115,9 @@ def _encode(args: argparse.Namespace) -> None:
         # Opened while the scene is read.
         opened = stack.enter_context(thread_pool(1)).submit(Device, args.device) if _looks(args, options) else None
         cameras = given_cameras(args)
-        photographs = None
-        if options.photographs is not None and cameras is not None:
-            photographs = Photographs(options.photographs, cameras, options.background)
+        ground_truth = None
+        if options.ground_truth is not None and cameras is not None:
+            ground_truth = GroundTruth(options.ground_truth, cameras, options.background)
         scene = load_scene(args.scene)
         options = dataclasses.replace(options, count=count(args, len(scene)))
         device = opened.result() if opened is not None and needs_views(scene, options) else None
@@ -128,7 +128,7 @@ def _encode(args: argparse.Namespace) -> None:
         with replacing(args.output) as file:
             if cameras is None and device is not None:
                 cameras = virtual_cameras(args, scene, placing)
-            views = JudgingViews.of(cameras) if cameras is not None and not args.no_quality else None
+            views = EvaluationViews.of(cameras) if cameras is not None and not args.no_quality else None
             if args.report_view is not None:
                 _ = views and views.named(args.report_view)  # an unknown name is told before the work
             if target is None:
@@ -143,24 +143,24 @@ def _encode(args: argparse.Namespace) -> None:
         pictures: list[PicturePair] = []
         quality: dict[str, Any] | str = "not judged, as asked"
         if views is not None:
-            quality, pictures = _judge(args, scene, written, views, encoded.device, opened, watch)
+            quality, pictures = _evaluate(args, scene, written, views, encoded.device, opened, watch)
         elif cameras is None:
             quality = "not judged: there are no cameras to look from"
         seconds = placing.seconds | encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
         report = encode_report(args.scene, scene, args.output, written, encoded, options, search, quality, seconds)
-        if photographs is not None and cameras is not None:
+        if ground_truth is not None and cameras is not None:
             used = encoded.device or device or Device(args.device)
-            _judge_by_photographs(photographs, cameras, scene, decode(written.data), used, options.background)
+            _evaluate_by_ground_truth(ground_truth, cameras, scene, decode(written.data), used, options.background)
         if page is not None:
             page.write(html_report(report, pictures).encode())
     print(json.dumps(report, indent=1, allow_nan=False) if args.json else format_encode_report(report))
 
 
-def _judge(
+def _evaluate(
     args: argparse.Namespace,
     scene: Scene,
     written: PotrFile,
-    views: JudgingViews,
+    views: EvaluationViews,
     device: Device | None,
     opened: Future[Device] | None,
     watch: Stopwatch,
@@ -169,17 +169,17 @@ def _judge(
 
     With pictures for the report, if there is to be one.
     """
-    watch("judge", 0.0)
+    watch("evaluate", 0.0)
     try:
         device = device or (Device(args.device) if opened is None else opened.result())
-        judge = Judge(device, scene, views, parse_colour(args.background))
+        evaluator = Evaluator(device, scene, views, parse_colour(args.background))
         try:
             candidate = decode(written.data)
-            quality = quality_report(views, judge.compare(candidate, lambda _, done: watch("judge", done)))
+            quality = quality_report(views, evaluator.compare(candidate, lambda _, done: watch("evaluate", done)))
             shown = views_to_show(quality, args.report_view) if args.report is not None else []
-            pairs = judge.pictures(candidate, [view["name"] for _, view in shown])
+            pairs = evaluator.pictures(candidate, [view["name"] for _, view in shown])
         finally:
-            judge.free()
+            evaluator.free()
     except DeviceError as error:
         return f"not judged: {error}", []
     return quality, [
@@ -187,8 +187,8 @@ def _judge(
     ]
 
 
-def _judge_by_photographs(
-    photographs: Photographs,
+def _evaluate_by_ground_truth(
+    ground_truth: GroundTruth,
     cameras: list[Camera],
     scene: Scene,
     candidate: Scene,
@@ -203,7 +203,7 @@ def _judge_by_photographs(
     before, after = 0.0, 0.0
     for each in (scene, candidate):
         rasterizer = Rasterizer(device, each, background=background)
-        before, after = after, photographs.psnr(rasterizer, views)
+        before, after = after, ground_truth.psnr(rasterizer, views)
         rasterizer.free()
     print(f"{len(views)} held-out photographs: uncompressed {before:.2f} dB, file {after:.2f} dB", file=sys.stderr)
     if after < before:

@@ -35,7 +35,7 @@ def sweep_options(args: argparse.Namespace) -> SweepOptions:
 
 def pruning_choices(args: argparse.Namespace) -> dict[str, Any]:
     """What :func:`add_pruning_options` added of the schedule, as keywords of EncodeOptions."""
-    return {"mapping_a": args.mapping_a, "damping": args.damping}
+    return {"mapping_a": args.mapping_a, "decay": args.decay}
 
 
 def as_bytes(gigabytes: float | None) -> int | None:
@@ -83,11 +83,12 @@ def add_pruning_options(p: argparse.ArgumentParser) -> None:
     )
     group.add_argument(
         "--damping",
+        dest="decay",
         type=float,
-        default=PruningOptions.damping,
+        default=PruningOptions.decay,
         metavar="X",
         help="what a splat's effect in one iteration counts against the next iteration's; 0: only the newest "
-        f"counts, as in the paper; default {PruningOptions.damping:g}",
+        f"counts, as in the paper; default {PruningOptions.decay:g}",
     )
     group.add_argument(
         "--mapping-a",

@@ -20,7 +20,7 @@ from potr_cl.quality.compare import (
     SceneFile,
     compare,
     comparison_report,
-    find_photographs,
+    find_ground_truth,
     format_comparison,
     format_sizes,
     side_by_side,
@@ -102,7 +102,7 @@ def _compare(args: argparse.Namespace) -> None:
         return
     parse_colour(args.background)
     views = _select(load_cameras(args.cameras), args.views, args.split)
-    photographs = find_photographs(args.truth, views) if args.truth is not None else None
+    ground_truth = find_ground_truth(args.truth, views) if args.truth is not None else None
     lpips, notes = None, []
     try:
         lpips = Lpips()
@@ -114,7 +114,7 @@ def _compare(args: argparse.Namespace) -> None:
         a, rasterizer_a = _rasterizer(args, args.a, device)
         b, rasterizer_b = _rasterizer(args, args.b, device)
         progress = stack.enter_context(contextlib.closing(Progress()))
-        comparison = compare(rasterizer_a, rasterizer_b, views, photographs, lpips, progress)
+        comparison = compare(rasterizer_a, rasterizer_b, views, ground_truth, lpips, progress)
         if picture is not None:
             worst = views[comparison.worst]
             pixels, factor = side_by_side(*(each.render(worst)[0] for each in (rasterizer_a, rasterizer_b)))

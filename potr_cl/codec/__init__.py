@@ -1,1 +1,3 @@
-"""From a scene to the bytes of a .potr file and back: quantiser, octree, entropy coders, container. No views, no device."""
+"""From a scene to the bytes of a .potr file and back: quantiser, octree, entropy coders, container. No views, no
+device.
+"""

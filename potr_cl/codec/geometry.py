@@ -104,15 +104,15 @@ def _nearest(means: NDArray[np.float32], views: Sequence[Camera], run: Run) -> N
     nearest = np.zeros(len(means))
     if not views:
         return nearest
-    eyes = camera_centres(views)
+    centres = camera_centres(views)
 
     def find(start: int) -> None:
         axes = means[start : start + _BLOCK].T.astype(np.float64)
         least = nearest[start : start + _BLOCK]
         squared, part = np.empty_like(least), np.empty_like(least)
         least[:] = np.inf
-        for eye in eyes:
-            for axis, (coordinates, at) in enumerate(zip(axes, eye, strict=True)):
+        for camera_centre in centres:
+            for axis, (coordinates, at) in enumerate(zip(axes, camera_centre, strict=True)):
                 to = part if axis else squared
                 np.subtract(coordinates, at, out=to)
                 np.square(to, out=to)

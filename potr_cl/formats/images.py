@@ -59,7 +59,7 @@ def image_size(path: Path) -> tuple[int, int]:
         return image.size
 
 
-def read_photograph(path: Path, background: Colour = (0.0, 0.0, 0.0)) -> FloatArray:
+def read_ground_truth(path: Path, background: Colour = (0.0, 0.0, 0.0)) -> FloatArray:
     """Read an image with 8 bits a channel.
 
     Args:

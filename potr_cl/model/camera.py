@@ -65,7 +65,7 @@ class Camera:
 
     @property
     def centre(self) -> NDArray[np.float64]:
-        """(3,) position of the eye in world units."""
+        """(3,) position of the camera centre in world units."""
         return -self.rotation.T @ self.translation
 
 
@@ -90,5 +90,5 @@ test_views.__test__ = False  # type: ignore[attr-defined]  # pytest would collec
 
 
 def camera_centres(cameras: Sequence[Camera]) -> NDArray[np.float64]:
-    """(S, 3) positions of the eyes in world units."""
+    """(S, 3) positions of the camera centres in world units."""
     return np.array([c.centre for c in cameras], dtype=np.float64).reshape(-1, 3)

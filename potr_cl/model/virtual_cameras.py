@@ -114,7 +114,7 @@ class _Candidates:
     """Views to choose from, in the frame's units.
 
     Attributes:
-        eyes: (C, 3) positions.
+        camera centres: (C, 3) positions.
         forward: (C, 3) unit vectors.
         tangent: (C,) tan of half the field of view.
         worth: (C, K) what the view shows of each target, 0 to 1.
@@ -123,7 +123,7 @@ class _Candidates:
         trained: whether the colours tell how plausible each view is; ``worth`` then holds it already.
     """
 
-    eyes: F64
+    centres: F64
     forward: F64
     tangent: F64
     worth: F32
@@ -162,10 +162,16 @@ def place_cameras(scene: Scene, count: int | None = None, size: int | None = Non
     cameras = []
     for number, view in enumerate(picked):
         split = "test" if every and number % every == every - 1 and number // every < tests else "train"
-        eye = frame.centre + frame.unit * candidates.eyes[view]
+        camera_centre = frame.centre + frame.unit * candidates.centres[view]
         cameras.append(
             _camera(
-                f"{_PREFIX}{number:03d}", eye, candidates.forward[view], frame.up, candidates.tangent[view], size, split
+                f"{_PREFIX}{number:03d}",
+                camera_centre,
+                candidates.forward[view],
+                frame.up,
+                candidates.tangent[view],
+                size,
+                split,
             )
         )
     return cameras
@@ -186,38 +192,38 @@ def standpoints(cameras: Sequence[Camera], means: F32) -> F64:
         means: (N, 3) centres of the scene.
 
     Returns:
-        (S, 3) the eyes of given cameras, (S, 4, 3) the places around those of virtual ones.
+        (S, 3) the camera centres of given cameras, (S, 4, 3) the places around those of virtual ones.
     """
-    eyes = camera_centres(cameras)
+    centres = camera_centres(cameras)
     if not is_virtual(cameras):
-        return eyes
+        return centres
     some = means[:: max(len(means) // _TARGETS, 1)].astype(np.float64)
-    away = np.array([np.median(np.linalg.norm(some - eye, axis=1)) for eye in eyes])
+    away = np.array([np.median(np.linalg.norm(some - camera_centre, axis=1)) for camera_centre in centres])
     corners = np.array([[1, 1, 1], [1, -1, -1], [-1, 1, -1], [-1, -1, 1]]) / math.sqrt(3)
-    return eyes[:, None] + _AROUND * away[:, None, None] * corners
+    return centres[:, None] + _AROUND * away[:, None, None] * corners
 
 
 def describe(cameras: Sequence[Camera]) -> str:
     """How many views, and where, in words."""
-    eyes = camera_centres(cameras)
+    centres = camera_centres(cameras)
     across = np.eye(3) - np.stack([np.outer(c.rotation[2], c.rotation[2]) for c in cameras])
     # The point that their lines of sight come nearest to.
-    focus = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, eyes), rcond=1e-9)[0]
-    distance = np.linalg.norm(eyes - focus, axis=1)
+    focus = np.linalg.lstsq(across.sum(axis=0), np.einsum("nij,nj->i", across, centres), rcond=1e-9)[0]
+    distance = np.linalg.norm(centres - focus, axis=1)
     at = ", ".join(f"{x:.3g}" for x in focus)
     train, test = (sum(c.split == split for c in cameras) for split in ("train", "test"))
     judges = f" and {test} to judge by" if test else ""
     return f"{train} virtual views{judges} placed {distance.min():.3g} to {distance.max():.3g} units from ({at})"
 
 
-def _camera(name: str, eye: F64, forward: F64, up: F64, tangent: float, size: int, split: str) -> Camera:
+def _camera(name: str, camera_centre: F64, forward: F64, up: F64, tangent: float, size: int, split: str) -> Camera:
     right = np.cross(forward, up)
     if np.linalg.norm(right) < 1e-3:  # looks straight up or down: any roll will do
         right = np.cross(forward, np.eye(3)[np.abs(forward).argmin()])
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
     focal = size / 2 / tangent
-    return Camera(name, size, size, focal, focal, size / 2, size / 2, rotation, -rotation @ eye, split)
+    return Camera(name, size, size, focal, focal, size / 2, size / 2, rotation, -rotation @ camera_centre, split)
 
 
 def _weighted_quantile(values: F64, weights: F64, part: float) -> float:
@@ -329,14 +335,14 @@ def _places(frame: _Frame) -> tuple[F64, F64]:
     return _on_sphere(spread[:, :2]) * away[:, None], _HALF_VIEW * distance / away
 
 
-def _surroundings(eye: F64, matter: _Matter) -> tuple[F32, float]:
-    """What is around ``eye``.
+def _surroundings(camera_centre: F64, matter: _Matter) -> tuple[F32, float]:
+    """What is around ``camera centre``.
 
     Returns:
         Distance of the nearest point in each cell of the cube map, infinite where there is none; and the part of all
         directions that matter within arm's length takes up.
     """
-    rays = matter.occluders - eye.astype(np.float32)[:, None]
+    rays = matter.occluders - camera_centre.astype(np.float32)[:, None]
     squared = np.einsum("ij,ij->j", rays, rays)
     horizon = np.full(6 * _CELLS * _CELLS, np.inf, np.float32)
     np.minimum.at(horizon, _cell(rays), np.sqrt(squared))
@@ -348,7 +354,7 @@ def _surroundings(eye: F64, matter: _Matter) -> tuple[F32, float]:
 def _candidates(frame: _Frame, matter: _Matter) -> _Candidates:
     """All views from all places that are free; from the freest tenth if too few are."""
     places, tangents = _places(frame)
-    horizons, blocked = zip(*[_surroundings(eye, matter) for eye in places], strict=True)
+    horizons, blocked = zip(*[_surroundings(camera_centre, matter) for camera_centre in places], strict=True)
     crowd = np.array(blocked)
     free = np.flatnonzero(crowd <= max(_CROWDED, float(np.quantile(crowd, 0.1))))
     views = [_views_from(places[place], tangents[place], horizons[place], frame, matter) for place in free]
@@ -359,7 +365,7 @@ def _candidates(frame: _Frame, matter: _Matter) -> _Candidates:
         worths = [worth * part for worth, part in zip(worths, plausible.astype(np.float32), strict=True)]
     each = [len(aims) for aims, _, _ in views]
     return _Candidates(
-        eyes=np.repeat(places[free], each, axis=0),
+        centres=np.repeat(places[free], each, axis=0),
         forward=np.concatenate([aims for aims, _, _ in views]),
         tangent=np.repeat(tangents[free], each),
         worth=np.concatenate(worths),
@@ -370,10 +376,10 @@ def _candidates(frame: _Frame, matter: _Matter) -> _Candidates:
 
 
 def _views_from(
-    eye: F64, tangent: float, horizon: F32, frame: _Frame, matter: _Matter
+    camera_centre: F64, tangent: float, horizon: F32, frame: _Frame, matter: _Matter
 ) -> tuple[F64, F32, NDArray[np.uint8]]:
     """Some directions to look in from one place, what each view shows of every target, and from which direction bin."""
-    rays = matter.targets - eye
+    rays = matter.targets - camera_centre
     distance = np.linalg.norm(rays, axis=1)
     towards = rays / np.maximum(distance, 1e-300)[:, None]
     # A cell is wide: what is a little behind its nearest point may be the same surface.
@@ -382,7 +388,7 @@ def _views_from(
     shown = np.where(visible, np.minimum(1, (matter.reach / np.maximum(distance * zoom, 1e-12)) ** 2), 0)
     seen = np.flatnonzero(visible)
     if len(seen) == 0:
-        aims = -eye[None] / max(float(np.linalg.norm(eye)), 1e-300)
+        aims = -camera_centre[None] / max(float(np.linalg.norm(camera_centre)), 1e-300)
     else:
         some = seen[((np.arange(_AIMS - 1) + 0.5) / (_AIMS - 1) * len(seen)).astype(np.int64)]
         middle = shown @ towards
@@ -396,9 +402,11 @@ def _views_from(
     return aims, worth, bins
 
 
-def _energy(eye: F64, matter: _Matter) -> F32:
-    """(K,) squared deviation of the targets' colours from their mean, seen from ``eye``, for coefficients of norm 1."""
-    rays = matter.targets - eye
+def _energy(camera_centre: F64, matter: _Matter) -> F32:
+    """(K,) squared deviation of the targets' colours from their mean, seen from ``camera centre``, for coefficients of
+    norm 1.
+    """
+    rays = matter.targets - camera_centre
     towards = rays / np.maximum(np.linalg.norm(rays, axis=1), 1e-300)[:, None]
     basis = _ac_basis(towards)[:, : matter.colours.shape[1]].astype(np.float32)
     deviation = np.einsum("km,kmc->kc", basis, matter.colours)

@@ -23,7 +23,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.reduction import Progress, reduce_scene
-from potr_cl.quality.ground_truth import Photographs, PhotographTargets
+from potr_cl.quality.ground_truth import GroundTruth, GroundTruthTargets
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.refitting.refit import RefitOptions, Refitted, RenderedTargets, active_coefficients, refit_colours
@@ -198,16 +198,16 @@ def _refit(
     decoded = geometry.decoded(reduced.sh)
     active = active_coefficients(reduced.sh, parameters.sf_sh) if options.compact else None
     how = RefitOptions(steps=options.refit, drop=parameters.drop, memory=options.sweep.memory)
-    targets: RenderedTargets | PhotographTargets
+    targets: RenderedTargets | GroundTruthTargets
     with ExitStack() as stack:
         stack.callback(watch, "refit", 1.0)
-        if options.photographs is None:
+        if options.ground_truth is None:
             rasterizer = Rasterizer(device, scene, background=options.background)
             stack.callback(rasterizer.free)
             targets = RenderedTargets(rasterizer, views)
         else:
-            photographs = Photographs(options.photographs, views, options.background)
-            targets = PhotographTargets(device, photographs, views)
+            ground_truth = GroundTruth(options.ground_truth, views, options.background)
+            targets = GroundTruthTargets(device, ground_truth, views)
             stack.callback(targets.free)
         return refit_colours(
             device,

@@ -24,7 +24,7 @@ class EncodeOptions:
         lam, alpha, delta_mse_max, drop, beta, gamma, sf_dc, sf_sh, sf_opacity, sf_rotation, sf_scale: replace single
             hyper-parameters (:class:`potr_cl.codec.quantize.HyperParameters`).
         prune: remove splats; looks at views.
-        iterations, mapping_a, damping: of the pruning schedule
+        iterations, mapping_a, decay: of the pruning schedule
             (:class:`potr_cl.stages.pruning.schedule.PruningOptions`).
         compact: make the SH coefficients sparse; looks at views.
         compact_at: the part of the pruning iterations after which that is done: later ones see its effect.
@@ -59,7 +59,7 @@ class EncodeOptions:
     prune: bool = True
     iterations: int = 48
     mapping_a: float = PruningOptions.a
-    damping: float = PruningOptions.damping
+    decay: float = PruningOptions.decay
     compact: bool = True
     compact_at: float = 0.75
     colour_model: ColourModel = CompactionOptions.colour_model
@@ -68,7 +68,7 @@ class EncodeOptions:
     refit: int = 0
     refit_at: tuple[float, ...] = ()
     refit_at_steps: int = 3
-    photographs: Path | None = None
+    ground_truth: Path | None = None
     count: int | None = None
     sweep: SweepOptions = field(default_factory=SweepOptions)
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)

@@ -53,7 +53,7 @@ def reduce_scene(
         options.iterations,
         a=options.mapping_a,
         count=options.count,
-        damping=options.damping,
+        decay=options.decay,
     )
     for name, parts in (("compact_at", (options.compact_at,)), ("refit_at", options.refit_at)):
         for part in parts:

@@ -35,7 +35,7 @@ from potr_cl.pipeline.encode import Encoded, Reduced, Stopwatch, code, needs_vie
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.reduction import Progress
-from potr_cl.quality.evaluator import Judge, JudgingViews
+from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 
 #: Qualities, and what they give in a typical scene: bytes a splat of the source, and PSNR in decibels. Means of two
 #: scenes (docs/benchmarks.md, "Rate and distortion"), less sure below 0.1. Above all the rate of growth matters.
@@ -271,12 +271,14 @@ class _Search:
         self._typical = _Typical(target, options, len(scene))
         self._axis = _Axis(options)
         self._scouted: tuple[float, float] | None = None  # where, and the value of a full encode, about
-        self._judge: Judge | None = None
+        self._evaluator: Evaluator | None = None
 
     def run(self) -> Found:
         target = self._target
         if target.min_psnr is not None:
-            self._judge = Judge(self._device, self._scene, JudgingViews.of(self._cameras), self._options.background)
+            self._evaluator = Evaluator(
+                self._device, self._scene, EvaluationViews.of(self._cameras), self._options.background
+            )
         q = self._scout(self._typical.quality(target.aim))
         reduces = bool(self._views) and needs_views(self._scene, self._options)
         best: _Candidate | None = None
@@ -428,16 +430,16 @@ class _Search:
 
     def _evaluate(self, kind: str, q: float, thinned: Reduced, reduced: Reduced, options: EncodeOptions) -> _Candidate:
         encoded: Encoded | None
-        if self._judge is None:
+        if self._evaluator is None:
             encoded = code(self._scene, reduced, self._views, options, self._watch)
             value = math.log(encoded.nbytes)
         else:
             encoded = None
             quick = dataclasses.replace(options, entropy=_QUICK_CODER)
             pieces = code(self._scene, reduced, self._views, quick, self._watch).pieces
-            self._watch("judge tries", 0.0)
-            value = min(self._judge.psnr(decode(b"".join(pieces))), _IDENTICAL)
-            self._watch("judge tries", 1.0)
+            self._watch("evaluate tries", 0.0)
+            value = min(self._evaluator.psnr(decode(b"".join(pieces))), _IDENTICAL)
+            self._watch("evaluate tries", 1.0)
         self._tries.append(Try(kind, q, value))
         self._tell(f"{KINDS[kind].format(f'{q:g}')} {self._target.describe(value)}")
         return _Candidate(thinned, reduced, options, value, encoded)
@@ -455,8 +457,8 @@ class _Search:
 
     def free(self) -> None:
         """Give all device memory back."""
-        if self._judge is not None:
-            self._judge.free()
+        if self._evaluator is not None:
+            self._evaluator.free()
 
 
 class _Typical:

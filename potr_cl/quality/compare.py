@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
 from potr_cl.formats.cameras.view_files import IMAGE_SUFFIXES, stem
-from potr_cl.formats.images import Colour, image_size, read_photograph, to_8_bits
+from potr_cl.formats.images import Colour, image_size, read_ground_truth, to_8_bits
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
@@ -28,8 +28,8 @@ from potr_cl.raster.rasterizer import Rasterizer
 
 _TITLES = {
     "b_against_a": "B against A",
-    "a_against_photograph": "A against photo",
-    "b_against_photograph": "B against photo",
+    "a_against_truth": "A against photo",
+    "b_against_truth": "B against photo",
     "loss": "loss by photo",
 }
 
@@ -70,8 +70,8 @@ class ViewFigures:
 
     Attributes:
         name: of the view.
-        figures: by what was compared: "b_against_a" always; with photographs also "a_against_photograph",
-            "b_against_photograph" and "loss", what B loses to A against the photograph (A's PSNR and SSIM minus B's,
+        figures: by what was compared: "b_against_a" always; with photographs also "a_against_truth",
+            "b_against_truth" and "loss", what B loses to A against the photograph (A's PSNR and SSIM minus B's,
             B's LPIPS minus A's: positive where B is worse).
     """
 
@@ -97,7 +97,7 @@ class Comparison:
     worst: int
 
 
-def find_photographs(folder: Path, cameras: Sequence[Camera]) -> dict[str, Path]:
+def find_ground_truth(folder: Path, cameras: Sequence[Camera]) -> dict[str, Path]:
     """The photograph of each view: the image in ``folder`` that is named after it.
 
     Raises:
@@ -144,7 +144,7 @@ def compare(
     a: Rasterizer,
     b: Rasterizer,
     cameras: Sequence[Camera],
-    photographs: Mapping[str, Path] | None = None,
+    ground_truth: Mapping[str, Path] | None = None,
     lpips: Lpips | None = None,
     progress: Callable[[str, float], None] = lambda _stage, _done: None,
 ) -> Comparison:
@@ -153,7 +153,7 @@ def compare(
     Args:
         a, b: the reference scene and the candidate, on one device, with the same rules and background.
         cameras: at least one.
-        photographs: by view name, see :func:`find_photographs`.
+        photographs: by view name, see :func:`find_ground_truth`.
         lpips: the metric, where it is installed.
         progress: called with the stage and the part of it that is done.
 
@@ -171,10 +171,10 @@ def compare(
         distances = [lpips(*(picture.download(device) for picture in pair)) if lpips else None for pair in pairs]
         return [Figures(*found, distance) for found, distance in zip(similarity(pairs), distances, strict=True)]
 
-    def judge(some: Sequence[Camera], of_a: list[Picture], of_b: list[Picture]) -> Iterator[ViewFigures]:
+    def evaluator(some: Sequence[Camera], of_a: list[Picture], of_b: list[Picture]) -> Iterator[ViewFigures]:
         found = [figures(list(zip(of_b, of_a, strict=True)))]
         names = ["b_against_a"]
-        if photographs is not None:
+        if ground_truth is not None:
             buffer = device.upload(np.concatenate([next(read).reshape(-1) for _ in some]), "the photographs")
             try:
                 truths = place_pictures(buffer, some)
@@ -182,16 +182,18 @@ def compare(
             finally:
                 device.free(buffer)
             found.append([_loss(*losses) for losses in zip(*found[1:], strict=True)])
-            names += ["a_against_photograph", "b_against_photograph", "loss"]
+            names += ["a_against_truth", "b_against_truth", "loss"]
         for camera, of_view in zip(some, zip(*found, strict=True), strict=True):
             yield ViewFigures(camera.name, dict(zip(names, of_view, strict=True)))
 
     progress(stage, 0.0)
     with thread_pool() as pool:
-        read = _photographs(pool, [photographs[camera.name] for camera in cameras] if photographs else [], a.background)
+        read = _ground_truth(
+            pool, [ground_truth[camera.name] for camera in cameras] if ground_truth else [], a.background
+        )
         for some in in_batches(device, cameras):
             with rendered(a, some) as of_a, rendered(b, some) as of_b:
-                for view in judge(some, of_a, of_b):
+                for view in evaluator(some, of_a, of_b):
                     views.append(view)
                     progress(stage, len(views) / len(cameras))
     if not views:
@@ -200,11 +202,11 @@ def compare(
     return Comparison(views, worst)
 
 
-def _photographs(pool: ThreadPoolExecutor, paths: Sequence[Path], background: Colour) -> Iterator[FloatArray]:
+def _ground_truth(pool: ThreadPoolExecutor, paths: Sequence[Path], background: Colour) -> Iterator[FloatArray]:
     """The photographs in order, some read ahead."""
     pending: deque[Future[FloatArray]] = deque()
     for path in paths:
-        pending.append(pool.submit(read_photograph, path, background))
+        pending.append(pool.submit(read_ground_truth, path, background))
         if len(pending) > _READ_AHEAD:
             yield pending.popleft().result()
     while pending:

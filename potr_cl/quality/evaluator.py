@@ -23,11 +23,11 @@ from potr_cl.raster.rasterizer import Rasterizer
 #: So many training views, spread evenly, stand for all of them where there are no test views.
 _MOST_TRAINING_VIEWS = 32
 #: Bytes of the uncompressed scene's pictures that are kept from one candidate to the next; others are rendered again.
-_KEPT_PICTURES = 1 << 30
+_CACHED_PICTURES = 1 << 30
 
 
 @dataclass(frozen=True)
-class JudgingViews:
+class EvaluationViews:
     """The views that a scene is judged by.
 
     Attributes:
@@ -41,7 +41,7 @@ class JudgingViews:
     available: int
 
     @staticmethod
-    def of(cameras: Sequence[Camera]) -> JudgingViews:
+    def of(cameras: Sequence[Camera]) -> EvaluationViews:
         """All test views; without any, up to 32 training views spread evenly.
 
         Raises:
@@ -49,10 +49,10 @@ class JudgingViews:
         """
         views = test_views(cameras)
         if views:
-            return JudgingViews(views, "test", len(views))
+            return EvaluationViews(views, "test", len(views))
         views = train_views(cameras)
         some = np.linspace(0, len(views) - 1, min(len(views), _MOST_TRAINING_VIEWS)).round().astype(int)
-        return JudgingViews([views[k] for k in some], "train", len(views))
+        return EvaluationViews([views[k] for k in some], "train", len(views))
 
     def named(self, name: str) -> Camera:
         """The view of a name.
@@ -73,7 +73,7 @@ class JudgingViews:
         return f"{which} {self.available} training views, for the cameras name no test views"
 
 
-class Judge:
+class Evaluator:
     """Compares candidates with one uncompressed scene.
 
     Args:
@@ -86,7 +86,7 @@ class Judge:
         DeviceError: the scene does not fit the device.
     """
 
-    def __init__(self, device: Device, scene: Scene, views: JudgingViews, background: Colour) -> None:
+    def __init__(self, device: Device, scene: Scene, views: EvaluationViews, background: Colour) -> None:
         self.views = views
         self._device = device
         self._background = background
@@ -94,7 +94,7 @@ class Judge:
         self._similarity = Similarity(device)
         self._pictures: dict[str, Picture] = {}
         self._kept = ExitStack()
-        self._room = min(_KEPT_PICTURES, device.info.memory // 16)
+        self._room = min(_CACHED_PICTURES, device.info.memory // 16)
 
     def psnr(self, candidate: Scene, most: int | None = None) -> float:
         """Mean over the views of the PSNR against the uncompressed scene's pictures, in decibels.

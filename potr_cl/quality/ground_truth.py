@@ -8,16 +8,16 @@ from pathlib import Path
 import numpy as np
 import pyopencl as cl
 
-from potr_cl.formats.images import Colour, read_photograph
+from potr_cl.formats.images import Colour, read_ground_truth
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
-from potr_cl.quality.compare import find_photographs
+from potr_cl.quality.compare import find_ground_truth
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
 
 
-class Photographs:
+class GroundTruth:
     """The photographs of some views, read and decoded one at a time.
 
     Args:
@@ -31,7 +31,7 @@ class Photographs:
     """
 
     def __init__(self, folder: Path, cameras: Sequence[Camera], background: Colour = (0.0, 0.0, 0.0)) -> None:
-        self._paths = find_photographs(folder, cameras)
+        self._paths = find_ground_truth(folder, cameras)
         self._background = background
 
     def picture(self, camera: Camera) -> FloatArray:
@@ -41,7 +41,7 @@ class Photographs:
             UsageError: it cannot be opened.
             DataError: it is damaged or has other than 8 bits a channel.
         """
-        return read_photograph(self._paths[camera.name], self._background)
+        return read_ground_truth(self._paths[camera.name], self._background)
 
     def psnr(self, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> float:
         """Mean over views of the PSNR of a scene's pictures against the photographs, in decibels.
@@ -53,7 +53,7 @@ class Photographs:
         return float(np.mean([psnr(rasterizer.render(camera)[0], self.picture(camera)) for camera in cameras]))
 
 
-class PhotographTargets:
+class GroundTruthTargets:
     """The photographs as targets of :class:`potr_cl.stages.refitting.refit.ColourRefit`.
 
     Args:
@@ -65,14 +65,14 @@ class PhotographTargets:
         DeviceError: a photograph does not fit the device.
     """
 
-    def __init__(self, device: Device, photographs: Photographs, cameras: Sequence[Camera]) -> None:
+    def __init__(self, device: Device, ground_truth: GroundTruth, cameras: Sequence[Camera]) -> None:
         self._device = device
-        self._photographs = photographs
+        self._ground_truth = ground_truth
         self._cameras = list(cameras)
         self._buffer = device.allocate(12 * max(c.width * c.height for c in cameras), "a photograph")
 
     def __call__(self, number: int) -> cl.Buffer:
-        picture = np.ascontiguousarray(self._photographs.picture(self._cameras[number]))
+        picture = np.ascontiguousarray(self._ground_truth.picture(self._cameras[number]))
         with self._device.errors("failed to take a photograph"):
             cl.enqueue_copy(self._device.queue, self._buffer, picture, is_blocking=True)
         return self._buffer

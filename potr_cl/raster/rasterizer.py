@@ -5,12 +5,12 @@ views more than once keeps them and repeats only the last stage:
 
 1. ``project``: each splat's ellipse and colour on screen (cl/raster/project.cl);
 2. ``count_tiles``, ``scan_tiles``, ``fill_tiles``: which splats touch which 16 x 16 tile (cl/raster/tile_lists_*.cl);
-3. ``sort_tiles``: each tile's list front to back (cl/raster/sort_*.cl); ``entry_patches``: which parts of its tile each
-   entry touches (cl/raster/entry_patches_*.cl);
+3. ``sort_tiles``: each tile's list front to back (cl/raster/sort_*.cl); ``subtile_masks``: which parts of its tile each
+   intersection touches (cl/raster/subtile_masks_*.cl);
 4. ``composite``: the picture (cl/raster/composite_*.cl).
 
 A GPU's kernels do all views of a set in one launch, a CPU's one view at a time. A view alone on a GPU is composited by
-``composite_frame`` (cl/raster/composite_frame_gpu.cl), which needs no patches.
+``composite_frame`` (cl/raster/composite_frame_gpu.cl), which needs no sub-tiles.
 
 Semantics: the original 3DGS rasterizer (Kerbl et al. 2023); where renderers differ, :class:`RasterRules` says how.
 """
@@ -47,8 +47,8 @@ _MOST_TILES = 0xFFFF
 #: Standard deviations above this many world units are taken as this: nothing can be seen to differ, nothing overflows.
 _LARGEST_SCALE = 1e12
 
-#: Bytes of an entry's patches.
-_PATCHES_BYTES = {"cpu": 4, "gpu": 2}
+#: Bytes of an intersection's sub-tiles.
+_SUBTILES_BYTES = {"cpu": 4, "gpu": 2}
 
 #: Splats whose parameters are uploaded at a time.
 _UPLOADED = 1 << 18
@@ -59,8 +59,8 @@ _SH = 4
 _CAMERA = np.dtype(
     [
         ("rotation", np.float32, 9),
-        ("eye_high", np.float32, 3),
-        ("eye_low", np.float32, 3),
+        ("camera_centre_high", np.float32, 3),
+        ("camera_centre_low", np.float32, 3),
         ("focal", np.float32, 2),
         ("principal", np.float32, 2),
         ("limit", np.float32, 2),
@@ -75,7 +75,7 @@ _SET_VIEW = np.dtype(
         ("view", _CAMERA),
         ("first_tile", np.uint32),
         ("first_offset", np.uint32),
-        ("first_entry", np.uint32),
+        ("first_intersection", np.uint32),
         ("first_pixel", np.uint32),
     ]
 )
@@ -83,8 +83,8 @@ _SET_VIEW = np.dtype(
 #: Work-items of a work-group a tile, stage by stage. On a CPU one: PoCL would keep the private memory of more of them
 #: on its stack.
 _TILE_GROUPS = {
-    "cpu": {"scan": 1, "sort": 1, "patches": 1, "composite": 1},
-    "gpu": {"scan": 256, "sort": 256, "patches": 128, "composite": 128, "frame": 256},
+    "cpu": {"scan": 1, "sort": 1, "subtiles": 1, "composite": 1},
+    "gpu": {"scan": 256, "sort": 256, "subtiles": 128, "composite": 128, "frame": 256},
 }
 
 
@@ -97,14 +97,14 @@ class RasterRules:
         alpha_cap: largest alpha of a splat in a pixel.
         square_extent: draw a splat only in the tiles that the square of half side ceil(3 sigma_max) around its centre
             touches, as the original does; without, wherever its alpha reaches 1/255.
-        stop_included: a pixel ends before a splat that would bring its transmittance to 1e-4 exactly; without, only
-            below.
+        threshold_included: a pixel ends before a splat that would bring its transmittance to 1e-4 exactly; without,
+            only below.
     """
 
     near: float = 0.2
     alpha_cap: float = 0.99
     square_extent: bool = True
-    stop_included: bool = False
+    threshold_included: bool = False
 
     def __post_init__(self) -> None:
         if not (np.isfinite(self.near) and self.near > 0):
@@ -113,16 +113,16 @@ class RasterRules:
             raise UsageError(f"the alpha cap must lie in [1/255, 1), not {self.alpha_cap}")
 
     @property
-    def stop(self) -> float:
+    def transmittance_threshold(self) -> float:
         """A pixel ends before its transmittance would fall below this float32."""
-        stop = np.float32(1e-4)
-        return float(np.nextafter(stop, np.float32(1)) if self.stop_included else stop)
+        threshold = np.float32(1e-4)
+        return float(np.nextafter(threshold, np.float32(1)) if self.threshold_included else threshold)
 
 
 #: The original 3DGS rasterizer.
 INRIA = RasterRules()
 #: gsplat's rasterizer, with the original's near plane instead of its own default of 0.01.
-GSPLAT = RasterRules(alpha_cap=0.999, square_extent=False, stop_included=True)
+GSPLAT = RasterRules(alpha_cap=0.999, square_extent=False, threshold_included=True)
 
 
 @lru_cache(maxsize=4096)
@@ -130,8 +130,8 @@ def camera_struct(camera: Camera) -> NDArray[Any]:
     """The camera as the kernels take it (``View`` in cl/include/splat.clh)."""
     struct = np.zeros((), _CAMERA)
     struct["rotation"] = camera.rotation.ravel()
-    struct["eye_high"] = camera.centre
-    struct["eye_low"] = camera.centre - struct["eye_high"]
+    struct["camera_centre_high"] = camera.centre
+    struct["camera_centre_low"] = camera.centre - struct["camera_centre_high"]
     struct["focal"] = camera.fx, camera.fy
     struct["principal"] = camera.cx, camera.cy
     struct["limit"] = 1.3 * camera.width / (2 * camera.fx), 1.3 * camera.height / (2 * camera.fy)
@@ -152,8 +152,8 @@ class View:
         owner: the set.
         camera: whose view it is.
         columns, rows: tiles across and down.
-        entry_count: entries there are; set once the device is known to have found them all.
-        capacity: entries that there is room for.
+        intersection_count: intersections there are; set once the device is known to have found them all.
+        capacity: intersections that there is room for.
     """
 
     def __init__(self, owner: ViewSet, camera: Camera) -> None:
@@ -165,7 +165,7 @@ class View:
                 f"view '{camera.name}': {camera.width} x {camera.height} pixels are more than {_MOST_TILES * TILE} "
                 "on a side; render a smaller image"
             )
-        self.entry_count = self.capacity = 0
+        self.intersection_count = self.capacity = 0
 
     @property
     def tiles(self) -> int:
@@ -189,13 +189,13 @@ class View:
 
     @property
     def offsets(self) -> cl.Buffer:
-        """(columns * rows + 1,) uint32, where each tile's run of ``entries`` begins."""
+        """(columns * rows + 1,) uint32, where each tile's run of ``intersections`` begins."""
         return self._alone.offsets
 
     @property
-    def entries(self) -> cl.Buffer:
+    def intersections(self) -> cl.Buffer:
         """(capacity,) uint32 splat numbers, tile by tile, front to back within a tile."""
-        return self._alone.entries
+        return self._alone.intersections
 
     @property
     def _alone(self) -> ViewSet:
@@ -208,7 +208,7 @@ class View:
 
 
 def gpu_limits(device: Device) -> dict[str, int]:
-    """Macros of the GPU kernels that composite (cl/include/patch_lists.clh), by what the device can do."""
+    """Macros of the GPU kernels that composite (cl/include/subtile_lists.clh), by what the device can do."""
     return {"NATIVE_EXP2": int(device.native_exp2)} | totals_limits(device)
 
 
@@ -226,19 +226,19 @@ class ViewSet:
     Attributes:
         views: each with the parts of the buffers that are its own.
         tiles, pixels: of all of them.
-        capacity: room for entries, of all views.
-        entry_starts: where each view's entries begin, and their end.
+        capacity: room for intersections, of all views.
+        intersection_starts: where each view's intersections begin, and their end.
         table: where each view's part begins, ``SetView`` in cl/include/view_set.clh.
-        shapes, colours, offsets, entries: as :class:`View` has them, and N splats a view.
-        patches: (capacity,), a bit for each patch of its tile that an entry touches (cl/include/patches.clh), uint32
-            for CPU kernels, uint16 for GPU kernels.
+        shapes, colours, offsets, intersections: as :class:`View` has them, and N splats a view.
+        subtiles: (capacity,), a bit for each sub-tile of its tile that an intersection touches
+            (cl/include/subtiles.clh), uint32 for CPU kernels, uint16 for GPU kernels.
     """
 
     shapes: cl.Buffer
     colours: cl.Buffer
     offsets: cl.Buffer
-    entries: cl.Buffer
-    patches: cl.Buffer
+    intersections: cl.Buffer
+    subtiles: cl.Buffer
 
     def __init__(self, device: Device, cameras: Sequence[Camera], stride: int) -> None:
         self._device = device
@@ -247,7 +247,7 @@ class ViewSet:
         self.tiles = sum(view.tiles for view in self.views)
         self.pixels = sum(view.pixels for view in self.views)
         self.capacity = 0
-        self.entry_starts = [0] * (len(cameras) + 1)
+        self.intersection_starts = [0] * (len(cameras) + 1)
         self._offset_starts = [0, *itertools.accumulate(view.tiles + 1 for view in self.views)]
         try:
             self.shapes = self._take(32 * stride * len(cameras), "the projected splats")
@@ -270,7 +270,7 @@ class ViewSet:
 
     def _write_table(self) -> None:
         table = np.zeros(len(self.views), _SET_VIEW)
-        table["first_entry"] = self.entry_starts[:-1]
+        table["first_intersection"] = self.intersection_starts[:-1]
         table["first_offset"] = self._offset_starts[:-1]
         tile = pixel = 0
         for row, view in zip(table, self.views, strict=True):
@@ -292,22 +292,22 @@ class ViewSet:
         return True
 
     def make_room(self, counts: Sequence[int]) -> None:
-        """Room for so many entries of each view; those there are get lost.
+        """Room for so many intersections of each view; those there are get lost.
 
         Raises:
             DeviceMemoryError: the device has not that much, or not all in one buffer.
         """
         if self.capacity:
-            self._give_back(self.entries, self.patches)
+            self._give_back(self.intersections, self.subtiles)
             self.capacity = 0
         starts = [0, *itertools.accumulate(counts)]
         if max(starts[-1], self.pixels) > 0xFFFFFFFF:
-            raise DeviceMemoryError(f"{len(counts)} views have more entries or pixels than can be numbered")
-        self.entries = self._take(4 * starts[-1], "the tile lists")
-        self.patches = self._take(_PATCHES_BYTES[self._device.family] * starts[-1], "the entries' patches")
+            raise DeviceMemoryError(f"{len(counts)} views have more intersections or pixels than can be numbered")
+        self.intersections = self._take(4 * starts[-1], "the tile lists")
+        self.subtiles = self._take(_SUBTILES_BYTES[self._device.family] * starts[-1], "the intersections' sub-tiles")
         for view, count in zip(self.views, counts, strict=True):
             view.capacity = count
-        self.entry_starts, self.capacity = starts, starts[-1]
+        self.intersection_starts, self.capacity = starts, starts[-1]
         if len(self.views) > 1:
             self._write_table()
 
@@ -317,7 +317,7 @@ class ViewSet:
         return [words[start:stop] for start, stop in itertools.pairwise(self._offset_starts)]
 
     def read_counts(self) -> list[int]:
-        """Each view's entries, once the device has found them; 2^32 - 1 for more than that."""
+        """Each view's intersections, once the device has found them; 2^32 - 1 for more than that."""
         if len(self.views) > 1:
             return [int(offsets[-1]) for offsets in self.read_offsets()]
         last = np.empty(1, np.uint32)
@@ -328,7 +328,7 @@ class ViewSet:
         return [int(last[0])]
 
     @property
-    def nbytes_kept(self) -> int:
+    def nbytes_cached(self) -> int:
         """Bytes of all but shapes and colours."""
         return sum(buffer.size for buffer in self._buffers if buffer not in (self.shapes, self.colours))
 
@@ -435,16 +435,19 @@ class Rasterizer:
             SQUARE_EXTENT=int(rules.square_extent),
         )
         make = device.shared_kernel
-        lists, patches = f"raster/tile_lists_{device.family}.cl", f"raster/entry_patches_{device.family}.cl"
+        lists, subtiles = f"raster/tile_lists_{device.family}.cl", f"raster/subtile_masks_{device.family}.cl"
         picture: list[Any] = [real, real, real, buffer, buffer]
-        limits: dict[str, float | int] = {"ALPHA_CAP": float(rules.alpha_cap), "STOP": rules.stop}
+        limits: dict[str, float | int] = {
+            "ALPHA_CAP": float(rules.alpha_cap),
+            "TRANSMITTANCE_THRESHOLD": rules.transmittance_threshold,
+        }
         if device.family == "gpu":
             self._count = make(lists, "count_tiles", [buffer, number, *[buffer] * 3])
             self._scan = make(lists, "scan_tiles", [buffer] * 3)
             self._fill = make(lists, "fill_tiles", [buffer, number, *[buffer] * 4, number])
             # 16 KB of keys: half of what every GPU has, so that two tiles are sorted at a time.
             self._sort = make("raster/sort_gpu.cl", "sort_tiles", [*[buffer] * 5, number], SORT_CAPACITY=2048)
-            self._patches = make(patches, "entry_patches", [buffer, number, *[buffer] * 4, number])
+            self._subtiles = make(subtiles, "subtile_masks", [buffer, number, *[buffer] * 4, number])
             limits |= gpu_limits(device)
             composite = [buffer, number, *[buffer] * 5, number, *picture]
             frame = [*[buffer] * 5, number, *picture]
@@ -455,7 +458,7 @@ class Rasterizer:
             self._scan = make(lists, "scan_tiles", [buffer, buffer, number])
             self._fill = make(lists, "fill_tiles", [buffer, buffer, number, _CAMERA, buffer, buffer, number])
             self._sort = make("raster/sort_cpu.cl", "sort_tiles", [*[buffer] * 4, number])
-            self._patches = make(patches, "entry_patches", [*[buffer] * 4, number, _CAMERA], LANES=limits["LANES"])
+            self._subtiles = make(subtiles, "subtile_masks", [*[buffer] * 4, number, _CAMERA], LANES=limits["LANES"])
             composite = [*[buffer] * 5, number, _CAMERA, *picture]
         self._composite = make(f"raster/composite_{device.family}.cl", "composite", composite, **limits)
 
@@ -526,36 +529,36 @@ class Rasterizer:
         self._over_tiles("scan", self._scan, views, 1)
 
     def _enqueue_lists(self, views: ViewSet, bounds: cl.Buffer, counts: cl.Buffer, frame: bool = False) -> None:
-        """Enqueue tile lists, depth order and patches of views with offsets; of a frame that is only composited no
-        patches where that needs none. Leaves the counts zero."""
+        """Enqueue tile lists, depth order and sub-tiles of views with offsets; of a frame that is only composited no
+        sub-tiles where that needs none. Leaves the counts zero."""
         # The bitonic network sorts in place, merging needs room for as many keys again.
         self._keys.reserve((8 if self.device.family == "gpu" else 16) * views.capacity)
         keys, capacity = self._keys.buffer, views.capacity
         if self.device.family == "gpu":
-            lists = (views.offsets, views.entries)
+            lists = (views.offsets, views.intersections)
             self._fill.set_args(views.table, self.stride, bounds, views.shapes, counts, keys, capacity)
             self._sort.set_args(views.table, keys, *lists, counts, capacity)
-            self._patches.set_args(views.table, self.stride, views.shapes, *lists, views.patches, capacity)
+            self._subtiles.set_args(views.table, self.stride, views.shapes, *lists, views.subtiles, capacity)
         else:
             (view,) = views.views
             camera = camera_struct(view.camera)
             self._fill.set_args(bounds, view.shapes, self.stride, camera, counts, keys, capacity)
-            self._sort.set_args(keys, view.offsets, view.entries, counts, capacity)
-            self._patches.set_args(view.shapes, view.offsets, view.entries, views.patches, capacity, camera)
+            self._sort.set_args(keys, view.offsets, view.intersections, counts, capacity)
+            self._subtiles.set_args(view.shapes, view.offsets, view.intersections, views.subtiles, capacity, camera)
         self._over_splats(self._fill, views)
         self._over_tiles("sort", self._sort, views)
         if not (frame and self.device.family == "gpu"):
-            self._over_tiles("patches", self._patches, views)
+            self._over_tiles("subtiles", self._subtiles, views)
 
     def _enqueue_composite(self, views: ViewSet, image: cl.Buffer) -> None:
         """Enqueue the pictures, one behind the other into ``image``."""
         self._transmittance.reserve(4 * views.pixels)
         if self.device.family == "gpu" and len(views.views) == 1:
-            alone = (views.table, views.shapes, views.colours, views.offsets, views.entries, views.capacity)
+            alone = (views.table, views.shapes, views.colours, views.offsets, views.intersections, views.capacity)
             self._frame.set_args(*alone, *self.background, image, self._transmittance.buffer)
             self._over_tiles("frame", self._frame, views)
             return
-        lists = (views.shapes, views.colours, views.offsets, views.entries, views.patches)
+        lists = (views.shapes, views.colours, views.offsets, views.intersections, views.subtiles)
         result = (*self.background, image, self._transmittance.buffer)
         if self.device.family == "gpu":
             self._composite.set_args(views.table, self.stride, *lists, views.capacity, *result)
@@ -565,7 +568,7 @@ class Rasterizer:
         self._over_tiles("composite", self._composite, views)
 
     def _first_capacity(self) -> int:
-        """Room for entries before anything is known of a view."""
+        """Room for intersections before anything is known of a view."""
         return max(4 * self.splats, 1 << 16)
 
     def prepare(self, camera: Camera) -> View:
@@ -587,7 +590,7 @@ class Rasterizer:
 
         Raises:
             DeviceMemoryError: they do not fit the device, or not all in buffers of the size that it allows.
-            DeviceError: one view alone has too many entries, or the device failed.
+            DeviceError: one view alone has too many intersections, or the device failed.
         """
         device = self.device
         views = ViewSet(device, cameras, self.stride)
@@ -695,12 +698,13 @@ class Rasterizer:
             start += nbytes
 
     def _accept(self, view: View, count: int) -> None:
-        """Take the number of entries that the device found to a view."""
+        """Take the number of intersections that the device found to a view."""
         if count == 0xFFFFFFFF:
             raise DeviceError(
-                f"view '{view.camera.name}' needs more than 2^32 tile entries: too many huge splats for this image size"
+                f"view '{view.camera.name}' needs more than 2^32 tile intersections: "
+                "too many huge splats for this image size"
             )
-        view.entry_count = count
+        view.intersection_count = count
 
     def _pictures(self, camera: Camera) -> tuple[FloatArray, FloatArray]:
         shape = (camera.height, camera.width)

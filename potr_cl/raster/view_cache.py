@@ -19,7 +19,7 @@ _LEAST_SETS = 16
 _SHAPE, _COLOUR = 32, 16
 
 
-class KeptViews:
+class ViewCache:
     """What is kept of views.
 
     Args:
@@ -57,7 +57,7 @@ class KeptViews:
         """
         to_spare = [*self._whole, views]
         shared = 0 if self.shared else max(map(self._geometry, to_spare))
-        needed = views.nbytes_kept + own
+        needed = views.nbytes_cached + own
         if needed + shared > self.room + sum(map(self._geometry, self._whole)):
             return False
         self.room -= needed + self._geometry(views)

@@ -16,7 +16,7 @@ from potr_cl.pipeline.encode import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.search import Found, Target
 from potr_cl.quality.compare import Comparison, Figures, mean_view
-from potr_cl.quality.evaluator import JudgingViews
+from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.report.file import file_report
 
 #: Sections of :func:`potr_cl.report.file.file_report` by the property that they belong to, as their names begin.
@@ -105,7 +105,7 @@ def search_report(target: Target, found: Found) -> dict[str, Any]:
     }
 
 
-def quality_report(views: JudgingViews, comparison: Comparison) -> dict[str, Any]:
+def quality_report(views: EvaluationViews, comparison: Comparison) -> dict[str, Any]:
     """The figures of the views that an encode was judged by."""
 
     def entry(name: str, figures: Figures) -> dict[str, Any]:

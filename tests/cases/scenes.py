@@ -28,15 +28,24 @@ def ring_of_cameras(count: int, distance: float = 4.0, size: int = 64) -> list[C
     cameras = []
     for k in range(count):
         angle = 2 * np.pi * k / count
-        eye = distance * np.array([np.cos(angle), np.sin(angle), 0.3])
-        forward = -eye / np.linalg.norm(eye)
+        camera_centre = distance * np.array([np.cos(angle), np.sin(angle), 0.3])
+        forward = -camera_centre / np.linalg.norm(camera_centre)
         right = np.cross(forward, [0, 0, 1])
         right /= np.linalg.norm(right)
         rotation = np.stack([right, np.cross(forward, right), forward])
         split = "test" if k % 4 == 0 else "train"
         cameras.append(
             Camera(
-                f"view_{k}", size, size, 1.2 * size, 1.2 * size, size / 2, size / 2, rotation, -rotation @ eye, split
+                f"view_{k}",
+                size,
+                size,
+                1.2 * size,
+                1.2 * size,
+                size / 2,
+                size / 2,
+                rotation,
+                -rotation @ camera_centre,
+                split,
             )
         )
     return cameras

@@ -26,14 +26,14 @@ def camera(width: int = 64, height: int = 48, focal: float = 60.0, **other: floa
 def tilted_camera(seed: int, width: int, height: int, offset: float = 0.0) -> Camera:
     """Somewhere around the origin (or ``offset`` from it along x), looking at it, principal point off the centre."""
     rng = np.random.default_rng(seed)
-    eye = rng.normal(size=3)
-    eye *= 4 / np.linalg.norm(eye)
-    forward = -eye / 4
+    camera_centre = rng.normal(size=3)
+    camera_centre *= 4 / np.linalg.norm(camera_centre)
+    forward = -camera_centre / 4
     right = np.cross(forward, rng.normal(size=3))
     right /= np.linalg.norm(right)
     rotation = np.stack([right, np.cross(forward, right), forward])
-    eye = eye + np.array([offset, 0, 0])
-    return Camera("tilted", width, height, 70, 75, width / 2 + 3, height / 2 - 2, rotation, -rotation @ eye)
+    camera_centre = camera_centre + np.array([offset, 0, 0])
+    return Camera("tilted", width, height, 70, 75, width / 2 + 3, height / 2 - 2, rotation, -rotation @ camera_centre)
 
 
 def random_splats(n: int, degree: int = 3, seed: int = 0) -> Scene:

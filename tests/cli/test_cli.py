@@ -106,7 +106,7 @@ def test_encode_tells_what_it_did(tmp_path, scene_path, capsys):
     assert (report["splats"], report["source"]["splats"]) == (90, 200)
     assert sum(report["properties"].values()) == report["bytes"]
     assert report["pruning"]["history"][-1]["left"] == 90
-    stages = ["prepare views", "prune", "compact", "octree", "quantise and code", "judge", "total"]
+    stages = ["prepare views", "prune", "compact", "octree", "quantise and code", "evaluate", "total"]
     assert list(report["seconds"]) == stages
     assert sum(report["seconds"][stage] for stage in stages[:-1]) <= report["seconds"]["total"]
     assert report["device"]["name"] == Device().info.name
@@ -124,7 +124,7 @@ def test_encode_tells_what_it_did(tmp_path, scene_path, capsys):
         assert part in text
     assert f"worst view {quality['worst']['name']}" in text
     assert "not judged, as asked" in run(capsys, *encode, "--no-quality")
-    assert "judge" not in json.loads(run(capsys, *encode, "--no-quality", "--json"))["seconds"]
+    assert "evaluate" not in json.loads(run(capsys, *encode, "--no-quality", "--json"))["seconds"]
 
 
 @pytest.fixture
@@ -214,7 +214,7 @@ def test_a_device_that_fails_while_judging_leaves_the_file(tmp_path, scene_path,
     def fail(*_args):
         raise DeviceError("device 'X' vanished")
 
-    monkeypatch.setattr(cli.encode, "Judge", fail)
+    monkeypatch.setattr(cli.encode, "Evaluator", fail)
     text = run(capsys, "encode", scene_path, "-o", potr, "--cameras", cameras, "--iterations", "2")
     assert "not judged: device 'X' vanished" in text
     assert load_scene(potr)
@@ -706,14 +706,14 @@ def test_compare_picture(tmp_path, scene_path, potr_path, cameras_path, capsys):
         )
 
 
-def test_compare_with_photographs(tmp_path, scene_path, potr_path, cameras_path, capsys):
+def test_compare_with_ground_truth(tmp_path, scene_path, potr_path, cameras_path, capsys):
     """The uncompressed scene's own pictures as photographs: 8 bits are all that A loses."""
     photos = tmp_path / "photos"
     run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", photos, "--background", "white")
     both = ["compare", scene_path, potr_path, "--cameras", cameras_path, "--background", "white"]
     mean = json.loads(run(capsys, *both, "--truth", photos, "--json"))["mean"]
-    assert mean["a_against_photograph"]["psnr"] > 55
-    assert mean["b_against_photograph"]["psnr"] == pytest.approx(mean["b_against_a"]["psnr"], abs=0.5)
+    assert mean["a_against_truth"]["psnr"] > 55
+    assert mean["b_against_truth"]["psnr"] == pytest.approx(mean["b_against_a"]["psnr"], abs=0.5)
     assert "loss by photo" in run(capsys, *both, "--truth", photos)
 
     picture = tmp_path / "worst.png"
@@ -777,7 +777,7 @@ def test_refit(tmp_path, scene_path, dimmed_path, cameras_path, capsys):
     assert not load_scene(out).sh[:, 1:].any()
 
 
-def test_refit_to_photographs(tmp_path, scene_path, dimmed_path, cameras_path, capsys):
+def test_refit_to_ground_truth(tmp_path, scene_path, dimmed_path, cameras_path, capsys):
     photos, out = tmp_path / "photos", tmp_path / "out.ply"
     run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", photos, "--background", "white")
     refit = ["refit", dimmed_path, "--reference", scene_path, "--cameras", cameras_path, "-o", out]
@@ -801,7 +801,7 @@ def test_refit_to_photographs(tmp_path, scene_path, dimmed_path, cameras_path, c
     assert not out.exists()
 
 
-def test_refit_to_photographs_without_held_out_views(tmp_path, scene_path, dimmed_path, cameras_path, capsys):
+def test_refit_to_ground_truth_without_held_out_views(tmp_path, scene_path, dimmed_path, cameras_path, capsys):
     views = [{**view, "split": "train"} for view in json.loads(cameras_path.read_text())]
     cameras_path.write_text(json.dumps(views))
     photos, out = tmp_path / "photos", tmp_path / "out.ply"
@@ -876,7 +876,7 @@ def test_no_device(capsys, monkeypatch):
     fails(capsys, ["devices"], 1, "no OpenCL device found")
 
 
-def test_encode_to_photographs(tmp_path, scene_path, capsys):
+def test_encode_to_ground_truth(tmp_path, scene_path, capsys):
     """Photographs that are darker than the scene: the file comes nearer to them than the scene is."""
     cameras_path, photos, out = cameras_json(tmp_path / "cameras.json"), tmp_path / "photos", tmp_path / "out.potr"
     run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", photos)

@@ -142,8 +142,8 @@ def test_within_the_criterion_of_the_cameras():
     scene = random_scene(2000, 0, extent=20)
     cameras = ring_of_cameras(12)
     options = dataclasses.replace(KEEP, entropy=FAST)
-    eyes = camera_centres(train_views(cameras))
-    nearest = np.linalg.norm(scene.means[:, None].astype(np.float64) - eyes, axis=2).min(axis=1)
+    centres = camera_centres(train_views(cameras))
+    nearest = np.linalg.norm(scene.means[:, None].astype(np.float64) - centres, axis=2).min(axis=1)
     p = options.parameters
     tolerance = np.maximum(p.gamma, p.beta * nearest)
     encoded = encode(scene, cameras, options)

@@ -141,7 +141,7 @@ def test_cameras_json_without_split_are_training_views(tmp_path: Path) -> None:
     refused(write_json(tmp_path / "cameras.json", views), "view 'a': 'split' is missing")
 
 
-def test_cameras_json_finds_photographs_beside_it(tmp_path: Path) -> None:
+def test_cameras_json_finds_ground_truth_beside_it(tmp_path: Path) -> None:
     write_image(tmp_path / "images" / "a.JPG")
     views = [view(img_name=name) for name in ("a", "frame.0001", "missing.png")]
     cameras = load_cameras(write_json(tmp_path / "cameras.json", views))
@@ -361,7 +361,7 @@ def test_a_model_with_points_rigs_and_several_cameras(write: str, tmp_path: Path
     assert [i for i, split in enumerate(in_order) if split == "test"] == list(range(0, len(cameras), 8))
 
 
-def test_photographs_of_a_model(model: Path, tmp_path: Path) -> None:
+def test_ground_truth_of_a_model(model: Path, tmp_path: Path) -> None:
     assert load_cameras(model)[0].image_path is None
     image = write_image(tmp_path / "images" / "20240212_003919.jpg")
     assert [c.image_path for c in load_cameras(tmp_path)] == [image, *[None] * 16]
@@ -369,11 +369,11 @@ def test_photographs_of_a_model(model: Path, tmp_path: Path) -> None:
 
 def test_folders_in_image_names_tell_views_apart(text_model: Path) -> None:
     images = text_model / "images.txt"
-    renamed = images.read_text().replace("20240212_003920.jpg", "right_eye/20240212_003919.jpg")
+    renamed = images.read_text().replace("20240212_003920.jpg", "right_camera_centre/20240212_003919.jpg")
     images.write_text(renamed)
     names = [camera.name for camera in load_cameras(text_model)]
     assert names[0] == "20240212_003919"
-    assert names[-1] == "right_eye/20240212_003919"
+    assert names[-1] == "right_camera_centre/20240212_003919"
     images.write_text(renamed.replace("20240212_003921", "20240212_003919"))
     refused(text_model, r"more than one view has the image '20240212_003919\.jpg'")
 

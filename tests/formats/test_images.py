@@ -9,7 +9,7 @@ import pytest
 from PIL import Image
 
 from potr_cl.errors import DataError, UsageError
-from potr_cl.formats.images import image_size, parse_colour, read_photograph, to_8_bits, write_png
+from potr_cl.formats.images import image_size, parse_colour, read_ground_truth, to_8_bits, write_png
 
 
 def random_pixels(channels, seed=0):
@@ -19,7 +19,7 @@ def random_pixels(channels, seed=0):
 def test_rgb(tmp_path):
     pixels = random_pixels(3)
     Image.fromarray(pixels).save(tmp_path / "a.png")
-    image = read_photograph(tmp_path / "a.png", (1, 1, 1))
+    image = read_ground_truth(tmp_path / "a.png", (1, 1, 1))
     assert image.dtype == np.float32
     assert np.array_equal(image, pixels.astype(np.float32) / np.float32(255))
     assert image_size(tmp_path / "a.png") == (9, 7)
@@ -31,21 +31,21 @@ def test_alpha_shows_the_background(tmp_path):
     background = np.array([1, 0.5, 0])
     alpha = pixels[..., 3:] / 255
     expected = pixels[..., :3] / 255 * alpha + background * (1 - alpha)
-    assert np.abs(read_photograph(tmp_path / "a.png", (1, 0.5, 0)) - expected).max() < 1e-6
-    assert np.abs(read_photograph(tmp_path / "a.png") - pixels[..., :3] / 255 * alpha).max() < 1e-6
+    assert np.abs(read_ground_truth(tmp_path / "a.png", (1, 0.5, 0)) - expected).max() < 1e-6
+    assert np.abs(read_ground_truth(tmp_path / "a.png") - pixels[..., :3] / 255 * alpha).max() < 1e-6
 
 
 def test_palette_with_a_transparent_colour(tmp_path):
     image = Image.new("P", (4, 4), 1)
     image.putpalette([255, 0, 0, 0, 255, 0])
     image.save(tmp_path / "a.png", transparency=1)
-    assert np.array_equal(read_photograph(tmp_path / "a.png", (0, 0, 1)), np.full((4, 4, 3), (0, 0, 1)))
+    assert np.array_equal(read_ground_truth(tmp_path / "a.png", (0, 0, 1)), np.full((4, 4, 3), (0, 0, 1)))
 
 
 def test_grey_is_every_channel(tmp_path):
     pixels = random_pixels(1)[..., 0]
     Image.fromarray(pixels).save(tmp_path / "a.png")
-    assert np.array_equal(to_8_bits(read_photograph(tmp_path / "a.png")), np.stack([pixels] * 3, axis=-1))
+    assert np.array_equal(to_8_bits(read_ground_truth(tmp_path / "a.png")), np.stack([pixels] * 3, axis=-1))
 
 
 def test_deep_images_are_refused(tmp_path):
@@ -53,7 +53,7 @@ def test_deep_images_are_refused(tmp_path):
     Image.fromarray(np.ones((7, 9), np.float32)).save(tmp_path / "a.tif")
     for name in ("a.png", "a.tif"):
         with pytest.raises(DataError, match="more than 8 bits"):
-            read_photograph(tmp_path / name)
+            read_ground_truth(tmp_path / name)
 
 
 @pytest.mark.parametrize("form", ["PNG", "JPEG"])
@@ -65,7 +65,7 @@ def test_damaged_files(tmp_path, form):
     for content in (b"", b"not an image", whole[:10], whole[: len(whole) // 2], bytes(200)):
         path.write_bytes(content)
         with pytest.raises(DataError, match="damaged or of another kind"):
-            read_photograph(path)
+            read_ground_truth(path)
 
 
 def test_a_size_that_would_not_fit_memory(tmp_path):
@@ -75,7 +75,7 @@ def test_a_size_that_would_not_fit_memory(tmp_path):
     data[18:26] = (50_000).to_bytes(4, "little") * 2
     path.write_bytes(data)
     with pytest.raises(DataError, match="damaged or of another kind"):
-        read_photograph(path)
+        read_ground_truth(path)
 
 
 def test_no_such_file(tmp_path):

@@ -52,15 +52,15 @@ def inside_room(cameras):
     return [c for c in cameras if (np.abs(c.centre) < INSIDE_ROOM).all()]
 
 
-def trained(scene: Scene, normals: np.ndarray, eyes: np.ndarray, degree: int = 3) -> Scene:
-    """The scene with coefficients that training from these eyes could give.
+def trained(scene: Scene, normals: np.ndarray, centres: np.ndarray, degree: int = 3) -> Scene:
+    """The scene with coefficients that training from these camera centres could give.
 
-    They are random sums of the basis functions in the directions of the eyes in front of a splat.
+    They are random sums of the basis functions in the directions of the camera centres in front of a splat.
     """
     rng = np.random.default_rng(0)
     sh = np.zeros((len(scene), (degree + 1) ** 2, 3))
-    for eye in eyes:
-        towards = scene.means - eye
+    for camera_centre in centres:
+        towards = scene.means - camera_centre
         facing = np.einsum("ij,ij->i", towards, normals) < 0
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         steps = facing[:, None, None] * rng.normal(0, 0.02, (len(scene), 1, 3))
@@ -147,8 +147,8 @@ def test_clutter_does_not_draw_the_views_away(clutter):
 
 def test_no_camera_stands_in_matter():
     scene = together(BALL, floaters(4000, 2))
-    eyes = camera_centres(place_cameras(scene))
-    blocked = [np.sum(np.linalg.norm(scene.means - eye, axis=1) < 0.1) for eye in eyes]
+    centres = camera_centres(place_cameras(scene))
+    blocked = [np.sum(np.linalg.norm(scene.means - camera_centre, axis=1) < 0.1) for camera_centre in centres]
     assert max(blocked) == 0
 
 
@@ -171,17 +171,17 @@ def test_an_object_in_a_room():
     assert seen.min() >= 1
 
 
-def upper_eyes(count: int, distance: float) -> np.ndarray:
+def upper_centres(count: int, distance: float) -> np.ndarray:
     rng = np.random.default_rng(3)
-    eyes = rng.normal(size=(count, 3))
-    eyes[:, 2] = np.abs(eyes[:, 2]) + 0.1
-    return distance * eyes / np.linalg.norm(eyes, axis=1, keepdims=True)
+    centres = rng.normal(size=(count, 3))
+    centres[:, 2] = np.abs(centres[:, 2]) + 0.1
+    return distance * centres / np.linalg.norm(centres, axis=1, keepdims=True)
 
 
 @pytest.mark.parametrize("degree", [2, 3])
 def test_colours_tell_the_side_that_was_photographed(around_ball, degree):
-    eyes = camera_centres(place_cameras(trained(BALL, BALL.means, upper_eyes(60, 3), degree)))
-    elevation = np.degrees(np.arcsin(eyes[:, 2] / np.linalg.norm(eyes, axis=1)))
+    centres = camera_centres(place_cameras(trained(BALL, BALL.means, upper_centres(60, 3), degree)))
+    elevation = np.degrees(np.arcsin(centres[:, 2] / np.linalg.norm(centres, axis=1)))
     assert np.mean(elevation > -20) > 0.95
     # Without that knowledge they are all around.
     blind = camera_centres(around_ball)
@@ -193,7 +193,7 @@ def test_colours_tell_a_room_from_an_object():
     from_inside = trained(ROOM, -WALLS, rng.uniform(-0.6, 0.6, (60, 3)) * INSIDE_ROOM)
     views = place_cameras(from_inside)
     assert len(inside_room(views)) > 0.94 * len(views)
-    from_outside = trained(ROOM, WALLS, upper_eyes(60, 12))
+    from_outside = trained(ROOM, WALLS, upper_centres(60, 12))
     views = place_cameras(from_outside)
     assert len(inside_room(views)) < 0.0625 * len(views)
 
@@ -270,11 +270,11 @@ def test_trained_colours_remember_their_views(name, request):
     places, _ = virtual_cameras._places(frame)
     true = (camera_centres(cameras) - frame.centre) / frame.unit
     shown, kept = [], []
-    for number, eye in enumerate(np.concatenate([true, places[::2]])):
-        horizon, blocked = virtual_cameras._surroundings(eye, matter)
+    for number, camera_centre in enumerate(np.concatenate([true, places[::2]])):
+        horizon, blocked = virtual_cameras._surroundings(camera_centre, matter)
         if number < len(true) or blocked <= virtual_cameras._CROWDED:
-            kept.append(eye)
-            view = virtual_cameras._views_from(eye, virtual_cameras._HALF_VIEW, horizon, frame, matter)
+            kept.append(camera_centre)
+            view = virtual_cameras._views_from(camera_centre, virtual_cameras._HALF_VIEW, horizon, frame, matter)
             shown.append(view[1].max(axis=0))
     remembered = virtual_cameras._remembered(np.array(kept), shown, matter)
     of_true, of_others = remembered[: len(true)], remembered[len(true) :]
@@ -285,16 +285,16 @@ def test_trained_colours_remember_their_views(name, request):
 
 def test_lego_is_looked_at_from_above(lego):
     scene = load_scene(lego / "point_cloud.ply")
-    eyes = camera_centres(place_cameras(scene))
-    distance = np.linalg.norm(eyes, axis=1)
-    assert np.mean(np.degrees(np.arcsin(eyes[:, 2] / distance)) > -20) > 0.97  # the photographs: all above 0
+    centres = camera_centres(place_cameras(scene))
+    distance = np.linalg.norm(centres, axis=1)
+    assert np.mean(np.degrees(np.arcsin(centres[:, 2] / distance)) > -20) > 0.97  # the photographs: all above 0
     assert 1.3 < np.median(distance) < 5
 
 
 def test_plush_is_looked_at_from_where_it_was_photographed(plush):
     scene, cameras = load_scene(plush / "point_cloud.ply"), load_cameras(plush / "cameras.json")
-    eyes, true = camera_centres(place_cameras(scene)), camera_centres(cameras)
-    nearest = np.linalg.norm(eyes[:, None] - true, axis=2).min(axis=1)
+    centres, true = camera_centres(place_cameras(scene)), camera_centres(cameras)
+    nearest = np.linalg.norm(centres[:, None] - true, axis=2).min(axis=1)
     # The photographs were taken from 2.6 to 7.3 units away from the toy, on a shell of about that radius.
     assert np.median(nearest) < 1.8
     assert np.quantile(nearest, 0.9) < 4

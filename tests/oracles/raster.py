@@ -184,7 +184,7 @@ def composite(
         margin = np.where(alive & inside, np.minimum(margin, np.abs(raw * 255 - 1)), margin)
         alpha = np.where(inside & (raw >= 1 / 255), np.minimum(raw, rules.alpha_cap), 0)
         following = transmittance * (1 - alpha)
-        ends = following <= 1e-4 if rules.stop_included else following < 1e-4
+        ends = following <= 1e-4 if rules.threshold_included else following < 1e-4
         touched = alive & (alpha > 0)
         margin = np.where(touched, np.minimum(margin, np.abs(following * 1e4 - 1)), margin)
         alive &= ~(touched & ends)
@@ -227,7 +227,7 @@ def composite_pixel(projected: Projected, column: int, row: int, rules: RasterRu
         alpha = min(raw[k], rules.alpha_cap)
         following = transmittance * (1 - alpha)
         margin = min(margin, abs(following * 1e4 - 1))
-        if following <= 1e-4 if rules.stop_included else following < 1e-4:
+        if following <= 1e-4 if rules.threshold_included else following < 1e-4:
             break
         gap = min(gap, abs(projected.depth[k] / depth - 1) if depth else np.inf)
         depth = projected.depth[k]

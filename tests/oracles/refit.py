@@ -196,7 +196,7 @@ LENGTHS = (3.0, 2.0, 3.0)
 
 
 def selection(
-    block: Array, x: Array, active: NDArray[np.bool_], length: float, prior: float, least: float, damping: float = 1e-4
+    block: Array, x: Array, active: NDArray[np.bool_], length: float, prior: float, least: float, decay: float = 1e-4
 ) -> tuple[NDArray[np.bool_], Array, float]:
     """Which coefficients of one channel of one splat are kept: the definition, with an inverse at every step.
 
@@ -209,7 +209,7 @@ def selection(
     """
     matrix = length * block + prior * np.eye(len(x))
     scale = np.sqrt(np.diag(matrix))
-    unit = matrix / np.outer(scale, scale) + damping * np.eye(len(x))
+    unit = matrix / np.outer(scale, scale) + decay * np.eye(len(x))
     kept, x, margin = active.copy(), np.where(active, x * scale, 0), np.inf
     while True:
         index = np.flatnonzero(kept)

@@ -209,14 +209,14 @@ def test_nothing_to_see(device):
     assert found.value == 200
 
 
-def test_colours_may_be_fitted_to_photographs(device, lego_excerpt, cameras, tmp_path):
+def test_colours_may_be_fitted_to_ground_truth(device, lego_excerpt, cameras, tmp_path):
     """Which sets a bound to the PSNR against the renders that no quality passes."""
     shown = Rasterizer(device, dataclasses.replace(lego_excerpt, sh=lego_excerpt.sh * np.float32(0.9)))
     for camera in (camera for camera in cameras if camera.split == "train"):
         with (tmp_path / f"{camera.name}.png").open("wb") as file:
             write_png(file, to_8_bits(shown.render(camera)[0]))
     shown.free()
-    options = EncodeOptions.for_preset("fast", iterations=6, photographs=tmp_path)
+    options = EncodeOptions.for_preset("fast", iterations=6, ground_truth=tmp_path)
     target = Target(min_psnr=42)
     assert target.inside(encode_to_target(lego_excerpt, cameras, target, options, device=device).value)
     with pytest.raises(UnreachableError, match="quality 1 gives 4"):

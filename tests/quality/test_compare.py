@@ -22,7 +22,7 @@ from potr_cl.quality.compare import (
     ViewFigures,
     compare,
     comparison_report,
-    find_photographs,
+    find_ground_truth,
     format_comparison,
     format_sizes,
     mean_view,
@@ -74,7 +74,7 @@ def test_figures_are_those_of_the_pictures(rasterizers, views):
     assert compare(a, b, views) == compare(a, b, views)
 
 
-def test_photographs(rasterizers, views, tmp_path):
+def test_ground_truth(rasterizers, views, tmp_path):
     """Photographs with alpha, made of A's own pictures: composited over the background they are A's pictures again."""
     a, b = rasterizers
     for camera in views:
@@ -83,13 +83,13 @@ def test_photographs(rasterizers, views, tmp_path):
         own = image - np.float32(BACKGROUND) * transmittance[..., None]
         straight = own / np.where(alpha > 0, alpha, 1)
         Image.fromarray(to_8_bits(np.concatenate([straight, alpha], axis=-1))).save(tmp_path / f"{camera.name}.png")
-    result = compare(a, b, views, find_photographs(tmp_path, views))
+    result = compare(a, b, views, find_ground_truth(tmp_path, views))
     for view in result.views:
         f = view.figures
-        assert f["a_against_photograph"].psnr > 45  # what 8 bits allow
-        assert f["b_against_photograph"].psnr == pytest.approx(f["b_against_a"].psnr, abs=0.5)
-        assert f["loss"].psnr == f["a_against_photograph"].psnr - f["b_against_photograph"].psnr > 0
-        assert f["loss"].ssim == f["a_against_photograph"].ssim - f["b_against_photograph"].ssim > 0
+        assert f["a_against_truth"].psnr > 45  # what 8 bits allow
+        assert f["b_against_truth"].psnr == pytest.approx(f["b_against_a"].psnr, abs=0.5)
+        assert f["loss"].psnr == f["a_against_truth"].psnr - f["b_against_truth"].psnr > 0
+        assert f["loss"].ssim == f["a_against_truth"].ssim - f["b_against_truth"].ssim > 0
     report = comparison_report(result)
     assert report["mean"]["loss"]["psnr"] == pytest.approx(
         np.mean([view["loss"]["psnr"] for view in report["views"]]), rel=1e-12
@@ -187,7 +187,7 @@ def save(path, width=64, height=64):
     Image.new("RGB", (width, height)).save(path)
 
 
-def test_photographs_are_found_by_name(tmp_path):
+def test_ground_truth_are_found_by_name(tmp_path):
     cameras = ring_of_cameras(4)
     cameras[2] = replace(cameras[2], name="left/view.2")
     cameras[3] = replace(cameras[3], name="view_3.png")  # views keep the extension where two differ only in it
@@ -200,27 +200,27 @@ def test_photographs_are_found_by_name(tmp_path):
     for path in (*paths, tmp_path / "view_3.jpg"):
         save(path)
     (tmp_path / "view_0.txt").write_text("not a picture")
-    assert find_photographs(tmp_path, cameras) == {c.name: p for c, p in zip(cameras, paths, strict=True)}
+    assert find_ground_truth(tmp_path, cameras) == {c.name: p for c, p in zip(cameras, paths, strict=True)}
 
 
-def test_photographs_missing_or_ambiguous(tmp_path):
+def test_ground_truth_missing_or_ambiguous(tmp_path):
     cameras = ring_of_cameras(2)
     with pytest.raises(UsageError, match=r"cannot read the folder of photographs .*nowhere"):
-        find_photographs(tmp_path / "nowhere", cameras)
+        find_ground_truth(tmp_path / "nowhere", cameras)
     save(tmp_path / "view_0.png")
     with pytest.raises(UsageError, match="no photograph of view 'view_1'"):
-        find_photographs(tmp_path, cameras)
+        find_ground_truth(tmp_path, cameras)
     save(tmp_path / "view_1.png")
     save(tmp_path / "view_1.jpg")
     with pytest.raises(UsageError, match=r"several photographs of view 'view_1'.*view_1.jpg, view_1.png"):
-        find_photographs(tmp_path, cameras)
+        find_ground_truth(tmp_path, cameras)
 
 
-def test_photographs_of_another_size_or_damaged(tmp_path):
+def test_ground_truth_of_another_size_or_damaged(tmp_path):
     cameras = ring_of_cameras(1)
     save(tmp_path / "view_0.png", 80, 60)
     with pytest.raises(UsageError, match=r"80 x 60 pixels, view 'view_0' of the cameras is 64 x 64"):
-        find_photographs(tmp_path, cameras)
+        find_ground_truth(tmp_path, cameras)
     (tmp_path / "view_0.png").write_bytes(b"\x89PNG damaged")
     with pytest.raises(DataError, match=r"view_0.png' is damaged"):
-        find_photographs(tmp_path, cameras)
+        find_ground_truth(tmp_path, cameras)

@@ -10,7 +10,7 @@ import pytest
 
 from potr_cl.errors import UsageError
 from potr_cl.opencl.device import Device
-from potr_cl.quality.evaluator import Judge, JudgingViews
+from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import render
 from tests.cases.scenes import random_scene, ring_of_cameras
@@ -25,25 +25,25 @@ def only_training(count):
 
 
 @pytest.fixture
-def judge():
+def evaluator():
     device = Device()
-    judge = Judge(device, SCENE, JudgingViews.of(CAMERAS), (0.2, 0.0, 0.0))
-    yield judge
-    judge.free()
+    evaluator = Evaluator(device, SCENE, EvaluationViews.of(CAMERAS), (0.2, 0.0, 0.0))
+    yield evaluator
+    evaluator.free()
     assert device.allocated == 0
 
 
 def test_test_views_judge_where_there_are_any():
-    views = JudgingViews.of(CAMERAS)
+    views = EvaluationViews.of(CAMERAS)
     assert (views.kind, [view.name for view in views.views]) == ("test", ["view_0", "view_4"])
     assert str(views) == "2 held-out test views"
 
 
 def test_training_views_stand_in_and_that_is_said():
-    views = JudgingViews.of(only_training(5))
+    views = EvaluationViews.of(only_training(5))
     assert (views.kind, len(views.views)) == ("train", 5)
     assert str(views) == "all 5 training views, for the cameras name no test views"
-    views = JudgingViews.of(only_training(100))
+    views = EvaluationViews.of(only_training(100))
     assert (views.kind, len(views.views), views.available) == ("train", 32, 100)
     names = [view.name for view in views.views]
     assert (names[0], names[-1], len(set(names))) == ("view_0", "view_99", 32)
@@ -52,34 +52,34 @@ def test_training_views_stand_in_and_that_is_said():
 
 def test_no_view_at_all():
     with pytest.raises(UsageError):
-        JudgingViews.of([])
+        EvaluationViews.of([])
 
 
-def test_figures_are_those_of_the_pictures(judge):
+def test_figures_are_those_of_the_pictures(evaluator):
     expected = [
         psnr(render(WORSE, camera, background=(0.2, 0, 0))[0], render(SCENE, camera, background=(0.2, 0, 0))[0])
         for camera in (CAMERAS[0], CAMERAS[4])
     ]
-    assert judge.psnr(WORSE) == pytest.approx(np.mean(expected), abs=2e-6)
-    assert judge.psnr(WORSE, most=1) == pytest.approx(expected[0], abs=2e-6)
-    assert judge.psnr(SCENE) == math.inf
+    assert evaluator.psnr(WORSE) == pytest.approx(np.mean(expected), abs=2e-6)
+    assert evaluator.psnr(WORSE, most=1) == pytest.approx(expected[0], abs=2e-6)
+    assert evaluator.psnr(SCENE) == math.inf
     done = []
-    comparison = judge.compare(WORSE, lambda _stage, part: done.append(part))
+    comparison = evaluator.compare(WORSE, lambda _stage, part: done.append(part))
     assert [view.figures["b_against_a"].psnr for view in comparison.views] == pytest.approx(expected, abs=2e-6)
     assert done[-1] == 1
 
 
-def test_pictures_that_are_not_kept_are_the_same(judge, monkeypatch):
-    kept = judge.psnr(WORSE), judge.psnr(WORSE)
-    monkeypatch.setattr("potr_cl.quality.evaluator._KEPT_PICTURES", 0)
-    other = Judge(Device(), SCENE, judge.views, (0.2, 0.0, 0.0))
+def test_pictures_that_are_not_kept_are_the_same(evaluator, monkeypatch):
+    kept = evaluator.psnr(WORSE), evaluator.psnr(WORSE)
+    monkeypatch.setattr("potr_cl.quality.evaluator._CACHED_PICTURES", 0)
+    other = Evaluator(Device(), SCENE, evaluator.views, (0.2, 0.0, 0.0))
     assert (other.psnr(WORSE), other.psnr(WORSE)) == kept
     other.free()
 
 
-def test_pictures(judge):
-    ((reference, candidate),) = judge.pictures(WORSE, ["view_4"])
+def test_pictures(evaluator):
+    ((reference, candidate),) = evaluator.pictures(WORSE, ["view_4"])
     assert np.array_equal(reference, render(SCENE, CAMERAS[4], background=(0.2, 0, 0))[0])
     assert np.array_equal(candidate, render(WORSE, CAMERAS[4], background=(0.2, 0, 0))[0])
     with pytest.raises(UsageError, match=r"no view 'view_1' among the 2 held-out test views"):
-        judge.pictures(WORSE, ["view_1"])
+        evaluator.pictures(WORSE, ["view_1"])

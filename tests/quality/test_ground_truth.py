@@ -10,7 +10,7 @@ import pytest
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.images import to_8_bits, write_png
 from potr_cl.opencl.device import Device
-from potr_cl.quality.ground_truth import Photographs, PhotographTargets
+from potr_cl.quality.ground_truth import GroundTruth, GroundTruthTargets
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.refit import RefitOptions, RenderedTargets, refit_colours
@@ -48,18 +48,18 @@ def folder(tmp_path, device, scene, cameras):
 
 
 def test_psnr_is_the_mean_over_the_views(device, scene, cameras, folder):
-    photographs = Photographs(folder, cameras)
+    ground_truth = GroundTruth(folder, cameras)
     rasterizer = Rasterizer(device, dataclasses.replace(scene, sh=scene.sh + np.float32(0.1)))
-    wanted = np.mean([psnr(rasterizer.render(c)[0], photographs.picture(c)) for c in cameras[:2]])
-    assert photographs.psnr(rasterizer, cameras[:2]) == pytest.approx(wanted)
+    wanted = np.mean([psnr(rasterizer.render(c)[0], ground_truth.picture(c)) for c in cameras[:2]])
+    assert ground_truth.psnr(rasterizer, cameras[:2]) == pytest.approx(wanted)
     rasterizer.free()
 
 
-def test_a_refit_to_photographs_is_one_to_what_they_show(device, scene, cameras, folder):
+def test_a_refit_to_ground_truth_is_one_to_what_they_show(device, scene, cameras, folder):
     """8 bits are all that tells the photographs from the pictures."""
     dimmed = dataclasses.replace(scene, sh=scene.sh * np.float32(0.5))
     options = RefitOptions(steps=20, gain=0, prior=1)
-    targets = PhotographTargets(device, Photographs(folder, cameras), cameras)
+    targets = GroundTruthTargets(device, GroundTruth(folder, cameras), cameras)
     refitted = refit_colours(device, dimmed, cameras, targets, options)
     targets.free()
     rasterizer = Rasterizer(device, scene)
@@ -70,19 +70,19 @@ def test_a_refit_to_photographs_is_one_to_what_they_show(device, scene, cameras,
     assert np.abs(refitted.sh - wanted.sh).mean() < 0.1 * np.abs(refitted.sh - dimmed.sh).mean()
 
 
-def test_photographs_that_are_not_there_or_of_another_size(cameras, folder):
+def test_ground_truth_that_are_not_there_or_of_another_size(cameras, folder):
     larger = dataclasses.replace(cameras[0], width=64)
     with pytest.raises(UsageError, match=r"is 32 x 32 pixels, view 'view_0' of the cameras is 64 x 32"):
-        Photographs(folder, [larger])
+        GroundTruth(folder, [larger])
     (folder / "view_3.png").unlink()
     with pytest.raises(UsageError, match="no photograph of view 'view_3'"):
-        Photographs(folder, cameras)
+        GroundTruth(folder, cameras)
 
 
 def test_a_damaged_photograph(device, scene, cameras, folder):
     whole = (folder / "view_2.png").read_bytes()
     (folder / "view_2.png").write_bytes(whole[: len(whole) // 2])
-    targets = PhotographTargets(device, Photographs(folder, cameras), cameras)
+    targets = GroundTruthTargets(device, GroundTruth(folder, cameras), cameras)
     with pytest.raises(DataError, match=r"view_2\.png"):
         refit_colours(device, scene, cameras, targets)
     targets.free()

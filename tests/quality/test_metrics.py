@@ -15,7 +15,7 @@ from scipy.ndimage import correlate
 
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_cameras, load_scene
-from potr_cl.formats.images import read_photograph
+from potr_cl.formats.images import read_ground_truth
 from potr_cl.opencl.device import Device
 from potr_cl.quality.metrics import Lpips, psnr, ssim
 from potr_cl.raster.rasterizer import GSPLAT, Rasterizer
@@ -136,6 +136,6 @@ def test_recorded_figures_of_another_renderer_and_other_metrics(name, request):
     for view in recorded:
         camera = cameras[view["img_name"]]
         image, _ = rasterizer.render(camera)
-        photograph = read_photograph(camera.image_path)
+        photograph = read_ground_truth(camera.image_path)
         assert psnr(image, photograph) == pytest.approx(view["psnr"], abs=0.01), camera.name
         assert ssim(image, photograph) == pytest.approx(view["ssim"], abs=1e-4), camera.name

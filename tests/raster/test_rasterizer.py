@@ -52,7 +52,7 @@ def check(
 
 def read_lists(device: Device, view: View) -> tuple[NDArray[np.uint32], NDArray[np.uint32]]:
     offsets = device.download(view.offsets, (view.tiles + 1,), np.uint32)
-    return offsets, device.download(view.entries, (view.entry_count,), np.uint32)
+    return offsets, device.download(view.intersections, (view.intersection_count,), np.uint32)
 
 
 @pytest.mark.parametrize("rules", [INRIA, GSPLAT], ids=["inria", "gsplat"])
@@ -134,7 +134,7 @@ def test_prepared_views_composite_as_rendered(device: Device) -> None:
         assert image.tobytes() == rendered[0].tobytes()
         assert transmittance.tobytes() == rendered[1].tobytes()
     for view in views:
-        assert view.capacity == view.entry_count > 0
+        assert view.capacity == view.intersection_count > 0
         view.free()
     rasterizer.free()
 
@@ -148,18 +148,18 @@ def test_views_of_a_set_are_those_prepared_alone(device: Device) -> None:
     cameras = [tilted_camera(1, 64, 64), tilted_camera(2, 120, 33, offset=1e4), tilted_camera(3, 17, 15)]
     views = rasterizer.prepare_set(cameras)
     offsets = views.read_offsets()
-    entries = device.download(views.entries, (views.capacity,), np.uint32)
-    patches = device.download(views.patches, (views.capacity,), np.uint16)
+    intersections = device.download(views.intersections, (views.capacity,), np.uint32)
+    subtiles = device.download(views.subtiles, (views.capacity,), np.uint16)
     for i, view in enumerate(cameras):
         alone = rasterizer.prepare(view)
-        part = slice(views.entry_starts[i], views.entry_starts[i + 1])
-        own_offsets, own_entries = read_lists(device, alone)
+        part = slice(views.intersection_starts[i], views.intersection_starts[i + 1])
+        own_offsets, own_intersections = read_lists(device, alone)
         assert np.array_equal(offsets[i], own_offsets)
-        assert np.array_equal(entries[part], own_entries)
-        own_patches = device.download(alone.owner.patches, (alone.entry_count,), np.uint16)
-        assert np.array_equal(patches[part], own_patches)
-        assert views.views[i].entry_count == alone.entry_count
-        assert (alone.entry_count == 0) == (i == 1)
+        assert np.array_equal(intersections[part], own_intersections)
+        own_subtiles = device.download(alone.owner.subtiles, (alone.intersection_count,), np.uint16)
+        assert np.array_equal(subtiles[part], own_subtiles)
+        assert views.views[i].intersection_count == alone.intersection_count
+        assert (alone.intersection_count == 0) == (i == 1)
         alone.free()
     views.free()
     rasterizer.free()
@@ -207,7 +207,7 @@ def test_tile_lists_are_tight_and_sorted(device: Device, rules: RasterRules) -> 
     scene, view = random_splats(300, 0, seed=8), tilted_camera(8, 91, 77)
     rasterizer = Rasterizer(device, scene, rules)
     prepared = rasterizer.prepare(view)
-    offsets, entries = read_lists(device, prepared)
+    offsets, intersections = read_lists(device, prepared)
     prepared.free()
     rasterizer.free()
 
@@ -227,14 +227,14 @@ def test_tile_lists_are_tight_and_sorted(device: Device, rules: RasterRules) -> 
             found |= {(tile, int(splat)) for tile in set(rows // TILE * prepared.columns + columns // TILE)}
     listed = set()
     for tile in range(prepared.tiles):
-        run = entries[offsets[tile] : offsets[tile + 1]]
+        run = intersections[offsets[tile] : offsets[tile + 1]]
         assert (np.diff(rank[run]) > 0).all()
         listed |= {(tile, int(splat)) for splat in run}
     assert touched <= listed
     # The ellipse is tested, not the pixels in it: where it touches a tile between pixel centres it is listed too.
     assert len(listed - nearly) <= 0.02 * len(listed)
     assert offsets[0] == 0
-    assert offsets[-1] == len(entries) == prepared.entry_count
+    assert offsets[-1] == len(intersections) == prepared.intersection_count
 
 
 @pytest.mark.parametrize("n", [1, 2, 15, 16, 17, 255, 256, 257, 1000, 2047, 2048, 2049, 4096, 5001, 12345])
@@ -244,18 +244,18 @@ def test_one_tile_of_any_length_is_sorted(device: Device, n: int) -> None:
     scene = splats(np.stack([0 * depth, 0 * depth, depth], axis=1), sigma=1e-4, logit=0)
     rasterizer = Rasterizer(device, scene)
     prepared = rasterizer.prepare(camera(16, 16))
-    offsets, entries = read_lists(device, prepared)
+    offsets, intersections = read_lists(device, prepared)
     prepared.free()
     rasterizer.free()
     assert offsets.tolist() == [0, n]
-    assert np.array_equal(entries, np.lexsort((np.arange(n), depth.astype(np.float32))))
+    assert np.array_equal(intersections, np.lexsort((np.arange(n), depth.astype(np.float32))))
 
 
 # Stress: every case must end, and end finite. Those with a well-defined picture are held against the definition too.
 
 
 def test_near_plane(device: Device) -> None:
-    """Behind, in the eye, just behind, on and just in front of the near plane."""
+    """Behind, in the camera centre, just behind, on and just in front of the near plane."""
     near = np.float32(INRIA.near)
     depths = [-5, -0.2, 0, np.nextafter(near, np.float32(0)), near, np.nextafter(near, np.float32(1))]
     for k, depth in enumerate(depths):
@@ -266,7 +266,7 @@ def test_near_plane(device: Device) -> None:
         assert np.isfinite(image).all()
 
 
-def test_close_to_the_eye_and_to_the_side(device: Device) -> None:
+def test_close_to_the_camera_centre_and_to_the_side(device: Device) -> None:
     scene = splats([[3, 2, 0.25], [-0.5, 0.1, 0.21], [0.3, -4, 0.3]], sigma=0.3, logit=2)
     check(device, scene, camera())
 
@@ -321,19 +321,19 @@ def test_five_thousand_layers_on_a_pixel(device: Device) -> None:
     check(device, scene, camera(24, 20), tolerance=5e-5)
 
 
-def test_a_tile_with_a_hundred_thousand_entries(device: Device) -> None:
+def test_a_tile_with_a_hundred_thousand_intersections(device: Device) -> None:
     rng = np.random.default_rng(2)
     n = 100_000
     means = np.concatenate([rng.uniform(-0.05, 0.05, (n, 2)), rng.uniform(1, 2, (n, 1))], axis=1)
     scene = splats(means, sigma=1e-3, logit=-2, colour=rng.uniform(0, 1, (n, 3)))
     rasterizer = Rasterizer(device, scene)
     view = rasterizer.prepare(camera(16, 16))
-    _, entries = read_lists(device, view)
+    _, intersections = read_lists(device, view)
     image, _ = rasterizer.composite(view)
     view.free()
     rasterizer.free()
-    assert len(entries) > 0.9 * n
-    depth = means[entries, 2].astype(np.float32)
+    assert len(intersections) > 0.9 * n
+    depth = means[intersections, 2].astype(np.float32)
     assert (np.diff(depth) >= 0).all()
     assert np.isfinite(image).all()
 
@@ -353,7 +353,7 @@ def test_image_sizes(device: Device, width: int, height: int) -> None:
 
 @pytest.mark.parametrize("offset", [1e3, 1e6])
 def test_far_from_the_origin(device: Device, offset: float) -> None:
-    """The digits that float32 leaves of the centres are all kept: the eye is subtracted first."""
+    """The digits that float32 leaves of the centres are all kept: the camera centre is subtracted first."""
     scene = random_splats(200, 3, seed=12)
     moved = Scene(
         scene.means + np.float32([offset, 0, 0]), scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh

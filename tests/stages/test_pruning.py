@@ -86,8 +86,8 @@ def test_history_adds_up():
         assert entry.largest_effect == EFFECTS[gone].max()
 
 
-@pytest.mark.parametrize(("damping", "order"), [(0.0, [0, 2, 1]), (0.5, [0, 2, 1]), (0.8, [0, 1, 2]), (1.0, [0, 1, 2])])
-def test_damping_is_a_weighted_mean_of_the_measurements(damping, order):
+@pytest.mark.parametrize(("decay", "order"), [(0.0, [0, 2, 1]), (0.5, [0, 2, 1]), (0.8, [0, 1, 2]), (1.0, [0, 1, 2])])
+def test_decay_is_a_weighted_mean_of_the_measurements(decay, order):
     class Moving(Additive):
         def measure(self):
             super().measure()
@@ -95,7 +95,7 @@ def test_damping_is_a_weighted_mean_of_the_measurements(damping, order):
 
     # The first splat uses up the first iteration's budget. Means of the others with 0.5: 7 / 1.5 and 6.9 / 1.5.
     effects = Moving(np.zeros(3), [100.0, 1.0, 1.0])
-    assert prune(effects, 3, PruningOptions(1, 2, count=1, damping=damping)).order.tolist()[:2] == order[:2]
+    assert prune(effects, 3, PruningOptions(1, 2, count=1, decay=decay)).order.tolist()[:2] == order[:2]
 
 
 def test_removes_all_candidates_and_nothing_else():
@@ -164,9 +164,9 @@ def test_ties_fall_by_number():
         {"a": 0},
         {"a": np.inf},
         {"count": 0},
-        {"damping": -0.1},
-        {"damping": 1.1},
-        {"damping": np.nan},
+        {"decay": -0.1},
+        {"decay": 1.1},
+        {"decay": np.nan},
     ],
 )
 def test_options_out_of_range(bad):

@@ -11,7 +11,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
-from potr_cl.stages.pruning.schedule import DampedEffects, PruningOptions, choose, prune
+from potr_cl.stages.pruning.schedule import PruningOptions, SmoothedEffects, choose, prune
 from tests.cases.refit import visible_scene
 from tests.cases.scenes import ring_of_cameras
 from tests.devices import KERNELS, open_device
@@ -44,9 +44,9 @@ def gpu(request):
     return open_device(request.param)
 
 
-@pytest.mark.parametrize("damping", [0.8, 0.0])
-def test_the_same_splats_go_as_in_numpy(gpu, lego_excerpt, cameras, damping):
-    options = dataclasses.replace(OPTIONS, damping=damping)
+@pytest.mark.parametrize("decay", [0.8, 0.0])
+def test_the_same_splats_go_as_in_numpy(gpu, lego_excerpt, cameras, decay):
+    options = dataclasses.replace(OPTIONS, decay=decay)
     found, sweeps = run(gpu, lego_excerpt, cameras, options)
     expected, expected_sweeps = run(gpu, lego_excerpt, cameras, options, on_device=False)
     assert 100 < expected.kept < 1400
@@ -66,16 +66,16 @@ def test_each_iteration_spends_its_budget(gpu, lego_excerpt, cameras):
     found, _ = run(gpu, lego_excerpt, cameras, OPTIONS)
     rasterizer = Rasterizer(gpu, lego_excerpt)
     removal = RemovalSweep(rasterizer, cameras, SweepOptions())
-    damped = DampedEffects(removal, OPTIONS.damping)
+    smoothed = SmoothedEffects(removal, OPTIONS.decay)
     alive = np.arange(len(lego_excerpt))
     start = 0
     for iteration in range(3):
-        delta_mse, importance = damped.measure()
+        delta_mse, importance = smoothed.measure()
         gone = found.order[start : start + (found.iteration_of == iteration).sum()]
         expected = choose(delta_mse, importance, alive, OPTIONS.iterations - iteration, OPTIONS)
         assert abs(len(gone) - len(expected)) <= 1
         assert len(np.setxor1d(gone, expected)) <= 1
-        damped.remove(gone)
+        smoothed.remove(gone)
         alive = np.setdiff1d(alive, gone)
         start += len(gone)
     removal.free()

@@ -253,7 +253,7 @@ def test_the_memory_budget_is_used_and_not_exceeded(device, share):
 
         def taken(memory):
             seen = Linearised(case, options=RefitOptions(steps=0, memory=memory))
-            nbytes, room = device.allocated, seen.refit._keeper.room
+            nbytes, room = device.allocated, seen.refit._cache.room
             seen.refit.free()
             return nbytes, room
 

@@ -119,9 +119,9 @@ def test_alpha_at_the_cap_behind_hundreds_of_layers(device):
     quaternions[:, 0] = 1
     dc = np.random.default_rng(0).normal(size=(layers, 1, 3)).astype(np.float32)
     scene = Scene(means, np.full((layers, 3), 0.5, np.float32), quaternions, logits, dc)
-    eye = np.array([-8.0, 0, 0])
+    camera_centre = np.array([-8.0, 0, 0])
     rotation = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
-    cameras = [Camera("along", 16, 16, 60, 60, 8, 8, rotation, -rotation @ eye)]
+    cameras = [Camera("along", 16, 16, 60, 60, 8, 8, rotation, -rotation @ camera_centre)]
     rasterizer, removal = sweep(device, scene, cameras)
     effect, _ = removal.measure()
     finish(rasterizer, removal)
@@ -164,7 +164,7 @@ def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, lego_ex
     for memory in (None, int(share * 4 * 48 * 1536)):
         rasterizer = Rasterizer(device, lego_excerpt)
         removal = RemovalSweep(rasterizer, cameras, SweepOptions(0, 1, memory))
-        kept = removal.kept_views
+        kept = removal.cached_views
         removal.measure()
         for start in (0, 5):
             removal.remove(np.arange(start, 1500, 10))
@@ -185,7 +185,7 @@ def test_buffers_too_small_for_all_views_change_nothing(device, lego_excerpt, le
         removal.measure()
         removal.remove(np.arange(0, 1500, 10))
         results.append(np.stack(removal.measure())[:, np.arange(1, 1500, 10)])
-        assert removal.kept_views == 7
+        assert removal.cached_views == 7
         sets.append(len(removal._kept))
         finish(rasterizer, removal)
     assert np.array_equal(*results)
@@ -214,13 +214,13 @@ def test_tolerance_saves_sweeps(device, lego_excerpt, lego_excerpt_cameras):
     assert sweeps[0] > sweeps[1] > sweeps[2] >= 1
 
 
-def entries_in_lists(removal: RemovalSweep) -> int:
+def intersections_in_lists(removal: RemovalSweep) -> int:
     lengths = [removal._device.download(s.lengths, (s.views.tiles,), np.uint32) for s in removal._kept]
     return int(np.concatenate(lengths).sum())
 
 
 def test_tightened_lists_change_no_result(device, lego_excerpt, lego_excerpt_cameras):
-    results, entries = {}, {}
+    results, intersections = {}, {}
     for tighten in (False, True):
         rasterizer = Rasterizer(device, lego_excerpt)
         removal = RemovalSweep(rasterizer, lego_excerpt_cameras[:3], SweepOptions(-1, tighten=tighten))
@@ -228,26 +228,26 @@ def test_tightened_lists_change_no_result(device, lego_excerpt, lego_excerpt_cam
         for start in (0, 3, 5):
             removal.remove(np.arange(start, 1500, 7))
             measured.append(removal.measure())
-        entries[tighten] = entries_in_lists(removal)
+        intersections[tighten] = intersections_in_lists(removal)
         views = [np.concatenate([splats, weights]) for _, splats, weights in removal.view_importances()]
         results[tighten] = np.concatenate([np.ravel(measured), *views])
         finish(rasterizer, removal)
     if device.family == "cpu":
         assert np.array_equal(results[False], results[True])
-    else:  # the order in which the pixels of a tile are added depends on an entry's place in the list
+    else:  # the order in which the pixels of a tile are added depends on an intersection's place in the list
         assert np.allclose(results[False], results[True], rtol=1e-6, atol=1e-6 * results[False][:1500].max())
-    assert entries[True] < entries[False]
+    assert intersections[True] < intersections[False]
 
 
 def test_tightened_lists_keep_what_is_hidden(device):
-    """Behind the end of all pixels, entries stay: they come back when what hides them goes."""
+    """Behind the end of all pixels, intersections stay: they come back when what hides them goes."""
     scene = visible_scene(30, seed=4).subset(np.arange(60) % 30)
     scene.log_scales[:30], scene.opacity_logits[:30] = 3, 12  # thirty walls
     cameras = ring_of_cameras(2, size=32)
     effects = {}
     for tighten in (False, True):
         rasterizer = Rasterizer(device, scene)
-        removal = RemovalSweep(rasterizer, cameras, SweepOptions(-1, tighten=tighten, stop=None))
+        removal = RemovalSweep(rasterizer, cameras, SweepOptions(-1, tighten=tighten, transmittance_threshold=None))
         hidden = removal.measure()[1][30:] == 0
         removal.measure()
         removal.remove(np.arange(30))
@@ -265,17 +265,17 @@ def test_a_removal_lets_pixels_go_on(device):
     cameras = ring_of_cameras(1, size=40)
     some = np.arange(0, 900, 10)
     shares = {}
-    for stop in (None, SweepOptions.stop):
+    for stop in (None, SweepOptions.transmittance_threshold):
         rasterizer = Rasterizer(device, scene)
-        removal = RemovalSweep(rasterizer, cameras, SweepOptions(stop=stop))
+        removal = RemovalSweep(rasterizer, cameras, SweepOptions(transmittance_threshold=stop))
         effect, _ = removal.measure()
         finish(rasterizer, removal)
         exact = BruteForce(reference.project(scene, cameras[0], INRIA), cameras[0], INRIA)
-        true = exact.effects(some, [INRIA.stop if stop is None else stop])[1, 0] / (3 * 40 * 40)
+        true = exact.effects(some, [INRIA.transmittance_threshold if stop is None else stop])[1, 0] / (3 * 40 * 40)
         strong = true > 1e-4 * true.max()
         shares[stop] = np.mean(np.abs(effect[some[strong]] / true[strong] - 1) < 1e-2)
-    assert shares[None] < shares[SweepOptions.stop]
-    assert shares[SweepOptions.stop] > 0.98
+    assert shares[None] < shares[SweepOptions.transmittance_threshold]
+    assert shares[SweepOptions.transmittance_threshold] > 0.98
 
 
 def test_a_random_sample_of_tiles(device, lego_excerpt, lego_excerpt_cameras):
@@ -313,7 +313,7 @@ def test_a_random_sample_of_tiles(device, lego_excerpt, lego_excerpt_cameras):
         {"tolerance": np.inf},
         {"turns": 0},
         {"memory": -1},
-        {"stop": 0.0},
+        {"transmittance_threshold": 0.0},
         {"stop": 1.0},
         {"stop": np.nan},
         {"sample": 0.0},

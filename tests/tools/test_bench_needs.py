@@ -50,7 +50,7 @@ def test_splats_that_nobody_sees_are_in_no_list(needs):
     for scene in (needs.scene, twice):
         rasterizer = Rasterizer(needs.device, scene)
         view = rasterizer.prepare(needs.views[0])
-        counts.append(view.entry_count)
+        counts.append(view.intersection_count)
         view.free()
         removal = RemovalSweep(rasterizer, needs.views, SweepOptions())
         assert (removal.measure()[1][len(needs.scene) :] == 0).all()

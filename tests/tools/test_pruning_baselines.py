@@ -47,7 +47,7 @@ def sums_by_definition(scene, camera, rules):
         alpha = np.minimum(projected.opacity[k] * np.exp(-0.5 * power), rules.alpha_cap)
         inside = reference.footprint(projected.centre[k], projected.covariance[k], rules, shape)
         touched = alive & inside & (alpha >= 1 / 255)
-        alive &= ~(touched & (t * (1 - alpha) < rules.stop))
+        alive &= ~(touched & (t * (1 - alpha) < rules.transmittance_threshold))
         touched &= alive
         plain[splat] = t[touched].sum()
         weighted[splat] = (t * alpha)[touched].sum()
@@ -62,7 +62,7 @@ def test_transmittance_sums(device, rules):
     rasterizer = Rasterizer(device, scene, rules)
     found = transmittance_sums(rasterizer, cameras)
     again = transmittance_sums(rasterizer, cameras)
-    sweep = RemovalSweep(rasterizer, cameras, SweepOptions(0, 1, stop=None))
+    sweep = RemovalSweep(rasterizer, cameras, SweepOptions(0, 1, transmittance_threshold=None))
     importance = sweep.measure()[1] * sum(c.width * c.height for c in cameras)
     sweep.free()
     rasterizer.free()

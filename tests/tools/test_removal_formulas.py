@@ -54,7 +54,7 @@ def test_prefix_sums_agree_in_lists_of_many_segments(splats, segments):
     agree("cpu", scene, [camera])
     device = devices(family="cpu")[0]
     rasterizer = Rasterizer(device, scene)
-    assert rasterizer.prepare(camera).entry_count > 1024 * segments
+    assert rasterizer.prepare(camera).intersection_count > 1024 * segments
     assert rasterizer.render(camera)[1].max() > 1e-4  # pixels go on to the end
 
 

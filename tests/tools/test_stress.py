@@ -113,8 +113,13 @@ def test_the_cap_that_a_device_gets_is_no_fault(device):
         ("project: alpha", lambda lists: dataclasses.replace(lists, shapes=lists.shapes * (1 + 1e-2))),
         ("project: colour", lambda lists: dataclasses.replace(lists, colours=lists.colours + 1e-3)),
         ("project: depth", lambda lists: dataclasses.replace(lists, shapes=lists.shapes * (1 + 1e-4))),
-        ("sort", lambda lists: dataclasses.replace(lists, entries=lists.entries[::-1])),
-        ("tile lists", lambda lists: dataclasses.replace(lists, entries=np.full_like(lists.entries, lists.entries[0]))),
+        ("sort", lambda lists: dataclasses.replace(lists, intersections=lists.intersections[::-1])),
+        (
+            "tile lists",
+            lambda lists: dataclasses.replace(
+                lists, intersections=np.full_like(lists.intersections, lists.intersections[0])
+            ),
+        ),
     ],
 )
 def test_faults_are_noticed(monkeypatch, measure, change):

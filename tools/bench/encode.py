@@ -47,7 +47,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device, DeviceInfo, Family, choose_device, list_devices
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.quality.evaluator import Judge, JudgingViews
+from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
@@ -102,8 +102,8 @@ class Row:
 #: Every stage's time, and its error.
 STAGES = {
     "project": ("a view's projection", "largest error of a centre, pixels"),
-    "tile lists": ("a view's tile lists", "entries that another variant has not"),
-    "sort": ("a view's depth sort", "entries out of order"),
+    "tile lists": ("a view's tile lists", "intersections that another variant has not"),
+    "sort": ("a view's depth sort", "intersections out of order"),
     "composite": ("a view's compositing", "largest error of a pixel"),
     "removal": ("a sweep over all tiles of a view", "median relative error of ΔMSE"),
     "prune": ("the schedule", "RMS error on test views at equal counts"),
@@ -235,20 +235,20 @@ class RasterizerTruth:
         view = rasterizer.prepare(self.camera)
         shapes = device.download(view.shapes, (rasterizer.stride, 8), np.float32)
         offsets = device.download(view.offsets, (view.tiles + 1,), np.uint32).astype(np.int64)
-        entries = device.download(view.entries, (view.entry_count,), np.uint32)
+        intersections = device.download(view.intersections, (view.intersection_count,), np.uint32)
         image, transmittance = rasterizer.composite(view)
         view.free()
         rasterizer.free()
-        listed = np.isin(self.projected.index, entries)
+        listed = np.isin(self.projected.index, intersections)
         centres = np.abs(shapes[self.projected.index[listed], :2] - self.projected.centre[listed])
         inside = (self.projected.centre[listed] >= 0).all(axis=1)
         inside &= (self.projected.centre[listed] < (self.camera.width, self.camera.height)).all(axis=1)
         tiles = np.repeat(np.arange(view.tiles), np.diff(offsets))
-        order = np.lexsort((entries, shapes[entries, 6], tiles))
-        wrong = int(np.count_nonzero(entries[order] != entries))
+        order = np.lexsort((intersections, shapes[intersections, 6], tiles))
+        wrong = int(np.count_nonzero(intersections[order] != intersections))
         ours = np.concatenate([image, transmittance[..., None]], axis=2).astype(np.float64)
         pixel = max((float(np.abs(ours[row, column] - true).max()) for column, row, true in self.pixels), default=0.0)
-        pairs = {pair.tobytes() for pair in np.stack([tiles, entries], axis=1)}
+        pairs = {pair.tobytes() for pair in np.stack([tiles, intersections], axis=1)}
         return float(centres[inside].max(initial=0)), wrong, pixel, pairs
 
 
@@ -283,7 +283,9 @@ def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]
     flags = ("no flags", "mad", "fast relaxed") if quick else tuple(FLAGS)
     default = SweepOptions()
     # What each sweep is compared with ends its pixels in the same place.
-    stops = sorted({INRIA.stop, default.stop or INRIA.stop}, reverse=True)
+    stops = sorted(
+        {INRIA.transmittance_threshold, default.transmittance_threshold or INRIA.transmittance_threshold}, reverse=True
+    )
     variants: list[tuple[str, bool, Device, SweepOptions]] = []
     for family in families(info):
         own = family == info.family
@@ -296,8 +298,8 @@ def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]
         other = dataclasses.replace(default, tighten=not default.tighten)
         variants.append((f"{family}, {'not ' if default.tighten else ''}tightened", False, plain, other))
         for stop in stops:
-            if stop != (default.stop or INRIA.stop):
-                ends = dataclasses.replace(default, stop=stop)
+            if stop != (default.transmittance_threshold or INRIA.transmittance_threshold):
+                ends = dataclasses.replace(default, transmittance_threshold=stop)
                 variants.append((f"{family}, pixels end at {stop:.0e}", False, plain, ends))
     rasterizer = Rasterizer(variants[0][2], load.scene)
     removal = RemovalSweep(rasterizer, [camera])
@@ -318,7 +320,9 @@ def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]
             best = min(best, time.perf_counter() - started)
         removal.free()
         rasterizer.free()
-        true = truths[options.stop or INRIA.stop] / (3 * camera.width * camera.height)
+        true = truths[options.transmittance_threshold or INRIA.transmittance_threshold] / (
+            3 * camera.width * camera.height
+        )
         seen = true > 0
         error = float(np.median(np.abs(effect[seen] / true[seen] - 1)))
         yield Row("removal", label, best, error, is_default)
@@ -435,7 +439,7 @@ def code_rows(load: Workload, quick: bool) -> Iterator[Row]:
 def encode_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
     """Presets, iterations, stages left out: time, bytes and PSNR over the test views."""
     device = Device(info)
-    judge = Judge(device, load.scene, JudgingViews.of([*load.train, *load.test]), (0.0, 0.0, 0.0))
+    evaluator = Evaluator(device, load.scene, EvaluationViews.of([*load.train, *load.test]), (0.0, 0.0, 0.0))
     variants: dict[str, dict[str, Any]] = {
         "paper": {"preset": "paper"},
         "fast": {"preset": "fast"},
@@ -456,9 +460,9 @@ def encode_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
             started = time.perf_counter()
             encoded = encode(load.scene, load.train, options, device=device)
             seconds = time.perf_counter() - started
-        psnr = judge.psnr(decode(b"".join(encoded.pieces)))
+        psnr = evaluator.psnr(decode(b"".join(encoded.pieces)))
         yield Row("encode", name, seconds, 10 ** (-psnr / 20), name == "best", encoded.nbytes)
-    judge.free()
+    evaluator.free()
 
 
 # ------------------------------------------------------------------------------------------ the run

@@ -72,7 +72,7 @@ def more(scene: Scene, **changes: Any) -> Scene:
 
 
 def looking_away(camera: Camera) -> Camera:
-    """The same eye, looking the other way."""
+    """The same camera centre, looking the other way."""
     turn = np.diag([-1.0, 1.0, -1.0])
     return dataclasses.replace(
         camera, name=f"{camera.name} away", rotation=turn @ camera.rotation, translation=turn @ camera.translation
@@ -213,9 +213,11 @@ class Needs:
             yield Line("the same", f"tolerance {label}", "every tile", self.two_schedules(lean, always))
         tightened = (dataclasses.replace(default, tighten=on) for on in (True, False))
         costs = self.two_schedules(*tightened)
-        yield Line("entries that reach no pixel", "lists tightened", "not tightened", costs)
-        costs = self.two_schedules(default, dataclasses.replace(default, stop=1e-30))
-        yield Line("what stands behind ended pixels", f"ends at {default.stop:g}", "ends at 1e-30", costs)
+        yield Line("intersections that reach no pixel", "lists tightened", "not tightened", costs)
+        costs = self.two_schedules(default, dataclasses.replace(default, transmittance_threshold=1e-30))
+        yield Line(
+            "what stands behind ended pixels", f"ends at {default.transmittance_threshold:g}", "ends at 1e-30", costs
+        )
         costs = self.two_schedules(default, dataclasses.replace(default, memory=0))
         yield Line("projections and lists made before", "kept (default)", "made again", costs)
         settled = self.schedule(default, threshold=0.0)[1]

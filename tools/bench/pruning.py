@@ -31,10 +31,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.formats import load_cameras, load_scene
-from potr_cl.formats.images import read_photograph
+from potr_cl.formats.images import read_ground_truth
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.opencl.device import Device
-from potr_cl.quality.compare import find_photographs
+from potr_cl.quality.compare import find_ground_truth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
@@ -110,11 +110,11 @@ class Bench:
         self.rasterizer = Rasterizer(device, self.scene)
         self._test_renders = self._renders(self.test)
         self._train_renders: list[Image] | None = None
-        self._photographs: list[Image] | None = None
+        self._ground_truth: list[Image] | None = None
         if truth:
-            files = find_photographs(folder / "images", self.test)
-            self._photographs = [read_photograph(files[c.name], self.rasterizer.background) for c in self.test]
-            pairs = zip(self._test_renders, self._photographs, strict=True)
+            files = find_ground_truth(folder / "images", self.test)
+            self._ground_truth = [read_ground_truth(files[c.name], self.rasterizer.background) for c in self.test]
+            pairs = zip(self._test_renders, self._ground_truth, strict=True)
             self._uncompressed = [decibels(squared_error(render, photograph)) for render, photograph in pairs]
         self._orders: dict[str, Indices] = {}
         self._baselines: dict[str, Indices] = {}
@@ -131,8 +131,8 @@ class Bench:
         for number, camera in enumerate(self.test):
             image = rasterizer.render(camera)[0]
             renders.append(decibels(squared_error(image, self._test_renders[number])))
-            if self._photographs is not None:
-                error = squared_error(image, self._photographs[number])
+            if self._ground_truth is not None:
+                error = squared_error(image, self._ground_truth[number])
                 losses.append(self._uncompressed[number] - decibels(error))
         rasterizer.free()
         row: Row = {"kept": len(survivors), "psnr": statistics.mean(renders)}
@@ -194,7 +194,7 @@ class Bench:
     def baselines(self) -> dict[str, Indices]:
         """The other pruners' orders."""
         if not self._baselines:
-            sweep = RemovalSweep(self.rasterizer, self.train, SweepOptions(stop=None))
+            sweep = RemovalSweep(self.rasterizer, self.train, SweepOptions(transmittance_threshold=None))
             importance = sweep.measure()[1]
             sweep.free()
             transmittance = transmittance_sums(self.rasterizer, self.train)
@@ -286,12 +286,15 @@ def skip_settings(iterations: Sequence[int]) -> list[Setting]:
     full = SweepOptions(0)
     settings = [Setting("nothing", most, full)]
     settings += [Setting(f"nothing, {most - n} iterations", most - n, full) for n in (1, 2) if most > n]
-    settings += [Setting(f"nothing, damping {d:g}", most, full, pruning={"damping": d}) for d in (0, 0.5, 0.9, 1)]
+    settings += [Setting(f"nothing, damping {d:g}", most, full, pruning={"decay": d}) for d in (0, 0.5, 0.9, 1)]
     settings += [Setting(f"nothing, a = {a:g}", most, full, pruning={"a": a}) for a in (1, 100)]
-    settings += [Setting(f"nothing, pixels end at {e:.0e}", most, SweepOptions(0, stop=e)) for e in (1e-6, 1e-8)]
+    settings += [
+        Setting(f"nothing, pixels end at {e:.0e}", most, SweepOptions(0, transmittance_threshold=e))
+        for e in (1e-6, 1e-8)
+    ]
     settings += [Setting("what touches no pixel", most, SweepOptions(0, tighten=True))]
     settings += [Setting(f"tolerance {t:g}", most, SweepOptions(t)) for t in (0.002, 0.005, 0.01, 0.02, 0.05)]
-    settings.append(Setting("tolerance 0.002, damping 0", most, pruning={"damping": 0}))
+    settings.append(Setting("tolerance 0.002, damping 0", most, pruning={"decay": 0}))
     settings += [Setting(f"{n} iterations", n) for n in fewer]
     settings += [Setting(f"views in {n} turns", most, SweepOptions(turns=n)) for n in (2, 4)]
     settings += [Setting(f"{n} iterations, views in 4 turns", n, SweepOptions(turns=4)) for n in fewer[-3:]]
@@ -345,16 +348,16 @@ def frame_rate(rasterizer: Rasterizer, cameras: Sequence[Camera], passes: int = 
 
 
 def rendering_cost(bench: Bench, survivors: Indices) -> Row:
-    """Frame rate over the training views and the entries in their tile lists."""
+    """Frame rate over the training views and the intersections in their tile lists."""
     rasterizer = Rasterizer(bench.device, bench.scene.subset(survivors))
     rate = frame_rate(rasterizer, bench.train)
-    entries = []
+    intersections = []
     for camera in bench.train[::8]:
         view = rasterizer.prepare(camera)
-        entries.append(view.entry_count)
+        intersections.append(view.intersection_count)
         view.free()
     rasterizer.free()
-    return {"frames_per_second": rate, "entries": statistics.mean(entries)}
+    return {"frames_per_second": rate, "intersections": statistics.mean(intersections)}
 
 
 def fewest(bench: Bench, order: Indices, good: Callable[[Row], bool], low: int, high: int, steps: int) -> Row:
@@ -459,16 +462,16 @@ def print_skips(rows: Sequence[Row]) -> None:
 
 
 def print_frames(rows: Sequence[Row]) -> None:
-    """Splats, tile entries and frame rates at equal loss."""
+    """Splats, tile intersections and frame rates at equal loss."""
     truth = any("loss" in r for r in rows)
     unit = "dB lost against the photographs" if truth else "dB against the uncompressed renders"
-    print(f"| {unit} | order | found | kept | tile entries a view | frames/s | against unpruned |")
+    print(f"| {unit} | order | found | kept | tile intersections a view | frames/s | against unpruned |")
     print("|---" * 7 + "|")
     for r in rows:
         unpruned = next(u for u in rows if u["level"] == r["level"] and u["method"] == "unpruned")
         found = f"{r['loss' if truth else 'psnr']:.2f}" if "psnr" in r else ""
         print(
-            f"| {r['level']:g} | {r['method']} | {found} | {r['kept']:,} | {r['entries']:,.0f} | "
+            f"| {r['level']:g} | {r['method']} | {found} | {r['kept']:,} | {r['intersections']:,.0f} | "
             f"{r['frames_per_second']:.0f} | {r['frames_per_second'] / unpruned['frames_per_second']:.2f} |"
         )
 

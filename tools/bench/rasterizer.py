@@ -68,7 +68,7 @@ def copy_bandwidth(device: Device) -> float:
     return 2 * size / best
 
 
-def least_bytes(scene: Scene, camera: Camera, entries: float) -> dict[str, float]:
+def least_bytes(scene: Scene, camera: Camera, intersections: float) -> dict[str, float]:
     """What each kernel must at least move through memory: every input read once, every output written once."""
     splats = len(scene)
     tiles = -(-camera.width // 16) * -(-camera.height // 16)
@@ -76,11 +76,11 @@ def least_bytes(scene: Scene, camera: Camera, entries: float) -> dict[str, float
         "project": splats * (44 + 12 * scene.sh.shape[1] + 56),
         "count_tiles": splats * 8 + tiles * 4,
         "scan_tiles": tiles * 12,
-        "fill_tiles": splats * 12 + entries * 8,
-        "sort_tiles": entries * 12,
-        "entry_patches": splats * 32 + entries * 6,
-        "composite": splats * 48 + entries * 6 + camera.width * camera.height * 16,
-        "composite_frame": splats * 48 + entries * 4 + camera.width * camera.height * 16,
+        "fill_tiles": splats * 12 + intersections * 8,
+        "sort_tiles": intersections * 12,
+        "subtile_masks": splats * 32 + intersections * 6,
+        "composite": splats * 48 + intersections * 6 + camera.width * camera.height * 16,
+        "composite_frame": splats * 48 + intersections * 4 + camera.width * camera.height * 16,
     }
 
 
@@ -92,7 +92,7 @@ def bench_scene(folder: Path, spec: str | None, family: str | None, passes: int,
     rasterizer = Rasterizer(device, scene, GSPLAT)
     times = frame_times(rasterizer, cameras, passes)
     views = [rasterizer.prepare(camera) for camera in cameras[:: max(len(cameras) // 8, 1)]]
-    entries = statistics.mean(view.entry_count for view in views)
+    intersections = statistics.mean(view.intersection_count for view in views)
     longest = max(int(np.diff(device.download(v.offsets, (v.tiles + 1,), np.uint32)).max(initial=0)) for v in views)
     for view in views:
         view.free()
@@ -107,10 +107,10 @@ def bench_scene(folder: Path, spec: str | None, family: str | None, passes: int,
         "frames_per_second": 1 / statistics.mean(times),
         "median_frames_per_second": 1 / statistics.median(times),
         "gsplat_frames_per_second": json.loads(metrics.read_text())["gsplat_fps_h200"] if metrics.exists() else None,
-        "entries": entries,
+        "intersections": intersections,
         "longest_list": longest,
         "stage_seconds": stage_times(scene, cameras, spec, family),
-        "least_bytes": least_bytes(scene, cameras[0], entries),
+        "least_bytes": least_bytes(scene, cameras[0], intersections),
         "bandwidth": copy_bandwidth(device),
     }
 
@@ -118,12 +118,14 @@ def bench_scene(folder: Path, spec: str | None, family: str | None, passes: int,
 def print_scenes(results: list[dict[str, Any]]) -> None:
     """Markdown tables of :func:`bench_scene`."""
     print(f"Device: {results[0]['device']}\n")
-    print("| scene | splats | pixels | tile entries a view | longest list | frames/s | median | gsplat's | ratio |")
+    print(
+        "| scene | splats | pixels | tile intersections a view | longest list | frames/s | median | gsplat's | ratio |"
+    )
     print("|---|---|---|---|---|---|---|---|---|")
     for r in results:
         theirs = r["gsplat_frames_per_second"]
         print(
-            f"| {r['scene']} | {r['splats']:,} | {r['pixels'][0]} x {r['pixels'][1]} | {r['entries']:,.0f} | "
+            f"| {r['scene']} | {r['splats']:,} | {r['pixels'][0]} x {r['pixels'][1]} | {r['intersections']:,.0f} | "
             f"{r['longest_list']:,} | {r['frames_per_second']:.0f} | {r['median_frames_per_second']:.0f} | "
             + (f"{theirs:.0f} | {r['frames_per_second'] / theirs:.2f} |" if theirs else "| |")
         )
@@ -181,7 +183,7 @@ def bench_growth(spec: str | None, largest: int) -> list[dict[str, Any]]:
                 "varied": varied,
                 "splats": splats,
                 "pixels": width * width,
-                "overlap": view.entry_count / view.tiles,
+                "overlap": view.intersection_count / view.tiles,
                 "seconds": statistics.median(times),
             }
         )

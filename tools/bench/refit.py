@@ -42,7 +42,7 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.reduction import reduce_scene
-from potr_cl.quality.ground_truth import Photographs, PhotographTargets
+from potr_cl.quality.ground_truth import GroundTruth, GroundTruthTargets
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
@@ -55,7 +55,7 @@ WAYS = {
     "splat by splat": (True, None),
     "joint": (False, "lambda"),
     "splat by splat, then joint": (True, "active"),
-    "splat by splat, then joint, to photographs": (True, "photographs"),
+    "splat by splat, then joint, to photographs": (True, "ground_truth"),
 }
 PAPER = "splat by splat"
 REMOVED = (0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9)
@@ -80,17 +80,17 @@ class Bench:
         self.train, self.test = train_views(cameras)[::every], test_views(cameras)[::every]
         self.rasterizer = Rasterizer(device, self.scene)
         self.renders = [self.rasterizer.render(c)[0] for c in self.test]
-        self.photographs: Photographs | None = None
+        self.ground_truth: GroundTruth | None = None
         self.truths: list[FloatArray] = []
         if (folder / "images").is_dir():
-            self.photographs = Photographs(folder / "images", [*self.train, *self.test])
-            self.truths = [self.photographs.picture(c) for c in self.test]
+            self.ground_truth = GroundTruth(folder / "images", [*self.train, *self.test])
+            self.truths = [self.ground_truth.picture(c) for c in self.test]
         self.targets = RenderedTargets(self.rasterizer, self.train)
 
     def free(self) -> None:
         self.rasterizer.free()
 
-    def judge(self, candidate: Scene) -> dict[str, float]:
+    def evaluator(self, candidate: Scene) -> dict[str, float]:
         """Means over the test views."""
         rasterizer = Rasterizer(self.device, candidate)
         images = [rasterizer.render(c)[0] for c in self.test]
@@ -99,7 +99,7 @@ class Bench:
         finite = [v for v in values if math.isfinite(v)]
         figures = {"psnr": float(np.mean(finite))} if finite else {}
         if self.truths:
-            figures["photo_psnr"] = float(np.mean([psnr(a, b) for a, b in zip(images, self.truths, strict=True)]))
+            figures["truth_psnr"] = float(np.mean([psnr(a, b) for a, b in zip(images, self.truths, strict=True)]))
         return figures
 
     def reduced(self, removed: float, compact: bool) -> Scene:
@@ -128,7 +128,13 @@ class Bench:
         """What coding a reduced scene takes, and what is left of it."""
         nbytes, decoded, _ = self.decoded(scene)
         sparsity = ac_sparsity(scene.sh, self.options.parameters.sf_sh)
-        return {"removed": removed, "splats": len(scene), "bytes": nbytes, "sparsity": sparsity, **self.judge(decoded)}
+        return {
+            "removed": removed,
+            "splats": len(scene),
+            "bytes": nbytes,
+            "sparsity": sparsity,
+            **self.evaluator(decoded),
+        }
 
     def refitted(
         self, scene: Scene, targets: Targets, options: RefitOptions, active: NDArray[np.bool_] | None
@@ -160,12 +166,12 @@ class Bench:
                 facts: dict[str, Any] = {}
                 with contextlib.ExitStack() as stack:
                     targets: Targets = self.targets
-                    if how == "photographs":
-                        if self.photographs is None:
+                    if how == "ground_truth":
+                        if self.ground_truth is None:
                             continue
-                        photographs = PhotographTargets(self.device, self.photographs, self.train)
-                        stack.callback(photographs.free)
-                        targets = photographs
+                        ground_truth = GroundTruthTargets(self.device, self.ground_truth, self.train)
+                        stack.callback(ground_truth.free)
+                        targets = ground_truth
                     if how is not None:
                         options = dataclasses.replace(self.refit, lam=lam) if how == "lambda" else self.refit
                         active = self.active(scene) if compact else None
@@ -211,7 +217,7 @@ class Bench:
         return rows
 
     def _row(self, scene: Scene, sh: FloatArray, error: float, **facts: Any) -> dict[str, Any]:
-        return {**facts, "train_error": error, **self.judge(dataclasses.replace(scene, sh=sh))}
+        return {**facts, "train_error": error, **self.evaluator(dataclasses.replace(scene, sh=sh))}
 
     def times(self, scene: Scene) -> dict[str, float]:
         """Seconds of a step and of a removal sweep of every tile; the shortest of three."""
@@ -263,7 +269,7 @@ def _measure(args: argparse.Namespace) -> None:
             "splats": len(bench.scene),
             "train_views": len(bench.train),
             "test_views": len(bench.test),
-            "uncompressed": bench.judge(bench.scene),
+            "uncompressed": bench.evaluator(bench.scene),
         }
         results["scenes"][bench.name] = entry
 
@@ -298,8 +304,8 @@ def _report(args: argparse.Namespace) -> None:
     for name, entry in results["scenes"].items():
         if "curves" not in entry:
             continue
-        curves, photographs = entry["curves"], "photo_psnr" in entry["uncompressed"]
-        keys = ["psnr", "photo_psnr"] if photographs else ["psnr"]
+        curves, ground_truth = entry["curves"], "truth_psnr" in entry["uncompressed"]
+        keys = ["psnr", "truth_psnr"] if ground_truth else ["psnr"]
         print(
             f"### {name}: {entry['splats']:,} splats, {entry['train_views']} training and {entry['test_views']} test "
             f"views, preset {results['preset']}, q = {results['q']:g}, up to {results['steps']} steps, prior "
@@ -318,8 +324,8 @@ def _report(args: argparse.Namespace) -> None:
                 p = points[number]
                 cells = " | ".join(f"{p[key]:.2f} dB" for key in keys)
                 print(f"| {part:.0%} | {way} | {p['bytes'] / 1e6:.3f} | {p['sparsity']:.1%} | {cells} |")
-        if photographs:
-            print(f"\nUncompressed against the photographs: {entry['uncompressed']['photo_psnr']:.2f} dB.")
+        if ground_truth:
+            print(f"\nUncompressed against the photographs: {entry['uncompressed']['truth_psnr']:.2f} dB.")
         print(f"\n{PART:.0%} removed, {PAPER}, then joint, before the quantiser of the colours:\n")
         print("| steps | mean squared error, training views | PSNR, test views |\n|---|---|---|")
         for row in entry["step_rows"]:
@@ -343,7 +349,7 @@ def _plot(name: str, entry: dict[str, Any], keys: list[str], path: Path) -> None
     import matplotlib.pyplot as plt
 
     figure, axes = plt.subplots(1, len(keys), figsize=(6.4 * len(keys), 4.8), squeeze=False)
-    titles = {"psnr": "PSNR against the uncompressed renders, dB", "photo_psnr": "PSNR against the photographs, dB"}
+    titles = {"psnr": "PSNR against the uncompressed renders, dB", "truth_psnr": "PSNR against the photographs, dB"}
     for axis, key in zip(axes[0], keys, strict=True):
         for way, points in entry["curves"].items():
             axis.plot([p["bytes"] / 1e6 for p in points], [p[key] for p in points], marker="o", ms=4, label=way)

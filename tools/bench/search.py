@@ -26,7 +26,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import Encoded, encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.search import Target, encode_to_target
-from potr_cl.quality.evaluator import Judge, JudgingViews
+from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 
 
 class Timed:
@@ -67,13 +67,13 @@ def bench(folder: Path, device: Device, args: argparse.Namespace) -> None:
     """One scene."""
     scene, cameras = load_scene(folder / "point_cloud.ply"), load_cameras(folder / "cameras.json")
     cameras = [c for split in ("train", "test") for c in [c for c in cameras if c.split == split][:: args.every]]
-    judge = Judge(device, scene, JudgingViews.of(cameras), (0.0, 0.0, 0.0))
+    evaluator = Evaluator(device, scene, EvaluationViews.of(cameras), (0.0, 0.0, 0.0))
     options = EncodeOptions.for_preset(args.preset)
     few = [camera for camera in cameras if camera.split == "train"][:4]
     encode(scene, few, replace(options, iterations=1), device=device)  # builds the kernels
 
     def measured(encoded: Encoded) -> float:
-        return judge.psnr(decode(b"".join(encoded.pieces)))
+        return evaluator.psnr(decode(b"".join(encoded.pieces)))
 
     print(
         f"\n{folder.name}, plain encodes:\n\n| quality | bytes | PSNR | time | of processors |\n|---|---|---|---|---|"
@@ -107,7 +107,7 @@ def bench(folder: Path, device: Device, args: argparse.Namespace) -> None:
             f"{clock} | {processors} |",
             flush=True,
         )
-    judge.free()
+    evaluator.free()
 
 
 def main() -> None:

@@ -57,14 +57,14 @@ def more_views(like: Sequence[Camera], views: int, width: int, height: int, seed
         skew = np.array([[0, -angles[2], angles[1]], [angles[2], 0, -angles[0]], [-angles[1], angles[0], 0]])
         turn = np.linalg.qr(np.eye(3) + skew)[0]
         turn *= np.sign(np.diag(turn))
-        eye = camera_centres([camera])[0] + rng.normal(0, 0.02 * spread, 3)
+        camera_centre = camera_centres([camera])[0] + rng.normal(0, 0.02 * spread, 3)
         entries.append(
             {
                 "id": number,
                 "img_name": f"view_{number:04}",
                 "width": width,
                 "height": height,
-                "position": eye.tolist(),
+                "position": camera_centre.tolist(),
                 "rotation": (camera.rotation.T @ turn).tolist(),
                 "fx": camera.fx * width / camera.width,
                 "fy": camera.fx * width / camera.width,

@@ -41,7 +41,7 @@ class Case:
 
 @dataclasses.dataclass(frozen=True)
 class RidgeCase:
-    """Systems for the compaction: splats, eyes, weights (N, S)."""
+    """Systems for the compaction: splats, camera centres, weights (N, S)."""
 
     name: str
     scene: Scene
@@ -68,7 +68,7 @@ def known_cases() -> Iterator[Case]:
     """What scenes and users come up with at their worst."""
     near = np.float32(INRIA.near)
     for label, depth in (
-        ("in the eye", 0.0),
+        ("in the camera centre", 0.0),
         ("behind", -0.2),
         ("a last digit before the near plane", np.nextafter(near, np.float32(0))),
         ("on the near plane", near),
@@ -76,7 +76,7 @@ def known_cases() -> Iterator[Case]:
     ):
         yield Case(f"one splat {label}", splats([0.01, 0.01, depth], sigma=0.02, logit=3), camera())
     yield Case(
-        "close to the eye and to the side",
+        "close to the camera centre and to the side",
         splats([[3, 2, 0.25], [-0.5, 0.1, 0.21], [0.3, -4, 0.3]], sigma=0.3, logit=2),
         camera(),
     )
@@ -129,7 +129,7 @@ def known_cases() -> Iterator[Case]:
     yield Case("coordinates up to 1e6", far, camera())
     for brightness in (1e3, 1e10, 1e30):
         yield Case(f"colours of {brightness:g}", splats(grid, 0.2, -1, brightness * colours[:144]), camera())
-    for label, mean in (("behind", [0, 0, -3]), ("beside", [100, 0, 1]), ("in the eye", [0, 0, 0])):
+    for label, mean in (("behind", [0, 0, -3]), ("beside", [100, 0, 1]), ("in the camera centre", [0, 0, 0])):
         yield Case(f"a view that sees nothing: {label}", splats(mean), camera())
     for degree, rules in itertools.product(range(4), (INRIA, GSPLAT)):
         name = f"100 random splats of degree {degree}, alpha cap {rules.alpha_cap:g}"
@@ -138,7 +138,7 @@ def known_cases() -> Iterator[Case]:
         yield Case("extremes of every parameter", extremes(300), tilted_camera(seed, 40, 30))
     n = 5_000
     means = np.concatenate([rng.uniform(-0.05, 0.05, (n, 2)), rng.uniform(1, 2, (n, 1))], axis=1)
-    yield Case("a tile with 5000 entries", splats(means, 1e-3, -2, rng.uniform(0, 1, (n, 3))), camera(4, 4))
+    yield Case("a tile with 5000 intersections", splats(means, 1e-3, -2, rng.uniform(0, 1, (n, 3))), camera(4, 4))
 
 
 def layered(in_front: int) -> Case:
@@ -168,18 +168,20 @@ def extremes(n: int) -> Scene:
 
 
 def around(views: int, spread: float, seed: int) -> F64:
-    """Eyes within an angle of about ``spread`` of each other: the condition number grows with its third power."""
+    """Camera centres within an angle of about ``spread`` of each other: the condition number grows with its third
+    power.
+    """
     rng = np.random.default_rng(seed)
     axis = rng.normal(size=3)
     directions = axis / np.linalg.norm(axis) + spread * rng.normal(size=(views, 3))
-    eyes: F64 = 6 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
-    return eyes
+    camera_centres: F64 = 6 * directions / np.linalg.norm(directions, axis=1, keepdims=True)
+    return camera_centres
 
 
 def ridge_case(
     seed: int, splat_count: int, views: int, log_lam: float, alpha: float, decades: float, spread: float, degree: int
 ) -> RidgeCase:
-    """Weights over so many decades, eyes within so large an angle."""
+    """Weights over so many decades, camera centres within so large an angle."""
     scene = random_scene(splat_count, degree, seed)
     scene = dataclasses.replace(scene, means=(spread * scene.means).astype(np.float32))
     dense = 10 ** np.random.default_rng(seed).uniform(-decades, min(decades, 6), (splat_count, views))
@@ -246,10 +248,10 @@ def known_refits() -> Iterator[RefitCase]:
     yield RefitCase("to black pictures", scene, black, views, plain)
     for offset in (1e3, 1e5):
         moved = [dataclasses.replace(s, means=s.means + np.array([offset, 0, 0], np.float32)) for s in (scene, other)]
-        eyes = [
+        camera_centres = [
             dataclasses.replace(v, translation=v.translation - v.rotation @ np.array([offset, 0, 0])) for v in views
         ]
-        yield RefitCase(f"{offset:g} from the origin", moved[0], moved[1], eyes, plain)
+        yield RefitCase(f"{offset:g} from the origin", moved[0], moved[1], camera_centres, plain)
     column = np.zeros((3000, 3))
     column[:, 2] = np.linspace(2, 6, 3000)
     colours = np.random.default_rng(5).uniform(0.2, 1, (3000, 3))

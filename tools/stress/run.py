@@ -81,7 +81,7 @@ WHAT = {
     "project: colour": "of a colour, relative to the sum of its terms' magnitudes",
     "project: depth": "of a depth, relative to the distance",
     "tile lists": "255 alpha - 1 of the brightest (pixel, splat) pair that a list lacks",
-    "sort": "entries out of order",
+    "sort": "intersections out of order",
     "composite": "of a pixel, relative to the brightest colour",
     "render": "of a pixel of the whole rasterizer, the same",
     "removal: importance": "of a splat's importance, relative",
@@ -225,8 +225,8 @@ def composite(raw: F64, colours: F64, rules: RasterRules, background: F64 | None
         alpha = np.where(raw[k] >= 1 / 255, np.minimum(raw[k], rules.alpha_cap), 0)
         after = transmittance * (1 - alpha)
         touched = alive & (alpha > 0)
-        margin = np.where(touched, np.minimum(margin, np.abs(after / rules.stop - 1)), margin)
-        alive &= ~(touched & (after < rules.stop))
+        margin = np.where(touched, np.minimum(margin, np.abs(after / rules.transmittance_threshold - 1)), margin)
+        alive &= ~(touched & (after < rules.transmittance_threshold))
         used[k] = np.where(touched & alive, alpha, 0)
         image += (transmittance * used[k])[:, None] * colours[k]
         transmittance = transmittance * (1 - used[k])
@@ -268,25 +268,25 @@ def removal_effects(alpha: F64, colours: F64, wanted: F64, splats: NDArray[np.in
 
 @dataclasses.dataclass
 class Lists:
-    """What the device made of a view: ellipses (N, 8), colours (N, 3), each tile's entries, pictures."""
+    """What the device made of a view: ellipses (N, 8), colours (N, 3), each tile's intersections, pictures."""
 
     shapes: F64
     colours: F64
     offsets: NDArray[np.uint32]
-    entries: NDArray[np.uint32]
+    intersections: NDArray[np.uint32]
     image: F64
     transmittance: F64
 
     def order(self) -> NDArray[np.int64]:
         """The splats in any list, front to back."""
-        listed = np.unique(self.entries).astype(np.int64)
+        listed = np.unique(self.intersections).astype(np.int64)
         return listed[np.lexsort((listed, self.shapes[listed, 6].astype(np.float32)))]
 
     def membership(self, splats: NDArray[np.int64], tiles: int) -> Mask:
         """(K, tiles) whether a splat is in a tile's list."""
         found = np.zeros((len(self.shapes), tiles), bool)
         lengths = self.offsets[1:] - self.offsets[:-1]
-        found[self.entries, np.repeat(np.arange(tiles), lengths)] = True
+        found[self.intersections, np.repeat(np.arange(tiles), lengths)] = True
         return cast(Mask, found[splats])
 
 
@@ -303,7 +303,7 @@ def rasterized(rasterizer: Rasterizer, view: Camera) -> Lists:
         shapes.astype(np.float64),
         wide,
         device.download(prepared.offsets, (prepared.tiles + 1,), np.uint32),
-        device.download(prepared.entries, (prepared.entry_count,), np.uint32),
+        device.download(prepared.intersections, (prepared.intersection_count,), np.uint32),
         image.reshape(-1, 3).astype(np.float64),
         transmittance.ravel().astype(np.float64),
     )
@@ -324,7 +324,7 @@ def check_projection(case: Case, lists: Lists, pixels: Pixels) -> Measures:
     distance = np.linalg.norm(case.scene.means[true.index].astype(np.float64) - case.view.centre, axis=1)
     error[np.abs(true.depth - case.rules.near) < 4 * ULP * distance] = 0
 
-    listed = np.isin(true.index, lists.entries)
+    listed = np.isin(true.index, lists.intersections)
     direction = (case.scene.means[true.index].astype(np.float64) - case.view.centre) / distance[:, None]
     terms = np.abs(reference.sh_basis(direction, case.scene.sh_degree))[:, :, None] * np.abs(case.scene.sh[true.index])
     scale = 0.5 + terms.sum(axis=1)
@@ -368,7 +368,7 @@ def check_lists(case: Case, lists: Lists, pixels: Pixels, raw: F64, member: Mask
     wrong = 0
     depth = lists.shapes[:, 6].astype(np.float32)
     for begin, end in itertools.pairwise(lists.offsets.tolist()):
-        run = lists.entries[begin:end]
+        run = lists.intersections[begin:end]
         wrong += int(np.count_nonzero(run != run[np.lexsort((run, depth[run]))]))
     found["sort"] = (float(wrong), 1.0)
     return found
@@ -454,7 +454,7 @@ def check_removal(
 ) -> Measures:
     """Effects and importances once the splats of every third place are gone, by the device's own ellipses."""
     rng = np.random.default_rng(SEED)
-    removal = RemovalSweep(rasterizer, [case.view], SweepOptions(tolerance=-1, stop=None))
+    removal = RemovalSweep(rasterizer, [case.view], SweepOptions(tolerance=-1, transmittance_threshold=None))
     try:
         removal.measure()
         order = lists.order()
@@ -509,7 +509,7 @@ def check(device: Device, case: Case) -> Measures:
     try:
         lists = rasterized(rasterizer, case.view)
         finite = np.isfinite(lists.image).all() and np.isfinite(lists.transmittance).all()
-        finite &= bool(np.isfinite(lists.colours[np.unique(lists.entries)]).all())
+        finite &= bool(np.isfinite(lists.colours[np.unique(lists.intersections)]).all())
         if not finite or lists.transmittance.min() < 0 or lists.transmittance.max() > 1:
             return {"composite": (np.inf, ULP)}
         pixels = Pixels.of(case.view)

@@ -28,7 +28,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import Stopwatch, reduce
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
-from tools.study.judging import JudgedScene
+from tools.study.evaluation import EvaluatedScene
 from tools.study.rate_distortion import write_json
 
 #: The paper's properties, the sections of a file that hold each, and float32 values a splat in a PLY of degree 3.
@@ -54,14 +54,14 @@ def from_channels(scene: Scene) -> Scene:
     return dataclasses.replace(scene, sh=np.stack(channels, axis=-1).astype(np.float32).reshape(scene.sh.shape))
 
 
-def _coded(judge: JudgedScene, scene: Scene, options: EncodeOptions, rgb: bool) -> dict[str, Any]:
+def _coded(evaluator: EvaluatedScene, scene: Scene, options: EncodeOptions, rgb: bool) -> dict[str, Any]:
     """Code a scene as R, G, B or as Y, Co, Cg; what the file takes by property, and what it keeps."""
-    views = train_views(judge.cameras)
+    views = train_views(evaluator.cameras)
     coded = code_scene(as_channels(scene) if rgb else scene, options.parameters, views, entropy=options.entropy)
     file = PotrFile.from_bytes(b"".join(coded.pieces))
     sections = file_report(file)["sections"]
     decoded = from_channels(file.scene()) if rgb else file.scene()
-    figures: dict[str, Any] = {"splats": len(scene), "bytes": coded.nbytes, **judge(decoded)}
+    figures: dict[str, Any] = {"splats": len(scene), "bytes": coded.nbytes, **evaluator(decoded)}
     figures["serialised_bytes"] = sum(section["serialised_bytes"] for section in sections.values())
     for column in ("bytes", "serialised_bytes"):
         figures[f"{column}_a_splat"] = {
@@ -71,10 +71,10 @@ def _coded(judge: JudgedScene, scene: Scene, options: EncodeOptions, rgb: bool) 
     return figures
 
 
-def measure_steps(judge: JudgedScene, device: Device, q: float) -> list[dict[str, Any]]:
+def measure_steps(evaluator: EvaluatedScene, device: Device, q: float) -> list[dict[str, Any]]:
     """All steps on one scene, the first without entropy coding."""
     options = EncodeOptions.for_preset("paper", q=q)
-    plain = _coded(judge, judge.source, options, rgb=True)
+    plain = _coded(evaluator, evaluator.source, options, rgb=True)
     serialised = {**plain, "bytes": plain["serialised_bytes"], "bytes_a_splat": plain["serialised_bytes_a_splat"]}
     steps = [{"step": "serialisation and quantisation", **serialised}, {"step": "entropy coding", **plain}]
     for name, changed, rgb in (
@@ -83,8 +83,8 @@ def measure_steps(judge: JudgedScene, device: Device, q: float) -> list[dict[str
         ("RGB → YCoCg", options, False),
         ("preset best", EncodeOptions.for_preset("best", q=q), False),
     ):
-        reduced = reduce(judge.source, train_views(judge.cameras), changed, Stopwatch(), device)
-        steps.append({"step": name, **_coded(judge, reduced.scene, changed, rgb)})
+        reduced = reduce(evaluator.source, train_views(evaluator.cameras), changed, Stopwatch(), device)
+        steps.append({"step": name, **_coded(evaluator, reduced.scene, changed, rgb)})
     return steps
 
 
@@ -92,29 +92,29 @@ def _measure(args: argparse.Namespace) -> None:
     device = Device(args.device)
     results: dict[str, Any] = {"device": device.info.name, "q": args.quality, "scenes": {}}
     for folder in args.scenes:
-        judge = JudgedScene(folder, device)
-        steps = measure_steps(judge, device, args.quality)
-        results["scenes"][judge.name] = {**judge.facts(), "steps": steps}
+        evaluator = EvaluatedScene(folder, device)
+        steps = measure_steps(evaluator, device, args.quality)
+        results["scenes"][evaluator.name] = {**evaluator.facts(), "steps": steps}
         write_json(args.json, results)
-        judge.free()
+        evaluator.free()
 
 
 def _report(args: argparse.Namespace) -> None:
     results = json.loads(args.results.read_text())
     for name, entry in results["scenes"].items():
-        photographs = "photo_psnr" in entry["uncompressed"]
+        ground_truth = "truth_psnr" in entry["uncompressed"]
         print(f"### {name}, q = {results['q']:g}, on {results['device']}\n")
         head, rule = "| | splats | MB | PSNR, SSIM against uncompressed |", "|---|---|---|---|"
         row = f"| uncompressed | {entry['source_splats']:,} | {entry['source_bytes'] / 1e6:.1f} | |"
-        if photographs:
+        if ground_truth:
             plain = entry["uncompressed"]
             head, rule = head + " PSNR, SSIM against photographs |", rule + "---|"
-            row += f" {plain['photo_psnr']:.2f} dB, {plain['photo_ssim']:.4f} |"
+            row += f" {plain['truth_psnr']:.2f} dB, {plain['truth_ssim']:.4f} |"
         print(head, rule, row, sep="\n")
         for s in entry["steps"]:
             row = f"| + {s['step']} | {s['splats']:,} | {s['bytes'] / 1e6:.2f} | {s['psnr']:.2f} dB, {s['ssim']:.4f} |"
-            if photographs:
-                row += f" {s['photo_psnr']:.2f} dB, {s['photo_ssim']:.4f} |"
+            if ground_truth:
+                row += f" {s['truth_psnr']:.2f} dB, {s['truth_ssim']:.4f} |"
             print(row)
         steps = entry["steps"]
         print("\nBytes a splat:\n")

@@ -27,7 +27,7 @@ from numpy.typing import NDArray
 import potr_cl.opencl.device
 from potr_cl.codec.quantize import quantize_sh, to_ycocg
 from potr_cl.formats import load_cameras, load_scene
-from potr_cl.formats.images import read_photograph
+from potr_cl.formats.images import read_ground_truth
 from potr_cl.model.camera import Camera, camera_centres, test_views, train_views
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
@@ -91,11 +91,11 @@ def _renders(rasterizer: Rasterizer, cameras: Sequence[Camera]) -> list[FloatArr
     return [np.clip(rasterizer.render(c)[0], 0, 1) for c in cameras]
 
 
-def _photographs(cameras: Sequence[Camera]) -> list[FloatArray] | None:
+def _ground_truth(cameras: Sequence[Camera]) -> list[FloatArray] | None:
     paths = [c.image_path for c in cameras]
     if not all(p is not None and p.exists() for p in paths):
         return None
-    return [read_photograph(p) for p in paths if p is not None]
+    return [read_ground_truth(p) for p in paths if p is not None]
 
 
 @contextlib.contextmanager
@@ -177,7 +177,7 @@ def measure(device: Device, folder: Path, every: int, powers: Sequence[float]) -
     scene, _ = load_scene(folder / "point_cloud.ply").cleaned()
     cameras = load_cameras(folder / "cameras.json")
     views, tests = train_views(cameras), test_views(cameras)[::every]
-    photographs = _photographs(tests)
+    ground_truth = _ground_truth(tests)
     options = EncodeOptions(compact=False)
     sf_sh = options.parameters.sf_sh
     settings: list[tuple[str, dict[str, Any]]] = [
@@ -193,17 +193,17 @@ def measure(device: Device, folder: Path, every: int, powers: Sequence[float]) -
         rasterizer = Rasterizer(device, scene)
         unquantized = _renders(rasterizer, tests)
         targets = {"uncompressed": targets.get("uncompressed", unquantized), "uncompacted": unquantized}
-        if photographs:
-            targets["photographs"] = photographs
-        judge = _Judge(rasterizer, tests, targets, sf_sh)
-        judge.add("no compaction", scene.sh)
-        judge.add("AC set to 0", np.where(np.arange(scene.sh.shape[1])[:, None] == 0, scene.sh, np.float32(0)))
+        if ground_truth:
+            targets["ground_truth"] = ground_truth
+        evaluator = _Judge(rasterizer, tests, targets, sf_sh)
+        evaluator.add("no compaction", scene.sh)
+        evaluator.add("AC set to 0", np.where(np.arange(scene.sh.shape[1])[:, None] == 0, scene.sh, np.float32(0)))
         weights = measured_weights(device, scene, views)
         compactor = Compactor(device)
         for label, changes in settings:
             chosen = replace(CompactionOptions(sf_sh=sf_sh), **changes)
             sh = compactor.compact(scene, camera_centres(views), weights, chosen).sh
-            judge.add(label, sh, alpha=chosen.alpha, lam=chosen.lam)
+            evaluator.add(label, sh, alpha=chosen.alpha, lam=chosen.lam)
         rasterizer.free()
         yield {
             "scene": folder.name,
@@ -213,7 +213,7 @@ def measure(device: Device, folder: Path, every: int, powers: Sequence[float]) -
             "views": len(tests),
             "sf_sh": sf_sh,
             "before": {name: _psnr(unquantized, target) for name, target in targets.items() if name != "uncompacted"},
-            "rows": judge.rows,
+            "rows": evaluator.rows,
             "resolution": _resolution(device, scene, views, weights, sf_sh),
         }
 
@@ -231,12 +231,12 @@ def show(result: dict[str, Any]) -> None:
     )
     for row in result["rows"]:
         degrees = " / ".join(f"{100 * z:.1f}" for z in row["by degree"])
-        photographs = f"{row['photographs']:.3f}" if "photographs" in row else "–"
+        ground_truth = f"{row['ground_truth']:.3f}" if "ground_truth" in row else "–"
         print(
             f"| {row['label']} | {100 * row['zeros']:.2f} % ({degrees}) | {row['magnitude']:.2f} "
-            f"| {row['uncompressed']:.2f} | {row['uncompacted']:.2f} | {photographs} |"
+            f"| {row['uncompressed']:.2f} | {row['uncompacted']:.2f} | {ground_truth} |"
         )
-    photographed = "photographs" in result["rows"][0]
+    photographed = "ground_truth" in result["rows"][0]
     columns = ["α", "AC zeros", "PSNR, uncompacted", *(["lost on the photographs"] if photographed else [])]
     print(f"\n| {' | '.join(columns)} |\n" + "|---" * len(columns) + "|")
     for alpha in ALPHAS:
@@ -247,8 +247,8 @@ def show(result: dict[str, Any]) -> None:
                 continue
             cells = [f"{np.interp(share, zeros, [r['uncompacted'] for r in rows]):.1f} dB"]
             if photographed:
-                left = float(np.interp(share, zeros, [r["photographs"] for r in rows]))
-                cells.append(f"{result['rows'][0]['photographs'] - left:.2f} dB")
+                left = float(np.interp(share, zeros, [r["ground_truth"] for r in rows]))
+                cells.append(f"{result['rows'][0]['ground_truth'] - left:.2f} dB")
             print(f"| {alpha:g} | {100 * share:g} % | {' | '.join(cells)} |")
     print("\n| λ (α = 0.9) | AC zeros | from views of half the size | the same, low-pass of full size |")
     print("|---|---|---|---|")
@@ -266,15 +266,15 @@ def plot(results: list[dict[str, Any]], file: Path) -> None:
 
     figure, axes = pyplot.subplots(3, len(results), figsize=(4.2 * len(results), 9), sharex=True, squeeze=False)
     for column, result in zip(axes.T, results, strict=True):
-        photographs = "photographs" in result["rows"][0]
-        quantities = ("zeros", "magnitude", "photographs" if photographs else "uncompacted")
+        ground_truth = "ground_truth" in result["rows"][0]
+        quantities = ("zeros", "magnitude", "ground_truth" if ground_truth else "uncompacted")
         kind = "pruned" if result["pruned"] else "not pruned"
         column[0].set_title(f"{result['scene']}, {kind}, {result['splats']:,} splats", fontsize=10)
         column[2].set_xlabel("λ")
         labels = {
             "zeros": "AC coefficients that are 0, %",
             "magnitude": "mean |AC| that is not 0, steps",
-            "photographs": "PSNR, photographs, dB",
+            "ground_truth": "PSNR, photographs, dB",
             "uncompacted": "PSNR, same splats uncompacted, dB",
         }
         for axis, quantity in zip(column, quantities, strict=True):

@@ -24,7 +24,7 @@ from typing import Any
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene
 from potr_cl.opencl.device import Device
-from tools.study.judging import JudgedScene
+from tools.study.evaluation import EvaluatedScene
 from tools.study.rate_distortion import size_at, value_at, write_json
 
 FORMATS = ("compressed.ply", "spz", "sog")
@@ -64,7 +64,7 @@ def _run(command: list[str], timeout: float) -> None:
 
 
 def _through(
-    judge: JudgedScene, source: Path, suffix: str, transform: list[str], timeout: float
+    evaluator: EvaluatedScene, source: Path, suffix: str, transform: list[str], timeout: float
 ) -> dict[str, Any] | None:
     """Write a scene in one format, decode it, judge it; None if that did not finish."""
     with tempfile.TemporaryDirectory() as folder:
@@ -73,12 +73,12 @@ def _through(
         try:
             _run([*transform, str(source), str(coded)], timeout)
         except subprocess.TimeoutExpired:
-            print(f"{judge.name} {suffix}: did not finish in {timeout:g} s", file=sys.stderr)
+            print(f"{evaluator.name} {suffix}: did not finish in {timeout:g} s", file=sys.stderr)
             return None
         seconds = time.perf_counter() - began
         _run([*transform, str(coded), str(decoded)], timeout)
         row = {"format": f".{suffix}", "bytes": coded.stat().st_size, "seconds": seconds, "measured": True}
-        return row | judge(load_scene(decoded))
+        return row | evaluator(load_scene(decoded))
 
 
 def _measure(args: argparse.Namespace) -> None:
@@ -87,16 +87,16 @@ def _measure(args: argparse.Namespace) -> None:
     device = Device(args.device)
     results: dict[str, Any] = {"tool": (version.stdout + version.stderr).strip(), "scenes": {}}
     for folder in args.scenes:
-        judge = JudgedScene(folder, device)
-        rows = [_through(judge, folder / "point_cloud.ply", f, transform, args.timeout) for f in args.formats]
+        evaluator = EvaluatedScene(folder, device)
+        rows = [_through(evaluator, folder / "point_cloud.ply", f, transform, args.timeout) for f in args.formats]
         measured = [row for row in rows if row is not None]
-        for name, (size, lost, psnr) in EARLIER.get(judge.name, {}).items():
+        for name, (size, lost, psnr) in EARLIER.get(evaluator.name, {}).items():
             if f".{name.lower()}" not in {row["format"] for row in measured}:
                 row = {"format": name, "bytes": round(size * 1e6), "psnr": psnr, "psnr_loss": lost}
                 measured.append({**row, "measured": False})
-        results["scenes"][judge.name] = {**judge.facts(), "formats": measured}
+        results["scenes"][evaluator.name] = {**evaluator.facts(), "formats": measured}
         write_json(args.json, results)
-        judge.free()
+        evaluator.free()
 
 
 # ------------------------------------------------------------------------------------------------ report

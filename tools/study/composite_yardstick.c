@@ -35,11 +35,11 @@ typedef struct {
 } SplatBlock;
 
 static void fetch_block(
-    SplatBlock *restrict s, const float *shapes, const float *colours, const uint32_t *entries, uint32_t begin,
+    SplatBlock *restrict s, const float *shapes, const float *colours, const uint32_t *intersections, uint32_t begin,
     uint32_t end, int x, int y)
 {
     for (uint32_t k = 0; k < BLOCK; ++k) {
-        const uint32_t splat = entries[begin + k < end ? begin + k : end - 1];
+        const uint32_t splat = intersections[begin + k < end ? begin + k : end - 1];
         const float *shape = shapes + 8 * (size_t)splat, *colour = colours + 4 * (size_t)splat;
         s->x[k] = shape[0];
         s->y[k] = shape[1];
@@ -73,7 +73,7 @@ static void fetch_block(
 
 /* Returns the (pixel, splat) pairs that were evaluated. */
 int64_t composite(
-    const float *shapes, const float *colours, const uint32_t *offsets, const uint32_t *entries, int columns, int rows,
+    const float *shapes, const float *colours, const uint32_t *offsets, const uint32_t *intersections, int columns, int rows,
     int width, int height, float alpha_cap, float stop, float *image, float *transmittance)
 {
     int64_t pairs = 0;
@@ -91,7 +91,7 @@ int64_t composite(
         int first_alive = 0, end_alive = pixel_rows_inside;
         SplatBlock s;
         for (uint32_t begin = offsets[tile]; begin < offsets[tile + 1] && first_alive < end_alive; begin += BLOCK) {
-            fetch_block(&s, shapes, colours, entries, begin, offsets[tile + 1], x, y);
+            fetch_block(&s, shapes, colours, intersections, begin, offsets[tile + 1], x, y);
             for (int k = 0; k < BLOCK; ++k) {
                 const float red = s.red[k], green = s.green[k], blue = s.blue[k];
                 const int first = MAX(s.first_row[k], first_alive);

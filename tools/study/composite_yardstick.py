@@ -73,7 +73,7 @@ def measure(library: ctypes.CDLL, device: Device, scene: Scene, cameras: list[Ca
         shapes = device.download(view.shapes, (splats, 8), np.float32)
         colours = device.download(view.colours, (splats, 4), np.float32)
         offsets = device.download(view.offsets, (view.tiles + 1,), np.uint32)
-        entries = device.download(view.entries, (view.entry_count,), np.uint32)
+        intersections = device.download(view.intersections, (view.intersection_count,), np.uint32)
         image = np.zeros((camera.height, camera.width, 3), np.float32)
         transmittance = np.zeros((camera.height, camera.width), np.float32)
         kernel_best = loop_best = np.inf
@@ -83,10 +83,10 @@ def measure(library: ctypes.CDLL, device: Device, scene: Scene, cameras: list[Ca
             kernel_best = min(kernel_best, device.stage_times()["composite"])
             started = time.perf_counter()
             done = library.composite(
-                *(_pointer(a) for a in (shapes, colours, offsets, entries)),
+                *(_pointer(a) for a in (shapes, colours, offsets, intersections)),
                 *(ctypes.c_int(n) for n in (view.columns, view.rows, camera.width, camera.height)),
                 ctypes.c_float(GSPLAT.alpha_cap),
-                ctypes.c_float(GSPLAT.stop),
+                ctypes.c_float(GSPLAT.transmittance_threshold),
                 _pointer(image),
                 _pointer(transmittance),
             )

@@ -34,13 +34,14 @@ LIGHTGAUSSIAN_POWER = 0.1
 MESONGS_POWERS = {"lego": 0.05, "plush": 0.1}
 _MESONGS_DEFAULT = 0.1
 
-#: Sums of T over a tile's pixels, one for each entry of the tile's list. Groups share a tile on a GPU and add up in
+#: Sums of T over a tile's pixels, one for each intersection of the tile's list. Groups share a tile on a GPU and add up
+#: in
 #: fixed point, of which 256 ones just fit 32 bits: the sums are the same on every run.
 _KERNELS = """
 kernel void transmittance_sums(
     global const float4 *shapes,
     global const uint *offsets,
-    global const uint *entries,
+    global const uint *intersections,
     View view,
     global float *sums)
 {
@@ -57,7 +58,7 @@ kernel void transmittance_sums(
     for (uint batch = begin; batch < end; batch += TILE * TILE) {
         const int size = min(end - batch, (uint)(TILE * TILE));
         if (lid < size) {
-            const uint splat = entries[batch + lid];
+            const uint splat = intersections[batch + lid];
             near_s0[lid] = shapes[2 * splat];
             near_s1[lid] = shapes[2 * splat + 1].xy;
         }
@@ -72,7 +73,7 @@ kernel void transmittance_sums(
             const float power = s1.y - u * u - v * v;
             if (power >= LOG2_ALPHA_MIN) {
                 const float after = t - t * fmin(exp2_polynomial(power), ALPHA_CAP);
-                if (after < STOP) {
+                if (after < TRANSMITTANCE_THRESHOLD) {
                     alive = 0;
                 } else {
                     atomic_add(&parts[k], convert_uint_rte(t * 8388608.0f));
@@ -95,8 +96,8 @@ kernel void transmittance_sums(
         t[i] = column < (float)view.width ? (vfloat)(1.0f) : (vfloat)(-1.0f);
     }
     const uint end = offsets[tile + 1];
-    for (uint entry = offsets[tile]; entry < end; ++entry) {
-        const uint splat = entries[entry];
+    for (uint intersection = offsets[tile]; intersection < end; ++intersection) {
+        const uint splat = intersections[intersection];
         const float4 s0 = shapes[2 * splat];
         const float2 s1 = shapes[2 * splat + 1].xy;
         const float reach = sqrt(fmax(s1.y - LOG2_ALPHA_MIN + LEVEL_SLACK, 0.0f)) / s1.x + 1.0f;
@@ -115,7 +116,7 @@ kernel void transmittance_sums(
                 const vfloat before = t[i];
                 const vint touched = (power >= LOG2_ALPHA_MIN) & (before > 0.0f);
                 const vfloat after = before - before * fmin(exp2_polynomial(power), (vfloat)(ALPHA_CAP));
-                const vint goes_on = touched & (after >= STOP);
+                const vint goes_on = touched & (after >= TRANSMITTANCE_THRESHOLD);
                 sum += goes_on ? before : (vfloat)(0.0f);
                 t[i] = touched ? (goes_on ? after : -before) : before;
             }
@@ -124,7 +125,7 @@ kernel void transmittance_sums(
         VSTORE(sum, 0, lanes);
         for (int lane = 0; lane < LANES; ++lane)
             total += lanes[lane];
-        sums[entry] = total;
+        sums[intersection] = total;
     }
 #endif
 }
@@ -138,7 +139,7 @@ def _kernel(device: Device, rasterizer: Rasterizer) -> cl.Kernel:
         "-cl-std=CL1.2",
         f"-DLANES={lanes}",
         f"-DALPHA_CAP={rules.alpha_cap:.9e}f",
-        f"-DSTOP={rules.stop:.9e}f",
+        f"-DTRANSMITTANCE_THRESHOLD={rules.transmittance_threshold:.9e}f",
     ]
     source = kernel_source("include/lanes.clh") + kernel_source("include/splat.clh") + _KERNELS
     return cl.Kernel(cl.Program(device.context, source).build(options), "transmittance_sums")
@@ -157,11 +158,11 @@ def transmittance_sums(rasterizer: Rasterizer, cameras: Sequence[Camera]) -> F64
     total = np.zeros(rasterizer.splats)
     for camera in cameras:
         view = rasterizer.prepare(camera)
-        sums = device.allocate(4 * view.entry_count, "the sums of transmittances")
-        kernel.set_args(view.shapes, view.offsets, view.entries, camera_struct(camera), sums)
+        sums = device.allocate(4 * view.intersection_count, "the sums of transmittances")
+        kernel.set_args(view.shapes, view.offsets, view.intersections, camera_struct(camera), sums)
         device.launch(kernel, (view.tiles * group,), (group,))
-        weights = device.download(sums, (view.entry_count,), np.float32)
-        splats = device.download(view.entries, (view.entry_count,), np.uint32)
+        weights = device.download(sums, (view.intersection_count,), np.float32)
+        splats = device.download(view.intersections, (view.intersection_count,), np.uint32)
         total += np.bincount(splats, weights, rasterizer.splats)
         device.free(sums)
         view.free()

@@ -31,7 +31,7 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
 from potr_cl.stages.pruning.removal import SweepOptions
-from tools.study.judging import JudgedScene
+from tools.study.evaluation import EvaluatedScene
 
 QUALITIES = tuple(round(0.1 * step, 1) for step in range(1, 11))
 
@@ -67,9 +67,9 @@ def encode_options(changes: dict[str, Any]) -> EncodeOptions:
     return EncodeOptions.for_preset(**{"preset": EncodeOptions.preset, **plain, "sweep": SweepOptions(**sweep)})
 
 
-def measure_encode(judge: JudgedScene, options: EncodeOptions, device: Device) -> dict[str, Any]:
+def measure_encode(evaluator: EvaluatedScene, options: EncodeOptions, device: Device) -> dict[str, Any]:
     """One encode with everything that it costs and keeps."""
-    encoded = encode(judge.source, judge.cameras, options, device=device)
+    encoded = encode(evaluator.source, evaluator.cameras, options, device=device)
     file = PotrFile.from_bytes(b"".join(encoded.pieces))
     report = file_report(file)
     return {
@@ -78,7 +78,7 @@ def measure_encode(judge: JudgedScene, options: EncodeOptions, device: Device) -
         "splats": len(encoded.order),
         "sections": {name: section["bytes"] for name, section in report["sections"].items()},
         "seconds": encoded.seconds,
-        **judge(file.scene()),
+        **evaluator(file.scene()),
     }
 
 
@@ -95,46 +95,46 @@ def _measure(args: argparse.Namespace) -> None:
         results = json.loads(args.json.read_text())
     results["device"] = device.info.name
     for folder in args.scenes:
-        judge = JudgedScene(folder, device)
-        entry = results["scenes"].setdefault(judge.name, {**judge.facts(), "series": {}})
+        evaluator = EvaluatedScene(folder, device)
+        entry = results["scenes"].setdefault(evaluator.name, {**evaluator.facts(), "series": {}})
         for name, options in series.items():
             curve = entry["series"].setdefault(name, {"options": options, "encodes": []})
             done = {point["q"] for point in curve["encodes"]}
             for q in args.qualities:
                 if q in done:
                     continue
-                point = measure_encode(judge, encode_options({**options, "q": q}), device)
+                point = measure_encode(evaluator, encode_options({**options, "q": q}), device)
                 curve["encodes"].append(point)
                 curve["encodes"].sort(key=lambda p: p["q"])
                 write_json(args.json, results)
-                print(f"{judge.name} {name} q {q:g}: {point['bytes']} bytes, {point['psnr']:.2f} dB", flush=True)
-        judge.free()
+                print(f"{evaluator.name} {name} q {q:g}: {point['bytes']} bytes, {point['psnr']:.2f} dB", flush=True)
+        evaluator.free()
 
 
 # ------------------------------------------------------------------------------------------------ report
 
 
 def _table(entry: dict[str, Any]) -> str:
-    photographs = "photo_psnr" in entry["uncompressed"]
+    ground_truth = "truth_psnr" in entry["uncompressed"]
     head = "| series | q | splats | MB | times smaller | bytes a splat | PSNR, SSIM against uncompressed |"
     rule = "|---|---|---|---|---|---|---|"
-    if photographs:
+    if ground_truth:
         head += " PSNR, SSIM against photographs | lost |"
         rule += "---|---|"
     lines = [head, rule]
     plain = entry["uncompressed"]
     row = f"| uncompressed | | {entry['source_splats']:,} | {entry['source_bytes'] / 1e6:.1f} | 1 | "
     row += f"{entry['source_bytes'] / entry['source_splats']:.0f} | |"
-    if photographs:
-        row += f" {plain['photo_psnr']:.2f} dB, {plain['photo_ssim']:.4f} | |"
+    if ground_truth:
+        row += f" {plain['truth_psnr']:.2f} dB, {plain['truth_ssim']:.4f} | |"
     lines.append(row)
     for name, curve in entry["series"].items():
         for p in curve["encodes"]:
             row = f"| {name} | {p['q']:g} | {p['splats']:,} | {p['bytes'] / 1e6:.3f} | "
             row += f"{entry['source_bytes'] / p['bytes']:.1f} | {p['bytes'] / p['splats']:.2f} | "
             row += f"{p['psnr']:.2f} dB, {p['ssim']:.4f} |"
-            if photographs:
-                row += f" {p['photo_psnr']:.2f} dB, {p['photo_ssim']:.4f} | {p['psnr_loss']:.2f} dB |"
+            if ground_truth:
+                row += f" {p['truth_psnr']:.2f} dB, {p['truth_ssim']:.4f} | {p['psnr_loss']:.2f} dB |"
             lines.append(row)
     return "\n".join(lines)
 
@@ -146,8 +146,8 @@ def _plot(entry: dict[str, Any], formats: list[dict[str, Any]], path: Path) -> N
     import matplotlib.pyplot as plt
 
     panels = [("psnr", "PSNR against the uncompressed renders, dB")]
-    if "photo_psnr" in entry["uncompressed"]:
-        panels.append(("photo_psnr", "PSNR against the photographs, dB"))
+    if "truth_psnr" in entry["uncompressed"]:
+        panels.append(("truth_psnr", "PSNR against the photographs, dB"))
     figure, axes = plt.subplots(1, len(panels), figsize=(6.4 * len(panels), 4.8), squeeze=False)
     for axis, (key, title) in zip(axes[0], panels, strict=True):
         for name, curve in entry["series"].items():
@@ -155,12 +155,12 @@ def _plot(entry: dict[str, Any], formats: list[dict[str, Any]], path: Path) -> N
             axis.plot([p["bytes"] / 1e6 for p in points], [p[key] for p in points], marker="o", ms=4, label=name)
         for row in formats:
             value = row.get(key)
-            if value is None and key == "photo_psnr" and row.get("psnr_loss") is not None:
-                value = entry["uncompressed"]["photo_psnr"] - row["psnr_loss"]
+            if value is None and key == "truth_psnr" and row.get("psnr_loss") is not None:
+                value = entry["uncompressed"]["truth_psnr"] - row["psnr_loss"]
             if value is not None:
                 axis.plot(row["bytes"] / 1e6, value, marker="s", ms=5, ls="", color="0.4")
                 axis.annotate(row["format"], (row["bytes"] / 1e6, value), xytext=(4, -9), textcoords="offset points")
-        if key == "photo_psnr":
+        if key == "truth_psnr":
             axis.axhline(entry["uncompressed"][key], color="0.6", lw=1, ls="--", label="uncompressed")
         axis.set_xscale("log")
         ticks = [t for t in (0.5, 1, 2, 3, 4, 6, 8, 12, 20, 40) if _within(axis.get_xlim(), t)]

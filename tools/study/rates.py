@@ -153,8 +153,8 @@ def _quantisers(scene: Scene, train: Sequence[Camera]) -> Iterator[tuple[str, fl
         steps = np.round(np.clip(logits, -8, 12) / width)
         yield f"opacity, steps of {width:g} in the logit", *with_opacity(steps, 1 / (1 + np.exp(-steps * width)))
 
-    eyes = camera_centres(train)
-    nearest = np.min([np.linalg.norm(scene.means - eye, axis=1) for eye in eyes], axis=0)
+    centres = camera_centres(train)
+    nearest = np.min([np.linalg.norm(scene.means - camera_centre, axis=1) for camera_centre in centres], axis=0)
     wide = float(np.median(largest / nearest))
     for part in (0.02, 0.04):
         for name, absolute in (("centre near enough", False), ("foreseeable level", True)):

@@ -33,7 +33,7 @@ from tests.oracles import raster as reference
 NOISE_FLOOR = 1e-3 * 10**-10.8
 ABOVE = (0.0, NOISE_FLOOR, 100 * NOISE_FLOOR)
 #: Transmittances at which pixels may end: the rules' first.
-STOPS = (INRIA.stop, 1e-6, 1e-8)
+THRESHOLDS = (INRIA.transmittance_threshold, 1e-6, 1e-8)
 REPEATS = 5
 SCENES = Path(__file__).parents[3] / "shared" / "scenes"
 F64 = NDArray[np.float64]
@@ -97,7 +97,7 @@ class BruteForce:
     def effects(self, splats: NDArray[np.int64], stops: Sequence[float] | None = None) -> F64:
         """ΔSE of each splat over the view's pixels and channels, (2, stops, splats): with the pixels' ends held, and as
         rendered, for each transmittance at which pixels may end; by default the rules' alone."""
-        stops = [self.rules.stop] if stops is None else stops
+        stops = [self.rules.transmittance_threshold] if stops is None else stops
         found = np.zeros((2, len(stops), len(splats)))
         tiles: dict[tuple[int, int], list[int]] = {}
         columns, rows = -(-self.camera.width // TILE), -(-self.camera.height // TILE)
@@ -145,9 +145,9 @@ def spent(device: Device) -> float:
 
 def predicted(rasterizer: Rasterizer, cameras: Sequence[Camera], stop: float) -> tuple[F64, F64, float]:
     """ΔMSE, importance, and the seconds of a sweep, the best of some."""
-    own = rasterizer.rules.stop
+    own = rasterizer.rules.transmittance_threshold
     removal = RemovalSweep(
-        rasterizer, cameras, SweepOptions(stop=None if np.float32(stop) == np.float32(own) else stop)
+        rasterizer, cameras, SweepOptions(transmittance_threshold=None if np.float32(stop) == np.float32(own) else stop)
     )
     effect, importance = removal.measure()
     seconds = []
@@ -168,16 +168,16 @@ def measure(folder: Path, devices: Sequence[Device], views: int, splats: int) ->
     predictions = []
     for device in devices:
         rasterizer = Rasterizer(device, scene)
-        predictions.append([predicted(rasterizer, cameras, stop) for stop in STOPS])
+        predictions.append([predicted(rasterizer, cameras, stop) for stop in THRESHOLDS])
         rasterizer.free()
     chosen = choose_splats(predictions[0][0][1], splats)
 
-    truth = np.zeros((2, len(STOPS), len(chosen)))
+    truth = np.zeros((2, len(THRESHOLDS), len(chosen)))
     for camera in cameras:
         view = BruteForce(reference.project(scene, camera, INRIA), camera, INRIA)
-        truth += view.effects(chosen, STOPS) / (3 * camera.width * camera.height * len(cameras))
+        truth += view.effects(chosen, THRESHOLDS) / (3 * camera.width * camera.height * len(cameras))
     for device, by_stop in zip(devices, predictions, strict=True):
-        for n, (stop, (effect, _, seconds)) in enumerate(zip(STOPS, by_stop, strict=True)):
+        for n, (stop, (effect, _, seconds)) in enumerate(zip(THRESHOLDS, by_stop, strict=True)):
             truths = {"pixel ends held": truth[0, n], "as rendered": truth[1, n]}
             if n:
                 truths["by the rules"] = truth[1, 0]

@@ -3,8 +3,8 @@
 Back to front is what the package computes, PD = T alpha (B - c) with the colour behind B grown from the last splat on.
 Prefix sums is the paper's, PD_k = P_k - P_{k+1} / (1 - alpha) + alpha / (1 - alpha) P_K, in a second sweep from front
 to back once the final colour P_K is known (removal_prefix_sums_*.cl): lists and sums are the same, and on GPUs the
-rest of the kernel. On CPUs back to front walks patch by patch and remembers alphas, prefix sums go splat by splat and
-do not, so there only the errors compare formulas.
+rest of the kernel. On CPUs back to front walks sub-tile by sub-tile and remembers alphas, prefix sums go splat by splat
+and do not, so there only the errors compare formulas.
 
 Compared: the error where an opaque splat stands behind many layers, the error on real scenes, both against removals in
 float64 that leave the pixels' ends where they are, and the time of a sweep. On the scenes both formulas also share the
@@ -41,7 +41,7 @@ _SECOND_HALVES = {
     "prune/removal_gpu.cl": "    /* From here on r, g, b are twice the difference",
 }
 #: Pixels end here, in the sweeps and in float64.
-STOP = 1e-8
+TRANSMITTANCE_THRESHOLD = 1e-8
 LAYERS_IN_FRONT = (0, 10, 100, 300)
 LAYERS_BEHIND = 19
 TIMED_VIEWS = 5
@@ -79,7 +79,7 @@ def measure(device: Device, scene: Scene, cameras: Sequence[Camera]) -> tuple[F6
     :meth:`potr_cl.stages.pruning.removal.RemovalSweep.measure`.
     """
     rasterizer = Rasterizer(device, scene)
-    removal = RemovalSweep(rasterizer, cameras, SweepOptions(stop=STOP))
+    removal = RemovalSweep(rasterizer, cameras, SweepOptions(transmittance_threshold=TRANSMITTANCE_THRESHOLD))
     result = removal.measure()
     removal.free()
     rasterizer.free()
@@ -88,7 +88,9 @@ def measure(device: Device, scene: Scene, cameras: Sequence[Camera]) -> tuple[F6
 
 def truth(scene: Scene, camera: Camera, splats: NDArray[np.int64]) -> F64:
     """ΔMSE of single splats in float64 with the pixels' ends held."""
-    held: F64 = BruteForce(reference.project(scene, camera, INRIA), camera, INRIA).effects(splats, [STOP])[0, 0]
+    held: F64 = BruteForce(reference.project(scene, camera, INRIA), camera, INRIA).effects(
+        splats, [TRANSMITTANCE_THRESHOLD]
+    )[0, 0]
     return held / (3 * camera.width * camera.height)
 
 
@@ -103,8 +105,8 @@ def column(in_front: int) -> tuple[Scene, Camera]:
     quaternions[:, 0] = 1
     dc = np.random.default_rng(0).normal(size=(layers, 1, 3)).astype(np.float32)
     rotation = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
-    eye = np.array([-8.0, 0, 0])
-    camera = Camera("along", 16, 16, 60, 60, 8, 8, rotation, -rotation @ eye)
+    camera_centre = np.array([-8.0, 0, 0])
+    camera = Camera("along", 16, 16, 60, 60, 8, 8, rotation, -rotation @ camera_centre)
     return Scene(means, np.full((layers, 3), 0.5, np.float32), quaternions, logits, dc), camera
 
 
@@ -138,7 +140,10 @@ def print_scene_errors(name: str, scene: Scene, camera: Camera, pair: tuple[Devi
 def time_sweeps(scene: Scene, cameras: Sequence[Camera], pair: tuple[Device, Device]) -> F64:
     """Seconds of a sweep over all tiles of all views, (repeats, 2), the formulas taking turns."""
     rasterizers = [Rasterizer(device, scene) for device in pair]
-    removals = [RemovalSweep(rasterizer, cameras, SweepOptions(-1, stop=STOP)) for rasterizer in rasterizers]
+    removals = [
+        RemovalSweep(rasterizer, cameras, SweepOptions(-1, transmittance_threshold=TRANSMITTANCE_THRESHOLD))
+        for rasterizer in rasterizers
+    ]
     seconds = np.zeros((REPEATS + 1, 2))
     for times in seconds:
         for i, (device, removal) in enumerate(zip(pair, removals, strict=True)):

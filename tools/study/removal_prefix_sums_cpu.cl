@@ -4,7 +4,7 @@
 
        PD_k = P_k - P_{k+1} / (1 - alpha) + alpha / (1 - alpha) P_K
 
-   Stands in removal_cpu.cl for the walks patch by patch; see removal_formulas.py. */
+   Stands in removal_cpu.cl for the walks sub-tile by sub-tile; see removal_formulas.py. */
 
 /* Work-item i handles tile tiles[start + i]. */
 kernel void removal(
@@ -15,8 +15,8 @@ kernel void removal(
     global const uchar *alive,
     global const uint *begins,
     global uint *lengths,
-    global uint *entries,
-    global uint *patches,
+    global uint *intersections,
+    global uint *subtiles,
     View view,
     float red,
     float green,
@@ -33,27 +33,27 @@ kernel void removal(
     const uint begin = begins[tile];
     const uint end = begin + lengths[tile];
 
-    vfloat t[PATCHES], r[PATCHES], g[PATCHES], b[PATCHES];
-    vint last[PATCHES];
-    for (int i = 0; i < PATCHES; ++i) {
-        t[i] = patch_transmittance(i, origin, view.width, view.height);
+    vfloat t[SUBTILES], r[SUBTILES], g[SUBTILES], b[SUBTILES];
+    vint last[SUBTILES];
+    for (int i = 0; i < SUBTILES; ++i) {
+        t[i] = subtile_transmittance(i, origin, view.width, view.height);
         r[i] = g[i] = b[i] = (vfloat)(0.0f);
         last[i] = (vint)(-1);
     }
 
-    uint living = ALL_PATCHES;
+    uint living = ALL_SUBTILES;
     uint kept = begin, swept = begin;
     for (uint read = begin; read < end; ++read) {
         if (living && read + AHEAD < end)
-            prefetch_splat(shapes, colours, entries[read + AHEAD]);
-        const uint number = entries[read];
+            prefetch_splat(shapes, colours, intersections[read + AHEAD]);
+        const uint number = intersections[read];
         if (!alive[number] || sums[read].y < 0.0f)
             continue;
-        uint todo = patches[read];
+        uint todo = subtiles[read];
         if (kept < read) {
-            entries[kept] = number;
+            intersections[kept] = number;
             sums[kept] = sums[read];
-            patches[kept] = todo;
+            subtiles[kept] = todo;
         }
         const vint place = (vint)((int)(kept++ - begin));
         if (!living)
@@ -63,8 +63,8 @@ kernel void removal(
         if (todo) {
             const Splat splat = load_splat(shapes, colours, number);
             for (; todo; todo &= todo - 1) {
-                const int i = LOWEST_PATCH(todo);
-                const vfloat power = patch_power(&splat, i, origin);
+                const int i = LOWEST_SUBTILE(todo);
+                const vfloat power = subtile_power(&splat, i, origin);
                 BLEND(weight, power, t[i]);
                 last[i] = goes_on ? place : last[i];
                 r[i] = MAD(weight, (vfloat)(splat.red), r[i]);
@@ -73,29 +73,29 @@ kernel void removal(
             }
         }
         if ((kept - begin) % AHEAD == 0)
-            living = living_patches(t);
+            living = living_subtiles(t);
     }
     lengths[tile] = kept - begin;
     /* What lies behind the last pixel's end has no effect any more; nor have the slots that the dead left. */
     for (uint e = swept; e < end; ++e) {
         if (e < kept)
-            replace_sums(totals + TOTAL_WORDS * entries[e], sums[e], (float2)(0.0f, 0.0f), scale, bound);
+            replace_sums(totals + TOTAL_WORDS * intersections[e], sums[e], (float2)(0.0f, 0.0f), scale, bound);
         sums[e] = (float2)(0.0f, 0.0f);
     }
 
     /* From here on r, g, b are the final colour, dr, dg, db twice its difference to the target, and pr, pg, pb the colour
        before a splat. */
-    vfloat dr[PATCHES], dg[PATCHES], db[PATCHES];
-    vfloat pr[PATCHES], pg[PATCHES], pb[PATCHES];
+    vfloat dr[SUBTILES], dg[SUBTILES], db[SUBTILES];
+    vfloat pr[SUBTILES], pg[SUBTILES], pb[SUBTILES];
     float differences[3][TILE * TILE];
-    for (int i = 0; i < PATCHES; ++i) {
+    for (int i = 0; i < SUBTILES; ++i) {
         const vfloat left = fabs(t[i]);
         r[i] = MAD(left, (vfloat)(red), r[i]);
         g[i] = MAD(left, (vfloat)(green), g[i]);
         b[i] = MAD(left, (vfloat)(blue), b[i]);
-        store_patch(r[i], i, differences[0]);
-        store_patch(g[i], i, differences[1]);
-        store_patch(b[i], i, differences[2]);
+        store_subtile(r[i], i, differences[0]);
+        store_subtile(g[i], i, differences[1]);
+        store_subtile(b[i], i, differences[2]);
         t[i] = (vfloat)(1.0f);
         pr[i] = pg[i] = pb[i] = (vfloat)(0.0f);
     }
@@ -109,11 +109,11 @@ kernel void removal(
                 differences[channel][pixel] = 2.0f * (differences[channel][pixel] - target[place]);
             }
     }
-    int ends[PATCHES];
-    for (int i = 0; i < PATCHES; ++i) {
-        dr[i] = load_patch(i, differences[0]);
-        dg[i] = load_patch(i, differences[1]);
-        db[i] = load_patch(i, differences[2]);
+    int ends[SUBTILES];
+    for (int i = 0; i < SUBTILES; ++i) {
+        dr[i] = load_subtile(i, differences[0]);
+        dg[i] = load_subtile(i, differences[1]);
+        db[i] = load_subtile(i, differences[2]);
         int lanes[LANES];
         VSTORE(last[i], 0, lanes);
         ends[i] = -1;
@@ -123,22 +123,22 @@ kernel void removal(
 
     for (uint e = begin; e < swept; ++e) {
         if (e + AHEAD < swept)
-            prefetch_splat(shapes, colours, entries[e + AHEAD]);
+            prefetch_splat(shapes, colours, intersections[e + AHEAD]);
         if ((e - begin) % AHEAD == 0) {
             living = 0;
-            for (int i = 0; i < PATCHES; ++i)
+            for (int i = 0; i < SUBTILES; ++i)
                 if (ends[i] >= (int)(e - begin))
                     living |= 1u << i;
         }
-        const uint number = entries[e];
+        const uint number = intersections[e];
         const vint place = (vint)((int)(e - begin));
         vfloat effect = (vfloat)(0.0f), importance = (vfloat)(0.0f);
-        uint todo = patches[e] & living;
+        uint todo = subtiles[e] & living;
         if (todo) {
             const Splat splat = load_splat(shapes, colours, number);
             for (; todo; todo &= todo - 1) {
-                const int i = LOWEST_PATCH(todo);
-                const vfloat power = patch_power(&splat, i, origin);
+                const int i = LOWEST_SUBTILE(todo);
+                const vfloat power = subtile_power(&splat, i, origin);
                 vfloat alpha = exp2_polynomial(power);
                 alpha = LESSER(alpha, (vfloat)(ALPHA_CAP));
                 alpha = (power >= LOG2_ALPHA_MIN) && (place <= last[i]) ? alpha : (vfloat)(0.0f);

@@ -21,25 +21,25 @@
     }
     if (swept == 0)
         return;
-    atomic_max(&end_of_patch[mine.patch], end);
+    atomic_max(&end_of_subtile[mine.subtile], end);
     if (lid == 0)
         rounds[0] = 0;
     barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
-    if (lid < PATCHES)
+    if (lid < SUBTILES)
         near.places[lid] = 0;
 
     local float2 *parts = all_parts + lid / SHARE * NEXT_PARTS;
     int parity = 0;
     for (batch = 0; batch < swept; batch += BATCH) {
         const int size = min(swept - batch, (uint)BATCH);
-        fetch(&near, shapes, colours, entries + batch, patches + batch, size, lid);
+        fetch(&near, shapes, colours, intersections + batch, subtiles + batch, size, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
         make_lists(&near, lid);
         mine = pixels_of(near.dealt[lid / SHARE], origin, lid);
-        local const uchar *list = near.lists + mine.patch * LIST_ROOM;
-        const int count = near.counts[mine.patch];
-        const int place = near.places[mine.patch];
-        const int left = clamp(end_of_patch[mine.patch] - place, 0, count);
+        local const uchar *list = near.lists + mine.subtile * LIST_ROOM;
+        const int count = near.counts[mine.subtile];
+        const int place = near.places[mine.subtile];
+        const int left = clamp(end_of_subtile[mine.subtile] - place, 0, count);
         if (share == 0)
             atomic_max(&rounds[parity], (left + ROUND - 1) / ROUND);
         float t[PIXELS], r[PIXELS], g[PIXELS], b[PIXELS];
@@ -72,7 +72,7 @@
         if (lid == 0)
             rounds[parity] = 0;
         if (share == 0)
-            near.places[mine.patch] = place + places(count);
+            near.places[mine.subtile] = place + places(count);
         for (int first = 0; first < all_rounds * ROUND; first += ROUND) {
             const int now = min(left - first, ROUND);
             for (int j = 0; j < now; ++j) {
@@ -112,7 +112,7 @@
                 float2 sum = (float2)(0.0f);
                 for (int j = 0; j < ROUND; ++j)
                     sum += parts[share * ROUND + ((j + summed) & (ROUND - 1))];
-                sum = clamp(sum, -view_bound / PATCHES, view_bound / PATCHES);
+                sum = clamp(sum, -view_bound / SUBTILES, view_bound / SUBTILES);
                 const int k = list[first + summed];
                 add_parts(levels + k, BATCH, sum.x);
                 add_parts(levels + LEVELS * BATCH + k, BATCH, sum.y);

@@ -48,7 +48,7 @@ kernel void compact(
     global const uint *offsets,      /* of each splat's run in views and weights, splats + 1 */
     global const uint *views,
     global const float *weights,
-    global const float4 *eyes,       /* two a view: the high and the low part of its position */
+    global const float4 *camera_centres,       /* two a view: the high and the low part of its position */
     uint splats,
     float threshold,
     float lambda_luma,
@@ -84,7 +84,7 @@ kernel void compact(
                 bool present = entry < end[lane];
                 entry = present ? entry : cursor[lane];
                 uint view = views[entry];
-                REAL4 to_splat = centre[lane] - TO_REAL4(eyes[2 * view]) - TO_REAL4(eyes[2 * view + 1]);
+                REAL4 to_splat = centre[lane] - TO_REAL4(camera_centres[2 * view]) - TO_REAL4(camera_centres[2 * view + 1]);
                 ray[b][0][lane] = to_splat.x;
                 ray[b][1][lane] = to_splat.y;
                 ray[b][2][lane] = to_splat.z;

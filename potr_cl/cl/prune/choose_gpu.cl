@@ -104,7 +104,7 @@ inline void merge(global uint *state, int digit, local const uint *bins, uint li
     add_fixed(state + digit * HISTOGRAM + 2 * lid, (long)sum);
 }
 
-/* Every splat's damped effect and key, and the histogram of the keys' first digit. */
+/* Every splat's smoothed effect and key, and the histogram of the keys' first digit. */
 kernel __attribute__((reqd_work_group_size(DIGIT, 1, 1)))
 void rank(
     uint splats,
@@ -114,7 +114,7 @@ void rank(
     float weight,
     float limit,
     float a,
-    global float *damped,
+    global float *smoothed,
     global uint *keys,
     global uint *state)
 {
@@ -131,8 +131,8 @@ void rank(
         importance = (ulong)max(total_at(total + 2), 0L);
         const float newest = convert_float_rte(total_at(total)) * effect_unit;
         /* In the first iteration the weight is 1. */
-        const float mean = weight == 1.0f ? newest : damped[i] + (newest - damped[i]) / weight;
-        damped[i] = mean;
+        const float mean = weight == 1.0f ? newest : smoothed[i] + (newest - smoothed[i]) / weight;
+        smoothed[i] = mean;
         if (mean < limit)
             key = importance == 0 && mean == 0.0f ? GOES_AT_ONCE
                                                   : ordered(limit > 0.0f ? mapping(mean / limit, a) : mean);

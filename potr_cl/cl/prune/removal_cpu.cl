@@ -1,4 +1,4 @@
-/* Removal effects for CPUs: one tile a work-item, patch by patch, one walk forward and one back over a patch's list.
+/* Removal effects for CPUs: one tile a work-item, sub-tile by sub-tile, one walk forward and one back over a sub-tile's list.
 
    Forward as in composite_cpu.cl, for the pixels' colours; each splat's alphas and weights w = T alpha are remembered.
    Then from the last splat to the first: B, the colour behind a splat as seen with nothing in front, is a convex sum that
@@ -7,26 +7,26 @@
 
        PD^2 + 2 PD (c - c_t),  PD = T alpha (B - c_k)      and      T alpha
 
-   (paper, section "Effect of a splat's removal"), in the slot of the splat's entry.
+   (paper, section "Effect of a splat's removal"), in the slot of the splat's intersection.
 
    A list of more than SEGMENT splats is walked segment by segment: forward through all of them, the transmittances before
    each kept, then from the last segment to the first, each walked forward once more for its alphas and weights.
 
-   Lists are compacted on the way: entries of splats that are not alive, or that the last sweep marked, are dropped, in
-   place; a tile's list begins at begins[tile] and has lengths[tile] entries.
+   Lists are compacted on the way: intersections of splats that are not alive, or that the last sweep marked, are dropped, in
+   place; a tile's list begins at begins[tile] and has lengths[tile] intersections.
 
-   Macros: LANES, ALPHA_CAP, STOP, TIGHTEN (whether to mark entries that touch no pixel). */
+   Macros: LANES, ALPHA_CAP, TRANSMITTANCE_THRESHOLD, TIGHTEN (whether to mark intersections that touch no pixel). */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
-#include "include/patch_vectors.clh"
-#include "include/patch_walk.clh"
+#include "include/subtile_vectors.clh"
+#include "include/subtile_walk.clh"
 #include "prune/removal.clh"
 
 /* Where a list's transmittances are kept at the most; of the segments between two of them those before are walked again. */
 #define CHECKPOINTS 16
 
-/* A patch's walk forward: its transmittances and colours move on, memory[2 j] and memory[2 j + 1] become the j-th splat's
+/* A sub-tile's walk forward: its transmittances and colours move on, memory[2 j] and memory[2 j + 1] become the j-th splat's
    alphas and weights. Returns the number of splats before the last pixel's end. */
 inline uint walk(
     const Splat *splats,
@@ -62,7 +62,7 @@ inline uint walk(
     return j;
 }
 
-/* A patch's walk back over what the walk forward remembers; `twice` is twice the colour's difference to the target,
+/* A sub-tile's walk back over what the walk forward remembers; `twice` is twice the colour's difference to the target,
    `behind` the colour behind. sums[list[j]] += the j-th splat's sums over the pixels. */
 inline void walk_back(
     const Splat *splats,
@@ -118,8 +118,8 @@ kernel void removal(
     global const uchar *alive,
     global const uint *begins,
     global uint *lengths,
-    global uint *entries,
-    global uint *patches,
+    global uint *intersections,
+    global uint *subtiles,
     View view,
     float red,
     float green,
@@ -138,13 +138,13 @@ kernel void removal(
 
     uint kept = begin;
     for (uint read = begin; read < end; ++read) {
-        const uint number = entries[read];
+        const uint number = intersections[read];
         if (!alive[number] || sums[read].y < 0.0f)
             continue;
         if (kept < read) {
-            entries[kept] = number;
+            intersections[kept] = number;
             sums[kept] = sums[read];
-            patches[kept] = patches[read];
+            subtiles[kept] = subtiles[read];
         }
         ++kept;
     }
@@ -153,15 +153,15 @@ kernel void removal(
         sums[e] = (float2)(0.0f, 0.0f);
 
     Splat splats[SEGMENT];
-    ushort lists[PATCHES][SEGMENT];
-    uint listed[PATCHES];
+    ushort lists[SUBTILES][SEGMENT];
+    uint listed[SUBTILES];
     uchar touching[SEGMENT];
     float memory[2 * (SEGMENT + LANES) * LANES];
     float2 fresh[SEGMENT];
-    vfloat t[PATCHES], rgb[PATCHES][3], twice[PATCHES][3], behind[PATCHES][3];
-    vfloat checkpoints[CHECKPOINTS][PATCHES];
-    for (int i = 0; i < PATCHES; ++i) {
-        t[i] = patch_transmittance(i, origin, view.width, view.height);
+    vfloat t[SUBTILES], rgb[SUBTILES][3], twice[SUBTILES][3], behind[SUBTILES][3];
+    vfloat checkpoints[CHECKPOINTS][SUBTILES];
+    for (int i = 0; i < SUBTILES; ++i) {
+        t[i] = subtile_transmittance(i, origin, view.width, view.height);
         rgb[i][0] = rgb[i][1] = rgb[i][2] = (vfloat)(0.0f);
         behind[i][0] = (vfloat)(red);
         behind[i][1] = (vfloat)(green);
@@ -171,35 +171,35 @@ kernel void removal(
     const uint segments = max((kept - begin + SEGMENT - 1) / SEGMENT, 1u);
     const uint apart = (segments + CHECKPOINTS - 1) / CHECKPOINTS;
     uint last = 0; /* the last segment in which a pixel goes on */
-    for (; last + 1 < segments && living_patches(t); ++last) {
+    for (; last + 1 < segments && living_subtiles(t); ++last) {
         if (last % apart == 0)
-            for (int i = 0; i < PATCHES; ++i)
+            for (int i = 0; i < SUBTILES; ++i)
                 checkpoints[last / apart][i] = t[i];
-        gather_splats(shapes, colours, entries, patches, begin + last * SEGMENT, kept, splats, lists, listed);
-        for (int i = 0; i < PATCHES; ++i)
-            walk(splats, lists[i], listed[i], patch_centre(origin, i), &t[i], rgb[i], memory, touching);
+        gather_splats(shapes, colours, intersections, subtiles, begin + last * SEGMENT, kept, splats, lists, listed);
+        for (int i = 0; i < SUBTILES; ++i)
+            walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], memory, touching);
     }
 
     for (uint segment = last + 1; segment-- > 0;) {
         const uint from = begin + segment * SEGMENT;
         if (segment < last) {
             const uint checkpoint = segment / apart;
-            for (int i = 0; i < PATCHES; ++i)
+            for (int i = 0; i < SUBTILES; ++i)
                 t[i] = checkpoints[checkpoint][i];
             for (uint before = checkpoint * apart; before < segment; ++before) {
-                gather_splats(shapes, colours, entries, patches, begin + before * SEGMENT, kept, splats, lists, listed);
-                for (int i = 0; i < PATCHES; ++i)
-                    walk(splats, lists[i], listed[i], patch_centre(origin, i), &t[i], rgb[i], memory, touching);
+                gather_splats(shapes, colours, intersections, subtiles, begin + before * SEGMENT, kept, splats, lists, listed);
+                for (int i = 0; i < SUBTILES; ++i)
+                    walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], memory, touching);
             }
         }
-        const uint count = gather_splats(shapes, colours, entries, patches, from, kept, splats, lists, listed);
+        const uint count = gather_splats(shapes, colours, intersections, subtiles, from, kept, splats, lists, listed);
         for (uint k = 0; k < count; ++k) {
             fresh[k] = (float2)(0.0f, 0.0f);
             touching[k] = 0;
         }
-        for (int i = 0; i < PATCHES; ++i) {
+        for (int i = 0; i < SUBTILES; ++i) {
             const uint walked =
-                walk(splats, lists[i], listed[i], patch_centre(origin, i), &t[i], rgb[i], memory, touching);
+                walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], memory, touching);
             if (segment == last) {
                 const vfloat through = fabs(t[i]);
                 float differences[3][LANES];
@@ -207,8 +207,8 @@ kernel void removal(
                 VSTORE(MAD(through, (vfloat)(green), rgb[i][1]), 0, differences[1]);
                 VSTORE(MAD(through, (vfloat)(blue), rgb[i][2]), 0, differences[2]);
                 for (int lane = 0; lane < LANES; ++lane) {
-                    const int column = origin.x + PATCH_COLUMN(i) + lane % PATCH_WIDTH;
-                    const int row = origin.y + PATCH_ROW(i) + lane / PATCH_WIDTH;
+                    const int column = origin.x + SUBTILE_COLUMN(i) + lane % SUBTILE_WIDTH;
+                    const int row = origin.y + SUBTILE_ROW(i) + lane / SUBTILE_WIDTH;
                     if (column >= view.width || row >= view.height)
                         continue;
                     const size_t place = 3 * ((size_t)row * view.width + column);
@@ -225,14 +225,14 @@ kernel void removal(
         }
         for (uint k = 0; k < count; ++k) {
             if (k + AHEAD < count)
-                PREFETCH_TO_WRITE(totals + TOTAL_WORDS * entries[from + k + AHEAD]);
-            replace_sums(totals + TOTAL_WORDS * entries[from + k], sums[from + k], fresh[k], scale, bound);
+                PREFETCH_TO_WRITE(totals + TOTAL_WORDS * intersections[from + k + AHEAD]);
+            replace_sums(totals + TOTAL_WORDS * intersections[from + k], sums[from + k], fresh[k], scale, bound);
             sums[from + k] = TIGHTEN && !touching[k] ? NEVER : fresh[k];
         }
     }
     /* What lies behind the last pixel's end has no effect any more. */
     for (uint e = begin + (last + 1) * SEGMENT; e < kept; ++e) {
-        replace_sums(totals + TOTAL_WORDS * entries[e], sums[e], (float2)(0.0f, 0.0f), scale, bound);
+        replace_sums(totals + TOTAL_WORDS * intersections[e], sums[e], (float2)(0.0f, 0.0f), scale, bound);
         sums[e] = (float2)(0.0f, 0.0f);
     }
 }
@@ -243,7 +243,7 @@ kernel void staleness(
     global const uchar *alive,
     global const uint *begins,
     global const uint *lengths,
-    global const uint *entries,
+    global const uint *intersections,
     global const float2 *sums,
     uint first,
     global float *stale)
@@ -252,7 +252,7 @@ kernel void staleness(
     const uint begin = begins[tile], end = begin + lengths[tile];
     float gone = 0.0f;
     for (uint e = begin; e < end; ++e)
-        if (alive[entries[e]] == 2 && sums[e].y >= 0.0f)
+        if (alive[intersections[e]] == 2 && sums[e].y >= 0.0f)
             gone += fmax(sums[e].y, LEAST_STALENESS);
     stale[first + tile] += gone * (1.0f / (TILE * TILE));
 }

@@ -1,13 +1,13 @@
 /* Removal effects for GPUs, all views of a set in one launch: one work-group a tile. See removal_cpu.cl for the method, and
-   patch_lists.clh for how a tile's work is shared out.
+   subtile_lists.clh for how a tile's work is shared out.
 
-   Macros: ALPHA_CAP, STOP, TIGHTEN, NATIVE_EXP2, INT64_ATOMICS. */
+   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, TIGHTEN, NATIVE_EXP2, INT64_ATOMICS. */
 
 #define ROUND 8
-#include "include/patch_lists.clh"
+#include "include/subtile_lists.clh"
 #include "prune/removal.clh"
 
-/* From one patch's parts to the next: a little more than they need, so that patches lie in different banks. */
+/* From one sub-tile's parts to the next: a little more than they need, so that sub-tiles lie in different banks. */
 #define NEXT_PARTS (PARTS + SHARE)
 
 /* Work-items that go through a tile's list together. */
@@ -24,8 +24,8 @@ void removal(
     global const float4 *colours,
     global const uint *offsets,
     global const uint *lengths,
-    global const uint *entries,
-    global const ushort *patches,
+    global const uint *intersections,
+    global const ushort *subtiles,
     float red,
     float green,
     float blue,
@@ -40,9 +40,9 @@ void removal(
     local State state;
     local Batch near;
     local float behind_r[TILE * TILE], behind_g[TILE * TILE], behind_b[TILE * TILE];
-    local float2 all_parts[PATCHES * NEXT_PARTS];
+    local float2 all_parts[SUBTILES * NEXT_PARTS];
     local int levels[2 * LEVELS * BATCH];
-    local int unfinished[2], end_of_patch[PATCHES], rounds[2];
+    local int unfinished[2], end_of_subtile[SUBTILES], rounds[2];
 #if TIGHTEN
     local int reached[BATCH];
 #endif
@@ -56,23 +56,23 @@ void removal(
     const uint tile = set_tile - views->first_tile;
     shapes += 2 * (size_t)stride * number;
     colours += (size_t)stride * number;
-    const uint begin = views->first_entry + offsets[views->first_offset + tile];
+    const uint begin = views->first_intersection + offsets[views->first_offset + tile];
     const uint length = lengths[set_tile];
-    entries += begin;
-    patches += begin;
+    intersections += begin;
+    subtiles += begin;
     sums += begin;
     const float weight = most_pixels / ((float)picture.x * picture.y);
     const float view_scale = scale * weight, view_bound = bound / weight;
 
-    for (int patch = lid; patch < PATCHES; patch += ITEMS)
-        end_of_patch[patch] = 0;
+    for (int subtile = lid; subtile < SUBTILES; subtile += ITEMS)
+        end_of_subtile[subtile] = 0;
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
     uint batch;
     const uint swept = forward(
-        &state, &near, unfinished, origin, picture, shapes, colours, entries, patches, length, lid, &batch);
+        &state, &near, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &batch);
     /* What lies behind the last pixel's end has no effect any more. */
     for (uint e = swept + lid; e < length; e += ITEMS) {
-        replace_sums(totals + TOTAL_WORDS * (size_t)entries[e], sums[e], (float2)(0.0f), view_scale, view_bound);
+        replace_sums(totals + TOTAL_WORDS * (size_t)intersections[e], sums[e], (float2)(0.0f), view_scale, view_bound);
         sums[e] = (float2)(0.0f);
     }
 
@@ -103,9 +103,9 @@ void removal(
     if (swept == 0)
         return;
 #if TIGHTEN
-    end = INT_MAX; /* every entry shows whether it touches a pixel */
+    end = INT_MAX; /* every intersection shows whether it touches a pixel */
 #endif
-    atomic_max(&end_of_patch[mine.patch], end);
+    atomic_max(&end_of_subtile[mine.subtile], end);
     if (lid == 0)
         rounds[0] = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
@@ -116,10 +116,10 @@ void removal(
     for (;;) {
         const int size = min(swept - batch, (uint)BATCH);
         mine = pixels_of(near.dealt[lid / SHARE], origin, lid);
-        local const uchar *list = near.lists + mine.patch * LIST_ROOM;
-        const int count = near.counts[mine.patch];
-        const int place = near.places[mine.patch] - places(count);
-        int left = clamp(end_of_patch[mine.patch] - place, 0, count);
+        local const uchar *list = near.lists + mine.subtile * LIST_ROOM;
+        const int count = near.counts[mine.subtile];
+        const int place = near.places[mine.subtile] - places(count);
+        int left = clamp(end_of_subtile[mine.subtile] - place, 0, count);
         if (share == 0)
             atomic_max(&rounds[parity], (left + ROUND - 1) / ROUND);
         float t[PIXELS], r[PIXELS], g[PIXELS], b[PIXELS], br[PIXELS], bg[PIXELS], bb[PIXELS];
@@ -148,7 +148,7 @@ void removal(
         if (lid == 0)
             rounds[parity] = 0;
         if (share == 0)
-            near.places[mine.patch] = place;
+            near.places[mine.subtile] = place;
         for (int round = 0; round < all_rounds; ++round, left -= ROUND) {
             const int now = min(left, ROUND);
 #pragma unroll 2
@@ -191,7 +191,7 @@ void removal(
                 for (int j = 0; j < ROUND; ++j)
                     /* Turned by the work-item's number, so that neighbours read from different banks. */
                     sum += parts[share * ROUND + ((j + summed) & (ROUND - 1))];
-                sum = clamp(sum, -view_bound / PATCHES, view_bound / PATCHES);
+                sum = clamp(sum, -view_bound / SUBTILES, view_bound / SUBTILES);
                 const int k = list[left - 1 - summed];
                 add_parts(levels + k, BATCH, sum.x);
                 add_parts(levels + LEVELS * BATCH + k, BATCH, sum.y);
@@ -220,7 +220,7 @@ void removal(
         if (batch == 0)
             break;
         batch -= BATCH;
-        fetch(&near, shapes, colours, entries + batch, patches + batch, BATCH, lid);
+        fetch(&near, shapes, colours, intersections + batch, subtiles + batch, BATCH, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
         make_lists(&near, lid);
     }
@@ -236,8 +236,8 @@ void staleness(
     uint view_count,
     global const uint *offsets,
     global uint *lengths,
-    global uint *entries,
-    global ushort *patches,
+    global uint *intersections,
+    global ushort *subtiles,
     global float2 *sums,
     uint first,
     global float *stale,
@@ -247,15 +247,15 @@ void staleness(
     volatile global uint *listed)
 {
     local float parts[LISTERS];
-    /* A bit an entry that goes. Three in turn: one in use, one still being read, one that is cleared. */
+    /* A bit an intersection that goes. Three in turn: one in use, one still being read, one that is cleared. */
     local uint going[3][LISTERS / 32];
     const uint set_tile = get_group_id(0), lid = get_local_id(0);
     const uint number = view_of_tile(views, view_count, set_tile);
-    const uint begin = views[number].first_entry
+    const uint begin = views[number].first_intersection
         + offsets[views[number].first_offset + set_tile - views[number].first_tile];
     const uint length = lengths[set_tile];
-    entries += begin;
-    patches += begin;
+    intersections += begin;
+    subtiles += begin;
     sums += begin;
     if (lid < LISTERS / 32)
         going[0][lid] = going[1][lid] = 0;
@@ -266,7 +266,7 @@ void staleness(
         const uint e = batch + lid;
         uint splat = 0, stays = 0;
         if (e < length) {
-            splat = entries[e];
+            splat = intersections[e];
             const uchar state = alive[splat];
             stays = state == 1;
 #if TIGHTEN
@@ -293,14 +293,14 @@ void staleness(
         ushort touched = 0;
         if (moves) {
             sum = sums[e];
-            touched = patches[e];
+            touched = subtiles[e];
         }
         barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
         if (moves) {
             const uint place = kept + lid - before;
-            entries[place] = splat;
+            intersections[place] = splat;
             sums[place] = sum;
-            patches[place] = touched;
+            subtiles[place] = touched;
         }
         kept += min(length - batch, (uint)LISTERS) - all;
         turn = (turn + 1) % 3;

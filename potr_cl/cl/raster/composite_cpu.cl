@@ -1,20 +1,20 @@
-/* Compositing for CPUs: one tile a work-item, splat by splat, over the patches that the splat's ellipse touches.
+/* Compositing for CPUs: one tile a work-item, splat by splat, over the sub-tiles that the splat's ellipse touches.
 
-   The 256 pixels' state lives in private memory, a vector a patch. A pixel that has ended keeps the negative of its
-   transmittance. Every AHEAD splats the patches that go on are found; the tile ends when none does.
+   The 256 pixels' state lives in private memory, a vector a sub-tile. A pixel that has ended keeps the negative of its
+   transmittance. Every AHEAD splats the sub-tiles that go on are found; the tile ends when none does.
 
-   Macros: LANES, ALPHA_CAP, STOP (a pixel ends before its transmittance would fall below it). */
+   Macros: LANES, ALPHA_CAP, TRANSMITTANCE_THRESHOLD (a pixel ends before its transmittance would fall below it). */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
-#include "include/patch_vectors.clh"
+#include "include/subtile_vectors.clh"
 
 kernel void composite(
     global const float4 *shapes,
     global const float4 *colours,
     global const uint *offsets,
-    global const uint *entries,
-    global const uint *patches,
+    global const uint *intersections,
+    global const uint *subtiles,
     uint capacity,
     View view,
     float red,
@@ -27,23 +27,23 @@ kernel void composite(
     const int2 origin = (int2)(tile % view.columns, tile / view.columns) * TILE;
     const uint end = min(offsets[tile + 1], capacity);
 
-    vfloat t[PATCHES], r[PATCHES], g[PATCHES], b[PATCHES];
-    for (int i = 0; i < PATCHES; ++i) {
-        t[i] = patch_transmittance(i, origin, view.width, view.height);
+    vfloat t[SUBTILES], r[SUBTILES], g[SUBTILES], b[SUBTILES];
+    for (int i = 0; i < SUBTILES; ++i) {
+        t[i] = subtile_transmittance(i, origin, view.width, view.height);
         r[i] = g[i] = b[i] = (vfloat)(0.0f);
     }
 
-    uint living = ALL_PATCHES;
+    uint living = ALL_SUBTILES;
     const uint begin = min(offsets[tile], capacity);
     for (uint e = begin; e < end && living; ++e) {
         if (e + AHEAD < end)
-            prefetch_splat(shapes, colours, entries[e + AHEAD]);
-        uint todo = patches[e] & living;
+            prefetch_splat(shapes, colours, intersections[e + AHEAD]);
+        uint todo = subtiles[e] & living;
         if (todo) {
-            const Splat splat = load_splat(shapes, colours, entries[e]);
+            const Splat splat = load_splat(shapes, colours, intersections[e]);
             for (; todo; todo &= todo - 1) {
-                const int i = LOWEST_PATCH(todo);
-                const vfloat power = patch_power(&splat, i, origin);
+                const int i = LOWEST_SUBTILE(todo);
+                const vfloat power = subtile_power(&splat, i, origin);
                 BLEND(weight, power, t[i]);
                 r[i] = MAD(weight, (vfloat)(splat.red), r[i]);
                 g[i] = MAD(weight, (vfloat)(splat.green), g[i]);
@@ -51,16 +51,16 @@ kernel void composite(
             }
         }
         if ((e - begin) % AHEAD == AHEAD - 1)
-            living = living_patches(t);
+            living = living_subtiles(t);
     }
 
     float rest[TILE * TILE], reds[TILE * TILE], greens[TILE * TILE], blues[TILE * TILE];
-    for (int i = 0; i < PATCHES; ++i) {
+    for (int i = 0; i < SUBTILES; ++i) {
         const vfloat through = fabs(t[i]);
-        store_patch(through, i, rest);
-        store_patch(MAD(through, (vfloat)(red), r[i]), i, reds);
-        store_patch(MAD(through, (vfloat)(green), g[i]), i, greens);
-        store_patch(MAD(through, (vfloat)(blue), b[i]), i, blues);
+        store_subtile(through, i, rest);
+        store_subtile(MAD(through, (vfloat)(red), r[i]), i, reds);
+        store_subtile(MAD(through, (vfloat)(green), g[i]), i, greens);
+        store_subtile(MAD(through, (vfloat)(blue), b[i]), i, blues);
     }
     const int pixel_columns = min(TILE, view.width - origin.x), pixel_rows = min(TILE, view.height - origin.y);
     for (int row = 0; row < pixel_rows; ++row) {

@@ -2,10 +2,10 @@
    pixels), splats fetched into local memory in batches.
 
    A frame that nothing runs beside takes as long as its longest tile list, which one work-group walks. This kernel is the
-   faster one there, and needs no patches; composite_gpu.cl does less work in all, and is for many views at a time. Both do
+   faster one there, and needs no sub-tiles; composite_gpu.cl does less work in all, and is for many views at a time. Both do
    the same to a pixel in the same order, so that their pictures have the same bits.
 
-   Macros: ALPHA_CAP, STOP (a pixel ends before its transmittance would fall below it), NATIVE_EXP2. */
+   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD (a pixel ends before its transmittance would fall below it), NATIVE_EXP2. */
 
 #define LANES 1
 #include "include/lanes.clh"
@@ -25,7 +25,7 @@
 /* One splat of the next batch into registers, long before it is needed; past the end one that touches nothing. */
 #define FETCH                                              \
     if (next < end) {                                      \
-        const uint splat = entries[next];                  \
+        const uint splat = intersections[next];                  \
         s0 = shapes[2 * (size_t)splat];                    \
         s1 = shapes[2 * (size_t)splat + 1];                \
         colour = colours[splat];                           \
@@ -42,7 +42,7 @@ void composite_frame(
     global const float4 *shapes,
     global const float4 *colours,
     global const uint *offsets,
-    global const uint *entries,
+    global const uint *intersections,
     uint capacity,
     float red,
     float green,
@@ -99,7 +99,7 @@ void composite_frame(
                 alphas[j] = powers[j] >= LOG2_ALPHA_MIN ? fmin(EXP2(powers[j]), ALPHA_CAP) : 0.0f;
             for (int j = 0; j < AHEAD; ++j) {
                 const float after = MAD(-alphas[j], t, t);
-                alive = alive && after >= STOP;
+                alive = alive && after >= TRANSMITTANCE_THRESHOLD;
                 const float weight = alive ? alphas[j] * t : 0.0f;
                 r = MAD(weight, near_s1[k + j].z, r);
                 g = MAD(weight, near_s1[k + j].w, g);

@@ -1,10 +1,10 @@
-/* Compositing for GPUs: one work-group a tile; get_group_id(1) is the view's number in its set. See patch_lists.clh for how
+/* Compositing for GPUs: one work-group a tile; get_group_id(1) is the view's number in its set. See subtile_lists.clh for how
    a tile's work is shared out.
 
-   Macros: ALPHA_CAP, STOP, NATIVE_EXP2. */
+   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2. */
 
 #define ROUND 1 /* there is nothing to sum */
-#include "include/patch_lists.clh"
+#include "include/subtile_lists.clh"
 
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 void composite(
@@ -13,8 +13,8 @@ void composite(
     global const float4 *shapes,
     global const float4 *colours,
     global const uint *offsets,
-    global const uint *entries,
-    global const ushort *patches,
+    global const uint *intersections,
+    global const ushort *subtiles,
     uint capacity,
     float red,
     float green,
@@ -36,14 +36,14 @@ void composite(
     shapes += 2 * (size_t)stride * number;
     colours += (size_t)stride * number;
     offsets += views->first_offset + tile;
-    const uint room = capacity - min(capacity, views->first_entry);
+    const uint room = capacity - min(capacity, views->first_intersection);
     const uint begin = min(offsets[0], room), end = min(offsets[1], room);
-    entries += views->first_entry + begin;
-    patches += views->first_entry + begin;
+    intersections += views->first_intersection + begin;
+    subtiles += views->first_intersection + begin;
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
     uint last_batch;
     forward(
-        &state, &near, unfinished, origin, picture, shapes, colours, entries, patches, end - begin, lid, &last_batch);
+        &state, &near, unfinished, origin, picture, shapes, colours, intersections, subtiles, end - begin, lid, &last_batch);
     const Mine mine = pixels_of(lid / SHARE, origin, lid);
     for (int p = 0; p < PIXELS; ++p)
         if (inside(mine, p, picture)) {

@@ -54,10 +54,10 @@ kernel void project(
     bounds += stride * get_global_id(1);
 
     vfloat lo = VLOAD(index, log2_opacities);
-    /* Relative to the eye first: both are large where a scene is far from the origin, their difference is not. */
-    vfloat dx = (VLOAD(index, means) - view->eye_high[0]) - view->eye_low[0];
-    vfloat dy = (VLOAD(index, means + stride) - view->eye_high[1]) - view->eye_low[1];
-    vfloat dz = (VLOAD(index, means + 2 * stride) - view->eye_high[2]) - view->eye_low[2];
+    /* Relative to the camera centre first: both are large where a scene is far from the origin, their difference is not. */
+    vfloat dx = (VLOAD(index, means) - view->camera_centre_high[0]) - view->camera_centre_low[0];
+    vfloat dy = (VLOAD(index, means + stride) - view->camera_centre_high[1]) - view->camera_centre_low[1];
+    vfloat dz = (VLOAD(index, means + 2 * stride) - view->camera_centre_high[2]) - view->camera_centre_low[2];
     global const float *w = view->rotation;
     vfloat tx = w[0] * dx + w[1] * dy + w[2] * dz;
     vfloat ty = w[3] * dx + w[4] * dy + w[5] * dz;

@@ -4,7 +4,7 @@
 
 /* all_keys holds the keys and behind them, from capacity on, as much room to merge into. */
 kernel void sort_tiles(
-    global ulong *all_keys, global const uint *offsets, global uint *entries, global uint *counts, uint capacity)
+    global ulong *all_keys, global const uint *offsets, global uint *intersections, global uint *counts, uint capacity)
 {
     const uint tile = get_global_id(0);
     const uint begin = min(offsets[tile], capacity);
@@ -43,5 +43,5 @@ kernel void sort_tiles(
         to = capacity - to;
     }
     for (uint i = 0; i < n; ++i)
-        entries[begin + i] = (uint)keys[from + i];
+        intersections[begin + i] = (uint)keys[from + i];
 }

@@ -51,7 +51,7 @@ void sort_tiles(
     global const SetView *views,
     global ulong *all_keys,
     global const uint *offsets,
-    global uint *entries,
+    global uint *intersections,
     global uint *counts,
     uint capacity)
 {
@@ -63,9 +63,9 @@ void sort_tiles(
         return;
     offsets += views->first_offset + tile;
     /* Offsets that did not fit 32 bits are at their end: no overflow below. */
-    const uint room = capacity - min(capacity, views->first_entry);
-    const uint begin = views->first_entry + min(offsets[0], room);
-    const uint n = views->first_entry + min(offsets[1], room) - begin;
+    const uint room = capacity - min(capacity, views->first_intersection);
+    const uint begin = views->first_intersection + min(offsets[0], room);
+    const uint n = views->first_intersection + min(offsets[1], room) - begin;
     global ulong *keys = all_keys + begin;
     if (lid == 0)
         counts[(views->first_tile + tile) * COUNTER_STRIDE] = 0; /* ready for the next view */
@@ -80,7 +80,7 @@ void sort_tiles(
         barrier(CLK_LOCAL_MEM_FENCE);
         if (n <= SORT_CAPACITY) {
             for (uint i = lid; i < m; i += GROUP)
-                entries[begin + i] = (uint)near[i];
+                intersections[begin + i] = (uint)near[i];
         } else {
             for (uint i = lid; i < m; i += GROUP)
                 keys[piece + i] = near[i];
@@ -116,5 +116,5 @@ void sort_tiles(
         }
     }
     for (uint i = lid; i < n; i += GROUP)
-        entries[begin + i] = (uint)keys[i];
+        intersections[begin + i] = (uint)keys[i];
 }

@@ -93,8 +93,8 @@ void fill_tiles(
     bounds += (size_t)stride * get_global_id(1);
     shapes += 2 * (size_t)stride * get_global_id(1);
     cursors += COUNTER_STRIDE * (size_t)views->first_tile;
-    keys += views->first_entry;
-    capacity -= min(capacity, views->first_entry);
+    keys += views->first_intersection;
+    capacity -= min(capacity, views->first_intersection);
     const int width = views->view.width, height = views->view.height, tiles_across = views->view.columns;
     string_rows(bounds, first, around);
     for (int row = get_local_id(0); row < first[GROUP]; row += GROUP) {

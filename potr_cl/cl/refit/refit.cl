@@ -32,9 +32,9 @@ inline vfloat active_lanes(global const uint *active, size_t stride, size_t inde
 
 inline void basis_towards(global const float *means, size_t stride, size_t index, global const View *view, vfloat *values)
 {
-    const vfloat x = (VLOAD(index, means) - view->eye_high[0]) - view->eye_low[0];
-    const vfloat y = (VLOAD(index, means + stride) - view->eye_high[1]) - view->eye_low[1];
-    const vfloat z = (VLOAD(index, means + 2 * stride) - view->eye_high[2]) - view->eye_low[2];
+    const vfloat x = (VLOAD(index, means) - view->camera_centre_high[0]) - view->camera_centre_low[0];
+    const vfloat y = (VLOAD(index, means + stride) - view->camera_centre_high[1]) - view->camera_centre_low[1];
+    const vfloat z = (VLOAD(index, means + 2 * stride) - view->camera_centre_high[2]) - view->camera_centre_low[2];
     const vfloat length = sqrt(x * x + y * y + z * z);
     const vfloat inverse = 1.0f / (length > 0.0f ? length : (vfloat)(1.0f));
     sh_basis(x * inverse, y * inverse, z * inverse, values);

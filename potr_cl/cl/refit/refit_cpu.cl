@@ -1,19 +1,19 @@
-/* The picture's dependence on the splats' colours, for CPUs: one tile a work-item, patch by patch.
+/* The picture's dependence on the splats' colours, for CPUs: one tile a work-item, sub-tile by sub-tile.
 
    The picture is linear in the colours: pixel = sum of w_k c_k + rest of the background, w_k = T alpha. A walk over a
-   patch's list makes its pixels' values v, less the target if there is one, and remembers the weights; they then give each
+   sub-tile's list makes its pixels' values v, less the target if there is one, and remembers the weights; they then give each
    splat's sum over the pixels of w_k v, three channels, and with WEIGHTS of w_k^2. A tile's sums go to exact totals
    (totals.clh). Lists of more than SEGMENT splats are walked twice.
 
-   Macros: LANES, ALPHA_CAP, STOP, WEIGHTS. */
+   Macros: LANES, ALPHA_CAP, TRANSMITTANCE_THRESHOLD, WEIGHTS. */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
-#include "include/patch_vectors.clh"
-#include "include/patch_walk.clh"
+#include "include/subtile_vectors.clh"
+#include "include/subtile_walk.clh"
 #include "refit/refit.clh"
 
-/* A patch's walk over its list: its transmittances and colours move on, weights[j] becomes the j-th splat's. Returns the
+/* A sub-tile's walk over its list: its transmittances and colours move on, weights[j] becomes the j-th splat's. Returns the
    number of splats before the last pixel's end. */
 inline uint blend(
     const Splat *splats, const ushort *list, uint length, float2 first, vfloat t[1], vfloat rgb[3], float *weights)
@@ -73,8 +73,8 @@ kernel void refit_sweep(
     global const float4 *shapes,
     global const float4 *colours,
     global const uint *offsets,
-    global const uint *entries,
-    global const uint *patches,
+    global const uint *intersections,
+    global const uint *subtiles,
     View view,
     float red,
     float green,
@@ -90,27 +90,27 @@ kernel void refit_sweep(
     const uint begin = offsets[tile], end = offsets[tile + 1];
 
     Splat splats[SEGMENT];
-    ushort lists[PATCHES][SEGMENT];
-    uint lengths[PATCHES];
+    ushort lists[SUBTILES][SEGMENT];
+    uint lengths[SUBTILES];
     float weights[(SEGMENT + LANES) * LANES];
     float4 sums[SEGMENT];
-    vfloat t[PATCHES], rgb[PATCHES][3];
-    float values[PATCHES][3][LANES];
+    vfloat t[SUBTILES], rgb[SUBTILES][3];
+    float values[SUBTILES][3][LANES];
     float error = 0.0f;
     const int twice = end - begin > SEGMENT;
     for (int pass = twice ? 0 : 1; pass < 2; ++pass) {
-        for (int i = 0; i < PATCHES; ++i) {
-            t[i] = patch_transmittance(i, origin, view.width, view.height);
+        for (int i = 0; i < SUBTILES; ++i) {
+            t[i] = subtile_transmittance(i, origin, view.width, view.height);
             rgb[i][0] = rgb[i][1] = rgb[i][2] = (vfloat)(0.0f);
         }
         for (uint from = begin; pass == 1 || from < end; from += SEGMENT) {
             const uint count = from < end ?
-                gather_splats(shapes, colours, entries, patches, from, end, splats, lists, lengths) : 0;
+                gather_splats(shapes, colours, intersections, subtiles, from, end, splats, lists, lengths) : 0;
             for (uint k = 0; k < count; ++k)
                 sums[k] = (float4)(0.0f);
-            for (int i = 0; i < PATCHES; ++i) {
+            for (int i = 0; i < SUBTILES; ++i) {
                 const uint length = count ? lengths[i] : 0;
-                const uint walked = blend(splats, lists[i], length, patch_centre(origin, i), &t[i], rgb[i], weights);
+                const uint walked = blend(splats, lists[i], length, subtile_centre(origin, i), &t[i], rgb[i], weights);
                 if (from + count >= end && pass == (twice ? 0 : 1)) {
                     /* The pixels' values are known. */
                     const vfloat through = fabs(t[i]);
@@ -118,8 +118,8 @@ kernel void refit_sweep(
                     VSTORE(MAD(through, (vfloat)(green), rgb[i][1]), 0, values[i][1]);
                     VSTORE(MAD(through, (vfloat)(blue), rgb[i][2]), 0, values[i][2]);
                     for (int lane = 0; lane < LANES; ++lane) {
-                        const int column = origin.x + PATCH_COLUMN(i) + lane % PATCH_WIDTH;
-                        const int row = origin.y + PATCH_ROW(i) + lane / PATCH_WIDTH;
+                        const int column = origin.x + SUBTILE_COLUMN(i) + lane % SUBTILE_WIDTH;
+                        const int row = origin.y + SUBTILE_ROW(i) + lane / SUBTILE_WIDTH;
                         const int inside = column < view.width && row < view.height;
                         const size_t pixel = 3 * ((size_t)row * view.width + column);
                         for (int channel = 0; channel < 3; ++channel) {
@@ -138,8 +138,8 @@ kernel void refit_sweep(
             if (pass == 1)
                 for (uint k = 0; k < count; ++k) {
                     if (k + AHEAD < count)
-                        PREFETCH_TO_WRITE(totals + 2 * TOTALS * entries[from + k + AHEAD]);
-                    add_sums(totals, entries[from + k], sums[k], scale);
+                        PREFETCH_TO_WRITE(totals + 2 * TOTALS * intersections[from + k + AHEAD]);
+                    add_sums(totals, intersections[from + k], sums[k], scale);
                 }
             if (from + count >= end)
                 break;

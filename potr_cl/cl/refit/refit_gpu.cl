@@ -1,11 +1,11 @@
 /* The picture's dependence on the splats' colours, for GPUs, all views of a set in one launch: one work-group a tile;
-   get_group_id(1) is the view's number. See refit_cpu.cl for the method, and patch_lists.clh for how a tile's work is shared
+   get_group_id(1) is the view's number. See refit_cpu.cl for the method, and subtile_lists.clh for how a tile's work is shared
    out.
 
-   Macros: ALPHA_CAP, STOP, WEIGHTS, NATIVE_EXP2, INT64_ATOMICS. */
+   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, WEIGHTS, NATIVE_EXP2, INT64_ATOMICS. */
 
 #define ROUND 4
-#include "include/patch_lists.clh"
+#include "include/subtile_lists.clh"
 #include "refit/refit.clh"
 
 /* Sums a splat: of w times the pixel's three channels, and of w^2. */
@@ -18,8 +18,8 @@ void refit_sweep(
     global const float4 *shapes,
     global const float4 *colours,
     global const uint *offsets,
-    global const uint *entries,
-    global const ushort *patches,
+    global const uint *intersections,
+    global const ushort *subtiles,
     float red,
     float green,
     float blue,
@@ -31,9 +31,9 @@ void refit_sweep(
 {
     local State state;
     local Batch near;
-    local float4 all_parts[PATCHES * PARTS];
+    local float4 all_parts[SUBTILES * PARTS];
     local int levels[SUMS * LEVELS * BATCH];
-    local int unfinished[2], end_of_patch[PATCHES], rounds[2];
+    local int unfinished[2], end_of_subtile[SUBTILES], rounds[2];
     local float item_errors[ITEMS];
 
     const int lid = get_local_id(0), share = lid % SHARE;
@@ -48,15 +48,15 @@ void refit_sweep(
     totals += 2 * TOTALS * (size_t)stride * number;
     offsets += views->first_offset + tile;
     const uint length = offsets[1] - offsets[0];
-    entries += views->first_entry + offsets[0];
-    patches += views->first_entry + offsets[0];
+    intersections += views->first_intersection + offsets[0];
+    subtiles += views->first_intersection + offsets[0];
 
-    for (int patch = lid; patch < PATCHES; patch += ITEMS)
-        end_of_patch[patch] = 0;
+    for (int subtile = lid; subtile < SUBTILES; subtile += ITEMS)
+        end_of_subtile[subtile] = 0;
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
     uint last_batch;
     const uint swept = forward(
-        &state, &near, unfinished, origin, picture, shapes, colours, entries, patches, length, lid, &last_batch);
+        &state, &near, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &last_batch);
 
     /* From here on r, g, b are the pixels' values to multiply by. */
     Mine mine = pixels_of(lid / SHARE, origin, lid);
@@ -89,8 +89,8 @@ void refit_sweep(
     }
     item_errors[lid] = error;
     if (swept > 0)
-        atomic_max(&end_of_patch[mine.patch], end);
-    if (last_batch > 0 && lid < PATCHES)
+        atomic_max(&end_of_subtile[mine.subtile], end);
+    if (last_batch > 0 && lid < SUBTILES)
         near.places[lid] = 0;
     if (lid == 0)
         rounds[0] = 0;
@@ -110,15 +110,15 @@ void refit_sweep(
     for (uint batch = 0; batch < swept; batch += BATCH) {
         const int size = min(swept - batch, (uint)BATCH);
         if (last_batch > 0) {
-            fetch(&near, shapes, colours, entries + batch, patches + batch, size, lid);
+            fetch(&near, shapes, colours, intersections + batch, subtiles + batch, size, lid);
             barrier(CLK_LOCAL_MEM_FENCE);
             make_lists(&near, lid);
         }
         mine = pixels_of(near.dealt[lid / SHARE], origin, lid);
-        local const uchar *list = near.lists + mine.patch * LIST_ROOM;
-        const int count = near.counts[mine.patch];
-        const int place = last_batch > 0 ? near.places[mine.patch] : 0;
-        const int left = clamp(end_of_patch[mine.patch] - place, 0, count);
+        local const uchar *list = near.lists + mine.subtile * LIST_ROOM;
+        const int count = near.counts[mine.subtile];
+        const int place = last_batch > 0 ? near.places[mine.subtile] : 0;
+        const int left = clamp(end_of_subtile[mine.subtile] - place, 0, count);
         if (share == 0)
             atomic_max(&rounds[parity], (left + ROUND - 1) / ROUND);
         float t[PIXELS], r[PIXELS], g[PIXELS], b[PIXELS];
@@ -140,7 +140,7 @@ void refit_sweep(
         if (lid == 0)
             rounds[parity] = 0;
         if (share == 0)
-            near.places[mine.patch] = place + places(count);
+            near.places[mine.subtile] = place + places(count);
         for (int first = 0; first < all_rounds * ROUND; first += ROUND) {
             const int now = min(left - first, ROUND);
 #pragma unroll 2

@@ -2,7 +2,7 @@
 
 A list of objects: ``img_name``, ``width``, ``height``, ``fx``, ``fy`` in pixels (principal point at the image's
 centre), ``rotation`` (3 x 3, its columns are the camera's axes in the world, x right, y down, z forward) and
-``position`` (the eye in the world).
+``position`` (the camera centre in the world).
 
 The original lists its test views too, without a mark, so they cannot be told apart: without a mark every view counts
 as a training view. A key ``split`` ("train" or "test") marks one; once a view has it, all must.
@@ -58,10 +58,10 @@ def parse(content: Any, path: Path) -> list[Camera]:
     if not content:
         raise DataError(f"'{path}' holds no view")
     files = [image_name(view.get("img_name"), f"'{path}', view {i}: 'img_name'") for i, view in enumerate(content)]
-    photographs = {stem(image.name): image for image in _images_beside(path)}
+    ground_truth = {stem(image.name): image for image in _images_beside(path)}
     marked = any("split" in view for view in content)
     return [
-        _camera(view, name, path, photographs.get(Path(stem(file)).name), marked)
+        _camera(view, name, path, ground_truth.get(Path(stem(file)).name), marked)
         for view, name, file in zip(content, _names(files, path), files, strict=True)
     ]
 

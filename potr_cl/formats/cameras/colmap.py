@@ -65,9 +65,9 @@ def load(folder: Path) -> list[Camera]:
     if not images:
         raise DataError(f"'{path}' holds no view")
     files = [image_name(image.name, f"'{path}': the name of image {image.image_id}") for image in images]
-    photographs = _photographs(folder)
+    ground_truth = _ground_truth(folder)
     return [
-        _camera(path, image, cameras[image.camera_id], name, split, photographs / file if photographs else None)
+        _camera(path, image, cameras[image.camera_id], name, split, ground_truth / file if ground_truth else None)
         for image, name, file, split in zip(images, view_names(files, path), files, every_eighth(files), strict=True)
     ]
 
@@ -130,7 +130,7 @@ def _pycolmap() -> ModuleType:
     return pycolmap  # type: ignore[no-any-return]
 
 
-def _photographs(folder: Path) -> Path | None:
+def _ground_truth(folder: Path) -> Path | None:
     """The folder that the names of the images are relative to, if it is where it usually is."""
     absolute = Path(os.path.abspath(folder))
     candidates = (parent / "images" for parent in (absolute, *absolute.parents[:2]))

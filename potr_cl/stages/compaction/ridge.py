@@ -302,12 +302,12 @@ class Compactor:
             (4 * max(entries, 1), "the views"),
             (4 * max(entries, 1), "the view weights"),
         )
-        eyes = np.zeros((len(camera_centres), 2, 4), np.float32)
-        eyes[:, 0, :3] = camera_centres
-        eyes[:, 1, :3] = camera_centres - eyes[:, 0, :3].astype(np.float64)
+        centres = np.zeros((len(camera_centres), 2, 4), np.float32)
+        centres[:, 0, :3] = camera_centres
+        centres[:, 1, :3] = camera_centres - centres[:, 0, :3].astype(np.float64)
         with contextlib.ExitStack() as stack:
-            device_eyes = self.device.upload(eyes, "the cameras")
-            stack.callback(self.device.free, device_eyes)
+            device_centres = self.device.upload(centres, "the cameras")
+            stack.callback(self.device.free, device_centres)
             slots = [
                 stack.enter_context(contextlib.closing(_Slot(self.device, sizes))) for _ in range(min(len(batches), 2))
             ]
@@ -318,7 +318,7 @@ class Compactor:
                 slot.upload(_arrays(scene, weights, options, slice(start, stop), share), pool)
                 seen = int(np.count_nonzero(offsets[start + 1 : stop + 1] > offsets[start:stop]))
                 if seen:
-                    self._launch(kernel, lanes, slot, device_eyes, seen, options)
+                    self._launch(kernel, lanes, slot, device_centres, seen, options)
                 slot.download(result[start:stop])
             for slot in slots:
                 slot.collect(pool)
@@ -362,13 +362,13 @@ class Compactor:
         kernel: cl.Kernel,
         lanes: int,
         slot: _Slot,
-        eyes: cl.Buffer,
+        centres: cl.Buffer,
         splats: int,
         options: CompactionOptions,
     ) -> None:
         kernel.set_args(
             *slot.buffers,
-            eyes,
+            centres,
             np.uint32(splats),
             np.float32(options.alpha),
             np.float32(options.lam),

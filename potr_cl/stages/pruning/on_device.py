@@ -54,7 +54,7 @@ class _Controller:
         self._splats = removal.splats
         self._groups = -(-self._splats // _DIGIT)
         with device.all_or_nothing():
-            self._damped = device.allocate(4 * self._splats, "the damped effects")
+            self._smoothed = device.allocate(4 * self._splats, "the smoothed effects")
             self._keys = device.allocate(4 * self._splats, "the splats' scores")
             self._removed = device.upload(np.zeros(self._splats, _REMOVED), "the removed splats")
             self._state = device.allocate(4 * _STATE, "the pruning's state")
@@ -70,7 +70,7 @@ class _Controller:
         left, done, weight = self._splats, 0, 0.0
         for iteration in range(options.iterations):
             removal.measure_on_device()
-            weight = options.damping * weight + 1
+            weight = options.decay * weight + 1
             gone = self._choose(iteration, weight)
             done = iteration + 1
             if gone == 0:
@@ -91,7 +91,7 @@ class _Controller:
         effect_unit, importance_unit = removal.units
         cl.enqueue_fill_buffer(self._device.queue, self._state, np.uint32(0), 0, 4 * _STATE)
         numbers = (effect_unit, weight, options.delta_mse_max, options.a)
-        self._rank.set_args(n, totals, alive, *numbers, self._damped, self._keys, self._state)
+        self._rank.set_args(n, totals, alive, *numbers, self._smoothed, self._keys, self._state)
         self._launch(self._rank)
         if remaining > 1:
             for digit in range(1, _DIGITS):
@@ -111,7 +111,7 @@ class _Controller:
     def _pruned(self, done: int) -> Pruned:
         device, n = self._device, self._splats
         alive = self._removal.alive.copy()
-        damped = device.download(self._damped, (n,), np.float32)
+        smoothed = device.download(self._smoothed, (n,), np.float32)
         removed = device.download(self._removed, (n,), _REMOVED)
         iteration = removed["iteration"].astype(np.int32)
         iteration[alive] = -1
@@ -121,7 +121,7 @@ class _Controller:
             alive[gone[-1]], iteration[gone[-1]] = True, -1
             gone = gone[:-1]
         kept = np.flatnonzero(alive)
-        kept = kept[ascending(damped[kept])]
+        kept = kept[ascending(smoothed[kept])]
         order = np.concatenate([gone, kept])
         return Pruned(order, len(kept), iteration, done, self._history(removed[gone], iteration[gone]))
 
@@ -140,5 +140,5 @@ class _Controller:
         )
 
     def free(self) -> None:
-        for buffer in (self._damped, self._keys, self._removed, self._state):
+        for buffer in (self._smoothed, self._keys, self._removed, self._state):
             self._device.free(buffer)

@@ -1,8 +1,8 @@
 """Removal effects and importances of all splats over all views (paper sections "Splat importance", "Effect of a
 splat's removal").
 
-A view's projection, tile lists and depth order are made once: pruning never changes them, it only takes entries out.
-Each measurement is one sweep over the tiles of every view (cl/prune/removal_*.cl), whose sums go to exact integer
+A view's projection, tile lists and depth order are made once: pruning never changes them, it only takes intersections
+out. Each measurement is one sweep over the tiles of every view (cl/prune/removal_*.cl), whose sums go to exact integer
 totals a splat; a tile in which little has changed since its last sweep keeps its sums.
 
 What does not fit the memory budget is made again when it is needed: first the projections, then whole views.
@@ -24,7 +24,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import TILE, Rasterizer, ViewSet, camera_struct, gpu_limits, totals_limits
-from potr_cl.raster.view_cache import KeptViews
+from potr_cl.raster.view_cache import ViewCache
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -41,7 +41,7 @@ _TOLERANCE = 10
 _SWEEP_GROUP = {"cpu": 1, "gpu": 128}
 _STALENESS_GROUP = {"cpu": 1, "gpu": 128}
 #: Below it transmittances lose digits in float32, and the sweep divides by them.
-_LEAST_STOP = 1e-30
+_LEAST_THRESHOLD = 1e-30
 #: Part of the device's memory that the views may take unless the caller sets a budget. A CPU's is that of the host: the
 #: scene, its new colours and everybody else live there too.
 _SHARE, _SHARE_OF_HOST = 0.5, 0.3
@@ -63,9 +63,10 @@ class SweepOptions:
         turns: a view is swept in every so many-th measurement only (all of them in the first). Views that do not fit
             the memory budget are swept in each.
         memory: bytes of device memory that the views may take; None: :func:`default_memory`.
-        tighten: drop a tile's entries that reach alpha 1/255 in none of its pixels. Changes no result.
-        stop: a pixel ends before its transmittance falls below this; None: where the rasterizer's rules end it. When a
-            removal lets a pixel go on one splat longer, its colour jumps by up to the hundredfold of this.
+        tighten: drop a tile's intersections that reach alpha 1/255 in none of its pixels. Changes no result.
+        transmittance_threshold: a pixel ends before its transmittance falls below this; None: where the rasterizer's
+            rules end it. When a removal lets a pixel go on one splat longer, its colour jumps by up to the hundredfold
+            of this.
         sample: part of the tiles to be swept that are, drawn at random; the others keep their sums until another time.
         sampled: measurements, after the first, in which only a sample is swept.
         seed: of the sample.
@@ -78,7 +79,7 @@ class SweepOptions:
     turns: int = 1
     memory: int | None = None
     tighten: bool = False
-    stop: float | None = 1e-8
+    transmittance_threshold: float | None = 1e-8
     sample: float = 1.0
     sampled: int = 24
     seed: int = 0
@@ -90,9 +91,10 @@ class SweepOptions:
             raise UsageError(f"views cannot be swept every {self.turns} measurements: at least 1 is needed")
         if self.memory is not None and self.memory < 0:
             raise UsageError(f"a memory budget of {self.memory} bytes is less than nothing")
-        if self.stop is not None and not _LEAST_STOP <= self.stop < 1:
+        if self.transmittance_threshold is not None and not _LEAST_THRESHOLD <= self.transmittance_threshold < 1:
             raise UsageError(
-                f"a pixel cannot end at a transmittance of {self.stop:g}: at least {_LEAST_STOP:g}, below 1"
+                f"a pixel cannot end at a transmittance of {self.transmittance_threshold:g}: at least "
+                f"{_LEAST_THRESHOLD:g}, below 1"
             )
         if not 0 < self.sample <= 1:
             raise UsageError(f"a sample of {self.sample:g} of the tiles: it must be above 0 and at most 1")
@@ -107,8 +109,8 @@ class _Swept:
     Attributes:
         number: of the first view among the cameras; the others follow it.
         views: their lists.
-        lengths: (tiles,) uint32, entries that a tile has left.
-        sums: (entries, 2) float32, see cl/prune/removal_cpu.cl.
+        lengths: (tiles,) uint32, intersections that a tile has left.
+        sums: (intersections, 2) float32, see cl/prune/removal_cpu.cl.
         target: (pixels, 3) float32.
         first_tile: where their tiles begin among those of all views that are kept.
         sweep, staleness: kernels with all their arguments but the place of the tiles to sweep in the list of tiles.
@@ -145,7 +147,7 @@ class RemovalSweep:
 
     Attributes:
         sweeps: work done so far, as a multiple of sweeping every tile of every view once.
-        kept_views: views whose lists fit the memory budget; the others are made again for every measurement.
+        cached_views: views whose lists fit the memory budget; the others are made again for every measurement.
 
     Raises:
         UsageError: no camera.
@@ -188,7 +190,7 @@ class RemovalSweep:
         self._totals = self._zero_totals()
 
         memory = self._options.memory
-        self._keeper = KeptViews(rasterizer, default_memory(device) if memory is None else memory)
+        self._cache = ViewCache(rasterizer, default_memory(device) if memory is None else memory)
         self._queues = [device.queue]
         self._kept: list[_Swept] = []
         self._remade: list[range] = []  # numbers of the views that nothing is kept of, as many as are made at a time
@@ -202,22 +204,26 @@ class RemovalSweep:
         self._listed_buffer = device.allocate(4 * len(self._kept), "the numbers of tiles to sweep")
         for place, swept in enumerate(self._kept):
             self._bind(swept, True, self._totals, place)
-        if device.family == "gpu" and device.several_queues and not self._keeper.shared:
+        if device.family == "gpu" and device.several_queues and not self._cache.shared:
             # A set's longest tile list keeps one work-group busy when all others are done: other sets fill the gap.
             self._queues = [
                 cl.CommandQueue(device.context, device.info.handle, device.queue.properties) for _ in range(_QUEUES)
             ]
 
     @property
-    def kept_views(self) -> int:
+    def cached_views(self) -> int:
         return sum(len(swept.views.views) for swept in self._kept)
 
     def _build(self) -> None:
         device, rules = self._device, self._rasterizer.rules
-        stop = rules.stop if self._options.stop is None else self._options.stop
+        stop = (
+            rules.transmittance_threshold
+            if self._options.transmittance_threshold is None
+            else self._options.transmittance_threshold
+        )
         limits: dict[str, float | int] = {
             "ALPHA_CAP": float(rules.alpha_cap),
-            "STOP": stop,
+            "TRANSMITTANCE_THRESHOLD": stop,
             "TIGHTEN": int(self._options.tighten),
         }
         if device.family == "gpu":
@@ -232,7 +238,7 @@ class RemovalSweep:
 
     def _prepare_all(self, progress: Callable[[int, int], None] | None) -> None:
         """Prepare every view, and keep as many as the budget allows."""
-        most = 1 if self._device.family == "cpu" else self._keeper.most_views(_MOST_VIEWS, 12 * self._pixels)
+        most = 1 if self._device.family == "cpu" else self._cache.most_views(_MOST_VIEWS, 12 * self._pixels)
         first_tile = number = 0
         while number < self._views:
             try:
@@ -279,7 +285,7 @@ class RemovalSweep:
     def _keep(self, swept: _Swept) -> bool:
         """Keep prepared views as far as the budget allows; whether it does."""
         own: int = swept.lengths.size + swept.sums.size + swept.target.size
-        if not self._keeper.keep(swept.views, own):
+        if not self._cache.keep(swept.views, own):
             self._remade.append(swept.numbers)
             swept.free(self._device)
             return False
@@ -290,7 +296,7 @@ class RemovalSweep:
         """Kernels of its own for a set, kept at this place or not at all: setting their arguments takes longer than
         launching them."""
         device, views, stride = self._device, swept.views, np.uint32(self._rasterizer.stride)
-        shared = self._keeper.shared
+        shared = self._cache.shared
         shapes, colours = shared if views.shapes is None and shared else (views.shapes, views.colours)
         background = (np.float32(channel) for channel in self._rasterizer.background)
         swept.sweep = device.kernel(self._source, "removal", **self._limits)
@@ -299,7 +305,7 @@ class RemovalSweep:
         if device.family == "cpu":
             (view,) = views.views
             weight = self._pixels / views.pixels
-            lists: tuple[cl.Buffer, ...] = (views.offsets, swept.lengths, views.entries)
+            lists: tuple[cl.Buffer, ...] = (views.offsets, swept.lengths, views.intersections)
             swept.sweep.set_args(
                 np.uint32(0),
                 self._tiles,
@@ -307,7 +313,7 @@ class RemovalSweep:
                 colours,
                 self._alive_buffer,
                 *lists,
-                views.patches,
+                views.subtiles,
                 camera_struct(view.camera),
                 *background,
                 np.int32(first),
@@ -320,7 +326,7 @@ class RemovalSweep:
             swept.staleness.set_args(self._alive_buffer, *lists, swept.sums, *gone)
             return
         table = (views.table, np.uint32(len(views.views)))
-        lists = (views.offsets, swept.lengths, views.entries, views.patches)
+        lists = (views.offsets, swept.lengths, views.intersections, views.subtiles)
         swept.sweep.set_args(
             np.uint32(0),
             self._tiles,
@@ -344,8 +350,8 @@ class RemovalSweep:
     def _sweep(self, swept: _Swept, start: int, count: int, queue: cl.CommandQueue | None = None) -> None:
         """Sweep ``count`` tiles of a set, listed in the tile buffer from ``start`` on."""
         if swept.views.shapes is None:
-            assert self._keeper.shared is not None
-            self._rasterizer.project(swept.views, None, *self._keeper.shared)
+            assert self._cache.shared is not None
+            self._rasterizer.project(swept.views, None, *self._cache.shared)
         swept.sweep.set_arg(0, np.uint32(start))
         group = _SWEEP_GROUP[self._device.family]
         self._device.launch(swept.sweep, (count * group,), (group,), queue)
@@ -622,15 +628,18 @@ class RemovalSweep:
     def _importances(self, swept: _Swept) -> Iterator[tuple[int, Indices, F64]]:
         """:meth:`view_importances` of the views of a set."""
         views, device = swept.views, self._device
-        for number, view, start in zip(swept.numbers, views.views, views.entry_starts, strict=False):
-            entries, sums = np.empty(view.entry_count, np.uint32), np.empty((view.entry_count, 2), np.float32)
+        for number, view, start in zip(swept.numbers, views.views, views.intersection_starts, strict=False):
+            intersections, sums = (
+                np.empty(view.intersection_count, np.uint32),
+                np.empty((view.intersection_count, 2), np.float32),
+            )
             with device.errors("failed while computing"):
-                for array, buffer in ((entries, views.entries), (sums, swept.sums)):
-                    if view.entry_count:
-                        offset = start * array.nbytes // view.entry_count
+                for array, buffer in ((intersections, views.intersections), (sums, swept.sums)):
+                    if view.intersection_count:
+                        offset = start * array.nbytes // view.intersection_count
                         cl.enqueue_copy(device.queue, array, buffer, src_offset=offset, is_blocking=True)
             weights = np.maximum(sums[:, 1], 0)  # negative: touches no pixel
-            total = np.bincount(entries, weights=weights, minlength=self.splats)[: self.splats]
+            total = np.bincount(intersections, weights=weights, minlength=self.splats)[: self.splats]
             splats = np.flatnonzero((total > 0) & (self._alive[: self.splats] == 1))
             yield number, splats, total[splats] / (view.camera.width * view.camera.height)
 
@@ -645,7 +654,7 @@ class RemovalSweep:
         for swept in self._kept:
             swept.free(self._device)
         self._kept = []
-        self._keeper.free()
+        self._cache.free()
         for buffer in (
             self._alive_buffer,
             self._totals,

@@ -40,8 +40,8 @@ class PruningOptions:
         iterations: rounds in which effects are measured anew.
         a: the mapping function's curvature: how much a negative ΔMSE is preferred to a small one.
         count: if given, the number of splats to keep, exactly.
-        damping: splats are ranked by the weighted mean of all their measurements, each counting this many times as
-            much as the next one; 0: by the newest alone, as in the paper. Splats that make up for the same error all
+        decay: splats are ranked by an exponential moving average of their measurements, each counting this many times
+            as much as the next one; 0: by the newest alone, as in the paper. Splats that make up for the same error all
             look removable at once; with the newest effects all of them go, and the error turns round.
 
     Raises:
@@ -52,7 +52,7 @@ class PruningOptions:
     iterations: int = 48
     a: float = 10.0
     count: int | None = None
-    damping: float = 0.8
+    decay: float = 0.8
 
     def __post_init__(self) -> None:
         if not self.delta_mse_max >= 0:
@@ -63,8 +63,8 @@ class PruningOptions:
             raise UsageError(f"the mapping's a is {self.a:g}, it must be positive")
         if self.count is not None and self.count < 1:
             raise UsageError(f"{self.count} splats to keep: at least 1 is needed")
-        if not 0 <= self.damping <= 1:
-            raise UsageError(f"the damping is {self.damping:g}, it must lie between 0 and 1")
+        if not 0 <= self.decay <= 1:
+            raise UsageError(f"the decay is {self.decay:g}, it must lie between 0 and 1")
 
 
 @dataclass(frozen=True)
@@ -89,7 +89,7 @@ class Pruned:
     """What a pruning run did.
 
     Attributes:
-        order: (N,) all splats: first the removed ones as they went, then the kept ones by ascending (damped) ΔMSE.
+        order: (N,) all splats: first the removed ones as they went, then the kept ones by ascending (smoothed) ΔMSE.
         kept: number of splats at the end of ``order`` that were kept.
         iteration_of: (N,) int32, the iteration (from 0) in which each splat went; -1 for the kept ones.
         iterations: rounds that were run: fewer than asked for when nothing was left to decide.
@@ -108,19 +108,19 @@ class Pruned:
         return np.flatnonzero(self.iteration_of < 0)
 
 
-class DampedEffects:
+class SmoothedEffects:
     """Effects of which each splat's is the weighted mean of all its measurements.
 
     Args:
         effects: measures and removes.
-        damping: how much a measurement counts against the next one, see :class:`PruningOptions`.
+        decay: how much a measurement counts against the next one, see :class:`PruningOptions`.
 
     Attributes:
         newest: (N,) ΔMSE_k as last measured.
     """
 
-    def __init__(self, effects: RemovalEffects, damping: float) -> None:
-        self._effects, self._damping = effects, damping
+    def __init__(self, effects: RemovalEffects, decay: float) -> None:
+        self._effects, self._decay = effects, decay
         self._weight = 0.0
         self._mean: F64 = np.zeros(0)
         self.newest = self._mean
@@ -128,7 +128,7 @@ class DampedEffects:
     def measure(self) -> tuple[F64, F64]:
         """The mean ΔMSE_k, and I_k as it is now."""
         self.newest, importance = self._effects.measure()
-        self._weight = self._damping * self._weight + 1
+        self._weight = self._decay * self._weight + 1
         if len(self._mean):
             change = self.newest - self._mean
             change /= self._weight
@@ -243,9 +243,9 @@ def prune(
     history: list[Iteration] = []
     done = 0
     delta_mse = np.zeros(splats)
-    damped = DampedEffects(effects, options.damping)
+    smoothed = SmoothedEffects(effects, options.decay)
     for iteration in range(options.iterations):
-        delta_mse, importance = damped.measure()
+        delta_mse, importance = smoothed.measure()
         gone = choose(delta_mse, importance, alive, options.iterations - iteration, options)
         if len(gone) >= len(alive) and options.count is None:
             gone = gone[: len(alive) - 1]  # an empty scene is no scene
@@ -254,9 +254,9 @@ def prune(
             break  # no candidate is left, and measuring again would find the same
         iteration_of[gone] = iteration
         removed.append(gone)
-        damped.remove(gone)  # first: the device is busy with it during the rest
+        smoothed.remove(gone)  # first: the device is busy with it during the rest
         alive = alive[iteration_of[alive] < 0]
-        effect = damped.newest[gone]
+        effect = smoothed.newest[gone]
         history.append(Iteration(len(alive), float(importance[gone].sum()), float(effect.sum()), float(effect.max())))
         if progress is not None:
             progress(done, len(alive))

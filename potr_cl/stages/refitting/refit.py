@@ -41,7 +41,7 @@ from potr_cl.raster.rasterizer import (
     gpu_limits,
     totals_limits,
 )
-from potr_cl.raster.view_cache import KeptViews
+from potr_cl.raster.view_cache import ViewCache
 from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS
 
 #: Gives the picture that view number i should show: a device buffer that begins with (H, W, 3) float32, valid until the
@@ -244,7 +244,10 @@ class ColourRefit:
         device, count = self.device, self._sh_count
         self._triangle = count * (count + 1) // 2
         self._lanes = 1 if device.family == "gpu" else device.vector_width
-        limits: dict[str, float | int] = {"ALPHA_CAP": float(rules.alpha_cap), "STOP": rules.stop}
+        limits: dict[str, float | int] = {
+            "ALPHA_CAP": float(rules.alpha_cap),
+            "TRANSMITTANCE_THRESHOLD": rules.transmittance_threshold,
+        }
         if device.family == "gpu":
             limits |= gpu_limits(device)
         else:
@@ -268,10 +271,10 @@ class ColourRefit:
         device = self.device
         memory = self.options.memory
         free = device.info.memory - device.allocated
-        self._keeper = KeptViews(self._rasterizer, free * _SHARE if memory is None else memory)
+        self._cache = ViewCache(self._rasterizer, free * _SHARE if memory is None else memory)
         # A sweep's own buffers take as much as geometry does, the sums included.
         own = _SWEEP_BYTES * self._stride
-        most = 1 if device.family == "cpu" else self._keeper.most_views(_MOST_VIEWS, own)
+        most = 1 if device.family == "cpu" else self._cache.most_views(_MOST_VIEWS, own)
         number = 0
         while number < len(self._cameras):
             numbers = range(number, min(number + most, len(self._cameras)))
@@ -282,7 +285,7 @@ class ColourRefit:
                     raise
                 most //= 2
                 continue
-            if self._keeper.keep(views):
+            if self._cache.keep(views):
                 self._sets.append((numbers, views))
             else:
                 views.free()
@@ -414,7 +417,7 @@ class ColourRefit:
         self._upload_scales(unit)
         for numbers, kept in self._sets:
             views = kept or self._prepare(numbers)
-            with self._keeper.geometry(views) as anew:
+            with self._cache.geometry(views) as anew:
                 if targets is not None:
                     self._enqueue_colours(views, coefficients, views.colours, False, 1.0)
                 else:
@@ -453,12 +456,12 @@ class ColourRefit:
         group = _SWEEP_GROUP[family]
         if family == "cpu":
             (view,) = views.views
-            lists: tuple[cl.Buffer, ...] = (views.offsets, views.entries, views.patches)
+            lists: tuple[cl.Buffer, ...] = (views.offsets, views.intersections, views.subtiles)
             sweep.set_args(views.shapes, colours, *lists, camera_struct(view.camera), *rest)
             self.device.launch(sweep, (views.tiles * group,), (group,))
         else:
             stride = np.uint32(self._stride)
-            lists = (views.offsets, views.entries, views.patches)
+            lists = (views.offsets, views.intersections, views.subtiles)
             sweep.set_args(views.table, stride, views.shapes, colours, *lists, *rest)
             most = max(view.tiles for view in views.views)
             self.device.launch(sweep, (most * group, len(views.views)), (group, 1))
@@ -491,8 +494,8 @@ class ColourRefit:
             return self._kept[numbers[0]]
         nbytes = self._target_bytes(numbers)
         buffer = self._target
-        if nbytes <= self._keeper.room:
-            self._keeper.room -= nbytes
+        if nbytes <= self._cache.room:
+            self._cache.room -= nbytes
             buffer = self._kept[numbers[0]] = self.device.allocate(nbytes, "the target images")
         if isinstance(targets, RenderedTargets):
             targets.into(numbers, buffer)
@@ -507,7 +510,7 @@ class ColourRefit:
 
     def _forget_targets(self) -> None:
         for buffer in self._kept.values():
-            self._keeper.room += buffer.size
+            self._cache.room += buffer.size
             self.device.free(buffer)
         self._kept, self._kept_of = {}, None
 
@@ -670,7 +673,7 @@ class ColourRefit:
         for _, views in self._sets:
             if views is not None:
                 views.free()
-        self._keeper.free()
+        self._cache.free()
         self._forget_targets()
         for buffer in self._vectors:
             self.device.free(buffer)

@@ -1,23 +1,23 @@
-/* Which patches of its tile each entry touches, for GPUs: one work-group a tile; get_group_id(1) is the view's number in
+/* Which sub-tiles of its tile each intersection touches, for GPUs: one work-group a tile; get_group_id(1) is the view's number in
    its set. Found once a view, however often its lists are swept. */
 
 #define LANES 1
-#define PATCH_WIDTH 4
+#define SUBTILE_WIDTH 4
 #include "include/lanes.clh"
 #include "include/splat.clh"
-#include "include/patches.clh"
+#include "include/subtiles.clh"
 #include "include/view_set.clh"
 
 #define GROUP 128
 
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void entry_patches(
+void subtile_masks(
     global const SetView *views,
     uint stride,
     global const float4 *shapes,
     global const uint *offsets,
-    global const uint *entries,
-    global ushort *patches,
+    global const uint *intersections,
+    global ushort *subtiles,
     uint capacity)
 {
     const uint tile = get_group_id(0);
@@ -27,12 +27,12 @@ void entry_patches(
         return;
     shapes += 2 * (size_t)stride * get_group_id(1);
     offsets += views->first_offset + tile;
-    const uint room = capacity - min(capacity, views->first_entry);
-    const uint end = views->first_entry + min(offsets[1], room);
+    const uint room = capacity - min(capacity, views->first_intersection);
+    const uint end = views->first_intersection + min(offsets[1], room);
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
-    for (uint e = views->first_entry + min(offsets[0], room) + get_local_id(0); e < end; e += GROUP) {
-        const size_t splat = entries[e];
+    for (uint e = views->first_intersection + min(offsets[0], room) + get_local_id(0); e < end; e += GROUP) {
+        const size_t splat = intersections[e];
         const float4 s0 = shapes[2 * splat], s1 = shapes[2 * splat + 1];
-        patches[e] = (ushort)touched_patches(s0.x, s0.y, s0.z, s0.w, s1.x, s1.y, origin);
+        subtiles[e] = (ushort)touched_subtiles(s0.x, s0.y, s0.z, s0.w, s1.x, s1.y, origin);
     }
 }

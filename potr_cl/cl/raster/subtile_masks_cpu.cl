@@ -1,18 +1,18 @@
-/* Which patches of its tile each entry touches, for CPUs: one tile a work-item, LANES entries at a time. Found once a view,
+/* Which sub-tiles of its tile each intersection touches, for CPUs: one tile a work-item, LANES intersections at a time. Found once a view,
    however often its lists are swept.
 
    Macros: LANES. */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
-#include "include/patch_vectors.clh"
+#include "include/subtile_vectors.clh"
 
-/* patches[e]: the bits of touched_patches for entry e. */
-kernel void entry_patches(
+/* sub-tiles[e]: the bits of touched_subtiles for intersection e. */
+kernel void subtile_masks(
     global const float4 *shapes,
     global const uint *offsets,
-    global const uint *entries,
-    global uint *patches,
+    global const uint *intersections,
+    global uint *subtiles,
     uint capacity,
     View view)
 {
@@ -24,9 +24,9 @@ kernel void entry_patches(
     for (uint begin = min(offsets[tile], capacity); begin < end; begin += LANES) {
         const int count = min(end - begin, (uint)LANES);
         for (uint e = begin + LANES; e < min(begin + 2 * LANES, end); ++e)
-            PREFETCH(shapes + 2 * entries[e]);
+            PREFETCH(shapes + 2 * intersections[e]);
         for (int k = 0; k < LANES; ++k) {
-            const uint splat = entries[begin + min(k, count - 1)];
+            const uint splat = intersections[begin + min(k, count - 1)];
             const float4 s0 = shapes[2 * splat], s1 = shapes[2 * splat + 1];
             x[k] = s0.x;
             y[k] = s0.y;
@@ -36,11 +36,11 @@ kernel void entry_patches(
             log2_opacity[k] = s1.y;
         }
         VSTORE(
-            touched_patches(
+            touched_subtiles(
                 VLOAD(0, x), VLOAD(0, y), VLOAD(0, a), VLOAD(0, b), VLOAD(0, c), VLOAD(0, log2_opacity), origin),
             0,
             touched);
         for (int k = 0; k < count; ++k)
-            patches[begin + k] = (uint)touched[k];
+            subtiles[begin + k] = (uint)touched[k];
     }
 }

@@ -11,11 +11,11 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, test_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.quality.compare import compare, find_photographs, mean_view
+from potr_cl.quality.compare import compare, find_ground_truth, mean_view
 from potr_cl.raster.rasterizer import Rasterizer
 
 
-class JudgedScene:
+class EvaluatedScene:
     """An uncompressed scene on the device, ready to be compared with others.
 
     Args:
@@ -39,7 +39,7 @@ class JudgedScene:
         if not self.views:
             raise DataError(f"'{folder / 'cameras.json'}' has no test views")
         images = folder / "images"
-        self._photographs = find_photographs(images, self.views) if images.is_dir() else None
+        self._ground_truth = find_ground_truth(images, self.views) if images.is_dir() else None
         self._device = device
         self._rasterizer = Rasterizer(device, self.source)
 
@@ -47,18 +47,18 @@ class JudgedScene:
         """Means over the test views.
 
         Returns:
-            ``psnr`` and ``ssim`` against the uncompressed scene's renders; with photographs also ``photo_psnr`` and
-            ``photo_ssim`` against those, and ``psnr_loss`` and ``ssim_loss``, what the uncompressed scene has more.
+            ``psnr`` and ``ssim`` against the uncompressed scene's renders; with photographs also ``truth_psnr`` and
+            ``truth_ssim`` against those, and ``psnr_loss`` and ``ssim_loss``, what the uncompressed scene has more.
             A PSNR of None means identical pictures.
         """
         rasterizer = Rasterizer(self._device, candidate)
         try:
-            mean = mean_view(compare(self._rasterizer, rasterizer, self.views, self._photographs).views).figures
+            mean = mean_view(compare(self._rasterizer, rasterizer, self.views, self._ground_truth).views).figures
         finally:
             rasterizer.free()
         names = {"b_against_a": ("psnr", "ssim")}
-        if self._photographs is not None:
-            names["b_against_photograph"] = ("photo_psnr", "photo_ssim")
+        if self._ground_truth is not None:
+            names["b_against_truth"] = ("truth_psnr", "truth_ssim")
             names["loss"] = ("psnr_loss", "ssim_loss")
         figures: dict[str, float | None] = {}
         for pair, (psnr, ssim) in names.items():
