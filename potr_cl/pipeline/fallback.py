@@ -8,7 +8,8 @@ from collections.abc import Callable
 from typing import TypeVar
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
-from potr_cl.opencl.device import Device, choose_device
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import choose_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.pruning.removal import default_memory
 

@@ -44,7 +44,8 @@ from potr_cl.codec.encoder import code_scene
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, camera_centres, test_views, train_views
 from potr_cl.model.scene import Scene
-from potr_cl.opencl.device import Device, DeviceInfo, Family, choose_device, list_devices
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, list_devices
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator

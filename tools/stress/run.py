@@ -38,7 +38,8 @@ from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.opencl.device import Device, DeviceInfo, list_devices
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DeviceInfo, list_devices
 from potr_cl.raster.rasterizer import TILE, Rasterizer, RasterRules
 from potr_cl.stages.compaction.ridge import Compactor, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import potr_cl.opencl.device
+import potr_cl.opencl.source
 from potr_cl.codec.quantize import quantize_sh, to_ycocg
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.formats.images import read_ground_truth
@@ -101,7 +101,7 @@ def _ground_truth(cameras: Sequence[Camera]) -> list[FloatArray] | None:
 @contextlib.contextmanager
 def _low_pass(factor: float) -> Iterator[None]:
     """Rasterizers built inside add ``factor`` of their low-pass filter."""
-    original = potr_cl.opencl.device.kernel_source
+    original = potr_cl.opencl.source.kernel_source
 
     def changed(name: str) -> str:
         text = original(name)
@@ -112,11 +112,11 @@ def _low_pass(factor: float) -> Iterator[None]:
             text = text.replace(squared, f"{0.09 * factor**2:.9f}f").replace(once, f"{0.3 * factor:.9f}f")
         return text
 
-    potr_cl.opencl.device.kernel_source = changed
+    potr_cl.opencl.source.kernel_source = changed
     try:
         yield
     finally:
-        potr_cl.opencl.device.kernel_source = original
+        potr_cl.opencl.source.kernel_source = original
 
 
 def _halved(camera: Camera) -> Camera:

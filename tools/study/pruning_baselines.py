@@ -23,7 +23,8 @@ from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.opencl.device import Device, kernel_source
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.source import kernel_source
 from potr_cl.raster.rasterizer import TILE, Rasterizer, camera_struct
 
 F64 = NDArray[np.float64]
