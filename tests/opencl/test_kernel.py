@@ -90,7 +90,7 @@ def test_structs_are_laid_out_as_the_compiler_does(device, source, name):
     members = {"View": struct_dtype("include/splat.clh", "View")}
     dtype = struct_dtype(source, name)
     if name == "SetView":  # what it holds must be known to the compiler by name first
-        matched, declaration = cl.tools.match_dtype_to_c_struct(device.info.handle, "ViewProbe", members["View"])
+        matched, _ = cl.tools.match_dtype_to_c_struct(device.info.handle, "ViewProbe", members["View"])
         assert matched == members["View"]
         cl.tools.get_or_register_dtype("ViewProbe", matched)
     matched, _ = cl.tools.match_dtype_to_c_struct(device.info.handle, f"{name}Probe", dtype)
