@@ -453,7 +453,7 @@ def test_without_pycolmap(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
 
 
 def test_folders(data: Path, tmp_path: Path) -> None:
-    refused(tmp_path, "holds no cameras, expected a cameras.json, a transforms.json, or a COLMAP model", UsageError)
+    refused(tmp_path, "holds no cameras, expected a cameras.json, a transforms.json or a COLMAP model", UsageError)
     shutil.copytree(data / "plush_sparse_binary", tmp_path / "sparse")
     assert len(load_cameras(tmp_path)) == 17
     write_json(tmp_path / "transforms.json", nerfstudio(["a.png", "b.png"]))

@@ -13,9 +13,13 @@ import numpy as np
 
 from potr_cl.codec import octree
 from potr_cl.errors import DataError, PotrError, UsageError
+from potr_cl.formats.declaration import install_command
 from potr_cl.model.scene import Scene
 
 _log = logging.getLogger("potr_cl")
+
+#: Of this package, which brings the library.
+EXTRA = "convert"
 
 _LARGEST_LOGIT = np.float32(20)
 
@@ -33,7 +37,7 @@ def library(path: str | os.PathLike[str]) -> Any:
     except ImportError as error:
         raise UsageError(
             f"'{path}': this kind of file needs the library gsply, which cannot be loaded ({_one_line(error)}): "
-            'pip install "potr-cl[convert]"'
+            f"{install_command(EXTRA)}"
         ) from None
     return gsply
 

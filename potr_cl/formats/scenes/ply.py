@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyListProperty
 
 from potr_cl.errors import DataError, UsageError
+from potr_cl.formats.declaration import SceneFormat
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
@@ -123,6 +124,16 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
             block[:, -7:-4] = scene.log_scales[span]
             block[:, -4:] = scene.quaternions[span]
             file.write(block.data)
+
+
+FORMAT = SceneFormat(
+    name="3DGS PLY",
+    suffixes=(".ply",),
+    note="as the original implementation, gsplat, nerfstudio, Postshot, Brush and SuperSplat write it: SH degree 0 to "
+    "3, binary or ASCII, properties in any order; the original layout is written",
+    load=load,
+    save=save,
+)
 
 
 def _property_names(rest: int) -> list[str]:
