@@ -221,7 +221,7 @@ def test_order_in_which_a_folder_is_searched(data: Path, tmp_path: Path) -> None
 def test_the_documentation_has_the_table() -> None:
     text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
     found = re.findall(r"<!-- generated: formats -->\n(.*?)\n<!-- end -->", text, re.DOTALL)
-    assert found == [registry.formats_table()]
+    assert found == [registry.formats_table()], "run: python -m tools.make.docs"
 
 
 def test_a_format_is_one_line_of_the_table(

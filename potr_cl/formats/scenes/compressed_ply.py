@@ -7,7 +7,8 @@ import re
 
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.gsply_arrays import EXTRA, file_size, from_scene, library, reading, to_scene
+from potr_cl.formats.scenes.gsply_arrays import EXTRA, from_scene, library, to_scene
+from potr_cl.formats.scenes.scene_files import file_size, reading
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 

@@ -17,6 +17,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.scenes.scene_files import cleaned
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
@@ -77,17 +78,7 @@ def load(path: str | os.PathLike[str]) -> Scene:
             scene = _read(path, stream, status.st_size)
         except OSError as error:
             raise DataError(f"cannot read '{path}': {error.strerror or error}") from error
-    try:
-        scene, report = scene.cleaned()
-    except DataError as error:
-        raise DataError(f"'{path}': {error}") from error
-    if report.non_finite:
-        _log.warning("'%s': dropped %d splats with non-finite values", path, report.non_finite)
-    if report.infinite_opacities:
-        _log.warning("'%s': made %d infinite opacity logits finite", path, report.infinite_opacities)
-    if report.zero_quaternions:
-        _log.warning("'%s': turned %d quaternions of length zero into no rotation", path, report.zero_quaternions)
-    return scene
+    return cleaned(path, scene)
 
 
 def save(path: str | os.PathLike[str], scene: Scene) -> None:

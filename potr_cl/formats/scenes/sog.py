@@ -11,7 +11,8 @@ from typing import Any
 
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.gsply_arrays import EXTRA, file_size, library, reading, to_scene
+from potr_cl.formats.scenes.gsply_arrays import EXTRA, library, to_scene
+from potr_cl.formats.scenes.scene_files import file_size, reading
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 
 #: What is packed in a SOG file is compressed already; only its description shrinks.
