@@ -15,7 +15,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import HealthCheck, given, settings
+from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
 from potr_cl import Scene, UsageError, cli
@@ -80,7 +80,12 @@ def test_formats_import_no_heavy_library() -> None:
 
 @pytest.mark.parametrize("entry", WRITTEN, ids=name)
 @given(splats=st.integers(1, 400), degree=st.integers(0, 3), seed=st.integers(0, 99))
-@settings(max_examples=12, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@settings(
+    max_examples=12,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],  # a format that fails does so for nearly every scene
+)
 def test_every_format_reads_what_it_writes(
     entry: SceneFormat, splats: int, degree: int, seed: int, tmp_path: Path
 ) -> None:
