@@ -22,10 +22,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import octree, quantize
-from potr_cl.codec.container import EntropyCoder, Property
+from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.sections import Property
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.formats.scenes import ply
 from potr_cl.model.camera import Camera, camera_centres, train_views

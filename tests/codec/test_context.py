@@ -10,8 +10,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from potr_cl.codec import context_coder
-from potr_cl.codec.context_coder import Lanes, Reader, Sizes, Streams
+from potr_cl.codec.context import encoder
+from potr_cl.codec.context.decoder import Reader
+from potr_cl.codec.context.encoder import Batches, Streams
+from potr_cl.codec.context.lanes import Lanes
+from potr_cl.codec.context.model import Sizes
 from potr_cl.errors import DataError
 
 
@@ -20,7 +23,7 @@ def read(stored, splats, streams, signed, predicted, history=None):
 
 
 def encode(streams, signed, predicted):
-    (stored,) = context_coder.encode([[Streams(streams, signed, predicted)]])
+    (stored,) = encoder.encode([[Streams(streams, signed, predicted)]])
     return stored and stored[0]
 
 
@@ -98,7 +101,7 @@ def test_history_of_earlier_sections():
     rng = np.random.default_rng(3)
     activity = rng.exponential(size=30000)
     first, second = ([np.round(rng.laplace(size=30000) * activity).astype(int) for _ in range(3)] for _ in range(2))
-    (stored,) = context_coder.encode([[Streams(first, signed=True), Streams(second, signed=True)]])
+    (stored,) = encoder.encode([[Streams(first, signed=True), Streams(second, signed=True)]])
     history = Sizes(Lanes(30000))
     for streams, data in zip((first, second), stored, strict=True):
         assert all((a == b).all() for a, b in zip(streams, read(data, 30000, 3, True, False, history), strict=True))
@@ -116,23 +119,20 @@ def test_sections_side_by_side_are_those_alone():
 
     for splats in (1, 700, 3000):
         chains = [[some(9, splats), some(3, splats)], [some(1, splats)], [some(3, splats, 300)], []]
-        alone = [context_coder.encode([chain])[0] for chain in chains]
-        assert context_coder.encode(chains) == alone
+        alone = [encoder.encode([chain])[0] for chain in chains]
+        assert encoder.encode(chains) == alone
         with ThreadPoolExecutor(3) as pool:
-            assert context_coder.encode(chains, pool.map) == alone
+            assert encoder.encode(chains, pool.map) == alone
         # One that cannot be coded does not keep the others from it.
         broken = [[some(3, splats), Streams([np.full(splats, 2**40)], True)], *chains]
-        assert context_coder.encode(broken) == [None, *alone]
+        assert encoder.encode(broken) == [None, *alone]
 
 
-def test_many_lanes_are_coded_as_few_are(monkeypatch):
+def test_many_lanes_are_coded_as_few_are():
     rng = np.random.default_rng(7)
     chains = [[Streams([rng.geometric(0.1 + 0.2 * k, 5000) for k in range(3)], False)] for _ in range(2)]
-    together = context_coder.encode(chains)
-    monkeypatch.setattr(context_coder, "_MANY_LANES", 1)
-    monkeypatch.setattr(context_coder, "_WORKING_BYTES", 0)
-    monkeypatch.setattr(context_coder, "_BLOCK", 64)
-    assert context_coder.encode(chains) == together
+    one_by_one = Batches(sizes=64, working_bytes=0, many_lanes=1)
+    assert encoder.encode(chains, batches=one_by_one) == encoder.encode(chains)
 
 
 def test_same_bytes_every_time():
