@@ -16,6 +16,7 @@ import importlib.util
 import json
 import re
 import sys
+from functools import partial
 from pathlib import Path
 
 from tools.make import benchmark_plots
@@ -71,7 +72,7 @@ def filled_pages(results: dict[str, Result]) -> dict[Path, str]:
     texts = {path: path.read_text(encoding="utf-8") for path in sorted(PAGES.glob("*.md"))}
     places = {name: place for path, text in texts.items() for name, place in _places(path, text).items()}
 
-    def fill(path: Path, match: re.Match[str]) -> str:
+    def fill(match: re.Match[str], path: Path) -> str:
         what = match["what"]
         if what == "headlines":
             content = _headlines(results, places)
@@ -82,7 +83,7 @@ def filled_pages(results: dict[str, Result]) -> dict[Path, str]:
             content = f"{table(results[name])}\n\n{circumstances(results[name])}"
         return f"<!-- {what} -->\n\n{content}\n\n<!-- end -->"
 
-    return {path: _BLOCK.sub(lambda match, path=path: fill(path, match), text) for path, text in texts.items()}
+    return {path: _BLOCK.sub(partial(fill, path=path), text) for path, text in texts.items()}
 
 
 def _tables(text: str) -> list[str]:
@@ -115,7 +116,9 @@ def _headlines(results: dict[str, Result], places: dict[str, tuple[str, str]]) -
         texts = [f"{column.text(rows[0][column.name])} {column.unit}".strip() for column in columns]
         heading, link = places[name]
         date = result.date or "unknown"
-        lines.append(f"| {entry['subject']} | {entry['text'].format(*texts)} | {result.machine} | {date} | [{heading}]({link}) |")
+        lines.append(
+            f"| {entry['subject']} | {entry['text'].format(*texts)} | {result.machine} | {date} | [{heading}]({link}) |"
+        )
     return "\n".join(lines)
 
 

@@ -1,7 +1,7 @@
 """The plots of docs/benchmarks, drawn of its results alone: each answers the question that its title asks.
 
-A picture keeps a digest of the figures that it was drawn of, so that :func:`stale` finds those that changed since without
-drawing anything. Lines and points differ by marker and dash, not by colour alone, to be read in print.
+A picture keeps a digest of the figures that it was drawn of, so that :func:`stale` finds those that changed since
+without drawing anything. Lines and points differ by marker and dash, not by colour alone, to be read in print.
 """
 
 from __future__ import annotations
@@ -11,6 +11,7 @@ import json
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 from typing import Any
 
@@ -149,7 +150,8 @@ def _rate_distortion(results: Results, axes: Sequence[Any], against: str, other:
 def bytes_at(rows: Sequence[dict[str, Any]], psnr: float) -> float:
     """Megabytes at a PSNR against the uncompressed renders, interpolated in the logarithm of the size."""
     points = sorted((row["PSNR against uncompressed"], math.log(row["size"])) for row in rows)
-    return math.exp(float(np.interp(psnr, *zip(*points, strict=True))))
+    known, sizes = np.array(points).T
+    return math.exp(float(np.interp(psnr, known, sizes)))
 
 
 def _encode_presets(results: Results, axes: Sequence[Any]) -> None:
@@ -184,8 +186,8 @@ def _pruning_curves(results: Results, axes: Sequence[Any]) -> None:
     axes[0].set_ylabel("PSNR against the uncompressed renders, dB")
 
 
-#: What a variant of the pruning is called in its table, and the family that the plot shows it as.
-_FAMILIES = (
+#: Families of the pruning's variants, and which names of their tables belong to each.
+_FAMILIES: tuple[tuple[str, Callable[[str], bool]], ...] = (
     ("tile tolerance", lambda name: name.startswith("tolerance") and "decay" not in name),
     ("iterations", lambda name: name.endswith("iterations") and not name.startswith("nothing")),
     ("part of the tiles at random", lambda name: "at random" in name),
@@ -214,7 +216,9 @@ def _pruning_skips(results: Results, axes: Sequence[Any]) -> None:
                     axis.annotate("4", (x, y), (-7, -4), textcoords="offset points", ha="right", fontsize=9)
         axis.axhline(0, color="0.5", lw=0.8)
         axis.set_yscale("symlog", linthresh=0.25)
-        axis.set_yticks([-0.1, 0, 0.1, 0.25, 0.5, 1, 2, 4, 8], [f"{v:g}" for v in (-0.1, 0, 0.1, 0.25, 0.5, 1, 2, 4, 8)])
+        axis.set_yticks(
+            [-0.1, 0, 0.1, 0.25, 0.5, 1, 2, 4, 8], [f"{v:g}" for v in (-0.1, 0, 0.1, 0.25, 0.5, 1, 2, 4, 8)]
+        )
         axis.set_ylim(-0.1, 10)
         axis.set_xlim(0, 0.7)
         axis.set(title=scene, xlabel="seconds of the schedule, NVIDIA H200")
@@ -258,13 +262,13 @@ PLOTS = (
     Plot(
         "rate_distortion_uncompressed",
         _CURVES,
-        lambda results, axes: _rate_distortion(results, axes, "uncompressed", "PSNR"),
+        partial(_rate_distortion, against="uncompressed", other="PSNR"),
         "How near does a file of a size come to the uncompressed scene?",
     ),
     Plot(
         "rate_distortion_photographs",
         _CURVES,
-        lambda results, axes: _rate_distortion(results, axes, "photographs", "lost"),
+        partial(_rate_distortion, against="photographs", other="lost"),
         "How near does a file of a size come to the photographs?",
     ),
     Plot(
@@ -297,7 +301,7 @@ PLOTS = (
         Plot(
             f"refit_{against}",
             _both("refit/"),
-            lambda results, axes, against=against: _refit(results, axes, against),
+            partial(_refit, against=against),
             f"Which treatment of colours takes the fewest bytes? (against the {what})",
         )
         for against, what in (("uncompressed", "uncompressed renders"), ("photographs", "photographs"))

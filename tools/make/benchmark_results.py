@@ -2,8 +2,8 @@
 
 A file holds the results of one subject, by name: ``encode.json`` with ``"stages"`` in it is the result "encode/stages".
 A result says what was measured, by which command, where and when, and holds its figures as numbers; how a figure is
-written is said once, by its column. What follows from other figures (a ratio), and what the package decides (which row is
-the default), is worked out here and stored nowhere.
+written is said once, by its column. What follows from other figures (a ratio), and what the package decides (which row
+is the default), is worked out here and stored nowhere.
 """
 
 from __future__ import annotations
@@ -227,7 +227,9 @@ def _default_rows(result: Result) -> list[int]:
 
 def _markdown(heads: list[str], rows: list[list[str]]) -> str:
     lines = [heads, ["---"] * len(heads), *rows]
-    return "\n".join("| " + " | ".join(line) + " |" if line is not lines[1] else "|---" * len(line) + "|" for line in lines)
+    return "\n".join(
+        "| " + " | ".join(line) + " |" if line is not lines[1] else "|---" * len(line) + "|" for line in lines
+    )
 
 
 def circumstances(result: Result) -> str:
