@@ -1,7 +1,7 @@
 """Fill the tables of docs/benchmarks and draw its plots: python -m tools.make.benchmark_pages [--check] [--tables]
 
 The pages are prose with markers; between ``<!-- table: encode/stages -->`` and ``<!-- end -->`` this puts the table of
-that result (docs/benchmarks/results/encode.json) and a line with its machine, date and command. Between
+that result (docs/benchmarks/results/encode.json) with its title, and a line with its machine, date and command. Between
 ``<!-- headlines -->`` and ``<!-- end -->`` stands the list of headlines, whose figures come from the same results.
 
 --check writes nothing; it fails and says what is stale: tables that are not those of the results, plots drawn of other
@@ -80,7 +80,7 @@ def filled_pages(results: dict[str, Result]) -> dict[Path, str]:
             name = what.removeprefix("table: ")
             if name not in results:
                 raise ResultError(f"{path}: there is no result '{name}' in {RESULTS}")
-            content = f"{table(results[name])}\n\n{circumstances(results[name])}"
+            content = f"**{results[name].title}**\n\n{table(results[name])}\n\n{circumstances(results[name])}"
         return f"<!-- {what} -->\n\n{content}\n\n<!-- end -->"
 
     return {path: _BLOCK.sub(partial(fill, path=path), text) for path, text in texts.items()}

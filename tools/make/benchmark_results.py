@@ -8,12 +8,14 @@ is the default), is worked out here and stored nowhere.
 
 from __future__ import annotations
 
+import argparse
 import json
 import re
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
+from potr_cl.cli.encode import add_encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.compaction.ridge import CompactionOptions
 from potr_cl.stages.pruning.removal import SweepOptions
@@ -138,10 +140,16 @@ class Result:
 
 
 def package_defaults() -> dict[str, Any]:
-    """The package's defaults, by the names that columns and results know them by."""
+    """The package's defaults, by the names that columns and results know them by.
+
+    What a preset decides is asked of the command line: there one is the default.
+    """
+    commands = argparse.ArgumentParser().add_subparsers()
+    add_encode(commands)
+    encode = commands.choices["encode"]
     return {
-        "quality": EncodeOptions.q,
-        "preset": "best",
+        "quality": encode.get_default("quality"),
+        "preset": encode.get_default("preset"),
         "iterations": PruningOptions.iterations,
         "mapping_a": PruningOptions.a,
         "decay": PruningOptions.decay,
