@@ -274,7 +274,8 @@ def canonical_rotations(quaternions: F32, log_scales: F32) -> tuple[F64, F32]:
 def rotation_factors(scale_steps: Sequence[NDArray[np.integer]], sf_rotation: float) -> F32:
     """(N,) scale factor of each splat's rotation in format version 2: SF times the root of its largest scale in steps.
 
-    Long splats need their direction more exactly; the root is the best power by measurement (docs/benchmarks/quantisers.md).
+    Long splats need their direction more exactly; the root is the best power by measurement
+    (docs/benchmarks/quantisers.md).
     """
     largest = np.maximum(np.maximum(scale_steps[0], scale_steps[1]), scale_steps[2])
     factors: F32 = np.sqrt(np.maximum(largest, 1).astype(np.float32)) * np.float32(sf_rotation)
