@@ -8,19 +8,17 @@ is the default), is worked out here and stored nowhere.
 
 from __future__ import annotations
 
-import argparse
 import json
 import re
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 from typing import Any
 
-from potr_cl.cli.encode import add_encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.stages.compact import Compact
 from potr_cl.stages.compaction.ridge import CompactionOptions
-from potr_cl.stages.pruning.removal import SweepOptions
-from potr_cl.stages.pruning.schedule import PruningOptions
-from potr_cl.stages.refitting.refit import RefitOptions
+from potr_cl.stages.prune import Prune
+from potr_cl.stages.refit import Refit
 
 ROOT = Path(__file__).parents[2]
 RESULTS = ROOT / "docs" / "benchmarks" / "results"
@@ -140,24 +138,20 @@ class Result:
 
 
 def package_defaults() -> dict[str, Any]:
-    """The package's defaults, by the names that columns and results know them by.
-
-    What a preset decides is asked of the command line: there one is the default.
-    """
-    commands = argparse.ArgumentParser().add_subparsers()
-    add_encode(commands)
-    encode = commands.choices["encode"]
+    """The package's defaults, by the names that columns and results know them by."""
+    options = EncodeOptions()
+    prune = options.stage(Prune)
     return {
-        "quality": encode.get_default("quality"),
-        "preset": encode.get_default("preset"),
-        "iterations": PruningOptions.iterations,
-        "mapping_a": PruningOptions.a,
-        "decay": PruningOptions.decay,
-        "tolerance": SweepOptions.tolerance,
-        "transmittance_threshold": SweepOptions.transmittance_threshold,
-        "compact_at": EncodeOptions.compact_at,
+        "quality": options.q,
+        "preset": options.preset,
+        "iterations": prune.iterations,
+        "mapping_a": prune.mapping_a,
+        "decay": prune.decay,
+        "tolerance": prune.tolerance,
+        "transmittance_threshold": prune.transmittance_threshold,
+        "compact_at": options.stage(Compact).at,
         "precision": CompactionOptions.precision,
-        "refit_steps": RefitOptions.steps,
+        "refit_steps": options.stage(Refit).steps,
     }
 
 
