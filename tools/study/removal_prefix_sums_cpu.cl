@@ -13,7 +13,7 @@ kernel void removal(
     global const float4 *shapes,
     global const float4 *colours,
     global const uchar *alive,
-    global const uint *begins,
+    global const uint *offsets,
     global uint *lengths,
     global uint *intersections,
     global uint *subtiles,
@@ -30,7 +30,7 @@ kernel void removal(
 {
     const int tile = tiles[start + get_global_id(0)];
     const int2 origin = (int2)(tile % view.columns, tile / view.columns) * TILE;
-    const uint begin = begins[tile];
+    const uint begin = offsets[tile];
     const uint end = begin + lengths[tile];
 
     vfloat t[SUBTILES], r[SUBTILES], g[SUBTILES], b[SUBTILES];

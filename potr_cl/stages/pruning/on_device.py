@@ -14,6 +14,7 @@ import pyopencl as cl
 from potr_cl.opencl.structs import struct_dtype
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Iteration, Pruned, PruningOptions, ascending, prune
+from potr_cl.stages.pruning.steering import Steering
 
 _SOURCE = "prune/choose_gpu.cl"
 #: Digits of a score in base 256, and the words of the state buffer (cl/prune/choose_gpu.cl): histograms, what is known
@@ -39,9 +40,9 @@ def prune_scene(
         progress: called with the iterations done and the number of splats left.
         after_iteration: called with the iteration.
     """
-    if not removal.steerable or options.count is not None or not np.isfinite(options.delta_mse_max):
+    if removal.steering is None or options.count is not None or not np.isfinite(options.delta_mse_max):
         return prune(removal, removal.splats, options, progress, after_iteration)
-    controller = _Controller(removal, options)
+    controller = _Controller(removal.steering, options)
     try:
         return controller.run(progress, after_iteration)
     finally:
@@ -49,7 +50,7 @@ def prune_scene(
 
 
 class _Controller:
-    def __init__(self, removal: RemovalSweep, options: PruningOptions) -> None:
+    def __init__(self, removal: Steering, options: PruningOptions) -> None:
         self._removal, self._options = removal, options
         self._device = device = removal.device
         self._splats = removal.splats
