@@ -171,7 +171,7 @@ class RemovalSweep(Owner):
             if numbers in cached:
                 yield from self._importances(cached[numbers])
             else:
-                with self._uncached.sweep_once(numbers) as views:
+                with self._uncached.swept_once(numbers) as views:
                     yield from self._importances(views)
 
     def _importances(self, prepared: PreparedSet) -> Iterator[tuple[int, Indices, F64]]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -60,17 +62,14 @@ class UncachedSweep:
             totals: NDArray[np.int64] = self._device.download(buffers.totals, (splats, 2), np.int64)
             return totals
 
-    def sweep_once(self, numbers: range) -> PreparedSet:
-        """Views prepared and swept for the sake of their sums.
-
-        Returns:
-            The views, which are the caller's to close.
-        """
-        with Memory(self._device) as memory:
-            views = self._prepared.prepare(numbers)
-            self._sweep_all(views, self._buffers(memory), first_time=True)
-            self._device.queue.finish()
-        return views
+    @contextmanager
+    def swept_once(self, numbers: range) -> Iterator[PreparedSet]:
+        """Views prepared and swept for the sake of their sums, closed at the end of the block."""
+        with self._prepared.prepare(numbers) as views:
+            with Memory(self._device) as memory:
+                self._sweep_all(views, self._buffers(memory), first_time=True)
+                self._device.queue.finish()
+            yield views
 
     def _store_target(self, views: PreparedSet, original_sh: cl.Buffer | None, scratch: SweepBuffers) -> None:
         """Sweep with all splats and the original colours; only the target is of interest."""
