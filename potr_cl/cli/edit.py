@@ -38,10 +38,11 @@ from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.reduction import reduce_scene
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from potr_cl.quality.ground_truth import GroundTruth, GroundTruthTargets
+from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import SweepOptions
-from potr_cl.stages.refitting.refit import RefitOptions, Refitted, RenderedTargets, active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit import RefitOptions, Refitted, active_coefficients, refit_colours
+from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
 
 #: Coefficients that round to 0 at so many steps a unit are 0, but for what storing R, G and B leaves of them.
 _ZERO_SF = 1e5
@@ -158,7 +159,6 @@ def _refit(args: argparse.Namespace) -> None:
                     targets = RenderedTargets(rasterizer, views)
                 else:
                     targets = GroundTruthTargets(device, ground_truth, views)
-                    stack.callback(targets.free)
                 active = active_coefficients(scene.sh, _ZERO_SF)
                 return refit_colours(
                     device, scene, views, targets, how, active, background,

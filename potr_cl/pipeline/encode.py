@@ -23,10 +23,11 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.reduction import Progress, reduce_scene
-from potr_cl.quality.ground_truth import GroundTruth, GroundTruthTargets
+from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.schedule import Pruned
-from potr_cl.stages.refitting.refit import RefitOptions, Refitted, RenderedTargets, active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit import RefitOptions, Refitted, active_coefficients, refit_colours
+from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
 
 
 @dataclass(frozen=True)
@@ -208,7 +209,6 @@ def _refit(
         else:
             ground_truth = GroundTruth(options.ground_truth, views, options.background)
             targets = GroundTruthTargets(device, ground_truth, views)
-            stack.callback(targets.free)
         return refit_colours(
             device,
             decoded,

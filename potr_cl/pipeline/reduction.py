@@ -18,7 +18,8 @@ from potr_cl.stages.compaction.ridge import Compactor, ViewWeights
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Pruned, PruningOptions
-from potr_cl.stages.refitting.refit import RefitOptions, RenderedTargets, refit_colours
+from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
+from potr_cl.stages.refitting.targets import RenderedTargets
 
 #: Called with the stage's name and the part of it that is done, 0 to 1.
 Progress = Callable[[str, float], None]
