@@ -1,4 +1,4 @@
-"""Scenes to re-fit, and the solver's vectors laid open: for the tests and for tools/check_platforms.py."""
+"""Scenes to re-fit, and products with the linear map: for the tests and for tools/stress/platforms.py."""
 
 from __future__ import annotations
 
@@ -14,7 +14,9 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, Refitted, RenderedTargets, Targets, refit_colours
+from potr_cl.stages.refitting.blocks import SplatBlocks
+from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, Refitted, refit_colours
+from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from tests.cases.scenes import random_scene
 from tests.oracles.refit import Array, Reference
 
@@ -62,52 +64,43 @@ class Case:
 
 
 class Linearised:
-    """A solver at its start, with its vectors to be looked at and set."""
+    """The map at a scene's own colours, cut where they are.
 
-    def __init__(self, case: Case, targets: Targets | None = None, options: RefitOptions | None = None) -> None:
-        refit = self.refit = ColourRefit(case.device, case.scene, case.cameras, options, background=case.background)
-        refit._zero(refit._gram)
-        refit._copy(refit._start, refit._x)
-        self.state = refit._linearise(targets or case.targets, refit.options.lam, True)
+    Attributes:
+        gradient: (N, M, 3) in Y, Co, Cg, A transposed W (pictures - targets).
+        error: |pictures - targets|^2 by W.
+        blocks: (N, M, M), the splats' own blocks.
+        room: bytes that are left of the memory for views and targets.
+    """
 
-    def vector(self, buffer: cl.Buffer) -> Array:
-        """(N, M, 3) in Y, Co, Cg."""
-        refit = self.refit
-        columns = refit.device.download(buffer, (refit._sh_count, 3, refit._stride), np.float32)
-        vector: Array = columns[:, :, : refit._splats].transpose(2, 0, 1).astype(np.float64)
-        return vector
+    def __init__(self, case: Case, targets: Targets | None = None, memory: int | None = None) -> None:
+        self._refit = ColourRefit(case.device, case.scene, case.cameras, background=case.background, memory=memory)
+        vectors, colour_map = self._refit.coefficients, self._refit.colour_map
+        self._at, result = vectors.vector(), vectors.vector()
+        vectors.write_sh(self._at, case.scene.sh)
+        vectors.zero(result)
+        with SplatBlocks(vectors) as blocks:
+            blocks.zero()
+            self.error = colour_map.gradient(self._at, targets or case.targets, result, blocks)
+            self.blocks: Array = blocks.read().astype(np.float64)
+        self.gradient: Array = vectors.read(result).astype(np.float64)
+        self.room = colour_map.room
 
     def normal(self, direction: Array) -> Array:
         """A transposed W A times a direction."""
-        refit = self.refit
-        columns = np.zeros((refit._sh_count, 3, refit._stride), np.float32)
-        columns[:, :, : refit._splats] = direction.transpose(1, 2, 0)
-        cl.enqueue_copy(refit.device.queue, refit._direction, columns)
-        refit._zero(refit._product)
-        refit._sweep_views(refit._direction, refit._product, None, unit=1 / float(np.abs(direction).max()))
-        return self.vector(refit._product)
-
-    def gram(self) -> Array:
-        """(N, M, M), upper triangles."""
-        refit, count = self.refit, self.refit._sh_count
-        packed = refit.device.download(refit._gram, (refit._triangle, refit._stride), np.float32)
-        blocks = np.zeros((refit._splats, count, count))
-        rows, columns = np.triu_indices(count)
-        blocks[:, rows, columns] = packed[:, : refit._splats].T
-        return blocks
-
-    def active(self) -> NDArray[np.bool_]:
-        """(N, M, 3)."""
-        refit = self.refit
-        words = refit.device.download(refit._active, (2, refit._stride), np.uint32)[:, : refit._splats]
-        bits = [words[c // 24] >> (c % 24) & 1 for c in range(refit._columns)]
-        return np.array(bits, bool).T.reshape(refit._splats, -1, 3)
+        vectors = self._refit.coefficients
+        x, result = vectors.vector(), vectors.vector()
+        vectors.write(x, direction)
+        vectors.zero(result)
+        self._refit.colour_map.normal(x, self._at, result)
+        product: Array = vectors.read(result).astype(np.float64)
+        return product
 
     def __enter__(self) -> Linearised:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.refit.free()
+        self._refit.close()
 
 
 class Pictures:
@@ -117,8 +110,12 @@ class Pictures:
         self.device, self.pictures = device, pictures
         self.buffers = [device.upload(np.ascontiguousarray(p, np.float32), "a picture") for p in pictures]
 
-    def __call__(self, number: int) -> cl.Buffer:
-        return self.buffers[number]
+    def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
+        start = 0
+        for number in numbers:
+            picture = self.buffers[number]
+            cl.enqueue_copy(self.device.queue, buffer, picture, byte_count=picture.size, dst_offset=start)
+            start += picture.size
 
     def __enter__(self) -> Pictures:
         return self

@@ -52,7 +52,8 @@ from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
-from potr_cl.stages.refitting.refit import RefitOptions, RenderedTargets, refit_colours
+from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
+from potr_cl.stages.refitting.targets import RenderedTargets
 from tests.oracles import raster as reference
 from tools.bench.pruning import Bench, halved, skips
 from tools.study.compaction_curves import measured_weights

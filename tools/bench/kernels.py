@@ -24,7 +24,8 @@ from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.pruning.schedule import PruningOptions, prune
-from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, RenderedTargets
+from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
+from potr_cl.stages.refitting.targets import RenderedTargets
 
 ITERATIONS = 8
 DELTA_MSE_MAX = 1e-9
@@ -70,9 +71,9 @@ def pruning(device: Device, scene: Scene, cameras: list[Camera]) -> Scene:
 def refit(device: Device, scene: Scene, left: Scene, cameras: list[Camera]) -> None:
     """Re-fit what is left to the whole scene's pictures."""
     rasterizer = Rasterizer(device, scene)
-    solver = ColourRefit(device, left, cameras, RefitOptions(steps=STEPS, drop=1e-10, gain=0))
-    solver.solve(RenderedTargets(rasterizer, cameras))
-    solver.free()
+    refit_colours(
+        device, left, cameras, RenderedTargets(rasterizer, cameras), RefitOptions(steps=STEPS, drop=1e-10, gain=0)
+    )
     rasterizer.free()
 
 

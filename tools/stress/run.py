@@ -43,7 +43,8 @@ from potr_cl.opencl.discovery import DeviceInfo, list_devices
 from potr_cl.raster.rasterizer import TILE, Rasterizer, RasterRules
 from potr_cl.stages.compaction.ridge import Compactor, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
-from potr_cl.stages.refitting.refit import RenderedTargets, refit_colours
+from potr_cl.stages.refitting.refit import refit_colours
+from potr_cl.stages.refitting.targets import RenderedTargets
 from tests.oracles import raster as reference
 from tests.oracles.refit import Reference, to_ycocg
 from tests.oracles.ridge import YCOCG, objective, ridge, weighted_basis
