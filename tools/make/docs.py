@@ -26,6 +26,7 @@ ROOT = Path(__file__).parents[2]
 _TABLES = {
     "formats": "potr_cl.formats.registry:formats_table",
     "presets": "potr_cl.pipeline.presets:presets_table",
+    "quirks": "tools.make.quirks_table:quirks_table",
 }
 
 
@@ -50,7 +51,7 @@ def with_tables(text: str) -> str:
             made: str = getattr(importlib.import_module(module), function)()
         except ModuleNotFoundError:
             return match[0]
-        return f"{match[1]}\n{made.strip()}\n\n{match[3]}"
+        return f"{match[1]}{made.strip()}\n{match[3]}"
 
     return re.sub(r"(<!-- generated: (\w+) -->\n)(?:.*?)(<!-- end -->)", table, text, flags=re.DOTALL)
 
