@@ -307,7 +307,7 @@ def test_interrupted_pruning_leaves_nothing(tmp_path, scene_path, capsys, monkey
     def interrupted(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("potr_cl.pipeline.reduction.prune_scene", interrupted)
+    monkeypatch.setattr("potr_cl.stages.prune.prune_scene", interrupted)
     cameras = cameras_json(tmp_path / "cameras.json")
     before = sorted(tmp_path.iterdir())
     for command in ("prune", "encode"):
