@@ -190,6 +190,7 @@ def changed(text: str, diff: str) -> str:
     return text
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(("title", "checks"), RECIPES.items(), ids=list(RECIPES))
 def test_a_recipe_can_be_followed(title: str, checks: list[str], tmp_path: Path) -> None:
     """Its files and changes, put into a copy of the package, pass their own tests and those that it names.

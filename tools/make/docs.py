@@ -47,10 +47,7 @@ def with_tables(text: str) -> str:
 
     def table(match: re.Match[str]) -> str:
         module, function = _TABLES[match[2]].split(":")
-        try:
-            made: str = getattr(importlib.import_module(module), function)()
-        except ModuleNotFoundError:
-            return match[0]
+        made: str = getattr(importlib.import_module(module), function)()
         return f"{match[1]}{made.strip()}\n{match[3]}"
 
     return re.sub(r"(<!-- generated: (\w+) -->\n)(?:.*?)(<!-- end -->)", table, text, flags=re.DOTALL)
