@@ -153,12 +153,22 @@ def _class(node: ast.ClassDef) -> str:
     if made is not None:
         return _call(node.name, made, "", bound=True)
     fields = [
-        ast.unparse(statement)
+        _field(statement)
         for statement in node.body
         if isinstance(statement, ast.AnnAssign) and not ast.unparse(statement.target).startswith("_")
     ]
     head = [f"@{ast.unparse(decorator)}" for decorator in node.decorator_list] + [f"class {node.name}{bases}"]
     return "\n".join([*head[:-1], head[-1] + (":" if fields else ""), *(f"    {field}" for field in fields)])
+
+
+def _field(node: ast.AnnAssign) -> str:
+    """A field of a dataclass; of a stage's option the default and the flag that sets it."""
+    made = node.value
+    if isinstance(made, ast.Call) and ast.unparse(made.func) == "option":
+        flag = next((ast.literal_eval(each.args[0]) for each in made.args[1:] if isinstance(each, ast.Call)), None)
+        text = f"{ast.unparse(node.target)}: {ast.unparse(node.annotation)} = {ast.unparse(made.args[0])}"
+        return f"{text}  # {flag}" if flag else text
+    return ast.unparse(node)
 
 
 def _call(name: str, node: ast.FunctionDef, result: str, bound: bool = False) -> str:
@@ -186,6 +196,8 @@ def _parameter(parameter: ast.arg, default: ast.expr | None) -> str:
 
 
 def _code(text: str) -> str:
+    """A block of code; quotes as the formatter of the project's code has them, not as ast does."""
+    text = re.sub(r"'([^'\"]*)'", r'"\1"', text)
     return f"```python\n{text}\n```"
 
 
