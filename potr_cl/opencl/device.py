@@ -12,7 +12,7 @@ import sys
 import tempfile
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from importlib.resources import files
@@ -348,8 +348,14 @@ def fitting_devices(spec: str | None = None) -> list[DeviceInfo]:
     return matches
 
 
-def kernel_source(name: str) -> str:
-    """Text of ``cl/<name>`` with its ``#include "…"`` lines replaced by the headers, each once."""
+def kernel_source(name: str, variants: Mapping[str, Path] | None = None) -> str:
+    """Text of ``cl/<name>`` with its ``#include "…"`` lines replaced by the headers, each once.
+
+    Args:
+        name: of the kernel file, as in ``prune/removal_cpu.cl``.
+        variants: files to read in place of those of these names, or under names that ``cl/`` does not have.
+    """
+    variants = variants or {}
     folder = files("potr_cl") / "cl"
     seen: set[str] = set()
 
@@ -360,7 +366,9 @@ def kernel_source(name: str) -> str:
             seen.add(match[1])
             return expand(match[1])
 
-        return re.sub(r'^#include "([\w./]+)"$', include, (folder / file).read_text("utf-8"), flags=re.MULTILINE)
+        return re.sub(
+            r'^#include "([\w./]+)"$', include, variants.get(file, folder / file).read_text("utf-8"), flags=re.MULTILINE
+        )
 
     return expand(name)
 
@@ -373,6 +381,9 @@ class Device:
         profiling: record a pair of device timestamps for every launch, see :attr:`timings`.
         family: run the kernels of this family instead of the device's own (for tests and benchmarks).
         build_options: compiler flags for every program; the kernels' accuracy is known without any.
+        variants: kernel files and headers to read in place of those of these names in ``cl/``, or under names that it
+            does not have (for experiments); what they include is looked up in the same way.
+        macros: values that the kernels' macros have in every program, whatever the package asks for (for experiments).
 
     Attributes:
         info, context, queue.
@@ -392,6 +403,8 @@ class Device:
         profiling: bool = False,
         family: Family | None = None,
         build_options: Sequence[str] = (),
+        variants: Mapping[str, Path] | None = None,
+        macros: Mapping[str, str | int | float] | None = None,
     ) -> None:
         self.info = info if isinstance(info, DeviceInfo) else choose_device(info)
         if compiler_fault(self.info) is not None:
@@ -402,6 +415,8 @@ class Device:
         self._unfinished: list[list[cl.Buffer]] = []
         self._profiling = profiling
         self._build_options = tuple(build_options)
+        self._variants = dict(variants or {})
+        self._macros = dict(macros or {})
         self._programs: dict[tuple[str, tuple[tuple[str, str], ...]], cl.Program] = {}
         self._kernels: dict[tuple[Any, ...], cl.Kernel] = {}
         with self.errors("cannot be opened"):
@@ -443,13 +458,13 @@ class Device:
         Raises:
             DeviceError: the device's compiler refused it.
         """
-        macros = tuple(sorted((name, _literal(value)) for name, value in defines.items()))
+        macros = tuple(sorted((name, _literal(value)) for name, value in {**defines, **self._macros}.items()))
         key = (source, macros)
         if key not in self._programs:
             options = ["-cl-std=CL1.2", *self._build_options, *(f"-D{name}={value}" for name, value in macros)]
             with self.errors(f"failed to build {source}"), warnings.catch_warnings():
                 warnings.simplefilter("ignore", cl.CompilerWarning)  # some drivers chat without being asked
-                self._programs[key] = cl.Program(self.context, kernel_source(source)).build(options)
+                self._programs[key] = cl.Program(self.context, kernel_source(source, self._variants)).build(options)
         return self._programs[key]
 
     def kernel(self, source: str, name: str, **defines: str | int | float) -> cl.Kernel:

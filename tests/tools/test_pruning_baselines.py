@@ -7,18 +7,21 @@ import dataclasses
 import numpy as np
 import pytest
 
+from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from tests.cases.scenes import random_scene, ring_of_cameras
 from tests.devices import KERNELS, open_device
 from tests.oracles import raster as reference
 from tools.bench.pruning import halved, pareto
+from tools.study import pruning_baselines as baselines
 from tools.study.pruning_baselines import mesongs_power, removal_order, scores, transmittance_sums
 
 
 @pytest.fixture(scope="module", params=KERNELS)
 def device(request):
-    device = open_device(request.param)
+    chosen = open_device(request.param)
+    device = Device(chosen.info, family=chosen.family, variants=baselines.KERNELS)
     yield device
     assert device.allocated == 0, "not all memory was given back"
 

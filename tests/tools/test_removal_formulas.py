@@ -9,7 +9,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from tests.cases.scenes import ring_of_cameras
 from tests.stages.test_removal import visible_scene
-from tools.study.removal_formulas import devices, prefix_sums_source
+from tools.study.removal_formulas import devices
 
 
 def measure(device, scene, cameras, background):
@@ -56,9 +56,3 @@ def test_prefix_sums_agree_in_lists_of_many_segments(splats, segments):
     rasterizer = Rasterizer(device, scene)
     assert rasterizer.prepare(camera).intersection_count > 1024 * segments
     assert rasterizer.render(camera)[1].max() > 1e-4  # pixels go on to the end
-
-
-def test_only_the_removal_kernel_is_replaced():
-    for family in ("cpu", "gpu"):
-        assert "paper's second half" in prefix_sums_source(f"prune/removal_{family}.cl")
-        assert "paper's second half" not in prefix_sums_source(f"raster/composite_{family}.cl")

@@ -35,7 +35,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.codec.container import EntropyCoder
@@ -56,7 +55,7 @@ from tests.oracles import raster as reference
 from tools.bench.pruning import Bench, halved, skips
 from tools.study.compaction_curves import measured_weights
 from tools.study.removal_exactness import SCENES, BruteForce, choose_splats
-from tools.study.removal_formulas import PrefixSumsDevice
+from tools.study.removal_formulas import PREFIX_SUMS
 
 F64 = NDArray[np.float64]
 
@@ -115,16 +114,9 @@ STAGES = {
 }
 
 
-class VariantDevice(Device):
-    """A device on which macros of the kernels have other values than the package gives them."""
-
-    def __init__(self, info: DeviceInfo, family: Family, flags: Sequence[str] = (), **macros: int) -> None:
-        self._macros = macros
-        super().__init__(info, profiling=True, family=family, build_options=flags)
-
-    def program(self, source: str, **defines: str | int | float) -> cl.Program:
-        changed = {name: value for name, value in self._macros.items() if name in defines}
-        return super().program(source, **{**defines, **changed})
+def profiled(info: DeviceInfo, family: Family, flags: Sequence[str] = (), **macros: int) -> Device:
+    """A device whose kernels are timed, with compiler flags and other values of the kernels' macros."""
+    return Device(info, profiling=True, family=family, build_options=flags, macros=macros)
 
 
 @dataclasses.dataclass
@@ -202,15 +194,15 @@ def kernel_variants(info: DeviceInfo, quick: bool) -> Iterator[tuple[str, bool, 
         for name, flags in FLAGS.items():
             if quick and name not in ("no flags", "mad", "fast relaxed"):
                 continue
-            yield f"{family}, {name}", family == info.family and not flags, VariantDevice(info, family, flags)
+            yield f"{family}, {name}", family == info.family and not flags, profiled(info, family, flags)
         if family == "gpu":
             for capacity in CAPACITIES:
                 if capacity != 2048 and 8 * capacity <= info.local_memory:
-                    device = VariantDevice(info, family, SORT_CAPACITY=capacity)
+                    device = profiled(info, family, SORT_CAPACITY=capacity)
                     yield f"{family}, sorts {capacity} at a time", False, device
-            default = VariantDevice(info, family).native_exp2
+            default = profiled(info, family).native_exp2
             name = "polynomial" if default else "native exponential"
-            yield f"{family}, {name}", False, VariantDevice(info, family, NATIVE_EXP2=int(not default))
+            yield f"{family}, {name}", False, profiled(info, family, NATIVE_EXP2=int(not default))
 
 
 class RasterizerTruth:
@@ -290,11 +282,11 @@ def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]
     for family in families(info):
         own = family == info.family
         for name in flags:
-            flagged = VariantDevice(info, family, FLAGS[name])
+            flagged = profiled(info, family, FLAGS[name])
             variants.append((f"{family}, {name}", own and name == "no flags", flagged, default))
-        prefix_sums = PrefixSumsDevice(info, profiling=True, family=family)
+        prefix_sums = Device(info, profiling=True, family=family, variants=PREFIX_SUMS)
         variants.append((f"{family}, prefix sums", False, prefix_sums, default))
-        plain = VariantDevice(info, family)
+        plain = profiled(info, family)
         other = dataclasses.replace(default, tighten=not default.tighten)
         variants.append((f"{family}, {'not ' if default.tighten else ''}tightened", False, plain, other))
         for stop in stops:
@@ -370,7 +362,7 @@ def ridge_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
     scene, centres = load.scene.subset(np.sort(chosen)), camera_centres(views)
     weights = measured_weights(Device(info), scene, views)
     for family in families(info):
-        device = VariantDevice(info, family)
+        device = profiled(info, family)
         doubles = "cl_khr_fp64" in info.handle.extensions.split()
         for precision in get_args(Precision):
             if precision == "fp64" and not doubles:

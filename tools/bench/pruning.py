@@ -39,7 +39,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.pruning.schedule import Pruned, PruningOptions, prune
-from tools.study.pruning_baselines import mesongs_power, removal_order, scores, transmittance_sums
+from tools.study.pruning_baselines import KERNELS, mesongs_power, removal_order, scores, transmittance_sums
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -573,7 +573,7 @@ def merged(files: Sequence[Path]) -> Row:
 
 def run(arguments: argparse.Namespace) -> Row:
     """Measure what the command line asks for."""
-    device = Device(arguments.device)
+    device = Device(arguments.device, variants=KERNELS)
     results: Row = {"device": device.info.name, "quick": arguments.quick, "scenes": {}}
     for folder in arguments.scenes:
         started = time.perf_counter()

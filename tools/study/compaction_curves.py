@@ -14,7 +14,6 @@ the photographs where they are there. Only SH coefficients are quantised. Prints
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -24,7 +23,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import potr_cl.opencl.device
 from potr_cl.codec.quantize import quantize_sh, to_ycocg
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.formats.images import read_ground_truth
@@ -50,8 +48,9 @@ PARTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("α = 0.9, λ = 100, visibility", {"weighting": "visibility", "lam": 100.0}),
     ("λ = ∞", {"lam": 1e20}),
 )
-#: Square pixels that the rasterizer adds to a splat's variance on screen, and their square, as in cl/raster/project.cl.
-_LOW_PASS = ("0.3f", "0.09f")
+#: Macros of cl/raster/project.cl: a quarter of its low-pass filter, which is to a view of half the size what the whole
+#: is to one of full size.
+QUARTER_LOW_PASS = {"LOW_PASS": 0.3 / 4, "LOW_PASS_SQUARED": 0.09 / 16}
 
 
 def measured_weights(device: Device, scene: Scene, cameras: Sequence[Camera]) -> ViewWeights:
@@ -98,27 +97,6 @@ def _ground_truth(cameras: Sequence[Camera]) -> list[FloatArray] | None:
     return [read_ground_truth(p) for p in paths if p is not None]
 
 
-@contextlib.contextmanager
-def _low_pass(factor: float) -> Iterator[None]:
-    """Rasterizers built inside add ``factor`` of their low-pass filter."""
-    original = potr_cl.opencl.device.kernel_source
-
-    def changed(name: str) -> str:
-        text = original(name)
-        if name == "raster/project.cl":
-            once, squared = _LOW_PASS
-            assert once in text
-            assert squared in text
-            text = text.replace(squared, f"{0.09 * factor**2:.9f}f").replace(once, f"{0.3 * factor:.9f}f")
-        return text
-
-    potr_cl.opencl.device.kernel_source = changed
-    try:
-        yield
-    finally:
-        potr_cl.opencl.device.kernel_source = original
-
-
 def _halved(camera: Camera) -> Camera:
     intrinsics = {name: getattr(camera, name) / 2 for name in ("fx", "fy", "cx", "cy")}
     return replace(camera, width=camera.width // 2, height=camera.height // 2, **intrinsics)
@@ -130,8 +108,8 @@ def _resolution(
     """Sparsity with weights from views of full and half size, and of half size with the low-pass of full size."""
     small = [_halved(c) for c in views]
     half = measured_weights(device, scene, small)
-    with _low_pass(0.25):
-        sharp = measured_weights(Device(device.info, family=device.family), scene, small)
+    sharp_device = Device(device.info, family=device.family, macros=QUARTER_LOW_PASS)
+    sharp = measured_weights(sharp_device, scene, small)
     centres, compactor = camera_centres(views), Compactor(device)
     rows = []
     for lam in (0.1, 1.0, 10.0):
