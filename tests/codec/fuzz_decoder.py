@@ -21,8 +21,8 @@ from potr_cl.codec.decoder import PotrFile
 from potr_cl.errors import PotrError
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.report.file import file_report
-from tests.cases.scenes import random_scene, ring_of_cameras
 
 HEADER, ENTRY = 120, 24
 KEEP = EncodeOptions(prune=False, compact=False)

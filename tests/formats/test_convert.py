@@ -25,7 +25,7 @@ from potr_cl.formats.scenes import ply, sog, spz
 from potr_cl.opencl.device import Device
 from potr_cl.quality.compare import compare, mean_view
 from potr_cl.raster.rasterizer import Rasterizer
-from tests.cases.scenes import random_scene
+from potr_cl.reference.scenes import random_scene
 
 pytest.importorskip("gsply", reason="the extra convert is not installed")
 

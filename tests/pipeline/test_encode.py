@@ -14,8 +14,8 @@ from potr_cl.pipeline.encode import Reduced, Stopwatch, code, encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.reduction import reduce_scene
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.pruning.removal import SweepOptions
-from tests.cases.scenes import random_scene, ring_of_cameras
 from tests.devices import KERNELS, open_device
 
 FEW = EncodeOptions(iterations=6)

@@ -31,8 +31,8 @@ from potr_cl.pipeline.search import (
 )
 from potr_cl.quality.compare import compare, mean_view
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.pruning.removal import SweepOptions
-from tests.cases.scenes import random_scene, ring_of_cameras
 from tests.devices import skip_without_cpu
 
 FEW = EncodeOptions(iterations=6)

@@ -25,9 +25,9 @@ from potr_cl.model.camera import camera_centres, train_views
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.reference.ridge import YCOCG, Mask, Ridges, triangles, usable_columns_of
+from potr_cl.reference.scenes import random_scene
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision, ViewWeights
-from tests.cases.scenes import random_scene
-from tests.oracles.ridge import YCOCG, Mask, Ridges, triangles, usable_columns_of
 from tools.make.large_scene import DEFAULT_SCENE
 from tools.study.compaction_curves import measured_weights
 

@@ -48,13 +48,14 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.reference import raster as reference
+from potr_cl.reference.removal import BruteForce
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.refitting.refit import RefitOptions, RenderedTargets, refit_colours
-from tests.oracles import raster as reference
 from tools.bench.pruning import Bench, halved, skips
 from tools.study.compaction_curves import measured_weights
-from tools.study.removal_exactness import SCENES, BruteForce, choose_splats
+from tools.study.removal_exactness import SCENES, choose_splats
 from tools.study.removal_formulas import PREFIX_SUMS
 
 F64 = NDArray[np.float64]
@@ -336,7 +337,7 @@ def ridge_errors(scene: Scene, compacted: Scene, centres: F64, weights: Any, opt
 
     Relative to the largest coefficient or 1.
     """
-    from tests.oracles.ridge import YCOCG, Ridges, triangles  # needs scipy
+    from potr_cl.reference.ridge import YCOCG, Ridges, triangles  # needs scipy
 
     before, after = scene.sh @ YCOCG.T, compacted.sh @ YCOCG.T
     largest = np.maximum(np.abs(before).max(axis=1), 1)

@@ -26,9 +26,10 @@ from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device, Family
 from potr_cl.raster.rasterizer import INRIA, Rasterizer
+from potr_cl.reference import raster as reference
+from potr_cl.reference.removal import BruteForce
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
-from tests.oracles import raster as reference
-from tools.study.removal_exactness import NOISE_FLOOR, SCENES, BruteForce, choose_splats, spent
+from tools.study.removal_exactness import NOISE_FLOOR, SCENES, choose_splats, spent
 
 F64 = NDArray[np.float64]
 

@@ -9,10 +9,10 @@ import pytest
 
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.reference import raster as reference
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
-from tests.cases.scenes import random_scene, ring_of_cameras
 from tests.devices import KERNELS, open_device
-from tests.oracles import raster as reference
 from tools.bench.pruning import halved, pareto
 from tools.study import pruning_baselines as baselines
 from tools.study.pruning_baselines import mesongs_power, removal_order, scores, transmittance_sums

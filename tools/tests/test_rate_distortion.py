@@ -11,7 +11,7 @@ import pytest
 
 from potr_cl.errors import UsageError
 from potr_cl.pipeline.options import EncodeOptions
-from tests.cases.scenes import random_scene
+from potr_cl.reference.scenes import random_scene
 from tools.study import ablation, compare_formats, rate_distortion
 
 

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.cases.scenes import ring_of_cameras
+from potr_cl.reference.scenes import ring_of_cameras
 from tools.bench.pruning import HalfSizeFirst, halved, pareto, skip_settings
 
 
