@@ -17,7 +17,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -33,15 +32,9 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
 from tools.bench.memory import reset_peak, resident
 from tools.make.large_scene import DEFAULT_SCENE, EXCERPT, large_scene
+from tools.results import circumstances
 
 SCENES = DEFAULT_SCENE.parents[1]
-
-
-def _processor() -> str:
-    for line in Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []:
-        if line.startswith("model name"):
-            return line.split(":")[1].strip()
-    return platform.processor()
 
 
 class _Peak:
@@ -266,8 +259,9 @@ def main() -> None:
     parser.add_argument("parts", nargs="*", choices=[[], *PARTS], default=[])
     parser.add_argument("--splats", type=int, default=10**6)
     args = parser.parse_args()
-    print(f"{date.today()}, {_processor()}, {os.cpu_count()} processors, Python {platform.python_version()}, ", end="")
-    print(f"numpy {np.__version__}; python -m tools.bench.codec {' '.join(sys.argv[1:])}".rstrip())
+    about = circumstances()
+    print("{machine}, {date}, commit {commit}".format(**about), end=", ")
+    print(f"Python {platform.python_version()}, numpy {np.__version__}; {about['command'][0]}")
     with tempfile.TemporaryDirectory() as folder:
         for part in args.parts or PARTS:
             PARTS[part](args.splats, Path(folder))

@@ -10,7 +10,6 @@ tools.study.compaction_curves.
 from __future__ import annotations
 
 import argparse
-import os
 import platform
 import time
 from dataclasses import dataclass
@@ -29,6 +28,7 @@ from potr_cl.reference.ridge import YCOCG, Mask, Ridges, triangles, usable_colum
 from potr_cl.reference.scenes import random_scene
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision, ViewWeights
 from tools.make.large_scene import DEFAULT_SCENE
+from tools.results import threads
 from tools.study.compaction_curves import measured_weights
 
 F64 = NDArray[np.float64]
@@ -55,13 +55,9 @@ def operations(views: int, degree: int) -> dict[str, float]:
     }
 
 
-def _threads() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _heading(device: Device) -> None:
     print(f"\n{device.info}, {device.family} kernels of {device.vector_width} lanes; {platform.machine()}, ", end="")
-    print(f"{_threads()} CPU thread(s)\n")
+    print(f"{threads()} CPU thread(s)\n")
 
 
 def _timed(

@@ -53,10 +53,11 @@ from potr_cl.reference.removal import BruteForce
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.refitting.refit import RefitOptions, RenderedTargets, refit_colours
-from tools.bench.pruning import Bench, halved, skips
+from tools.bench.pruning import Bench, skips
 from tools.study.compaction_curves import measured_weights
-from tools.study.removal_exactness import SCENES, choose_splats
+from tools.study.removal_exactness import choose_splats
 from tools.study.removal_formulas import PREFIX_SUMS
+from tools.workloads import SCENES, best_of, scaled
 
 F64 = NDArray[np.float64]
 
@@ -144,7 +145,7 @@ class Workload:
         """A scene's folder, or the excerpt's files put into one."""
         cameras = load_cameras(folder / "cameras.json")
         if quick:
-            cameras = [halved(camera) for camera in cameras]
+            cameras = [scaled(camera, 0.5) for camera in cameras]
         train, test = train_views(cameras), test_views(cameras)
         scene = load_scene(folder / "point_cloud.ply")
         return Workload(folder, scene, train, test, 2 if quick else 5, 3 if quick else 7, 8 if quick else 48)
@@ -158,17 +159,6 @@ class Workload:
 def families(info: DeviceInfo) -> tuple[Family, ...]:
     """The device's own kernel family first."""
     return ("cpu", "gpu") if info.family == "cpu" else ("gpu",)
-
-
-def best_of(repeats: int, work: Callable[[], Any]) -> float:
-    """Seconds by the clock, after one run that is not counted."""
-    work()
-    times = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - started)
-    return min(times)
 
 
 # ------------------------------------------------------------------------------------------ stages

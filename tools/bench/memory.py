@@ -7,7 +7,6 @@ memory is the host's and counts. Prints Markdown. tools.make.large_scene makes s
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from pathlib import Path
 
@@ -17,6 +16,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.pruning.removal import SweepOptions
+from tools.results import Column, Results, Table
 
 
 def resident(field: str) -> float:
@@ -39,7 +39,8 @@ class StagePeaks:
         rows: stage, its peak in gigabytes, what was resident when it ended, its seconds.
     """
 
-    def __init__(self, first: str) -> None:
+    def __init__(self, first: str, table: Table) -> None:
+        self._table = table
         self.rows: list[tuple[str, float, float, float]] = []
         self._stage, self._began = first, time.perf_counter()
         reset_peak()
@@ -48,7 +49,7 @@ class StagePeaks:
         if stage != self._stage:
             now = time.perf_counter()
             self.rows.append((self._stage, resident("VmHWM"), resident("VmRSS"), now - self._began))
-            print("| {} | {:.2f} | {:.2f} | {:.0f} s |".format(*self.rows[-1]), flush=True)
+            self._table.add(*self.rows[-1])
             self._stage, self._began = stage, now
             reset_peak()
 
@@ -62,10 +63,18 @@ def main() -> None:
     parser.add_argument("--views", type=int, metavar="N", help="the first so many only")
     parser.add_argument("--memory", type=float, metavar="GB", help="as encode's")
     parser.add_argument("--device")
+    parser.add_argument("--json", type=Path, help="also keep the results here")
     args = parser.parse_args()
     device = Device(args.device)
-    print(f"{device.info}, {os.cpu_count()} processors\n\n| stage | peak GB | at its end | time |\n|---|---|---|---|")
-    peaks = StagePeaks("read")
+    table = Results(device.info, args.json).table(
+        "stages",
+        f"Host memory of an encode of {args.scene.name}, preset {args.preset}, {args.iterations} iterations",
+        Column("stage"),
+        Column("peak", "GB", ".2f"),
+        Column("at its end", "GB", ".2f"),
+        Column("time", "s", ".0f"),
+    )
+    peaks = StagePeaks("read", table)
     scene = load_scene(args.scene)
     cameras = load_cameras(args.cameras)[: args.views]
     memory = None if args.memory is None else int(args.memory * 2**30)

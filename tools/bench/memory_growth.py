@@ -36,6 +36,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.pruning.removal import SweepOptions
 from tools.bench.memory import reset_peak, resident
 from tools.make.large_scene import DEFAULT_SCENE, EXCERPT, cameras_beside, large_scene, more_views
+from tools.results import circumstances, write_json
 
 #: Parts of what the views would take that --memory is tried with.
 SHARES = (0.0, 0.1, 0.3, 0.6, 0.9)
@@ -181,7 +182,8 @@ def main() -> None:
     print_budgets(budgets, middle)
     if args.json:
         content = {"growth": points, "budgets": budgets}
-        args.json.write_text(json.dumps(content, default=dataclasses.asdict, indent=1))
+        figures = {name: [dataclasses.asdict(point) for point in points] for name, points in content.items()}
+        write_json(args.json, {**circumstances(device.info), **figures})
 
 
 if __name__ == "__main__":

@@ -47,7 +47,8 @@ from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, RenderedTargets, Targets, active_coefficients
-from tools.study.rate_distortion import size_at, write_json
+from tools.results import circumstances, write_json
+from tools.study.rate_distortion import size_at
 
 #: By name: whether splat by splat (the paper's compaction) comes first, and how the re-fit is done, if at all.
 WAYS = {
@@ -260,8 +261,8 @@ def _measure(args: argparse.Namespace) -> None:
     options = EncodeOptions(q=args.quality, preset=args.preset, iterations=args.iterations)
     refit = RefitOptions(steps=args.steps, prior=args.prior)
     results: dict[str, Any] = {
-        "device": device.info.name, "q": args.quality, "preset": args.preset, "steps": args.steps,
-        "prior": args.prior, "every": args.every, "scenes": {},
+        **circumstances(device.info), "device": device.info.name, "q": args.quality, "preset": args.preset,
+        "steps": args.steps, "prior": args.prior, "every": args.every, "scenes": {},
     }  # fmt: skip
     for folder in args.scenes:
         bench = Bench(folder, device, options, refit, args.every)

@@ -28,8 +28,8 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import Stopwatch, reduce
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
+from tools.results import circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
-from tools.study.rate_distortion import write_json
 
 #: The paper's properties, the sections of a file that hold each, and float32 values a splat in a PLY of degree 3.
 PROPERTIES = {
@@ -90,7 +90,8 @@ def measure_steps(evaluator: EvaluatedScene, device: Device, q: float) -> list[d
 
 def _measure(args: argparse.Namespace) -> None:
     device = Device(args.device)
-    results: dict[str, Any] = {"device": device.info.name, "q": args.quality, "scenes": {}}
+    about = circumstances(device.info)
+    results: dict[str, Any] = {**about, "device": device.info.name, "q": args.quality, "scenes": {}}
     for folder in args.scenes:
         evaluator = EvaluatedScene(folder, device)
         steps = measure_steps(evaluator, device, args.quality)

@@ -34,6 +34,7 @@ from potr_cl.pipeline.reduction import reduce_scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
+from tools.workloads import scaled
 
 ALPHAS = (1.0, 0.9, 0.7)
 POWERS = tuple(range(-5, 6))
@@ -97,16 +98,11 @@ def _ground_truth(cameras: Sequence[Camera]) -> list[FloatArray] | None:
     return [read_ground_truth(p) for p in paths if p is not None]
 
 
-def _halved(camera: Camera) -> Camera:
-    intrinsics = {name: getattr(camera, name) / 2 for name in ("fx", "fy", "cx", "cy")}
-    return replace(camera, width=camera.width // 2, height=camera.height // 2, **intrinsics)
-
-
 def _resolution(
     device: Device, scene: Scene, views: list[Camera], weights: ViewWeights, sf_sh: float
 ) -> list[dict[str, Any]]:
     """Sparsity with weights from views of full and half size, and of half size with the low-pass of full size."""
-    small = [_halved(c) for c in views]
+    small = [scaled(c, 0.5) for c in views]
     half = measured_weights(device, scene, small)
     sharp_device = Device(device.info, family=device.family, macros=QUARTER_LOW_PASS)
     sharp = measured_weights(sharp_device, scene, small)

@@ -24,8 +24,9 @@ from typing import Any
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene
 from potr_cl.opencl.device import Device
+from tools.results import circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
-from tools.study.rate_distortion import size_at, value_at, write_json
+from tools.study.rate_distortion import size_at, value_at
 
 FORMATS = ("compressed.ply", "spz", "sog")
 
@@ -85,7 +86,8 @@ def _measure(args: argparse.Namespace) -> None:
     transform = shlex.split(args.transform)
     version = subprocess.run([*transform, "--version"], capture_output=True, text=True, check=True)
     device = Device(args.device)
-    results: dict[str, Any] = {"tool": (version.stdout + version.stderr).strip(), "scenes": {}}
+    tool = (version.stdout + version.stderr).strip()
+    results: dict[str, Any] = {**circumstances(device.info), "tool": tool, "scenes": {}}
     for folder in args.scenes:
         evaluator = EvaluatedScene(folder, device)
         rows = [_through(evaluator, folder / "point_cloud.ply", f, transform, args.timeout) for f in args.formats]

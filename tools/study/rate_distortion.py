@@ -25,12 +25,12 @@ import numpy as np
 
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.errors import UsageError
-from potr_cl.host.atomic_write import replacing
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
 from potr_cl.stages.pruning.removal import SweepOptions
+from tools.results import circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
 
 QUALITIES = tuple(round(0.1 * step, 1) for step in range(1, 11))
@@ -82,18 +82,13 @@ def measure_encode(evaluator: EvaluatedScene, options: EncodeOptions, device: De
     }
 
 
-def write_json(path: Path, content: Any) -> None:
-    with replacing(path) as file:
-        file.write(json.dumps(content, indent=1, allow_nan=False).encode())
-
-
 def _measure(args: argparse.Namespace) -> None:
     series = dict(parse_series(text) for text in args.series)
     device = Device(args.device)
     results: dict[str, Any] = {"scenes": {}}
     if args.json.exists():
         results = json.loads(args.json.read_text())
-    results["device"] = device.info.name
+    results |= {**circumstances(device.info), "device": device.info.name}
     for folder in args.scenes:
         evaluator = EvaluatedScene(folder, device)
         entry = results["scenes"].setdefault(evaluator.name, {**evaluator.facts(), "series": {}})

@@ -29,6 +29,7 @@ from potr_cl.raster.rasterizer import INRIA, Rasterizer
 from potr_cl.reference.raster import project
 from potr_cl.reference.removal import BruteForce
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
+from tools.workloads import SCENES
 
 #: A thousandth of ΔMSE_MAX at q = 1.
 NOISE_FLOOR = 1e-3 * 10**-10.8
@@ -36,7 +37,6 @@ ABOVE = (0.0, NOISE_FLOOR, 100 * NOISE_FLOOR)
 #: Transmittances at which pixels may end: the rules' first.
 THRESHOLDS = (INRIA.transmittance_threshold, 1e-6, 1e-8)
 REPEATS = 5
-SCENES = Path(__file__).parents[3] / "shared" / "scenes"
 F64 = NDArray[np.float64]
 
 

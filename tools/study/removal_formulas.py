@@ -29,7 +29,8 @@ from potr_cl.raster.rasterizer import INRIA, Rasterizer
 from potr_cl.reference import raster as reference
 from potr_cl.reference.removal import BruteForce
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
-from tools.study.removal_exactness import NOISE_FLOOR, SCENES, choose_splats, spent
+from tools.study.removal_exactness import NOISE_FLOOR, choose_splats, spent
+from tools.workloads import SCENES
 
 F64 = NDArray[np.float64]
 
