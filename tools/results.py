@@ -128,7 +128,9 @@ def _storable(cell: Cell) -> Cell:
 def circumstances(device: DeviceInfo | None = None) -> dict[str, Any]:
     """Where, when and by what a result is made: machine, date, command, commit."""
     parts = [device.name] if device is not None else []
-    if device is None or device.kind != "cpu":
+    if device is not None and device.kind == "cpu":
+        parts.append(device.platform)
+    else:
         parts.append(processor())
     return {
         "machine": f"{', '.join(parts)}, {threads()} processors",

@@ -30,6 +30,27 @@ def scene_parser(description: str | None) -> argparse.ArgumentParser:
     return parser
 
 
+def study_parser(
+    description: str | None, measure: Callable[[argparse.Namespace], None], report: Callable[[argparse.Namespace], None]
+) -> tuple[argparse.ArgumentParser, argparse.ArgumentParser, argparse.ArgumentParser]:
+    """A command line of two commands: ``measure SCENE … --json FILE`` and ``report FILE``.
+
+    Returns:
+        The parser, whose arguments' ``run`` is the function to call with them; and the commands', for more options.
+    """
+    parser = argparse.ArgumentParser(description=description, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    measuring = commands.add_parser("measure")
+    measuring.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
+    measuring.add_argument("--json", type=Path, required=True)
+    measuring.add_argument("--device", help="as for potr-cl")
+    measuring.set_defaults(run=measure)
+    reporting = commands.add_parser("report")
+    reporting.add_argument("results", type=Path, help="the JSON that measure wrote")
+    reporting.set_defaults(run=report)
+    return parser, measuring, reporting
+
+
 def read(folder: Path) -> tuple[Scene, list[Camera]]:
     """The scene and all cameras of a folder."""
     return load_scene(folder / "point_cloud.ply"), load_cameras(folder / "cameras.json")

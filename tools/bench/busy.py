@@ -1,4 +1,6 @@
-"""How busy the device is during an encode, stage by stage: python -m tools.bench.busy --scene SCENE.ply --cameras PATH
+"""How busy the device is during an encode, stage by stage.
+
+    python -m tools.bench.busy --scene SCENE.ply --cameras PATH
 
 The device is busy while at least one of its kernels runs, by the timestamps of a run that records them; the stages'
 wall times are the medians of runs that do not. Everything has been built and used once before. Prints Markdown.

@@ -1,4 +1,6 @@
-"""Speed, memory and size of the codec without pruning: python -m tools.bench.codec [PART …] [--splats N]
+"""Speed, memory and size of the codec without pruning.
+
+    python -m tools.bench.codec [PART …] [--splats N]
 
 Parts: decode, encode, octree, sizes (all by default). Prints Markdown for docs/benchmarks.md. Every measurement that
 concerns memory runs in a process of its own.
@@ -255,7 +257,7 @@ def main() -> None:
     if sys.argv[1:2] == ["--child"]:
         print(json.dumps(CHILDREN[sys.argv[2]](*sys.argv[3:])))
         return
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", choices=[[], *PARTS], default=[])
     parser.add_argument("--splats", type=int, default=10**6)
     args = parser.parse_args()

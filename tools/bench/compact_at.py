@@ -1,4 +1,6 @@
-"""When to compact the colours within the pruning schedule: python -m tools.bench.compact_at SCENE … [--device D]
+"""When to compact the colours within the pruning schedule.
+
+    python -m tools.bench.compact_at SCENE … [--device D]
 
 A SCENE is a folder with point_cloud.ply and cameras.json. For each part of the schedule: splats, bytes, AC sparsity,
 and PSNR on test views against the uncompressed scene's renders, after quantisation. Prints Markdown.

@@ -1,4 +1,6 @@
-"""Speed and accuracy of the SH energy compaction: python -m tools.bench.compaction PART … [options]
+"""Speed and accuracy of the SH energy compaction.
+
+    python -m tools.bench.compaction PART … [options]
 
 Parts:
   speed     synthetic splats, each seen by --views views; needs no files

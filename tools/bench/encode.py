@@ -1,16 +1,15 @@
-"""Run time against error of all stages and whole encodes, on every OpenCL device: python -m tools.bench.encode
-[options]
+"""Run time against error of all stages and whole encodes, on every OpenCL device.
+
+    python -m tools.bench.encode                           every device, the scenes lego and plush
+    python -m tools.bench.encode --quick                   the best device, the bundled excerpt; under two minutes
+    python -m tools.bench.encode --scenes FOLDER …         folders with point_cloud.ply and cameras.json
+    python -m tools.bench.encode --stages sort ridge       some stages only
+    python -m tools.bench.encode --from benchmark.json     tables and plots again
 
 For each stage the variants that exist: kernel family, compiler flags, formula, precision, sort, skips, iterations,
 steps, entropy coder, preset; each with its time and its error against float64 or against the full computation. A
 variant is on the Pareto front if no other of its stage is at least as good in time, error and bytes and better in one
 by more than the noise of 5 %.
-
-  python -m tools.bench.encode                           every device, the scenes lego and plush
-  python -m tools.bench.encode --quick                   the best device, the bundled excerpt; under two minutes
-  python -m tools.bench.encode --scenes FOLDER …         folders with point_cloud.ply and cameras.json
-  python -m tools.bench.encode --stages sort ridge       some stages only
-  python -m tools.bench.encode --from benchmark.json     tables and plots again
 
 Every device runs in a process of its own. Times of the rasterizer's kernels and of the ridge are the device's own, the
 others the clock's. Each is the best of some. Prints Markdown; --json keeps the figures, --plots draws them.
@@ -54,6 +53,7 @@ from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precis
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.refitting.refit import RefitOptions, RenderedTargets, refit_colours
 from tools.bench.pruning import Bench, skips
+from tools.results import circumstances, processor
 from tools.study.compaction_curves import measured_weights
 from tools.study.removal_exactness import choose_splats
 from tools.study.removal_formulas import PREFIX_SUMS
@@ -473,11 +473,6 @@ def measure(info: DeviceInfo, load: Workload, quick: bool, stages: Sequence[str]
 
 def header(info: DeviceInfo) -> dict[str, str]:
     """The machine and the versions."""
-    processor = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        models = [line.split(":")[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
-        processor = models[0] if models else processor
     packages = ("potr-cl", "pyopencl", "numpy", "zstandard")
     versions = []
     for package in packages:
@@ -487,7 +482,7 @@ def header(info: DeviceInfo) -> dict[str, str]:
             versions.append(f"{package} not installed")
     return {
         "device": f"{info.name}, {info.platform}, {info.version}, driver {info.handle.driver_version}",
-        "machine": f"{processor}, {os.cpu_count()} processors, {platform.system()} {platform.release()}",
+        "machine": f"{processor()}, {os.cpu_count()} processors, {platform.system()} {platform.release()}",
         "versions": f"Python {platform.python_version()}, " + ", ".join(versions),
         "date": time.strftime("%Y-%m-%d"),
     }
@@ -627,7 +622,7 @@ def main() -> None:
                 scenes = {folder.name: folder for folder in (SCENES / "lego", SCENES / "plush") if folder.exists()}
             scenes = scenes or {"excerpt": excerpt(Path(scratch) / "excerpt")}
             results = [
-                in_process(info, folder, name, args.quick, args.stages)
+                {**circumstances(info), **in_process(info, folder, name, args.quick, args.stages)}
                 for info in infos
                 for name, folder in scenes.items()
             ]

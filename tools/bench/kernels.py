@@ -1,4 +1,6 @@
-"""Processor time of each kernel of a pruning and of a re-fit: python -m tools.bench.kernels SCENE …
+"""Processor time of each kernel of a pruning and of a re-fit.
+
+    python -m tools.bench.kernels SCENE …
 
 For CPU devices on machines that do other work too: a launch's time is that of the process, and of REPEATS runs of the
 same work the least. Each SCENE is a folder with point_cloud.ply and cameras.json. Prints Markdown: milliseconds a

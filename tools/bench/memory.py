@@ -1,4 +1,6 @@
-"""Host memory of an encode, stage by stage: python -m tools.bench.memory SCENE.ply CAMERAS.json [--iterations N] …
+"""Host memory of an encode, stage by stage.
+
+    python -m tools.bench.memory SCENE.ply CAMERAS.json [--iterations N] …
 
 The peak of every stage is the kernel's own (Linux only): it is reset when a stage begins. On CPU devices the device's
 memory is the host's and counts. Prints Markdown. tools.make.large_scene makes scenes of any size.

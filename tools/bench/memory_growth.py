@@ -1,5 +1,6 @@
-"""Peak memory of an encode against splats and views, and whether --memory is obeyed: python -m
-tools.bench.memory_growth
+"""Peak memory of an encode against splats and views, and whether --memory is obeyed.
+
+    python -m tools.bench.memory_growth [--splats N …] [--views N …] [--size WxH] [options]
 
 Scenes of any size are drawn from a trained one (tools.make.large_scene). Each encode runs in a process of its own, so
 that its peak is its own; the host's is the kernel's figure (Linux only) less what the process held before the encode,

@@ -1,4 +1,6 @@
-"""What a scene does not need, and what leaving it out saves: python -m tools.bench.needs [SCENE …] [--views N]
+"""What a scene does not need, and what leaving it out saves.
+
+    python -m tools.bench.needs [SCENE …] [--views N]
 
 Each line compares two runs of the same work, in turn: with and without what is skipped where that can be switched, and
 else of the scene and of the scene with so much more of what nobody needs: then the ratio says what the skip leaves to

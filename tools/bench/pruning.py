@@ -1,4 +1,6 @@
-"""Quality, cost and gain of pruning: python -m tools.bench.pruning SCENE … [options] | --plot FILE …
+"""Quality, cost and gain of pruning.
+
+    python -m tools.bench.pruning SCENE … [options] | --plot FILE …
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, for --truth, images. Parts (all by default):
 

@@ -1,7 +1,7 @@
-"""What the joint re-fit of the colours brings and takes: python -m tools.bench.refit measure SCENE … --json OUT.json
+"""What the joint re-fit of the colours brings and takes.
 
-python -m tools.bench.refit measure SCENE … --json OUT.json [--removed PART …] [--drops X …] [--every N] [--quality Q]
-python -m tools.bench.refit report OUT.json [--images DIR]
+    python -m tools.bench.refit measure SCENE … --json OUT.json [--removed PART …] [--drops X …] [options]
+    python -m tools.bench.refit report OUT.json [--images DIR]
 
 A SCENE is a folder with point_cloud.ply, cameras.json with test views and, if it has any, photographs in images.
 ``measure`` looks at
@@ -49,6 +49,7 @@ from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, RenderedTargets, Targets, active_coefficients
 from tools.results import circumstances, write_json
 from tools.study.rate_distortion import size_at
+from tools.workloads import study_parser
 
 #: By name: whether splat by splat (the paper's compaction) comes first, and how the re-fit is done, if at all.
 WAYS = {
@@ -370,11 +371,7 @@ def _plot(name: str, entry: dict[str, Any], keys: list[str], path: Path) -> None
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(required=True)
-    measure = commands.add_parser("measure")
-    measure.add_argument("scenes", nargs="+", type=Path)
-    measure.add_argument("--json", type=Path, required=True)
+    parser, measure, report = study_parser(__doc__, _measure, _report)
     measure.add_argument("--removed", nargs="+", type=float, default=REMOVED, help="parts of the splats")
     measure.add_argument("--drops", nargs="*", type=float, default=DROPS, help="mean squared errors a coefficient")
     measure.add_argument("--quality", type=float, default=0.5)
@@ -384,12 +381,7 @@ def main() -> None:
     measure.add_argument("--prior", type=float, default=RefitOptions.prior)
     measure.add_argument("--most-steps", type=int, default=max(STEPS), help="of the parts steps and cuts")
     measure.add_argument("--every", type=int, default=1, help="look at every N-th view only")
-    measure.add_argument("--device")
-    measure.set_defaults(run=_measure)
-    report = commands.add_parser("report")
-    report.add_argument("results", type=Path)
     report.add_argument("--images", type=Path)
-    report.set_defaults(run=_report)
     args = parser.parse_args()
     args.run(args)
 

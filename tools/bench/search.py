@@ -1,4 +1,6 @@
-"""Encoding to a size or a PSNR: python -m tools.bench.search SCENE … [--sizes B …] [--psnrs DB …] [--device D]
+"""Encoding to a size or a PSNR.
+
+    python -m tools.bench.search SCENE … [--sizes B …] [--psnrs DB …] [--device D]
 
 A SCENE is a folder with point_cloud.ply and cameras.json. For each target: what was reached, the steps, what the file
 loses to a plain encode of its size, and how many times such an encode's time the search took. Both are read off curves

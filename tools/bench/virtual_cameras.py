@@ -1,4 +1,6 @@
-"""What encoding without cameras costs: python -m tools.bench.virtual_cameras SCENE … [options]
+"""What encoding without cameras costs.
+
+    python -m tools.bench.virtual_cameras SCENE … [options]
 
 A SCENE is a folder with point_cloud.ply and cameras.json. Each is encoded at several qualities, once with its training
 cameras and once with the cameras that :mod:`potr_cl.model.virtual_cameras` places. PSNR is the mean over the true test

@@ -1,4 +1,6 @@
-"""Make the golden files of both versions of the format: python -m tools.make.golden_files
+"""Make the golden files of both versions of the format.
+
+    python -m tools.make.golden_files
 
 Writes tests/data/golden_vN_NAME.potr and has the tests' independent decoder write the values that they must yield for
 ever. Refuses to touch a golden file that exists: those are never made again. What an encoder of another day makes

@@ -1,4 +1,6 @@
-"""The rasterizer on every OpenCL runtime of this machine: python -m tools.stress.platforms [--scenes FOLDER]
+"""The rasterizer on every OpenCL runtime of this machine.
+
+    python -m tools.stress.platforms [--scenes FOLDER]
 
 Each device and kernel family runs in a process of its own, so that a runtime that crashes is one row of the table. What
 is checked: the device's self-check; small random scenes of every SH degree and both rules against the float64

@@ -1,4 +1,6 @@
-"""Numerical stress of every kernel against float64, on every OpenCL device: python -m tools.stress.run [options]
+"""Numerical stress of every kernel against float64, on every OpenCL device.
+
+    python -m tools.stress.run [options]
 
 Each stage is judged on what it was given, so that an error belongs to one kernel: projection on the scene, tile lists,
 order and compositing on the ellipses that projection left, removal effects on the same, the ridge on its own systems,
@@ -46,6 +48,7 @@ from potr_cl.reference.ridge import YCOCG, objective, ridge, weighted_basis
 from potr_cl.stages.compaction.ridge import Compactor, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.refitting.refit import RenderedTargets, refit_colours
+from tools.results import circumstances
 from tools.stress.cases import (
     Case,
     RefitCase,
@@ -766,7 +769,7 @@ def main() -> None:
                 result = in_process(info, family, args.examples)
             else:
                 result = run_device(Device(info, family=family), args.examples)  # type: ignore[arg-type]
-            results.append({"device": str(info), "family": family, **result})
+            results.append({**circumstances(info), "device": str(info), "family": family, **result})
             print(f"{info}, {family} kernels: done", file=sys.stderr, flush=True)
             if args.json is not None:
                 args.json.write_text(json.dumps(results, indent=1))

@@ -1,7 +1,7 @@
-"""What each part of the codec contributes, one added after the other: python -m tools.study.ablation measure|report …
+"""What each part of the codec contributes, one added after the other.
 
-python -m tools.study.ablation measure SCENE … --json OUT.json [--quality Q]
-python -m tools.study.ablation report OUT.json
+    python -m tools.study.ablation measure SCENE … --json OUT.json [--quality Q]
+    python -m tools.study.ablation report OUT.json
 
 The steps are those of the paper's table "Ablation study": serialisation and quantisation, entropy coding, pruning,
 SH compaction, YCoCg; those before YCoCg quantise R, G and B. The last is ours: balanced steps and a context coder, the
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -30,6 +29,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
 from tools.results import circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
+from tools.workloads import study_parser
 
 #: The paper's properties, the sections of a file that hold each, and float32 values a splat in a PLY of degree 3.
 PROPERTIES = {
@@ -131,17 +131,8 @@ def _report(args: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(required=True)
-    measure = commands.add_parser("measure")
-    measure.add_argument("scenes", nargs="+", type=Path)
-    measure.add_argument("--json", type=Path, required=True)
+    parser, measure, _ = study_parser(__doc__, _measure, _report)
     measure.add_argument("--quality", type=float, default=0.5)
-    measure.add_argument("--device")
-    measure.set_defaults(run=_measure)
-    report = commands.add_parser("report")
-    report.add_argument("results", type=Path)
-    report.set_defaults(run=_report)
     args = parser.parse_args()
     args.run(args)
 

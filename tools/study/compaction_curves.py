@@ -1,14 +1,13 @@
-"""What the SH energy compaction does to sparsity and pictures: python -m tools.study.compaction_curves FOLDER …
-[options]
+"""What the SH energy compaction does to sparsity and pictures.
+
+    python -m tools.study.compaction_curves FOLDER … --json curves.json       measure; keep the figures
+    python -m tools.study.compaction_curves --from curves.json [--png FILE]   tables and plot of figures that were kept
 
 Each FOLDER holds point_cloud.ply and cameras.json. Of each scene, as it is and pruned at quality 0.5: share of AC
 coefficients that are quantised to 0, mean magnitude of the others in steps of the quantiser, and PSNR over all test
 views, against λ and α and without single parts of the method; and the same sparsity from training views of half the
 size. PSNR is against the renders of the uncompressed scene, of the same splats uncompacted and unquantised, and against
 the photographs where they are there. Only SH coefficients are quantised. Prints Markdown.
-
-  python -m tools.study.compaction_curves FOLDER … --json curves.json       measure; keep the figures
-  python -m tools.study.compaction_curves --from curves.json [--png FILE]   tables and plot of figures that were kept
 """
 
 from __future__ import annotations

@@ -1,7 +1,7 @@
 """Size against quality: encode at many qualities, decode, judge by all test views; then tables and plots.
 
-python -m tools.study.rate_distortion measure SCENE … --json OUT.json [--qualities Q …] [--series NAME[:OPTION=VALUE,…]
-…] python -m tools.study.rate_distortion report OUT.json [--formats FORMATS.json] [--images DIR] [--against NAME --at Q]
+    python -m tools.study.rate_distortion measure SCENE … --json OUT.json [--series NAME[:OPTION=VALUE,…] …] [options]
+    python -m tools.study.rate_distortion report OUT.json [--formats FORMATS.json] [--images DIR] [options]
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photographs in images. A series is a curve:
 the name it gets and the fields of EncodeOptions in which it differs from the defaults, as in best:preset=best; those of
@@ -32,6 +32,7 @@ from potr_cl.report.file import file_report
 from potr_cl.stages.pruning.removal import SweepOptions
 from tools.results import circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
+from tools.workloads import study_parser
 
 QUALITIES = tuple(round(0.1 * step, 1) for step in range(1, 11))
 
@@ -236,22 +237,13 @@ def _report(args: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(required=True)
-    measure = commands.add_parser("measure")
-    measure.add_argument("scenes", nargs="+", type=Path)
-    measure.add_argument("--json", type=Path, required=True)
+    parser, measure, report = study_parser(__doc__, _measure, _report)
     measure.add_argument("--qualities", nargs="+", type=float, default=QUALITIES, metavar="Q")
     measure.add_argument("--series", nargs="+", default=["default"], metavar="NAME[:OPTION=VALUE,…]")
-    measure.add_argument("--device")
-    measure.set_defaults(run=_measure)
-    report = commands.add_parser("report")
-    report.add_argument("results", type=Path)
     report.add_argument("--formats", type=Path, help="what tools.study.compare_formats measured")
     report.add_argument("--images", type=Path, metavar="DIR", help="draw the curves too")
     report.add_argument("--against", metavar="NAME")
     report.add_argument("--at", type=float, default=0.5, metavar="Q")
-    report.set_defaults(run=_report)
     args = parser.parse_args()
     args.run(args)
 

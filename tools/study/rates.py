@@ -1,4 +1,6 @@
-"""Where the bits go and what they buy: python -m tools.study.rates PART SCENE … [--q Q] [--reduced FOLDER]
+"""Where the bits go and what they buy.
+
+    python -m tools.study.rates PART SCENE … [--q Q] [--reduced FOLDER]
 
 Parts: errors (bits and error of each quantiser, and of others that were tried), margins (what a bit less of each
 property costs), streams (bytes and decode time with each coder), sizes (the steps from the paper's file to the

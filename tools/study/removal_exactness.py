@@ -1,4 +1,6 @@
-"""Predicted removal effects against rendering without each splat in float64: python -m tools.study.removal_exactness
+"""Predicted removal effects against rendering without each splat in float64.
+
+    python -m tools.study.removal_exactness
 
 For splats spread over the whole range of importance: their ΔMSE over some training views as one sweep predicts it, and
 as brute force finds it: every tile that a splat can touch is composited in float64 with and without it, once with each
@@ -102,7 +104,7 @@ def measure(folder: Path, devices: Sequence[Device], views: int, splats: int) ->
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device")
     parser.add_argument("--views", type=int, default=6)
     parser.add_argument("--splats", type=int, default=300)

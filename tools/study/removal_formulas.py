@@ -1,4 +1,6 @@
-"""The two formulas of removal effects beside each other: python -m tools.study.removal_formulas
+"""The two formulas of removal effects beside each other.
+
+    python -m tools.study.removal_formulas
 
 Back to front is what the package computes, PD = T alpha (B - c) with the colour behind B grown from the last splat on.
 Prefix sums is the paper's, PD_k = P_k - P_{k+1} / (1 - alpha) + alpha / (1 - alpha) P_K, in a second sweep from front
@@ -135,7 +137,7 @@ def time_sweeps(scene: Scene, cameras: Sequence[Camera], pair: tuple[Device, Dev
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device")
     parser.add_argument("--splats", type=int, default=150)
     parser.add_argument("--family", choices=("cpu", "gpu"), help="of kernels; default: the device's own")
