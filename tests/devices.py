@@ -8,7 +8,8 @@ from typing import Any, cast
 import pytest
 
 from potr_cl.errors import DeviceError
-from potr_cl.opencl.device import Device, DeviceInfo, Family, choose_device, compiler_fault, list_devices
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, compiler_fault, list_devices
 
 
 def _is_of_pip(info: DeviceInfo) -> bool:

@@ -25,7 +25,7 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.host.atomic_write import replacing
-from potr_cl.opencl.device import DeviceInfo
+from potr_cl.opencl.discovery import DeviceInfo
 
 ROOT = Path(__file__).parents[1]
 

@@ -15,7 +15,11 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import Run, Stopwatch
+from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.code import Code
+from potr_cl.stages.stage import State
 
 #: Whole scenes, for tools that take none on the command line: folders lego and plush.
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"
@@ -54,6 +58,12 @@ def study_parser(
 def read(folder: Path) -> tuple[Scene, list[Camera]]:
     """The scene and all cameras of a folder."""
     return load_scene(folder / "point_cloud.ply"), load_cameras(folder / "cameras.json")
+
+
+def reduced(scene: Scene, views: Sequence[Camera], options: EncodeOptions, device: Device | None = None) -> Scene:
+    """What all stages but the coder leave of a scene; device: the best one there is by default."""
+    before_coding = [type(stage) for stage in options.stages if not isinstance(stage, Code)]
+    return Run(options, Stopwatch(), device).stages(State.of(scene, views), before_coding).scene
 
 
 def pictures(device: Device, scene: Scene, views: Sequence[Camera]) -> list[FloatArray]:

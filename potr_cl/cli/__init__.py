@@ -51,7 +51,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     argv = sys.argv[1:] if argv is None else argv
     if argv and argv[0] in _ON_A_DEVICE and not {"-h", "--help"} & set(argv):
         # Drivers take as long to load as the command's modules to be imported.
-        in_background(import_module("potr_cl.opencl.device").list_devices)
+        in_background(import_module("potr_cl.opencl.discovery").list_devices)
     args = _parser(argv).parse_args(argv)
     try:
         args.run(args)

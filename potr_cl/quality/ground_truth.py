@@ -12,6 +12,7 @@ from potr_cl.formats.images import Colour, read_ground_truth
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner
 from potr_cl.quality.compare import find_ground_truth
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
@@ -53,7 +54,7 @@ class GroundTruth:
         return float(np.mean([psnr(rasterizer.render(camera)[0], self.picture(camera)) for camera in cameras]))
 
 
-class GroundTruthTargets:
+class GroundTruthTargets(Owner):
     """The photographs as targets of :class:`potr_cl.stages.refitting.refit.ColourRefit`.
 
     Args:
@@ -76,6 +77,9 @@ class GroundTruthTargets:
         with self._device.errors("failed to take a photograph"):
             cl.enqueue_copy(self._device.queue, self._buffer, picture, is_blocking=True)
         return self._buffer
+
+    def close(self) -> None:
+        self.free()
 
     def free(self) -> None:
         """Give the device's memory back."""

@@ -30,7 +30,9 @@ from numpy.typing import NDArray
 from potr_cl.errors import DeviceError, DeviceMemoryError, UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
-from potr_cl.opencl.device import Device, Scratch
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner, Scratch
+from potr_cl.opencl.structs import struct_dtype
 
 TILE = 16
 
@@ -56,29 +58,9 @@ _UPLOADED = 1 << 18
 #: Where the SH coefficients stand among the kernel's parameters.
 _SH = 4
 
-_CAMERA = np.dtype(
-    [
-        ("rotation", np.float32, 9),
-        ("camera_centre_high", np.float32, 3),
-        ("camera_centre_low", np.float32, 3),
-        ("focal", np.float32, 2),
-        ("principal", np.float32, 2),
-        ("limit", np.float32, 2),
-        ("size", np.int32, 2),
-        ("tiles", np.int32, 2),
-    ]
-)
-
-#: ``SetView`` in cl/include/view_set.clh.
-_SET_VIEW = np.dtype(
-    [
-        ("view", _CAMERA),
-        ("first_tile", np.uint32),
-        ("first_offset", np.uint32),
-        ("first_intersection", np.uint32),
-        ("first_pixel", np.uint32),
-    ]
-)
+#: ``View`` of the kernels, and ``SetView``, which has one.
+_CAMERA = struct_dtype("include/splat.clh", "View")
+_SET_VIEW = struct_dtype("include/view_set.clh", "SetView")
 
 #: Work-items of a work-group a tile, stage by stage. On a CPU one: PoCL would keep the private memory of more of them
 #: on its stack.
@@ -132,11 +114,12 @@ def camera_struct(camera: Camera) -> NDArray[Any]:
     struct["rotation"] = camera.rotation.ravel()
     struct["camera_centre_high"] = camera.centre
     struct["camera_centre_low"] = camera.centre - struct["camera_centre_high"]
-    struct["focal"] = camera.fx, camera.fy
-    struct["principal"] = camera.cx, camera.cy
-    struct["limit"] = 1.3 * camera.width / (2 * camera.fx), 1.3 * camera.height / (2 * camera.fy)
-    struct["size"] = camera.width, camera.height
-    struct["tiles"] = _tiles(camera)
+    struct["fx"], struct["fy"] = camera.fx, camera.fy
+    struct["cx"], struct["cy"] = camera.cx, camera.cy
+    struct["limit_x"] = 1.3 * camera.width / (2 * camera.fx)
+    struct["limit_y"] = 1.3 * camera.height / (2 * camera.fy)
+    struct["width"], struct["height"] = camera.width, camera.height
+    struct["columns"], struct["rows"] = _tiles(camera)
     return struct
 
 
@@ -344,7 +327,7 @@ class ViewSet:
         self._buffers = []
 
 
-class Rasterizer:
+class Rasterizer(Owner):
     """Renders one scene on one device, with the scene and all scratch memory kept there.
 
     Args:
@@ -604,13 +587,13 @@ class Rasterizer:
             views.make_room(found)
             self._enqueue_lists(views, bounds, counts)
         except BaseException:
-            self._counts.free()  # not zero
+            self._counts.close()  # not zero
             views.free()
             raise
         finally:
             if len(cameras) > 1:  # far more than a single view will need
                 for scratch in (self._keys, self._bounds, self._counts):
-                    scratch.free()
+                    scratch.close()
         return views
 
     def _zeroed_counts(self, views: ViewSet) -> cl.Buffer:
@@ -662,7 +645,7 @@ class Rasterizer:
                     return self._image.buffer, self._transmittance.buffer
                 views.make_room([count + count // 4])
         except BaseException:
-            self._counts.free()  # maybe not zero
+            self._counts.close()  # maybe not zero
             raise
 
     def render_into(self, cameras: Sequence[Camera], target: cl.Buffer) -> None:
@@ -732,6 +715,9 @@ class Rasterizer:
         self._scratch = views
         return views
 
+    def close(self) -> None:
+        self.free()
+
     def free(self) -> None:
         """Give all device memory back; the rasterizer is of no use afterwards."""
         if self._scratch is not None:
@@ -739,7 +725,7 @@ class Rasterizer:
         for buffer in self._parameters:
             self.device.free(buffer)
         for scratch in (self._bounds, self._counts, self._keys, self._image, self._transmittance):
-            scratch.free()
+            scratch.close()
 
 
 def render(

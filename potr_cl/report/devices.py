@@ -6,7 +6,8 @@ from collections.abc import Sequence
 from typing import Any
 
 from potr_cl.errors import DeviceError
-from potr_cl.opencl.device import Device, DeviceInfo, compiler_fault, fitting_devices, list_devices
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DeviceInfo, compiler_fault, fitting_devices, list_devices
 
 
 def device_report(check: bool) -> list[dict[str, Any]]:

@@ -21,7 +21,8 @@ from potr_cl.errors import DeviceError
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.formats.images import to_8_bits
 from potr_cl.formats.scenes import ply
-from potr_cl.opencl.device import DEVICE_VARIABLE, Device, compiler_fault, list_devices
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DEVICE_VARIABLE, compiler_fault, list_devices
 from potr_cl.raster.rasterizer import GSPLAT, Rasterizer
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
 
@@ -306,7 +307,7 @@ def test_interrupted_pruning_leaves_nothing(tmp_path, scene_path, capsys, monkey
     def interrupted(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("potr_cl.pipeline.reduction.prune_scene", interrupted)
+    monkeypatch.setattr("potr_cl.stages.prune.prune_scene", interrupted)
     cameras = cameras_json(tmp_path / "cameras.json")
     before = sorted(tmp_path.iterdir())
     for command in ("prune", "encode"):
@@ -872,7 +873,7 @@ def test_devices_check_fails_if_the_one_to_be_taken_does(capsys, monkeypatch, ch
 
 
 def test_no_device(capsys, monkeypatch):
-    monkeypatch.setattr("potr_cl.opencl.device.list_devices", list)
+    monkeypatch.setattr("potr_cl.opencl.discovery.list_devices", list)
     fails(capsys, ["devices"], 1, "no OpenCL device found")
 
 

@@ -5,7 +5,6 @@ python -m tests.codec.fuzz_decoder COUNT SEED: prints a JSON line with what happ
 
 from __future__ import annotations
 
-import dataclasses
 import json
 import resource
 import signal
@@ -20,24 +19,23 @@ from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.errors import PotrError
 from potr_cl.pipeline.encode import encode
-from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.report.file import file_report
+from tests.cases.options import as_it_is
 
 HEADER, ENTRY = 120, 24
-KEEP = EncodeOptions(prune=False, compact=False)
 SECONDS_A_FILE = 20  # a file of this size decodes in milliseconds: whatever reaches this hangs
 
 
 def seeds() -> list[bytes]:
     coincident = random_scene(120, 1, seed=2).subset(np.r_[np.arange(120), np.arange(40), [3, 3]])
     encoded = [
-        encode(random_scene(150, 3, seed=1), ring_of_cameras(6), KEEP),
-        encode(coincident, None, dataclasses.replace(KEEP, q=0.3, entropy=EntropyCoder("npz"))),
-        encode(random_scene(400, 0, seed=3), None, dataclasses.replace(KEEP, q=1.0, entropy=EntropyCoder("zstd", 1))),
-        encode(random_scene(1, 0, seed=4), None, KEEP),
-        encode(random_scene(1200, 2, seed=5), None, dataclasses.replace(KEEP, preset="best")),
-        encode(random_scene(200, 1, seed=6), ring_of_cameras(6), dataclasses.replace(KEEP, preset="fast")),
+        encode(random_scene(150, 3, seed=1), ring_of_cameras(6), as_it_is()),
+        encode(coincident, None, as_it_is(entropy=EntropyCoder("npz"), q=0.3)),
+        encode(random_scene(400, 0, seed=3), None, as_it_is(entropy=EntropyCoder("zstd", 1), q=1.0)),
+        encode(random_scene(1, 0, seed=4), None, as_it_is()),
+        encode(random_scene(1200, 2, seed=5), None, as_it_is("best")),
+        encode(random_scene(200, 1, seed=6), ring_of_cameras(6), as_it_is("fast")),
     ]
     return [b"".join(e.pieces) for e in encoded]
 

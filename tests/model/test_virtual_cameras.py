@@ -255,7 +255,7 @@ def test_the_basis_is_that_of_the_rasterizer():
 
 def test_encode_places_them_itself(monkeypatch):
     monkeypatch.setattr("potr_cl.pipeline.encode.place_cameras", lambda scene: place_cameras(scene, 6, 64))
-    scene, options = random_scene(150, 2), EncodeOptions(iterations=2)
+    scene, options = random_scene(150, 2), EncodeOptions.for_preset("paper", prune={"iterations": 2})
     given = encode(scene, place_cameras(scene, 6, 64), options)
     assert b"".join(encode(scene, None, options).pieces) == b"".join(given.pieces)
     assert given.pruned is not None

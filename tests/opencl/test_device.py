@@ -13,16 +13,11 @@ import pyopencl as cl
 import pytest
 
 from potr_cl.errors import DeviceError
-from potr_cl.opencl import device as device_module
-from potr_cl.opencl.device import (
-    Device,
-    DeviceInfo,
-    Scratch,
-    choose_device,
-    compiler_fault,
-    kernel_source,
-    list_devices,
-)
+from potr_cl.opencl import discovery, loader
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DeviceInfo, choose_device, compiler_fault, list_devices
+from potr_cl.opencl.memory import Scratch
+from potr_cl.opencl.source import kernel_source
 from potr_cl.report.devices import device_report, format_devices
 
 
@@ -43,9 +38,10 @@ def invented(
 def faults(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
     """What is wrong with the compilers of devices, by name: those of this test's choice, whatever the machine has."""
     faults: dict[str, str] = {}
-    monkeypatch.setattr(device_module, "compiler_fault", lambda info: faults.get(info.name))
+    monkeypatch.setattr(discovery, "compiler_fault", lambda info: faults.get(info.name))
+    monkeypatch.setattr("potr_cl.opencl.device.compiler_fault", lambda info: faults.get(info.name))
     monkeypatch.setattr("potr_cl.report.devices.compiler_fault", lambda info: faults.get(info.name))
-    monkeypatch.setattr(device_module, "_passed_over", set())
+    monkeypatch.setattr(discovery, "_passed_over", set())
     return faults
 
 
@@ -63,7 +59,7 @@ def machine(monkeypatch: pytest.MonkeyPatch, faults: dict[str, str]) -> list[Dev
         invented(6, "RTX", "gpu", "NVIDIA CUDA"),
         invented(7, "RTX", "gpu", "NVIDIA CUDA"),
     ]
-    monkeypatch.setattr(device_module, "_devices", devices)
+    monkeypatch.setattr(discovery, "_devices", devices)
     monkeypatch.delenv("POTR_CL_DEVICE", raising=False)
     return devices
 
@@ -74,7 +70,7 @@ def test_preference(machine: list[DeviceInfo]) -> None:
     while machine:
         order.append(choose_device().index)
         machine.remove(choose_device())
-        device_module._devices = machine
+        discovery._devices = machine
     assert order == [6, 7, 5, 4, 3, 2, 1, 0]
 
 
@@ -99,8 +95,8 @@ def test_specification_that_fits_nothing(machine: list[DeviceInfo], spec: str) -
     ("architecture", "advice"), [("x86_64", "`pip install intel"), ("AMD64", "`pip install intel"), ("aarch64", "PoCL")]
 )
 def test_no_device_at_all(monkeypatch: pytest.MonkeyPatch, architecture: str, advice: str) -> None:
-    monkeypatch.setattr(device_module, "_devices", [])
-    monkeypatch.setattr(device_module, "machine", lambda: architecture)
+    monkeypatch.setattr(discovery, "_devices", [])
+    monkeypatch.setattr(discovery, "machine", lambda: architecture)
     monkeypatch.setattr("sys.platform", "linux")
     with pytest.raises(DeviceError, match=f"or a CPU runtime by .*{advice}"):
         choose_device()
@@ -171,13 +167,13 @@ def test_listing_asks_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
     def asked(handle: cl.Device) -> None:
         raise AssertionError("a compiler was asked")
 
-    monkeypatch.setattr(device_module.compiler, "fault", asked)
-    monkeypatch.setattr(device_module, "_devices", None)
+    monkeypatch.setattr(discovery.compiler, "fault", asked)
+    monkeypatch.setattr(discovery, "_devices", None)
     assert list_devices()
 
 
 def test_only_cpus_of_pocl_are_asked(machine: list[DeviceInfo], monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(device_module.compiler, "fault", lambda handle: REFUSED)
+    monkeypatch.setattr(discovery.compiler, "fault", lambda handle: REFUSED)
     pocl_gpu = invented(8, "Some GPU", "gpu", "Portable Computing Language")
     assert [info.name for info in [*machine, pocl_gpu] if compiler_fault(info)] == ["pthread-old", "pthread-new"]
 
@@ -196,23 +192,23 @@ def test_the_report_shows_what_cannot_compile(machine: list[DeviceInfo], faults:
 @pytest.mark.skipif(sys.platform == "win32", reason="a module's own libraries cannot be looked through there")
 def test_other_threads_go_on_while_a_device_is_opened() -> None:
     """pyopencl's calls keep the interpreter's lock: the loader's own functions are found, and take what it takes."""
-    assert None not in [device_module._loader_function(name) for name in ("clGetPlatformIDs", "clCreateContext")]
+    assert None not in [loader.loader_function(name) for name in ("clGetPlatformIDs", "clCreateContext")]
     info = choose_device()
-    assert device_module._new_context(info.handle).devices == [info.handle]
+    assert loader.new_context(info.handle).devices == [info.handle]
 
 
 def test_without_the_loaders_functions_pyopencl_does_it(monkeypatch: pytest.MonkeyPatch) -> None:
     known = list_devices()
-    monkeypatch.setattr(device_module, "_loader_function", lambda name: None)
-    monkeypatch.setattr(device_module, "_devices", None)
+    monkeypatch.setattr(loader, "loader_function", lambda name: None)
+    monkeypatch.setattr(discovery, "_devices", None)
     assert list_devices() == known
     assert Device().vector_width >= 1
 
 
 def test_a_loader_without_platforms(monkeypatch: pytest.MonkeyPatch) -> None:
     """It leaves the count as it was and returns an error; nothing is asked of it any more."""
-    monkeypatch.setattr(device_module, "_loader_function", lambda name: lambda *arguments: -1001)
-    device_module._load_drivers()
+    monkeypatch.setattr(loader, "loader_function", lambda name: lambda *arguments: -1001)
+    loader.load_drivers()
 
 
 def test_compilers_of_this_machine() -> None:
@@ -246,7 +242,7 @@ def test_compilers_of_this_machine() -> None:
     ],
 )
 def test_the_line_that_tells_most(message: str, said: str) -> None:
-    assert device_module.compiler.complaint(cl.RuntimeError(message)) == said
+    assert discovery.compiler.complaint(cl.RuntimeError(message)) == said
 
 
 def test_this_machine() -> None:
@@ -270,7 +266,7 @@ def test_each_device_of_this_machine(index: int) -> None:
 def list_names(vendors: Path, **environment: str) -> list[str]:
     """The devices that a fresh process finds with this folder of ICDs."""
     run = subprocess.run(
-        [sys.executable, "-c", "from potr_cl.opencl.device import *\nfor d in list_devices(): print(d.platform)"],
+        [sys.executable, "-c", "from potr_cl.opencl.discovery import *\nfor d in list_devices(): print(d.platform)"],
         env=os.environ | {"OCL_ICD_VENDORS": str(vendors)} | environment,
         cwd=Path(__file__).parents[2],
         capture_output=True,
@@ -306,22 +302,22 @@ def test_registering_a_runtime_keeps_the_others(tmp_path: Path, monkeypatch: pyt
         def locate(self) -> Path:
             return library
 
-    monkeypatch.setattr(device_module.importlib.metadata, "files", lambda package: [Installed()])
-    monkeypatch.setattr(device_module.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(loader.importlib.metadata, "files", lambda package: [Installed()])
+    monkeypatch.setattr(loader.tempfile, "gettempdir", lambda: str(tmp_path))
     monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))
-    device_module._register_intel_runtime()
+    loader._register_intel_runtime()
     made = Path(os.environ["OCL_ICD_VENDORS"])
     assert made.parent == tmp_path
     assert {p.name: p.read_text() for p in made.iterdir()} == {
         "other.icd": "libother.so\n",
         "potr_cl_intel_cpu.icd": f"{library}\n",
     }
-    device_module._register_intel_runtime()  # what is there already is left alone
+    loader._register_intel_runtime()  # what is there already is left alone
     assert os.environ["OCL_ICD_VENDORS"] == str(made)
 
     library.unlink()
     monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))
-    device_module._register_intel_runtime()
+    loader._register_intel_runtime()
     assert os.environ["OCL_ICD_VENDORS"] == str(vendors)
 
 
@@ -335,13 +331,13 @@ def test_registering_a_runtime_on_windows(tmp_path: Path, monkeypatch: pytest.Mo
         def locate(self) -> Path:
             return library
 
-    monkeypatch.setattr(device_module.importlib.metadata, "files", lambda package: [Installed()])
+    monkeypatch.setattr(loader.importlib.metadata, "files", lambda package: [Installed()])
     monkeypatch.setenv("OCL_ICD_FILENAMES", known)
-    device_module._register_intel_runtime_on_windows()
+    loader._register_intel_runtime_on_windows()
     assert os.environ["OCL_ICD_FILENAMES"] == known  # it is not there
     library.touch()
     for _ in range(2):  # the second time it is known
-        device_module._register_intel_runtime_on_windows()
+        loader._register_intel_runtime_on_windows()
         assert os.environ["OCL_ICD_FILENAMES"].split(os.pathsep) == [*filter(None, [known]), str(library)]
 
 
@@ -379,8 +375,7 @@ def test_a_variant_takes_the_place_of_a_file(tmp_path: Path, device: Device) -> 
     )
     buffer = changed.upload(np.ones(1, np.float32), "a number")
     kernel = changed.kernel("mine/probe.cl", "f")
-    kernel.set_args(buffer)
-    changed.launch(kernel, (1,))
+    kernel.bind(x=buffer).launch((1,))
     assert changed.download(buffer, (1,), np.float32) == 6
     changed.free(buffer)
     assert "#define TILE 3" not in kernel_source("raster/project.cl")
@@ -453,8 +448,8 @@ def test_scratch_grows_and_survives_failure(device: Device) -> None:
         scratch.reserve(device.info.memory * 2)
     assert scratch.nbytes == 0
     assert scratch.reserve(10)
-    scratch.free()
-    scratch.free()
+    scratch.close()
+    scratch.close()
     assert device.allocated == before
 
 

@@ -39,8 +39,10 @@ def main() -> None:
         scene, cameras = read(folder)
         views = test_views(cameras)
         wanted = pictures(device, scene, views)
-        settings = [(f"{part:g}", EncodeOptions(compact_at=part)) for part in (0, 0.25, 0.5, 0.75, 1)]
-        for label, options in [*settings, ("never", EncodeOptions(compact=False))]:
+        settings = [
+            (f"{part:g}", EncodeOptions.for_preset("paper", compact={"at": part})) for part in (0, 0.25, 0.5, 0.75, 1)
+        ]
+        for label, options in [*settings, ("never", EncodeOptions.for_preset("paper", compact=False))]:
             encoded = encode(scene, cameras, options, device=device)
             decoded = decode(b"".join(encoded.pieces))
             got = pictures(device, decoded, views)

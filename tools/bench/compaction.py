@@ -213,7 +213,7 @@ def _accuracy(device: Device, folder: Path, every: int, precisions: list[Precisi
         "| largest AC coefficient / max(1, norm) |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
-    parameters = EncodeOptions().parameters
+    parameters = EncodeOptions.for_preset("paper").parameters
     violators: list[str] = []
     for lam, alpha in ((1.0, 0.9), (parameters.lam, parameters.alpha), (0.01, 1.0)):
         for precision in precisions:

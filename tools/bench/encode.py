@@ -42,7 +42,8 @@ from potr_cl.codec.encoder import code_scene
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, camera_centres, test_views, train_views
 from potr_cl.model.scene import Scene
-from potr_cl.opencl.device import Device, DeviceInfo, Family, choose_device, list_devices
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, list_devices
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
@@ -382,7 +383,7 @@ def refit_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
     removal.free()
     rasterizer.free()
     kept = load.scene.subset(np.sort(np.argsort(importance)[len(importance) // 2 :]))
-    default = EncodeOptions.for_preset("best").refit
+    default = EncodeOptions.for_preset("best").refit.steps
     for family in families(info)[: 1 if quick else 2]:
         device = Device(info, family=family)
         rasterizer = Rasterizer(device, load.scene)
@@ -416,7 +417,7 @@ def code_rows(load: Workload, quick: bool) -> Iterator[Row]:
             ("decode", lambda d=data: decode(d)),
         ):
             seconds = best_of(1 if stage == "code" else load.repeats, work)
-            yield Row(stage, name, seconds, len(data), coder == EncodeOptions.for_preset("best").entropy)
+            yield Row(stage, name, seconds, len(data), coder == EncodeOptions.for_preset("best").code.coder)
 
 
 def encode_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
@@ -427,15 +428,15 @@ def encode_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
         "paper": {"preset": "paper"},
         "fast": {"preset": "fast"},
         "best": {"preset": "best"},
-        "paper, 12 iterations": {"preset": "paper", "iterations": 12},
-        "paper, 4 iterations": {"preset": "paper", "iterations": 4},
-        "paper, every removal effect anew": {"preset": "paper", "sweep": SweepOptions(tolerance=-1)},
+        "paper, 12 iterations": {"preset": "paper", "prune": {"iterations": 12}},
+        "paper, 4 iterations": {"preset": "paper", "prune": {"iterations": 4}},
+        "paper, every removal effect anew": {"preset": "paper", "prune": {"tolerance": -1}},
         "paper, no compaction": {"preset": "paper", "compact": False},
         "paper, no pruning": {"preset": "paper", "prune": False},
         "paper, neither": {"preset": "paper", "prune": False, "compact": False},
-        "paper, re-fit of 8 steps": {"preset": "paper", "refit": 8},
-        "best, re-fit of 4 steps": {"preset": "best", "refit": 4},
-        "best, re-fit of 16 steps": {"preset": "best", "refit": 16},
+        "paper, re-fit of 8 steps": {"preset": "paper", "refit": {"steps": 8}},
+        "best, re-fit of 4 steps": {"preset": "best", "refit": {"steps": 4}},
+        "best, re-fit of 16 steps": {"preset": "best", "refit": {"steps": 16}},
     }
     for number, (name, changes) in enumerate(variants.items()):
         options = EncodeOptions.for_preset(**changes)

@@ -20,6 +20,7 @@ import pyopencl as cl
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.kernel import Kernel
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.pruning.schedule import PruningOptions, prune
@@ -46,7 +47,7 @@ class TimedDevice(Device):
 
     def launch(
         self,
-        kernel: cl.Kernel,
+        kernel: Kernel,
         items: tuple[int, ...],
         group: tuple[int, ...] | None = None,
         queue: cl.CommandQueue | None = None,
@@ -55,7 +56,7 @@ class TimedDevice(Device):
         start = time.process_time()
         super().launch(kernel, items, group, queue)
         (queue or self.queue).finish()
-        self.launches.append((kernel.function_name, time.process_time() - start))
+        self.launches.append((kernel.name, time.process_time() - start))
 
 
 def pruning(device: Device, scene: Scene, cameras: list[Camera]) -> Scene:

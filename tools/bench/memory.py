@@ -17,7 +17,6 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.stages.pruning.removal import SweepOptions
 from tools.results import Column, Results, Table
 
 
@@ -60,7 +59,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("cameras", type=Path)
-    parser.add_argument("--iterations", type=int, default=EncodeOptions.iterations)
+    parser.add_argument("--iterations", type=int, help="of pruning; default: the preset's")
     parser.add_argument("--preset", choices=PRESETS, default=EncodeOptions.preset)
     parser.add_argument("--views", type=int, metavar="N", help="the first so many only")
     parser.add_argument("--memory", type=float, metavar="GB", help="as encode's")
@@ -80,8 +79,9 @@ def main() -> None:
     scene = load_scene(args.scene)
     cameras = load_cameras(args.cameras)[: args.views]
     memory = None if args.memory is None else int(args.memory * 2**30)
-    sweep = SweepOptions(memory=memory)
-    options = EncodeOptions.for_preset(args.preset, iterations=args.iterations, sweep=sweep)
+    options = EncodeOptions.for_preset(args.preset, memory=memory)
+    if args.iterations is not None:
+        options = options.changed(prune={"iterations": args.iterations})
     encoded = encode(scene, cameras, options, peaks, device)
     peaks("end")
     most = max(row[1] for row in peaks.rows)

@@ -34,7 +34,6 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.stages.pruning.removal import SweepOptions
 from tools.bench.memory import reset_peak, resident
 from tools.make.large_scene import DEFAULT_SCENE, EXCERPT, cameras_beside, large_scene, more_views
 from tools.results import circumstances, write_json
@@ -84,8 +83,7 @@ def measure(point: Point, like: Path, size: tuple[int, int], preset: Preset, rou
         path.write_text(json.dumps(entries))
         cameras = load_cameras(path)
     device = CountingDevice(spec)
-    sweep = SweepOptions(memory=point.memory)
-    options = EncodeOptions.for_preset(preset, iterations=rounds, sweep=sweep)
+    options = EncodeOptions.for_preset(preset, prune={"iterations": rounds}, memory=point.memory)
     before = resident("VmRSS")
     reset_peak()
     encode(scene, cameras, options, device.enter, device)

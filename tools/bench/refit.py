@@ -41,7 +41,6 @@ from potr_cl.model.camera import test_views, train_views
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.reduction import reduce_scene
 from potr_cl.quality.ground_truth import GroundTruth, GroundTruthTargets
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
@@ -49,7 +48,7 @@ from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, RenderedTargets, Targets, active_coefficients
 from tools.results import circumstances, write_json
 from tools.study.rate_distortion import size_at
-from tools.workloads import study_parser
+from tools.workloads import reduced, study_parser
 
 #: By name: whether splat by splat (the paper's compaction) comes first, and how the re-fit is done, if at all.
 WAYS = {
@@ -106,8 +105,9 @@ class Bench:
 
     def reduced(self, removed: float, compact: bool) -> Scene:
         count = max(round((1 - removed) * len(self.scene)), 1)
-        options = dataclasses.replace(self.options, count=count, compact=compact)
-        return reduce_scene(self.scene, self.train, options, device=self.device)[0]
+        return reduced(
+            self.scene, self.train, self.options.changed(prune={"count": count}, compact=compact), self.device
+        )
 
     def decoded(self, scene: Scene) -> tuple[int, Scene, NDArray[np.int64]]:
         """Bytes, the decoded scene, and the number in ``scene`` of each of its splats."""
@@ -259,7 +259,7 @@ def _seconds(work: Callable[[], Any]) -> float:
 
 def _measure(args: argparse.Namespace) -> None:
     device = Device(args.device)
-    options = EncodeOptions(q=args.quality, preset=args.preset, iterations=args.iterations)
+    options = EncodeOptions.for_preset(args.preset, q=args.quality, prune={"iterations": args.iterations})
     refit = RefitOptions(steps=args.steps, prior=args.prior)
     results: dict[str, Any] = {
         **circumstances(device.info), "device": device.info.name, "q": args.quality, "preset": args.preset,

@@ -75,7 +75,7 @@ def bench(folder: Path, device: Device, results: Results, args: argparse.Namespa
     evaluator = Evaluator(device, scene, EvaluationViews.of(cameras), (0.0, 0.0, 0.0))
     options = EncodeOptions.for_preset(args.preset)
     few = [camera for camera in cameras if camera.split == "train"][:4]
-    encode(scene, few, replace(options, iterations=1), device=device)  # builds the kernels
+    encode(scene, few, options.changed(prune={"iterations": 1}), device=device)  # builds the kernels
 
     def measured(encoded: Encoded) -> float:
         return evaluator.psnr(decode(b"".join(encoded.pieces)))

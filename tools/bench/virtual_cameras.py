@@ -97,7 +97,7 @@ def main() -> None:
         placing = time.perf_counter() - began
         options = EncodeOptions.for_preset("best")
         if args.quick:
-            options = dataclasses.replace(options, iterations=8)
+            options = options.changed(prune={"iterations": 8})
             judges = [scaled(c, 0.5) for c in judges[::3]]
             true, placed = [scaled(c, 0.5) for c in true], [scaled(c, 0.5) for c in placed]
         wanted = pictures(device, scene, judges)

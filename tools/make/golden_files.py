@@ -12,12 +12,10 @@ from __future__ import annotations
 
 import subprocess
 import sys
-from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.model.scene import Scene
 from potr_cl.pipeline.encode import encode
@@ -25,7 +23,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
 
 DATA = Path(__file__).parents[2] / "tests" / "data"
-KEEP = EncodeOptions(prune=False, compact=False)
+KEEP = EncodeOptions.for_preset("paper", prune=False, compact=False)
 
 
 def _with_means(scene: Scene, means: np.ndarray) -> Scene:
@@ -41,18 +39,18 @@ def main() -> None:
     still.sh[:, 4:] = 0
     scenes = {
         "degree3_cameras": encode(random_scene(200, 3, seed=1), cameras, KEEP),
-        "degree1_npz": encode(random_scene(80, 1, seed=2), None, replace(KEEP, q=0.8, entropy=EntropyCoder("npz"))),
-        "degree2_coincident": encode(coincident, None, replace(KEEP, q=0.2)),
+        "degree1_npz": encode(random_scene(80, 1, seed=2), None, KEEP.changed(q=0.8, code={"entropy": "npz"})),
+        "degree2_coincident": encode(coincident, None, KEEP.changed(q=0.2)),
         "degree0_one_splat": encode(random_scene(1, 0, seed=4), None, KEEP),
-        "degree0_deep": encode(_with_means(random_scene(40, 0, seed=5), deep), None, replace(KEEP, q=1.0)),
+        "degree0_deep": encode(_with_means(random_scene(40, 0, seed=5), deep), None, KEEP.changed(q=1.0)),
         "degree0_all_coincident": encode(
             _with_means(random_scene(30, 0, seed=6), np.full((30, 3), 0.7)),
             cameras,
             KEEP,
         ),
-        "degree3_zero_bands": encode(still, cameras, replace(KEEP, q=0.0)),
+        "degree3_zero_bands": encode(still, cameras, KEEP.changed(q=0.0)),
         "degree0_wide_integers": encode(
-            random_scene(30, 0, seed=9, extent=1e3), None, replace(KEEP, sf_scale=1e8, sf_sh=1e6)
+            random_scene(30, 0, seed=9, extent=1e3), None, KEEP.with_parameters(sf_scale=1e8, sf_sh=1e6)
         ),
     }
     best, fast = (EncodeOptions.for_preset(preset, prune=False, compact=False) for preset in ("best", "fast"))
@@ -60,7 +58,7 @@ def main() -> None:
     many.sh[:, 1:] *= np.random.default_rng(2).random((1500, 15, 1)) < 0.3
     scenes |= {
         "degree3_context": encode(many, cameras, best),
-        "degree1_context": encode(random_scene(1000, 1, seed=12), None, replace(best, q=1.0)),
+        "degree1_context": encode(random_scene(1000, 1, seed=12), None, best.changed(q=1.0)),
         "degree3_zstd": encode(random_scene(200, 3, seed=13), cameras, fast),
         "degree2_coincident_balanced": encode(coincident, None, best),
         "degree0_one_splat_balanced": encode(random_scene(1, 0, seed=14), None, best),

@@ -31,7 +31,8 @@ import pyopencl as cl
 from potr_cl.errors import DeviceError
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import camera_centres
-from potr_cl.opencl.device import Device, DeviceInfo, list_devices
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DeviceInfo, list_devices
 from potr_cl.quality.metrics import ssim
 from potr_cl.quality.metrics_device import Picture, Similarity
 from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer

@@ -40,7 +40,8 @@ from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.opencl.device import Device, DeviceInfo, list_devices
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DeviceInfo, list_devices
 from potr_cl.raster.rasterizer import TILE, Rasterizer, RasterRules
 from potr_cl.reference import raster as reference
 from potr_cl.reference.refit import Reference, to_ycocg

@@ -24,12 +24,11 @@ from potr_cl.codec.encoder import code_scene
 from potr_cl.model.camera import train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Stopwatch, reduce
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
 from tools.results import circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
-from tools.workloads import study_parser
+from tools.workloads import reduced, study_parser
 
 #: The paper's properties, the sections of a file that hold each, and float32 values a splat in a PLY of degree 3.
 PROPERTIES = {
@@ -57,7 +56,7 @@ def from_channels(scene: Scene) -> Scene:
 def _coded(evaluator: EvaluatedScene, scene: Scene, options: EncodeOptions, rgb: bool) -> dict[str, Any]:
     """Code a scene as R, G, B or as Y, Co, Cg; what the file takes by property, and what it keeps."""
     views = train_views(evaluator.cameras)
-    coded = code_scene(as_channels(scene) if rgb else scene, options.parameters, views, entropy=options.entropy)
+    coded = code_scene(as_channels(scene) if rgb else scene, options.parameters, views, entropy=options.code.coder)
     file = PotrFile.from_bytes(b"".join(coded.pieces))
     sections = file_report(file)["sections"]
     decoded = from_channels(file.scene()) if rgb else file.scene()
@@ -78,13 +77,13 @@ def measure_steps(evaluator: EvaluatedScene, device: Device, q: float) -> list[d
     serialised = {**plain, "bytes": plain["serialised_bytes"], "bytes_a_splat": plain["serialised_bytes_a_splat"]}
     steps = [{"step": "serialisation and quantisation", **serialised}, {"step": "entropy coding", **plain}]
     for name, changed, rgb in (
-        ("pruning", dataclasses.replace(options, compact=False), True),
-        ("SH compaction", dataclasses.replace(options, colour_model="rgb"), True),
+        ("pruning", options.changed(compact=False), True),
+        ("SH compaction", options.changed(compact={"colour_model": "rgb"}), True),
         ("RGB → YCoCg", options, False),
         ("preset best", EncodeOptions.for_preset("best", q=q), False),
     ):
-        reduced = reduce(evaluator.source, train_views(evaluator.cameras), changed, Stopwatch(), device)
-        steps.append({"step": name, **_coded(evaluator, reduced.scene, changed, rgb)})
+        left = reduced(evaluator.source, train_views(evaluator.cameras), changed, device)
+        steps.append({"step": name, **_coded(evaluator, left, changed, rgb)})
     return steps
 
 

@@ -29,11 +29,10 @@ from potr_cl.model.camera import Camera, camera_centres, test_views, train_views
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.reduction import reduce_scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
-from tools.workloads import scaled
+from tools.workloads import reduced, scaled
 
 ALPHAS = (1.0, 0.9, 0.7)
 POWERS = tuple(range(-5, 6))
@@ -151,7 +150,7 @@ def measure(device: Device, folder: Path, every: int, powers: Sequence[float]) -
     cameras = load_cameras(folder / "cameras.json")
     views, tests = train_views(cameras), test_views(cameras)[::every]
     ground_truth = _ground_truth(tests)
-    options = EncodeOptions(compact=False)
+    options = EncodeOptions.for_preset("paper", compact=False)
     sf_sh = options.parameters.sf_sh
     settings: list[tuple[str, dict[str, Any]]] = [
         (f"α = {alpha:g}, λ = 10^{power:g}", {"alpha": alpha, "lam": 10.0**power})
@@ -162,7 +161,7 @@ def measure(device: Device, folder: Path, every: int, powers: Sequence[float]) -
     targets: dict[str, list[FloatArray]] = {}
     for pruned in (False, True):
         if pruned:
-            scene, _ = reduce_scene(scene, cameras, options, device=device)
+            scene = reduced(scene, views, options, device)
         rasterizer = Rasterizer(device, scene)
         unquantized = _renders(rasterizer, tests)
         targets = {"uncompressed": targets.get("uncompressed", unquantized), "uncompacted": unquantized}

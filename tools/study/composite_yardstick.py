@@ -24,7 +24,8 @@ from numpy.typing import NDArray
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
-from potr_cl.opencl.device import Device, compiler_fault, list_devices
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import compiler_fault, list_devices
 from potr_cl.raster.rasterizer import GSPLAT, Rasterizer
 
 SOURCE = Path(__file__).with_suffix(".c")

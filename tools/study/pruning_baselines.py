@@ -58,8 +58,13 @@ def transmittance_sums(rasterizer: Rasterizer, cameras: Sequence[Camera]) -> F64
     for camera in cameras:
         view = rasterizer.prepare(camera)
         sums = device.allocate(4 * view.intersection_count, "the sums of transmittances")
-        kernel.set_args(view.shapes, view.offsets, view.intersections, camera_struct(camera), sums)
-        device.launch(kernel, (view.tiles * group,), (group,))
+        kernel.bind(
+            shapes=view.shapes,
+            offsets=view.offsets,
+            intersections=view.intersections,
+            view=camera_struct(camera),
+            sums=sums,
+        ).launch((view.tiles * group,), (group,))
         weights = device.download(sums, (view.intersection_count,), np.float32)
         splats = device.download(view.intersections, (view.intersection_count,), np.uint32)
         total += np.bincount(splats, weights, rasterizer.splats)

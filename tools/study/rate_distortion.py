@@ -4,8 +4,8 @@
     python -m tools.study.rate_distortion report OUT.json [--formats FORMATS.json] [--images DIR] [options]
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photographs in images. A series is a curve:
-the name it gets and the fields of EncodeOptions in which it differs from the defaults, as in best:preset=best; those of
-its SweepOptions too, as in exact:preset=best,sweep.tolerance=0. ``measure`` writes its results after every encode and
+the name it gets and the options of EncodeOptions in which it differs from the defaults, those of a stage with its name,
+as in exact:preset=best,prune.tolerance=0. ``measure`` writes its results after every encode and
 goes on where an existing file stops. ``report`` prints Markdown and draws DIR/rate_distortion_SCENE.png; the points of
 other formats come from tools.study.compare_formats. With --against it prints instead how many bytes more or fewer each
 series takes at the PSNR that the series NAME has at quality Q, by interpolation, and how long its encodes take.
@@ -29,7 +29,6 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
-from potr_cl.stages.pruning.removal import SweepOptions
 from tools.results import circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
 from tools.workloads import study_parser
@@ -41,19 +40,20 @@ QUALITIES = tuple(round(0.1 * step, 1) for step in range(1, 11))
 
 
 def parse_series(text: str) -> tuple[str, dict[str, Any]]:
-    """``NAME:OPTION=VALUE,…`` to the name and the options.
+    """``NAME:OPTION=VALUE,…`` to the name and the options; those of a stage are STAGE.OPTION, STAGE alone is a switch.
 
     Raises:
-        UsageError: an option is no field of :class:`EncodeOptions`.
+        UsageError: there is no such option.
     """
     name, _, rest = text.partition(":")
     options: dict[str, Any] = {}
-    fields = {field.name for field in dataclasses.fields(EncodeOptions)} - {"sweep"}
-    fields |= {f"sweep.{field.name}" for field in dataclasses.fields(SweepOptions)}
+    known = {field.name for field in dataclasses.fields(EncodeOptions)} - {"q", "stages"}
+    for stage in EncodeOptions().stages:
+        known |= {stage.name, *(f"{stage.name}.{field.name}" for field in dataclasses.fields(stage))}
     for part in filter(None, rest.split(",")):
         key, _, value = part.partition("=")
-        if key not in fields or key == "q":
-            raise UsageError(f"--series {text}: '{key}' is no option, expected one of {', '.join(sorted(fields))}")
+        if key not in known:
+            raise UsageError(f"--series {text}: '{key}' is no option, expected one of {', '.join(sorted(known))}")
         try:
             options[key] = ast.literal_eval(value)
         except (ValueError, SyntaxError):
@@ -63,9 +63,14 @@ def parse_series(text: str) -> tuple[str, dict[str, Any]]:
 
 def encode_options(changes: dict[str, Any]) -> EncodeOptions:
     """The options of a series, quality included."""
-    sweep = {key.removeprefix("sweep."): value for key, value in changes.items() if key.startswith("sweep.")}
-    plain = {key: value for key, value in changes.items() if not key.startswith("sweep.")}
-    return EncodeOptions.for_preset(**{"preset": EncodeOptions.preset, **plain, "sweep": SweepOptions(**sweep)})
+    nested: dict[str, Any] = {}
+    for key, value in changes.items():
+        stage, _, option = key.partition(".")
+        if option:
+            nested.setdefault(stage, {})[option] = value
+        else:
+            nested[stage] = value
+    return EncodeOptions.for_preset(**nested)
 
 
 def measure_encode(evaluator: EvaluatedScene, options: EncodeOptions, device: Device) -> dict[str, Any]:

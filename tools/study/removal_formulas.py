@@ -26,7 +26,8 @@ from numpy.typing import NDArray
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
-from potr_cl.opencl.device import Device, Family
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import Family
 from potr_cl.raster.rasterizer import INRIA, Rasterizer
 from potr_cl.reference import raster as reference
 from potr_cl.reference.removal import BruteForce

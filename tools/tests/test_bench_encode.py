@@ -9,7 +9,8 @@ import numpy as np
 import pytest
 
 from potr_cl.model.camera import camera_centres
-from potr_cl.opencl.device import Device, choose_device
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import choose_device
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
 from tests.stages.test_compaction import channels, dense_weights, on_a_sphere, sparse_weights
 from tools.bench import encode as benchmark

@@ -1,18 +1,18 @@
-/* Small kernels by which device.py finds out what a device does right. Macros: LANES. */
+/* Small kernels by which opencl/device.py finds out what a device does right. Macros: LANES. */
 
 #include "include/lanes.clh"
 
-kernel void probe_rows(global const float *in, global float *out)
+kernel void probe_rows(global const float *values, global float *result)
 {
     const size_t i = get_global_id(0);
-    VSTORE(exp2_polynomial(VLOAD(i, in)), i, out);
+    VSTORE(exp2_polynomial(VLOAD(i, values)), i, result);
 }
 
 #if LANES == 1
-kernel void probe_native_exp2(global const float *in, global float *out)
+kernel void probe_native_exp2(global const float *values, global float *result)
 {
     const size_t i = get_global_id(0);
-    out[i] = native_exp2(in[i]);
+    result[i] = native_exp2(values[i]);
 }
 
 kernel __attribute__((reqd_work_group_size(64, 1, 1)))

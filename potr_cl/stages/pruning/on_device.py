@@ -11,6 +11,7 @@ from collections.abc import Callable
 import numpy as np
 import pyopencl as cl
 
+from potr_cl.opencl.structs import struct_dtype
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Iteration, Pruned, PruningOptions, ascending, prune
 
@@ -21,7 +22,7 @@ _DIGIT, _DIGITS = 256, 4
 _COUNTER = _DIGITS * 2 * _DIGIT + 4 * _DIGITS
 _STATE = _COUNTER + 1
 
-_REMOVED = np.dtype([("iteration", np.uint32), ("key", np.uint32), ("effect", np.float32), ("importance", np.float32)])
+_REMOVED = struct_dtype(_SOURCE, "Removed")
 
 
 def prune_scene(

@@ -1,0 +1,116 @@
+"""Device memory and who owns it: what is taken together is given back together, also when an error comes between."""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+import pyopencl as cl
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+    from potr_cl.opencl.device import Device
+
+
+class Owner(ABC):
+    """Something that holds device memory until it is closed: ``with Rasterizer(…) as rasterizer:``."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Give all device memory back; the object is of no use afterwards. Closing twice does no harm."""
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+
+class Memory(Owner):
+    """Buffers of one device that are given back together.
+
+    An owner of buffers makes one, takes all its buffers from it, and closes it when it is closed itself. As a context
+    manager it is for buffers that live as long as a block of code::
+
+        with Memory(device) as memory:
+            totals = memory.upload(zeros, "the totals")
+
+    Args:
+        device: whose memory it is.
+
+    Attributes:
+        nbytes: taken and not given back.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+        self._buffers: list[cl.Buffer] = []
+
+    @property
+    def nbytes(self) -> int:
+        return sum(buffer.size for buffer in self._buffers)
+
+    def allocate(self, nbytes: int, what: str) -> cl.Buffer:
+        """A read-write buffer, see :meth:`potr_cl.opencl.device.Device.allocate`."""
+        return self.adopt(self._device.allocate(nbytes, what))
+
+    def upload(self, array: np.ndarray[Any, Any], what: str) -> cl.Buffer:
+        """A buffer that holds a copy of ``array``, C order."""
+        return self.adopt(self._device.upload(array, what))
+
+    def adopt(self, buffer: cl.Buffer) -> cl.Buffer:
+        """Own a buffer that somebody else took."""
+        self._buffers.append(buffer)
+        return buffer
+
+    def release(self, buffer: cl.Buffer) -> cl.Buffer:
+        """Own a buffer no longer: it is the caller's from now on."""
+        self._buffers.remove(buffer)
+        return buffer
+
+    def free(self, *buffers: cl.Buffer) -> None:
+        """Give single buffers back."""
+        for buffer in buffers:
+            self._device.free(self.release(buffer))
+
+    def close(self) -> None:
+        self.free(*self._buffers)
+
+
+class Scratch(Owner):
+    """A buffer that grows when asked to, and loses its content then.
+
+    Attributes:
+        buffer: the memory. nbytes: its size; 0 before the first :meth:`reserve` and after one that failed.
+    """
+
+    def __init__(self, device: Device, what: str) -> None:
+        self._device = device
+        self._what = what
+        self.buffer: cl.Buffer = None
+        self.nbytes = 0
+
+    def reserve(self, nbytes: int) -> bool:
+        """Have at least ``nbytes``; whether the memory is new.
+
+        Raises:
+            DeviceError: the device has no room.
+        """
+        if self.buffer is not None and self.nbytes >= nbytes:
+            return False
+        self.close()
+        self.buffer = self._device.allocate(nbytes, self._what)
+        self.nbytes = nbytes
+        return True
+
+    def close(self) -> None:
+        """Give the memory back; the next :meth:`reserve` takes new memory."""
+        if self.buffer is not None:
+            self._device.free(self.buffer)
+            self.buffer = None
+        self.nbytes = 0

@@ -1,0 +1,104 @@
+"""Kernels' arguments by name, checked against the declaration; structs that are described in the kernels' source."""
+
+from __future__ import annotations
+
+import re
+from importlib.resources import files
+
+import numpy as np
+import pyopencl as cl
+import pyopencl.tools
+import pytest
+
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.kernel import declared_parameters
+from potr_cl.opencl.memory import Memory
+from potr_cl.opencl.structs import struct_dtype
+
+COLUMNS = ("raster/columns.cl", "columns")
+
+
+@pytest.fixture(scope="module")
+def device() -> Device:
+    return Device()
+
+
+def test_values_arrive_where_their_names_say(device):
+    rows = np.arange(6, dtype=np.float32).reshape(3, 2)
+    with Memory(device) as memory:
+        source, result = memory.upload(rows, "rows"), memory.upload(np.full(8, -1, np.float32), "columns")
+        kernel = device.kernel(*COLUMNS)
+        kernel.bind(stride_=4, width=2, result=result, first=0, rows=source).launch((3,))
+        assert device.download(result, (2, 4), np.float32).tolist() == [[0, 2, 4, -1], [1, 3, 5, -1]]
+        kernel.set(first=1)
+        kernel.launch((3,))
+        assert device.download(result, (2, 4), np.float32).tolist() == [[0, 0, 2, 4], [1, 1, 3, 5]]
+    assert memory.nbytes == 0
+
+
+def test_what_is_missing_or_unknown_is_named(device):
+    kernel = device.kernel(*COLUMNS)
+    with pytest.raises(TypeError, match=r"kernel columns lacks first, rows and does not know start: it takes rows, f"):
+        kernel.bind(start=0, width=1, stride_=4, result=None)
+    with pytest.raises(TypeError, match=r"kernel columns does not know start: it takes rows, first, width"):
+        kernel.set(start=0)
+
+
+def test_values_of_another_kind_are_refused(device):
+    kernel = device.kernel(*COLUMNS)
+    with pytest.raises(TypeError, match=r"kernel columns: rows is global const float \*, not a int"):
+        kernel.set(rows=3)
+    with Memory(device) as memory, pytest.raises(TypeError, match=r"first is uint, not a Buffer"):
+        kernel.set(first=memory.allocate(16, "something"))
+    composite = device.kernel("raster/sort_cpu.cl", "sort_tiles")
+    with pytest.raises(TypeError, match=r"capacity is uint, not a str"):
+        composite.set(capacity="3")
+
+
+def test_a_struct_must_be_the_one_declared(device):
+    fill = device.kernel("raster/tile_lists_cpu.cl", "count_tiles")
+    view = struct_dtype("include/splat.clh", "View")
+    fill.set(view=np.zeros((), view))
+    with pytest.raises(TypeError, match=r"view is View, not a ndarray"):
+        fill.set(view=np.zeros((), np.float32))
+
+
+def test_a_kernel_that_is_not_declared():
+    with pytest.raises(TypeError, match=r"raster/columns\.cl declares no kernel 'rows'"):
+        declared_parameters("raster/columns.cl", "rows")
+
+
+def test_every_kernel_can_be_read():
+    folder = files("potr_cl") / "cl"
+    found = 0
+    for part in folder.iterdir():
+        for file in part.iterdir():
+            for kernel in re.findall(r"^(?:kernel .*?)?void (\w+)\($", file.read_text("utf-8"), re.MULTILINE):
+                if file.name.endswith(".cl"):
+                    names = [parameter.name for parameter in declared_parameters(f"{part.name}/{file.name}", kernel)]
+                    assert names
+                    assert len(set(names)) == len(names)
+                    found += 1
+    assert found > 20
+
+
+@pytest.mark.parametrize(
+    ("source", "name"),
+    [("include/splat.clh", "View"), ("include/view_set.clh", "SetView"), ("prune/choose_gpu.cl", "Removed")],
+)
+def test_structs_are_laid_out_as_the_compiler_does(device, source, name):
+    members = {"View": struct_dtype("include/splat.clh", "View")}
+    dtype = struct_dtype(source, name)
+    if name == "SetView":  # what it holds must be known to the compiler by name first
+        matched, _ = cl.tools.match_dtype_to_c_struct(device.info.handle, "ViewProbe", members["View"])
+        assert matched == members["View"]
+        cl.tools.get_or_register_dtype("ViewProbe", matched)
+    matched, _ = cl.tools.match_dtype_to_c_struct(device.info.handle, f"{name}Probe", dtype)
+    assert matched == dtype
+
+
+def test_members_that_compilers_may_pad_are_refused():
+    with pytest.raises(TypeError, match=r"defines no struct 'Views'"):
+        struct_dtype("include/view_set.clh", "Views")
+    with pytest.raises(TypeError, match=r"'ulong'"):
+        struct_dtype("prune/choose_gpu.cl", "Cut")
