@@ -40,16 +40,18 @@ What happens at the limits (``stress``):
 =================  =====================================================================================================
 stress.run         every kernel against float64 on the worst inputs: what error is the kernel's own?
 stress.platforms   the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
+stress.fuzz        does any changed file do more than be refused or decode to finite numbers?
 =================  =====================================================================================================
 
-What tests and benchmarks are fed with (``make``):
+What tests and pages are made of (``make``):
 
-===================  ===================================================================================================
-make.large_scene     a scene of any size with the statistics of a real one
-make.test_data       the excerpts in tests/data
-make.foreign_files   the excerpt in other tools' formats
-make.golden_files    files that every later decoder must read to the same values
-===================  ===================================================================================================
+====================  ==================================================================================================
+make.large_scene      a scene of any size with the statistics of a real one
+make.test_data        the excerpts in tests/data
+make.foreign_files    the excerpt in other tools' formats
+make.golden_files     files that every later decoder must read to the same values
+make.benchmark_pages  the tables and plots of docs/benchmarks, from the results beside them
+====================  ==================================================================================================
 
 Shared: :mod:`tools.results` (tables that say what they are of), :mod:`tools.workloads` (scenes, views, repeated work),
 :mod:`tools.study.evaluation` (what a candidate loses to its scene), :mod:`tools.study.pruning_baselines` (the orders of

@@ -40,7 +40,7 @@ from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Progress, Stage, State, parameters
 
 #: Qualities, and what they give in a typical scene: bytes a splat of the source, and PSNR in decibels. Means of two
-#: scenes (docs/benchmarks.md, "Rate and distortion"), less sure below 0.1. Above all the rate of growth matters.
+#: scenes (docs/benchmarks/rate_distortion.md), less sure below 0.1. Above all the rate of growth matters.
 _TYPICAL_Q = (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1)
 _TYPICAL: dict[Preset, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "paper": (

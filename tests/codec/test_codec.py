@@ -13,8 +13,9 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from potr_cl.codec import quantize
-from potr_cl.codec.container import Coder, EntropyCoder, Property
+from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.codec.sections import Coder, Property
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.camera import camera_centres, train_views
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
@@ -74,9 +75,9 @@ def check_within_balanced_steps(source: Scene, data: bytes, order, tolerance):
     imaginary, log_scales = quantize.canonical_rotations(original.quaternions, original.log_scales)
     scales, scales_back = np.exp(log_scales.astype(np.float64)), np.exp(decoded.log_scales.astype(np.float64))
     assert (np.abs(scales_back - scales) <= 0.5 / header.sf_scale + 1e-5 * scales).all()
-    steps = np.round(scales_back * header.sf_scale)
-    factor = header.sf_rotation * np.sqrt(np.maximum(steps.max(axis=1, keepdims=True), 1))
-    ball = (steps.max(axis=1) == steps.min(axis=1))[:, None]
+    levels = np.round(scales_back * header.sf_scale)
+    factor = header.sf_rotation * np.sqrt(np.maximum(levels.max(axis=1, keepdims=True), 1))
+    ball = (levels.max(axis=1) == levels.min(axis=1))[:, None]
     assert ((np.abs(decoded.quaternions[:, 1:] - imaginary) <= 0.5 / factor + 1e-5) | ball).all()
 
     logits = np.clip(original.opacity_logits, -8, 12)

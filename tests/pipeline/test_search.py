@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potr_cl.codec.container import Coder
 from potr_cl.codec.decoder import PotrFile, decode
 from potr_cl.codec.quantize import PRESETS, HyperParameters
+from potr_cl.codec.sections import Coder
 from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.formats.images import to_8_bits, write_png
 from potr_cl.opencl.device import Device

@@ -2,7 +2,7 @@
 
     python -m tools.bench.codec [PART …] [--splats N]
 
-Parts: decode, encode, octree, sizes (all by default). Prints Markdown for docs/benchmarks.md. Every measurement that
+Parts: decode, encode, octree, sizes (all by default). Prints Markdown for docs/benchmarks. Every measurement that
 concerns memory runs in a process of its own.
 """
 

@@ -8,7 +8,7 @@ gsplat's figure stands beside.
 growth: time against the number of splats, of pixels, and the overlap, on synthetic scenes. plot: draws what
 growth --json wrote, on one or several devices.
 
-Prints Markdown for docs/benchmarks.md, or JSON with --json.
+Prints Markdown for docs/benchmarks, or JSON with --json.
 """
 
 from __future__ import annotations

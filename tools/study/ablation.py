@@ -61,8 +61,12 @@ def _coded(evaluator: EvaluatedScene, scene: Scene, options: EncodeOptions, rgb:
     sections = file_report(file)["sections"]
     decoded = from_channels(file.scene()) if rgb else file.scene()
     figures: dict[str, Any] = {"splats": len(scene), "bytes": coded.nbytes, **evaluator(decoded)}
-    figures["serialised_bytes"] = sum(section["serialised_bytes"] for section in sections.values())
-    for column in ("bytes", "serialised_bytes"):
+    columns = ["bytes"]
+    # The context coder codes integers that were never bytes.
+    if all(section["serialised_bytes"] is not None for section in sections.values()):
+        figures["serialised_bytes"] = sum(section["serialised_bytes"] for section in sections.values())
+        columns.append("serialised_bytes")
+    for column in columns:
         figures[f"{column}_a_splat"] = {
             name: sum(sections[part][column] for part in parts if part in sections) / len(scene)
             for name, (parts, _) in PROPERTIES.items()

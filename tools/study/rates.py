@@ -6,7 +6,7 @@ Parts: errors (bits and error of each quantiser, and of others that were tried),
 property costs), streams (bytes and decode time with each coder), sizes (the steps from the paper's file to the
 smallest, at equal PSNR), balance (pruning and compaction against steps: a grid over both). A SCENE is a folder with
 point_cloud.ply and cameras.json with test views. All but balance start from the scene as preset "paper" prunes and
-compacts it, which is kept in FOLDER. Prints Markdown for docs/benchmarks.md.
+compacts it, which is kept in FOLDER. Prints Markdown for docs/benchmarks.
 """
 
 from __future__ import annotations
@@ -24,10 +24,11 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import octree, quantize
-from potr_cl.codec.container import EntropyCoder, Property
+from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.sections import Property
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.formats.scenes import ply
 from potr_cl.model.camera import Camera, camera_centres, train_views
