@@ -1,8 +1,7 @@
-"""Scenes to re-fit, and products with the linear map: for the tests and for tools/stress/platforms.py."""
+"""Scenes to re-fit on a device and in float64, and the device's vectors laid open beside the definition's."""
 
 from __future__ import annotations
 
-import dataclasses
 from collections.abc import Sequence
 from typing import Any
 
@@ -14,22 +13,10 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.reference.refit import Array, Reference
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, Refitted, refit_colours
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
-from tests.cases.scenes import random_scene
-from tests.oracles.refit import Array, Reference
-
-
-def visible_scene(splats: int, degree: int = 3, seed: int = 0) -> Scene:
-    """Splats of several pixels; one colour in fifteen is cut at 0."""
-    scene = random_scene(splats, degree, seed)
-    rng = np.random.default_rng(seed + 100)
-    return dataclasses.replace(
-        scene,
-        log_scales=rng.normal(-2, 0.5, size=(splats, 3)).astype(np.float32),
-        opacity_logits=rng.normal(-1, 1.5, size=splats).astype(np.float32),
-    )
 
 
 class Case:
