@@ -12,6 +12,7 @@ import numpy as np
 import pyopencl as cl
 
 from potr_cl.opencl.structs import struct_dtype
+from potr_cl.raster.rasterizer import totals_limits
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Iteration, Pruned, PruningOptions, ascending, prune
 from potr_cl.stages.pruning.steering import Steering
@@ -60,7 +61,7 @@ class _Controller:
             self._keys = device.allocate(4 * self._splats, "the splats' scores")
             self._removed = device.upload(np.zeros(self._splats, _REMOVED), "the removed splats")
             self._state = device.allocate(4 * _STATE, "the pruning's state")
-        limits = removal.limits
+        limits = totals_limits(device)
         self._rank, self._refine, self._mark = (device.kernel(_SOURCE, n, **limits) for n in ("rank", "refine", "mark"))
         number, real, buffer = np.uint32, np.float32, None
         self._rank.set_scalar_arg_dtypes([number, buffer, buffer, *[real] * 4, *[buffer] * 3])

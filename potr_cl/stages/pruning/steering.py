@@ -7,7 +7,6 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.opencl.device import Device
-from potr_cl.raster.rasterizer import totals_limits
 from potr_cl.stages.pruning.cached_sweep import CachedSweep
 from potr_cl.stages.pruning.survivors import Survivors
 
@@ -27,7 +26,6 @@ class Steering:
 
     Attributes:
         device, totals, units, splats: as given; totals are (N, 2) int64 in the device's memory.
-        limits: macros of kernels that read the totals (cl/include/totals.clh).
         marks: (N,) uint8 in the device's memory, :class:`~potr_cl.stages.pruning.survivors.SplatState`. Who marks
             splats as JUST_REMOVED has :meth:`remove_marked` take them out, and makes them REMOVED when marking next.
     """
@@ -44,7 +42,6 @@ class Steering:
     ) -> None:
         self._cached, self._survivors, self._tolerance = cached, survivors, tolerance
         self.device, self.totals, self.units, self.splats = device, totals, units, splats
-        self.limits = totals_limits(device)
         self.marks = survivors.buffer
 
     @property
