@@ -6,7 +6,6 @@ import io
 import os
 import tracemalloc
 import warnings
-import zlib
 
 import numpy as np
 import pytest
@@ -14,6 +13,7 @@ from PIL import Image
 
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.images import image_size, parse_colour, read_ground_truth, to_8_bits, write_png
+from tests.cases.images import png_of
 
 
 def random_pixels(channels, seed=0):
@@ -80,16 +80,6 @@ def test_webp_is_read(tmp_path):
     pixels = random_pixels(3)
     Image.fromarray(pixels).save(tmp_path / "a.webp", lossless=True)
     assert np.array_equal(to_8_bits(read_ground_truth(tmp_path / "a.webp")), pixels)
-
-
-def png_of(width, height) -> bytes:
-    """The start of a PNG file, which is all that its size is known from."""
-
-    def chunk(kind, content):
-        return len(content).to_bytes(4, "big") + kind + content + zlib.crc32(kind + content).to_bytes(4, "big")
-
-    header = width.to_bytes(4, "big") + height.to_bytes(4, "big") + bytes([8, 2, 0, 0, 0])
-    return b"\x89PNG\r\n\x1a\n" + chunk(b"IHDR", header) + chunk(b"IDAT", zlib.compress(bytes(100)))
 
 
 @pytest.mark.parametrize(("width", "height"), [(100_000, 1400), (13_000, 13_000), (60_000, 60_000)])

@@ -200,7 +200,6 @@ def test_formats_without_an_extra_need_no_library(name: str, data: Path) -> None
 
 def test_order_in_which_a_folder_is_searched(data: Path, tmp_path: Path) -> None:
     """From the last place to the first: each new file wins over those that were there."""
-    pytest.importorskip("pycolmap", reason="the extra colmap is not installed")
     one, two = ([f"{i}.png" for i in range(n)] for n in (1, 2))
 
     def rewrite(model: Path, source: str) -> None:
