@@ -21,27 +21,23 @@
     }
     if (swept == 0)
         return;
-    atomic_max(&end_of_subtile[mine.subtile], end);
-    if (lid == 0)
-        rounds[0] = 0;
+    end_subtile(&walk, mine.subtile, end);
     barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
     if (lid < SUBTILES)
-        near.places[lid] = 0;
+        batch.places[lid] = 0;
 
-    local float2 *parts = all_parts + lid / SHARE * NEXT_PARTS;
-    int parity = 0;
-    for (batch = 0; batch < swept; batch += BATCH) {
-        const int size = min(swept - batch, (uint)BATCH);
-        fetch(&near, shapes, colours, intersections + batch, subtiles + batch, size, lid);
+    local PART *parts = walk.parts + lid / SHARE * SUBTILE_PARTS;
+    int turn = 0;
+    for (first = 0; first < swept; first += BATCH) {
+        const int size = min(swept - first, (uint)BATCH);
+        fetch(&batch, shapes, colours, intersections + first, subtiles + first, size, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
-        make_lists(&near, lid);
-        mine = pixels_of(near.dealt[lid / SHARE], origin, lid);
-        local const uchar *list = near.lists + mine.subtile * LIST_ROOM;
-        const int count = near.counts[mine.subtile];
-        const int place = near.places[mine.subtile];
-        const int left = clamp(end_of_subtile[mine.subtile] - place, 0, count);
-        if (share == 0)
-            atomic_max(&rounds[parity], (left + ROUND - 1) / ROUND);
+        make_lists(&batch, lid);
+        mine = pixels_of(batch.dealt[lid / SHARE], origin, lid);
+        local const uchar *list = batch.lists + mine.subtile * LIST_ROOM;
+        const int count = batch.counts[mine.subtile];
+        const int place = batch.places[mine.subtile];
+        const int left = intersections_left(&walk, mine.subtile, place, count, turn, lid);
         float t[PIXELS], r[PIXELS], g[PIXELS], b[PIXELS];
         float dr[PIXELS], dg[PIXELS], db[PIXELS], pr[PIXELS], pg[PIXELS], pb[PIXELS];
         int last[PIXELS];
@@ -63,21 +59,16 @@
                 db[p] = 2.0f * (b[p] - pixel[2]);
             }
         }
-        for (int i = lid; i < BATCH; i += ITEMS)
-            for (int level = 0; level < 2 * LEVELS; ++level)
-                levels[level * BATCH + i] = 0;
+        clear_sums(&walk, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
-        const int all_rounds = rounds[parity];
-        parity ^= 1;
-        if (lid == 0)
-            rounds[parity] = 0;
+        const int rounds = agree_on_rounds(&walk, &turn, lid);
         if (share == 0)
-            near.places[mine.subtile] = place + places(count);
-        for (int first = 0; first < all_rounds * ROUND; first += ROUND) {
-            const int now = min(left - first, ROUND);
+            batch.places[mine.subtile] = place + places(count);
+        for (int done = 0; done < rounds * ROUND; done += ROUND) {
+            const int now = min(left - done, ROUND);
             for (int j = 0; j < now; ++j) {
-                const int i = first + j;
-                local const float4 *splat = near.shapes + 3 * list[i];
+                const int i = done + j;
+                local const float4 *splat = batch.shapes + 3 * list[i];
                 const float4 s0 = splat[0], s1 = splat[1];
                 const float blue_k = splat[2].x;
                 const float u0 = s0.z * (mine.x - s0.x);
@@ -107,15 +98,10 @@
                 parts[j * SHARE + share] = (float2)(effect, importance);
             }
             barrier(CLK_LOCAL_MEM_FENCE);
-            const int summed = share / (SHARE / ROUND);
+            const int summed = summed_splat(share);
             if (summed < now) {
-                float2 sum = (float2)(0.0f);
-                for (int j = 0; j < ROUND; ++j)
-                    sum += parts[share * ROUND + ((j + summed) & (ROUND - 1))];
-                sum = clamp(sum, -view_bound / SUBTILES, view_bound / SUBTILES);
-                const int k = list[first + summed];
-                add_parts(levels + k, BATCH, sum.x);
-                add_parts(levels + LEVELS * BATCH + k, BATCH, sum.y);
+                const float2 sum = clamp(sum_parts(parts, share), -view_bound / SUBTILES, view_bound / SUBTILES);
+                add_to_sums(&walk, list[done + summed], sum);
             }
             barrier(CLK_LOCAL_MEM_FENCE);
         }
@@ -128,11 +114,9 @@
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int i = lid; i < size; i += ITEMS) {
-            const float2 after =
-                (float2)(whole_sum(levels + i, BATCH), whole_sum(levels + LEVELS * BATCH + i, BATCH));
-            const float2 before = sums[batch + i];
-            replace_sums(totals + TOTAL_WORDS * (size_t)near.splats[i], before, after, view_scale, view_bound);
-            sums[batch + i] = after;
+            const float2 before = sums[first + i], after = sums_of(&walk, i);
+            replace_sums(totals + TOTAL_WORDS * (size_t)batch.splats[i], before, after, view_scale, view_bound);
+            sums[first + i] = after;
         }
     }
 }

@@ -1,13 +1,17 @@
 /* Compositing for CPUs: one tile a work-item, splat by splat, over the sub-tiles that the splat's ellipse touches.
 
    The 256 pixels' state lives in private memory, a vector a sub-tile. A pixel that has ended keeps the negative of its
-   transmittance. Every AHEAD splats the sub-tiles that go on are found; the tile ends when none does.
+   transmittance. Every LOOK_EVERY splats the sub-tiles that go on are found; the tile ends when none does.
 
    Macros: LANES, ALPHA_CAP, TRANSMITTANCE_THRESHOLD (a pixel ends before its transmittance would fall below it). */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
 #include "include/subtile_vectors.clh"
+
+#ifndef LOOK_EVERY
+#define LOOK_EVERY 16
+#endif
 
 kernel void composite(
     global const float4 *shapes,
@@ -36,8 +40,8 @@ kernel void composite(
     uint living = ALL_SUBTILES;
     const uint begin = min(offsets[tile], capacity);
     for (uint e = begin; e < end && living; ++e) {
-        if (e + AHEAD < end)
-            prefetch_splat(shapes, colours, intersections[e + AHEAD]);
+        if (e + PREFETCH_AHEAD < end)
+            prefetch_splat(shapes, colours, intersections[e + PREFETCH_AHEAD]);
         uint todo = subtiles[e] & living;
         if (todo) {
             const Splat splat = load_splat(shapes, colours, intersections[e]);
@@ -50,7 +54,7 @@ kernel void composite(
                 b[i] = MAD(weight, (vfloat)(splat.blue), b[i]);
             }
         }
-        if ((e - begin) % AHEAD == AHEAD - 1)
+        if ((e - begin) % LOOK_EVERY == LOOK_EVERY - 1)
             living = living_subtiles(t);
     }
 

@@ -19,8 +19,11 @@
 #endif
 
 #define BATCH (TILE * TILE)
-/* Splats whose exponents are computed before the first is composited: independent work to hide latency behind. */
-#define AHEAD 8
+/* The exponents of so many splats are computed before the first of them is composited: independent work hides latency. A
+   divisor of BATCH. */
+#ifndef AT_ONCE
+#define AT_ONCE 8
+#endif
 
 /* One splat of the next batch into registers, long before it is needed; past the end one that touches nothing. */
 #define FETCH                                              \
@@ -50,8 +53,8 @@ void composite_frame(
     global float *image,
     global float *transmittance)
 {
-    local float4 near_s0[BATCH], near_s1[BATCH];
-    local float near_blue[BATCH];
+    local float4 batch_s0[BATCH], batch_s1[BATCH];
+    local float batch_blue[BATCH];
     local int living[2];
 
     const int lid = get_local_id(0);
@@ -73,19 +76,19 @@ void composite_frame(
     for (uint batch = begin; batch < end && tile_alive; batch += BATCH) {
         const int size = min((uint)BATCH, end - batch);
         barrier(CLK_LOCAL_MEM_FENCE);
-        near_s0[lid] = s0;
-        near_s1[lid] = (float4)(s1.x, s1.y, colour.x, colour.y);
-        near_blue[lid] = colour.z;
+        batch_s0[lid] = s0;
+        batch_s1[lid] = (float4)(s1.x, s1.y, colour.x, colour.y);
+        batch_blue[lid] = colour.z;
         if (lid == 0)
             living[parity] = 0;
         barrier(CLK_LOCAL_MEM_FENCE);
         FETCH
-        for (int k = 0; k < size && alive; k += AHEAD) {
-            float powers[AHEAD];
+        for (int k = 0; k < size && alive; k += AT_ONCE) {
+            float powers[AT_ONCE];
             float most = LOG2_ALPHA_MIN - 1.0f;
-            for (int j = 0; j < AHEAD; ++j) {
-                const float4 n0 = near_s0[k + j];
-                const float2 n1 = near_s1[k + j].xy;
+            for (int j = 0; j < AT_ONCE; ++j) {
+                const float4 n0 = batch_s0[k + j];
+                const float2 n1 = batch_s1[k + j].xy;
                 const float dy = y - n0.y;
                 const float u = MAD(n0.w, dy, n0.z * (x - n0.x)), v = n1.x * dy;
                 powers[j] = MAD(-u, u, MAD(-v, v, n1.y));
@@ -94,16 +97,16 @@ void composite_frame(
             if (most < LOG2_ALPHA_MIN)
                 continue;
             /* Without branches from here on: a pixel that this splat misses or that has ended adds nothing. */
-            float alphas[AHEAD];
-            for (int j = 0; j < AHEAD; ++j)
+            float alphas[AT_ONCE];
+            for (int j = 0; j < AT_ONCE; ++j)
                 alphas[j] = powers[j] >= LOG2_ALPHA_MIN ? fmin(EXP2(powers[j]), ALPHA_CAP) : 0.0f;
-            for (int j = 0; j < AHEAD; ++j) {
+            for (int j = 0; j < AT_ONCE; ++j) {
                 const float after = MAD(-alphas[j], t, t);
                 alive = alive && after >= TRANSMITTANCE_THRESHOLD;
                 const float weight = alive ? alphas[j] * t : 0.0f;
-                r = MAD(weight, near_s1[k + j].z, r);
-                g = MAD(weight, near_s1[k + j].w, g);
-                b = MAD(weight, near_blue[k + j], b);
+                r = MAD(weight, batch_s1[k + j].z, r);
+                g = MAD(weight, batch_s1[k + j].w, g);
+                b = MAD(weight, batch_blue[k + j], b);
                 t = alive ? after : t;
             }
         }

@@ -3,7 +3,6 @@
 
    Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2. */
 
-#define ROUND 1 /* there is nothing to sum */
 #include "include/subtile_lists.clh"
 
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
@@ -23,7 +22,7 @@ void composite(
     global float *transmittance)
 {
     local State state;
-    local Batch near;
+    local Batch batch;
     local int unfinished[2];
 
     const int lid = get_local_id(0);
@@ -43,7 +42,7 @@ void composite(
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
     uint last_batch;
     forward(
-        &state, &near, unfinished, origin, picture, shapes, colours, intersections, subtiles, end - begin, lid, &last_batch);
+        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, end - begin, lid, &last_batch);
     const Mine mine = pixels_of(lid / SHARE, origin, lid);
     for (int p = 0; p < PIXELS; ++p)
         if (inside(mine, p, picture)) {

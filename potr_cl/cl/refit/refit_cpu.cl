@@ -137,8 +137,8 @@ kernel void refit_sweep(
             }
             if (pass == 1)
                 for (uint k = 0; k < count; ++k) {
-                    if (k + AHEAD < count)
-                        PREFETCH_TO_WRITE(totals + 2 * TOTALS * intersections[from + k + AHEAD]);
+                    if (k + PREFETCH_AHEAD < count)
+                        PREFETCH_TO_WRITE(totals + 2 * TOTALS * intersections[from + k + PREFETCH_AHEAD]);
                     add_sums(totals, intersections[from + k], sums[k], scale);
                 }
             if (from + count >= end)
