@@ -9,7 +9,7 @@ from typing import Any, TypeAlias, get_args
 
 from potr_cl.errors import UsageError
 from potr_cl.opencl.discovery import DEVICE_VARIABLE
-from potr_cl.raster.rasterizer import GSPLAT, INRIA
+from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.stages.compaction.ridge import ColourModel, CompactionOptions, Weighting
 from potr_cl.stages.pruning.removal import SweepOptions
 from potr_cl.stages.pruning.schedule import PruningOptions

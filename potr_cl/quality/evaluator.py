@@ -17,7 +17,8 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.quality.compare import Comparison, compare
-from potr_cl.quality.metrics_device import Picture, Similarity, in_batches, rendered
+from potr_cl.quality.metrics_device import Similarity, in_batches
+from potr_cl.quality.pictures import Picture, rendered
 from potr_cl.raster.rasterizer import Rasterizer
 
 #: So many training views, spread evenly, stand for all of them where there are no test views.

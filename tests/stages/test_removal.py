@@ -10,7 +10,8 @@ import pytest
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.raster.rasterizer import INRIA, Rasterizer
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions, default_memory
 from potr_cl.stages.pruning.schedule import PruningOptions, prune
 from tests.cases.scenes import random_scene, ring_of_cameras

@@ -7,7 +7,8 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from tests.cases.scenes import random_scene, ring_of_cameras
 from tests.devices import KERNELS, open_device

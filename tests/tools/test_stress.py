@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from potr_cl.opencl.device import Device
-from potr_cl.raster.rasterizer import GSPLAT, INRIA
+from potr_cl.raster.rules import GSPLAT, INRIA
 from tests.cases.splats import random_splats, tilted_camera
 from tests.devices import KERNELS, open_device
 from tests.oracles import raster as reference

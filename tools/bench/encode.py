@@ -49,7 +49,8 @@ from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, list_dev
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.refitting.refit import RefitOptions, RenderedTargets, refit_colours

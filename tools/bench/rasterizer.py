@@ -25,7 +25,8 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.raster.rasterizer import GSPLAT, Rasterizer
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT
 
 
 def frame_times(rasterizer: Rasterizer, cameras: list[Camera], passes: int) -> list[float]:

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.raster.rasterizer import GSPLAT, INRIA, RasterRules
+from potr_cl.raster.rules import GSPLAT, INRIA, RasterRules
 from potr_cl.stages.compaction.ridge import CompactionOptions
 from potr_cl.stages.refitting.refit import RefitOptions
 from tests.cases.scenes import random_scene, ring_of_cameras

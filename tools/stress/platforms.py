@@ -32,8 +32,10 @@ from potr_cl.model.camera import camera_centres
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, list_devices
 from potr_cl.quality.metrics import ssim
-from potr_cl.quality.metrics_device import Picture, Similarity
-from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.quality.metrics_device import Similarity
+from potr_cl.quality.pictures import Picture
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.stages.compaction.ridge import Compactor, ViewWeights
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions

@@ -40,7 +40,9 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, list_devices
-from potr_cl.raster.rasterizer import TILE, Rasterizer, RasterRules
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.view_set import TILE
 from potr_cl.stages.compaction.ridge import Compactor, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.refitting.refit import RenderedTargets, refit_colours

@@ -24,7 +24,8 @@ from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import compiler_fault, list_devices
-from potr_cl.raster.rasterizer import GSPLAT, Rasterizer
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT
 
 SOURCE = Path(__file__).with_suffix(".c")
 # All of -ffast-math that does not reorder sums: 2^x rounds by adding and subtracting a large number.

@@ -25,7 +25,8 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.source import kernel_source
-from potr_cl.raster.rasterizer import TILE, Rasterizer, camera_struct
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.view_set import TILE, camera_struct
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]

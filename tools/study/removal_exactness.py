@@ -25,7 +25,9 @@ from numpy.typing import NDArray
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.opencl.device import Device
-from potr_cl.raster.rasterizer import INRIA, TILE, Rasterizer, RasterRules
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA, RasterRules
+from potr_cl.raster.view_set import TILE
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from tests.oracles import raster as reference
 

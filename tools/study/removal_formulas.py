@@ -29,7 +29,8 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import Family
 from potr_cl.opencl.source import kernel_source
-from potr_cl.raster.rasterizer import INRIA, Rasterizer
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from tests.oracles import raster as reference
 from tools.study.removal_exactness import NOISE_FLOOR, SCENES, BruteForce, choose_splats, spent

@@ -41,7 +41,7 @@
 
 kernel __attribute__((reqd_work_group_size(BATCH, 1, 1)))
 void composite_frame(
-    global const SetView *view,
+    global const SetView *views,
     global const float4 *shapes,
     global const float4 *colours,
     global const uint *offsets,
@@ -59,10 +59,10 @@ void composite_frame(
 
     const int lid = get_local_id(0);
     const int tile = get_group_id(0);
-    const int columns = view->view.columns, width = view->view.width;
+    const int columns = views->view.columns, width = views->view.width;
     const int column = tile % columns * TILE + (lid & 7) + (lid >> 2 & 8);
     const int row = tile / columns * TILE + (lid >> 3 & 3) + (lid >> 6 << 2);
-    const int inside = column < width && row < view->view.height;
+    const int inside = column < width && row < views->view.height;
     const float x = column + 0.5f, y = row + 0.5f;
     const uint begin = min(offsets[tile], capacity), end = min(offsets[tile + 1], capacity);
     uint next = begin + lid;

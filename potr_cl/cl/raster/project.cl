@@ -40,24 +40,24 @@ kernel void project(
     global const float *quaternions,
     global const float *log2_opacities,
     global const float *sh,
-    uint stride_,
+    uint stride,
     global const SetView *views,
     global float4 *shapes,
     global float4 *colours,
     global ushort4 *bounds)
 {
     const size_t index = get_global_id(0);
-    const size_t stride = stride_;
+    const size_t column = stride; /* from one number of a parameter to the next */
     global const View *view = &views[get_global_id(1)].view;
-    shapes += 2 * stride * get_global_id(1);
-    colours += stride * get_global_id(1);
-    bounds += stride * get_global_id(1);
+    shapes += 2 * column * get_global_id(1);
+    colours += column * get_global_id(1);
+    bounds += column * get_global_id(1);
 
     vfloat lo = VLOAD(index, log2_opacities);
     /* Relative to the camera centre first: both are large where a scene is far from the origin, their difference is not. */
     vfloat dx = (VLOAD(index, means) - view->camera_centre_high[0]) - view->camera_centre_low[0];
-    vfloat dy = (VLOAD(index, means + stride) - view->camera_centre_high[1]) - view->camera_centre_low[1];
-    vfloat dz = (VLOAD(index, means + 2 * stride) - view->camera_centre_high[2]) - view->camera_centre_low[2];
+    vfloat dy = (VLOAD(index, means + column) - view->camera_centre_high[1]) - view->camera_centre_low[1];
+    vfloat dz = (VLOAD(index, means + 2 * column) - view->camera_centre_high[2]) - view->camera_centre_low[2];
     global const float *w = view->rotation;
     vfloat tx = w[0] * dx + w[1] * dy + w[2] * dz;
     vfloat ty = w[3] * dx + w[4] * dy + w[5] * dz;
@@ -74,9 +74,9 @@ kernel void project(
 
     /* Columns of the rotation, times the scale, through the view's rotation and the Jacobian: the axes on screen. */
     vfloat qw = VLOAD(index, quaternions);
-    vfloat qx = VLOAD(index, quaternions + stride);
-    vfloat qy = VLOAD(index, quaternions + 2 * stride);
-    vfloat qz = VLOAD(index, quaternions + 3 * stride);
+    vfloat qx = VLOAD(index, quaternions + column);
+    vfloat qy = VLOAD(index, quaternions + 2 * column);
+    vfloat qz = VLOAD(index, quaternions + 3 * column);
     vfloat axes[9] = {
         1.0f - 2.0f * (qy * qy + qz * qz), 2.0f * (qx * qy + qw * qz), 2.0f * (qx * qz - qw * qy),
         2.0f * (qx * qy - qw * qz), 1.0f - 2.0f * (qx * qx + qz * qz), 2.0f * (qy * qz + qw * qx),
@@ -87,7 +87,7 @@ kernel void project(
         vfloat ux = w[0] * axis[0] + w[1] * axis[1] + w[2] * axis[2];
         vfloat uy = w[3] * axis[0] + w[4] * axis[1] + w[5] * axis[2];
         vfloat uz = w[6] * axis[0] + w[7] * axis[1] + w[8] * axis[2];
-        vfloat scale = VLOAD(index, scales + k * stride) * inverse_z;
+        vfloat scale = VLOAD(index, scales + k * column) * inverse_z;
         mx[k] = view->fx * scale * (ux - ratio_x * uz);
         my[k] = view->fy * scale * (uy - ratio_y * uz);
         vfloat shrink = fmin(AXIS_LIMIT / fmax(fmax(fabs(mx[k]), fabs(my[k])), 1.0f), 1.0f);
@@ -127,7 +127,7 @@ kernel void project(
     vfloat rgb[3] = {(vfloat)(0.0f), (vfloat)(0.0f), (vfloat)(0.0f)};
     if (VANY(drawn)) {
         vfloat inverse_length = 1.0f / sqrt(dx * dx + dy * dy + dz * dz);
-        sh_colour(sh, stride, index, dx * inverse_length, dy * inverse_length, dz * inverse_length, rgb);
+        sh_colour(sh, column, index, dx * inverse_length, dy * inverse_length, dz * inverse_length, rgb);
     }
 
 #if LANES == 1

@@ -49,13 +49,13 @@ inline void merge_local(local ulong *keys, uint n, uint reach, int mirrored, uin
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sort_tiles(
     global const SetView *views,
-    global ulong *all_keys,
+    global ulong *keys,
     global const uint *offsets,
     global uint *intersections,
     global uint *counts,
     uint capacity)
 {
-    local ulong near[SORT_CAPACITY];
+    local ulong piece_keys[SORT_CAPACITY];
     const uint lid = get_local_id(0);
     const uint tile = get_group_id(0);
     views += get_group_id(1);
@@ -66,7 +66,7 @@ void sort_tiles(
     const uint room = capacity - min(capacity, views->first_intersection);
     const uint begin = views->first_intersection + min(offsets[0], room);
     const uint n = views->first_intersection + min(offsets[1], room) - begin;
-    global ulong *keys = all_keys + begin;
+    keys += begin;
     if (lid == 0)
         counts[(views->first_tile + tile) * COUNTER_STRIDE] = 0; /* ready for the next view */
 
@@ -74,16 +74,16 @@ void sort_tiles(
     for (uint piece = 0; piece < n; piece += SORT_CAPACITY) {
         uint m = min(n - piece, (uint)SORT_CAPACITY);
         for (uint i = lid; i < m; i += GROUP)
-            near[i] = keys[piece + i];
+            piece_keys[i] = keys[piece + i];
         for (uint reach = 1; reach < m; reach *= 2)
-            merge_local(near, m, reach, 1, lid);
+            merge_local(piece_keys, m, reach, 1, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
         if (n <= SORT_CAPACITY) {
             for (uint i = lid; i < m; i += GROUP)
-                intersections[begin + i] = (uint)near[i];
+                intersections[begin + i] = (uint)piece_keys[i];
         } else {
             for (uint i = lid; i < m; i += GROUP)
-                keys[piece + i] = near[i];
+                keys[piece + i] = piece_keys[i];
         }
         barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
     }
@@ -107,11 +107,11 @@ void sort_tiles(
         for (uint piece = 0; piece < n; piece += SORT_CAPACITY) {
             uint m = min(n - piece, (uint)SORT_CAPACITY);
             for (uint i = lid; i < m; i += GROUP)
-                near[i] = keys[piece + i];
-            merge_local(near, m, SORT_CAPACITY / 2, 0, lid);
+                piece_keys[i] = keys[piece + i];
+            merge_local(piece_keys, m, SORT_CAPACITY / 2, 0, lid);
             barrier(CLK_LOCAL_MEM_FENCE);
             for (uint i = lid; i < m; i += GROUP)
-                keys[piece + i] = near[i];
+                keys[piece + i] = piece_keys[i];
             barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
         }
     }

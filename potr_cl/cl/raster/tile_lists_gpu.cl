@@ -83,7 +83,7 @@ void fill_tiles(
     uint stride,
     global const ushort4 *bounds,
     global const float4 *shapes,
-    volatile global uint *cursors,
+    volatile global uint *counts,
     global ulong *keys,
     uint capacity)
 {
@@ -92,7 +92,7 @@ void fill_tiles(
     views += get_global_id(1);
     bounds += (size_t)stride * get_global_id(1);
     shapes += 2 * (size_t)stride * get_global_id(1);
-    cursors += COUNTER_STRIDE * (size_t)views->first_tile;
+    counts += COUNTER_STRIDE * (size_t)views->first_tile;
     keys += views->first_intersection;
     capacity -= min(capacity, views->first_intersection);
     const int width = views->view.width, height = views->view.height, tiles_across = views->view.columns;
@@ -105,7 +105,7 @@ void fill_tiles(
         int2 columns = splat_tile_columns(shapes, splat, tiles, tile_row, width, height);
         ulong key = depth_key(shapes[2 * splat + 1].z, splat);
         for (int column = columns.x; column < columns.y; ++column) {
-            uint slot = atomic_inc(&cursors[(tile_row * tiles_across + column) * COUNTER_STRIDE]);
+            uint slot = atomic_inc(&counts[(tile_row * tiles_across + column) * COUNTER_STRIDE]);
             if (slot < capacity)
                 keys[slot] = key;
         }

@@ -23,8 +23,10 @@ from potr_cl.errors import DeviceMemoryError, UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
-from potr_cl.raster.rasterizer import TILE, Rasterizer, ViewSet, camera_struct, gpu_limits, totals_limits
+from potr_cl.raster.macros import gpu_limits, totals_limits
+from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_cache import ViewCache
+from potr_cl.raster.view_set import TILE, ViewSet, camera_struct
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]

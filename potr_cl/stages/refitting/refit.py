@@ -31,17 +31,11 @@ from potr_cl.errors import DeviceMemoryError, UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.raster.rasterizer import (
-    INRIA,
-    TILE,
-    Rasterizer,
-    RasterRules,
-    ViewSet,
-    camera_struct,
-    gpu_limits,
-    totals_limits,
-)
+from potr_cl.raster.macros import gpu_limits, totals_limits
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.view_cache import ViewCache
+from potr_cl.raster.view_set import TILE, ViewSet, camera_struct
 from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS
 
 #: Gives the picture that view number i should show: a device buffer that begins with (H, W, 3) float32, valid until the
