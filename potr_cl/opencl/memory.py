@@ -2,8 +2,7 @@
 
 from __future__ import annotations
 
-from abc import abstractmethod
-from contextlib import AbstractContextManager
+from abc import ABC, abstractmethod
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
@@ -16,7 +15,7 @@ if TYPE_CHECKING:
     from potr_cl.opencl.device import Device
 
 
-class Owner(AbstractContextManager["Owner"]):
+class Owner(ABC):
     """Something that holds device memory until it is closed: ``with Rasterizer(…) as rasterizer:``."""
 
     @abstractmethod

@@ -14,7 +14,8 @@ from potr_cl.model.virtual_cameras import standpoints
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.compaction.ridge import Compactor, ViewWeights
+from potr_cl.stages.compaction.ridge import Compactor
+from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Pruned, PruningOptions

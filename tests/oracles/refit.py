@@ -18,7 +18,7 @@ from scipy.sparse.linalg import LinearOperator, lsmr
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rules import INRIA
-from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from tests.oracles import raster as reference
 
 Array = NDArray[np.float64]

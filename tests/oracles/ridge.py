@@ -9,7 +9,7 @@ import numpy as np
 import scipy.linalg
 from numpy.typing import NDArray
 
-from potr_cl.stages.compaction.ridge import ViewWeights
+from potr_cl.stages.compaction.view_weights import ViewWeights
 from tests.oracles.raster import sh_basis
 
 Array = NDArray[np.float64]

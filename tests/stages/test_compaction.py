@@ -17,7 +17,8 @@ from potr_cl.model.camera import Camera, camera_centres, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS, CompactionOptions, Compactor, ViewWeights, Weighting
+from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Weighting
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
 from tests.cases.scenes import random_scene
 from tests.devices import KERNELS, open_device
@@ -430,7 +431,7 @@ def measured_weights(device: Device, scene: Scene, cameras: list[Camera]) -> Vie
     sweep.measure()
     weights = ViewWeights.from_importances(len(scene), sweep.view_importances())
     sweep.free()
-    rasterizer.free()
+    rasterizer.close()
     return weights
 
 

@@ -34,7 +34,7 @@ def run(device, scene, cameras, options, sweep=None, on_device=True, after_itera
         result = prune(removal, len(scene), options)
     left, sweeps = removal.alive, removal.sweeps
     removal.free()
-    rasterizer.free()
+    rasterizer.close()
     assert np.flatnonzero(left).tolist() == result.survivors.tolist() or result.kept == 1
     return result, sweeps
 
@@ -79,7 +79,7 @@ def test_each_iteration_spends_its_budget(gpu, lego_excerpt, cameras):
         alive = np.setdiff1d(alive, gone)
         start += len(gone)
     removal.free()
-    rasterizer.free()
+    rasterizer.close()
 
 
 def test_order_and_history_fit_the_iterations(gpu, lego_excerpt, cameras):
@@ -171,4 +171,4 @@ def test_options_that_only_the_host_knows(gpu, lego_excerpt, cameras):
     removal = RemovalSweep(rasterizer, cameras)
     assert prune_scene(removal, PruningOptions(0, 3, count=700)).kept == 700
     removal.free()
-    rasterizer.free()
+    rasterizer.close()

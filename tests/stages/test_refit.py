@@ -9,7 +9,7 @@ import pytest
 
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
-from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, active_coefficients
 from tests.cases.refit import Case, Linearised, Pictures, visible_scene
 from tests.cases.scenes import ring_of_cameras

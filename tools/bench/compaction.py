@@ -25,7 +25,8 @@ from potr_cl.model.camera import camera_centres, train_views
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision, ViewWeights
+from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
+from potr_cl.stages.compaction.view_weights import ViewWeights
 from tests.cases.scenes import random_scene
 from tests.oracles.ridge import YCOCG, Mask, Ridges, triangles, usable_columns_of
 from tools.make.large_scene import DEFAULT_SCENE

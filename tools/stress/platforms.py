@@ -36,7 +36,8 @@ from potr_cl.quality.metrics_device import Similarity
 from potr_cl.quality.pictures import Picture
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
-from potr_cl.stages.compaction.ridge import Compactor, ViewWeights
+from potr_cl.stages.compaction.ridge import Compactor
+from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.pruning.schedule import PruningOptions

@@ -43,7 +43,8 @@ from potr_cl.opencl.discovery import DeviceInfo, list_devices
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.view_set import TILE
-from potr_cl.stages.compaction.ridge import Compactor, ViewWeights
+from potr_cl.stages.compaction.ridge import Compactor
+from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.refitting.refit import RenderedTargets, refit_colours
 from tests.oracles import raster as reference

@@ -34,7 +34,8 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.reduction import reduce_scene
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, ViewWeights
+from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
+from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
 
 ALPHAS = (1.0, 0.9, 0.7)

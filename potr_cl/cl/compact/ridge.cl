@@ -46,7 +46,7 @@ kernel void compact(
     global const float4 *means,
     global const uint *order,        /* splats seen by any view in the order of their numbers of views */
     global const uint *offsets,      /* of each splat's run in views and weights, splats + 1 */
-    global const uint *views,
+    global const uint *view_numbers,
     global const float *weights,
     global const float4 *camera_centres,       /* two a view: the high and the low part of its position */
     uint splats,
@@ -83,7 +83,7 @@ kernel void compact(
                 uint entry = cursor[lane] + done + b;
                 bool present = entry < end[lane];
                 entry = present ? entry : cursor[lane];
-                uint view = views[entry];
+                uint view = view_numbers[entry];
                 REAL4 to_splat = centre[lane] - TO_REAL4(camera_centres[2 * view]) - TO_REAL4(camera_centres[2 * view + 1]);
                 ray[b][0][lane] = to_splat.x;
                 ray[b][1][lane] = to_splat.y;

@@ -36,7 +36,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.view_cache import ViewCache
 from potr_cl.raster.view_set import TILE, ViewSet, camera_struct
-from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 
 #: Gives the picture that view number i should show: a device buffer that begins with (H, W, 3) float32, valid until the
 #: next call.
