@@ -13,6 +13,9 @@ from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
 from potr_cl.raster.view_set import ViewSet
 
+#: Words from one tile's counter to the next: the memory system does one atomic operation at a time in 32 bytes.
+_COUNTER_STRIDE = 8
+
 #: Keys that are sorted in local memory: 16 KB, half of what every GPU has, so that two tiles are sorted at a time.
 _SORT_CAPACITY = 2048
 
@@ -26,15 +29,16 @@ class GpuLauncher:
     whole_sets = True
     lanes = 1
     key_bytes = 8  # the bitonic network sorts in place
-    counter_bytes = 32  # COUNTER_STRIDE in cl/raster/tile_lists_gpu.cl
+    counter_bytes = 4 * _COUNTER_STRIDE
     subtile_bytes = 2
 
     def __init__(self, device: Device, rules: RasterRules) -> None:
         make = device.shared_kernel
-        self._count = make("raster/tile_lists_gpu.cl", "count_tiles")
-        self._scan = make("raster/tile_lists_gpu.cl", "scan_tiles")
-        self._fill = make("raster/tile_lists_gpu.cl", "fill_tiles")
-        self._sort = make("raster/sort_gpu.cl", "sort_tiles", SORT_CAPACITY=_SORT_CAPACITY)
+        counters = {"COUNTER_STRIDE": _COUNTER_STRIDE}
+        self._count = make("raster/tile_lists_gpu.cl", "count_tiles", **counters)
+        self._scan = make("raster/tile_lists_gpu.cl", "scan_tiles", **counters)
+        self._fill = make("raster/tile_lists_gpu.cl", "fill_tiles", **counters)
+        self._sort = make("raster/sort_gpu.cl", "sort_tiles", SORT_CAPACITY=_SORT_CAPACITY, **counters)
         self._subtiles = make("raster/subtile_masks_gpu.cl", "subtile_masks")
         pixels = {
             "ALPHA_CAP": float(rules.alpha_cap),

@@ -1,4 +1,6 @@
-/* Small kernels by which opencl/device.py finds out what a device does right. Macros: LANES. */
+/* Small kernels by which opencl/device.py finds out what a device does right.
+
+   Macros: LANES (see lanes.clh). With 1 there are more kernels, which have no vectors. */
 
 #include "include/lanes.clh"
 

@@ -1,6 +1,7 @@
-/* Turns rows of `width` floats, one row a splat, into columns of `stride` floats. The first row is that of splat `first`.
+/* Turns rows of `width` floats, one row a splat, into columns of `stride` floats. The first row is that of splat
+   `first`. Both kernel families use it.
 
-   Macros: none. Both kernel families use it. */
+   Macros: none. */
 
 kernel void columns(global const float *rows, uint first, uint width, uint stride, global float *result)
 {

@@ -1,34 +1,33 @@
-/* Compositing of one view alone for GPUs: one work-group a tile, one pixel a work-item (32 in a row make a block of 8 x 4
-   pixels), splats fetched into local memory in batches.
+/* Composites one view alone, for GPUs: one work-group a tile, one pixel a work-item (32 in a row make a block of 8 x 4
+   pixels). Splats are fetched into local memory in batches.
 
-   A frame that nothing runs beside takes as long as its longest tile list, which one work-group walks. This kernel is the
-   faster one there, and needs no sub-tiles; composite_gpu.cl does less work in all, and is for many views at a time. Both do
-   the same to a pixel in the same order, so that their pictures have the same bits.
+   A frame that nothing runs beside takes as long as its longest tile list, which one work-group walks. This kernel is
+   the faster one there, and needs no sub-tiles. composite_gpu.cl does less work in all, and is for many views at a
+   time. Both do the same to a pixel in the same order, so that their pictures have the same bits.
 
-   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD (a pixel ends before its transmittance would fall below it), NATIVE_EXP2. */
+   Macros:
+       ALPHA_CAP                largest alpha of a splat in a pixel;
+       TRANSMITTANCE_THRESHOLD  a pixel ends before its transmittance would fall below it;
+       NATIVE_EXP2              see lanes.clh;
+       AT_ONCE                  splats whose exponents are computed before the first of them is composited: a divisor of
+                                BATCH, 8 by default. */
 
 #define LANES 1
 #include "include/lanes.clh"
 #include "include/splat.clh"
 #include "include/view_set.clh"
 
-#if NATIVE_EXP2
-#define EXP2 native_exp2
-#else
-#define EXP2 exp2_polynomial
-#endif
-
 #define BATCH (TILE * TILE)
-/* The exponents of so many splats are computed before the first of them is composited: independent work hides latency. A
-   divisor of BATCH. */
+/* The exponents do not depend on each other, which hides latency. */
 #ifndef AT_ONCE
 #define AT_ONCE 8
 #endif
 
-/* One splat of the next batch into registers, long before it is needed; past the end one that touches nothing. */
+/* Takes one splat of the next batch into registers, long before it is needed. Past the end it is one that touches
+   nothing. */
 #define FETCH                                              \
     if (next < end) {                                      \
-        const uint splat = intersections[next];                  \
+        const uint splat = intersections[next];            \
         s0 = shapes[2 * (size_t)splat];                    \
         s1 = shapes[2 * (size_t)splat + 1];                \
         colour = colours[splat];                           \
@@ -96,7 +95,7 @@ void composite_frame(
             }
             if (most < LOG2_ALPHA_MIN)
                 continue;
-            /* Without branches from here on: a pixel that this splat misses or that has ended adds nothing. */
+            /* There are no branches from here on: a pixel that has ended, or that the splat misses, adds nothing. */
             float alphas[AT_ONCE];
             for (int j = 0; j < AT_ONCE; ++j)
                 alphas[j] = powers[j] >= LOG2_ALPHA_MIN ? fmin(EXP2(powers[j]), ALPHA_CAP) : 0.0f;

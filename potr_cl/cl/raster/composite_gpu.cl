@@ -1,7 +1,8 @@
-/* Compositing for GPUs: one work-group a tile; get_group_id(1) is the view's number in its set. See subtile_lists.clh for how
-   a tile's work is shared out.
+/* Composites the splats to a picture, for GPUs: one work-group a tile; get_group_id(1) is the view's number in its set.
+   See subtile_lists.clh for how a tile's work is shared out. composite_cpu.cl is its twin; composite_frame_gpu.cl does
+   a view alone.
 
-   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2. */
+   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2 (see subtile_lists.clh). */
 
 #include "include/subtile_lists.clh"
 
@@ -40,9 +41,10 @@ void composite(
     intersections += views->first_intersection + begin;
     subtiles += views->first_intersection + begin;
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
-    uint last_batch;
+    const uint length = end - begin;
+    uint last; /* batch, which nobody needs */
     forward(
-        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, end - begin, lid, &last_batch);
+        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &last);
     const Mine mine = pixels_of(lid / SHARE, origin, lid);
     for (int p = 0; p < PIXELS; ++p)
         if (inside(mine, p, picture)) {

@@ -1,6 +1,11 @@
-/* Depth order of each tile's list, for CPUs: one tile a work-item, insertion sort of short runs, then merges. */
+/* The depth order of each tile's list, for CPUs: one tile a work-item, which sorts short runs by insertion and then
+   merges them. sort_gpu.cl is its twin.
 
+   Macros: RUN (keys of a run; 16 by default). */
+
+#ifndef RUN
 #define RUN 16
+#endif
 
 /* Behind the keys, from `capacity` on, there is as much room again to merge into. */
 kernel void sort_tiles(

@@ -1,9 +1,10 @@
-/* Which splats touch which tile, for CPUs: one splat a work-item. See tile_lists_gpu.cl for the scheme. */
+/* Which splats touch which tile, for CPUs: one splat a work-item. See tile_lists_gpu.cl, its twin, for the scheme.
+
+   Macros: none. */
 
 #include "include/splat.clh"
 
 #define GROUP 1
-#define COUNTER_STRIDE 1
 
 #include "raster/scan_tiles.clh"
 
