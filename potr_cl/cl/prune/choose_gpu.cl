@@ -129,9 +129,9 @@ void rank(
     barrier(CLK_LOCAL_MEM_FENCE);
     uint key = STAYS;
     ulong importance = 0;
-    if (i < splats && alive[i] == 2)
-        alive[i] = 0;
-    if (i < splats && alive[i] == 1) {
+    if (i < splats && alive[i] == SPLAT_JUST_REMOVED)
+        alive[i] = SPLAT_REMOVED;
+    if (i < splats && alive[i] == SPLAT_ALIVE) {
         global const uint *total = totals + TOTAL_WORDS * (size_t)i;
         importance = (ulong)max(total_at(total + 2), 0L);
         const float newest = convert_float_rte(total_at(total)) * effect_unit;
@@ -177,7 +177,7 @@ void refine(
     merge(state, digit, bins, lid);
 }
 
-/* Marks the splats that go (alive = 2), notes when they went and at what cost, and counts them. */
+/* Marks the splats that go as just removed, notes when they went and at what cost, and counts them. */
 kernel __attribute__((reqd_work_group_size(DIGIT, 1, 1)))
 void mark(
     uint splats,
@@ -200,7 +200,7 @@ void mark(
     const uint last = remaining > 1 ? min(cut.digits, LAST_KEY) : LAST_KEY;
     if (i < splats && keys[i] <= last) {
         global const uint *total = totals + TOTAL_WORDS * (size_t)i;
-        alive[i] = 2;
+        alive[i] = SPLAT_JUST_REMOVED;
         removed[i].iteration = iteration;
         removed[i].key = keys[i];
         removed[i].effect = convert_float_rte(total_at(total)) * effect_unit;

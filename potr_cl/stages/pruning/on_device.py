@@ -17,6 +17,7 @@ from potr_cl.opencl.structs import struct_dtype
 from potr_cl.raster.macros import totals_limits
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Iteration, Pruned, PruningOptions, ascending, prune
+from potr_cl.stages.pruning.steering import Steering
 
 _SOURCE = "prune/choose_gpu.cl"
 #: Digits of a score in base 256, and the words of the state buffer (cl/prune/choose_gpu.cl): histograms, what is known
@@ -42,9 +43,9 @@ def prune_scene(
         progress: called with the iterations done and the number of splats left.
         after_iteration: called with the iteration.
     """
-    if not removal.steerable or options.count is not None or not np.isfinite(options.delta_mse_max):
+    if removal.steering is None or options.count is not None or not np.isfinite(options.delta_mse_max):
         return prune(removal, removal.splats, options, progress, after_iteration)
-    with _Controller(removal, options) as controller:
+    with _Controller(removal.steering, options) as controller:
         return controller.run(progress, after_iteration)
 
 
@@ -55,7 +56,7 @@ class _Controller(Owner):
         DeviceError: the device has no room for the state.
     """
 
-    def __init__(self, removal: RemovalSweep, options: PruningOptions) -> None:
+    def __init__(self, removal: Steering, options: PruningOptions) -> None:
         self._removal, self._options = removal, options
         self._device = device = removal.device
         self._splats = removal.splats

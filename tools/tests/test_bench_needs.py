@@ -1,0 +1,60 @@
+"""What a scene does not need is not done: the costs that do not depend on the machine."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from potr_cl.opencl.device import Device
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from tools.bench.needs import Needs, looking_away, more
+
+
+@pytest.fixture(scope="module")
+def needs(lego_excerpt, lego_excerpt_cameras):
+    views = [camera for camera in lego_excerpt_cameras if camera.split == "train"][:2]
+    return Needs(lego_excerpt, views, Device(), repeats=1, iterations=3)
+
+
+@pytest.mark.slow
+def test_what_is_skipped_costs_less(needs):
+    lines = {}
+    for line in needs.lines():
+        lines.setdefault(line.skipped, []).append(line)
+        assert all(cost > 0 for cost in line.costs)
+    sweeps = [line.costs for line in lines["unchanged and hardly changed tiles"]]
+    assert all(lean < full for lean, full in sweeps)
+    settled = lines["iterations with nothing left to decide"][0].costs
+    assert settled[0] < settled[1]
+    sizes = lines["bands that are all zero"][0].costs
+    assert sizes[0] == sizes[1]
+    grey, coloured = lines["channels that are all zero"][0].costs
+    assert grey < 0.8 * coloured
+
+
+def test_views_that_look_away_see_nothing(needs):
+    rasterizer = Rasterizer(needs.device, needs.scene)
+    for camera in needs.views:
+        image, transmittance = rasterizer.render(looking_away(camera))
+        assert not image.any()
+        assert (transmittance == 1).all()
+        assert np.allclose(looking_away(camera).centre, camera.centre)
+    rasterizer.free()
+
+
+def test_splats_that_nobody_sees_are_in_no_list(needs):
+    twice = more(needs.scene, opacity_logits=np.full(len(needs.scene), -6, np.float32))
+    assert len(twice) == 2 * len(needs.scene)
+    counts = []
+    for scene in (needs.scene, twice):
+        rasterizer = Rasterizer(needs.device, scene)
+        view = rasterizer.prepare(needs.views[0])
+        counts.append(view.intersection_count)
+        view.free()
+        removal = RemovalSweep(rasterizer, needs.views, SweepOptions())
+        assert (removal.measure()[1][len(needs.scene) :] == 0).all()
+        removal.free()
+        rasterizer.free()
+    assert counts[0] == counts[1] > 0
