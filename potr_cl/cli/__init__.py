@@ -29,7 +29,8 @@ _COMMANDS = {
 _ON_A_DEVICE = {"encode", "prune", "compact", "refit", "render", "compare", "devices"}
 
 
-def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
+def command_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """The parser of the command that ``argv`` begins with; of all commands where it begins with none."""
     parser = argparse.ArgumentParser(
         prog="potr-cl", description="Compress trained 3D Gaussian Splatting scenes without retraining."
     )
@@ -52,7 +53,7 @@ def main(argv: Sequence[str] | None = None) -> int:
     if argv and argv[0] in _ON_A_DEVICE and not {"-h", "--help"} & set(argv):
         # Drivers take as long to load as the command's modules to be imported.
         in_background(import_module("potr_cl.opencl.discovery").list_devices)
-    args = _parser(argv).parse_args(argv)
+    args = command_parser(argv).parse_args(argv)
     try:
         args.run(args)
     except PotrError as error:

@@ -8,11 +8,10 @@ from pathlib import Path
 from potr_cl.cli.options import Commands
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene, scene_writer
+from potr_cl.formats.registry import extras_needed, suffixes_read, suffixes_written
 
 
 def _convert(args: argparse.Namespace) -> None:
-    if args.output.suffix.lower() == ".potr":
-        raise UsageError(f"'{args.output}': a .potr file is made by the command encode, which reads '{args.scene}' too")
     write = scene_writer(args.output)  # a wrong name is told before anything is read
     if args.output.resolve() == args.scene.resolve():
         raise UsageError(f"'{args.scene}' would be replaced by itself: give another name for the output")
@@ -29,9 +28,8 @@ def add_convert(commands: Commands) -> None:
     p = commands.add_parser(
         "convert",
         help="a scene from one format to another, for other tools",
-        description="Read a scene (.ply, .compressed.ply, .potr, .spz, .sog) and write it as .ply, .compressed.ply or "
-        ".spz. Nothing but what the format itself rounds is changed; axes are kept. All but .ply and .potr need "
-        'pip install "potr-cl[convert]".',
+        description=f"Read a scene ({suffixes_read()}) and write it as {suffixes_written()}. Nothing but what the "
+        f"format itself rounds is changed; axes are kept. {extras_needed()}.",
     )
     p.add_argument("scene", type=Path, metavar="IN")
     p.add_argument("output", type=Path, metavar="OUT")

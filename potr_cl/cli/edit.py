@@ -11,19 +11,9 @@ from pathlib import Path
 
 import numpy as np
 
-from potr_cl.cli.options import (
-    Commands,
-    add_compaction_options,
-    add_device_options,
-    add_memory_option,
-    add_pruning_options,
-    as_bytes,
-    compaction_choices,
-    count,
-    pruning_choices,
-    sweep_options,
-)
+from potr_cl.cli.options import Commands, add_device_options, add_memory_option, as_bytes
 from potr_cl.cli.progress import Progress
+from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
 from potr_cl.codec.quantize import ac_sparsity
 from potr_cl.errors import UsageError
@@ -34,15 +24,18 @@ from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import Run, Stopwatch
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.reduction import reduce_scene
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.removal import SweepOptions
+from potr_cl.stages.compact import Compact
+from potr_cl.stages.prune import Prune
+from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.refitting.refit import RefitOptions, Refitted, active_coefficients, refit_colours
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
+from potr_cl.stages.stage import Stage, State
 
 #: Coefficients that round to 0 at so many steps a unit are 0, but for what storing R, G and B leaves of them.
 _ZERO_SF = 1e5
@@ -51,33 +44,42 @@ _ZERO_SF = 1e5
 def _prune(args: argparse.Namespace) -> None:
     if args.order is not None and args.order.resolve() == args.output.resolve():
         raise UsageError("--order and --output name the same file")
-    options = EncodeOptions(
-        q=args.quality,
-        delta_mse_max=args.delta_mse_max,
-        iterations=args.iterations,
-        **pruning_choices(args),
-        compact=False,
-        sweep=sweep_options(args),
-        background=parse_colour(args.background),
-    )
-    _ = options.parameters  # a wrong option is told before a gigabyte is read
+    options = _options(args, Prune)
     cameras = given_cameras(args)
     scene = load_scene(args.scene)
-    options = dataclasses.replace(options, count=count(args, len(scene)))
-    device = Device(args.device)
     with contextlib.ExitStack() as stack:
         order = stack.enter_context(replacing(args.order)) if args.order is not None else None
-        progress = stack.enter_context(contextlib.closing(Progress()))
-        cameras = cameras or virtual_cameras(args, scene, progress)
-        kept, pruned = reduce_scene(scene, cameras, options, progress, device)
-        assert pruned is not None
-        ply.save(args.output, kept)
+        state, device = _run(args, scene, cameras, options, Prune)
+        pruned: Pruned = state.learnt["prune"]
+        ply.save(args.output, state.scene)
         if order is not None:
             np.save(order, pruned.order)
     print(
         f"{args.output}: kept {pruned.kept} of {len(scene)} splats "
         f"({100 * pruned.kept / len(scene):.1f} %) in {pruned.iterations} iterations on {device.info}"
     )
+
+
+def _options(args: argparse.Namespace, kind: type[Stage]) -> EncodeOptions:
+    """Those of ``encode`` with one stage alone."""
+    options = EncodeOptions(q=args.quality, background=parse_colour(args.background), memory=as_bytes(args.memory))
+    options = options.changed(**{stage.name: isinstance(stage, kind) for stage in options.stages})
+    options = options.changed(**stage_choices(args))
+    _ = options.parameters  # a wrong option is told before a gigabyte is read
+    return options
+
+
+def _run(
+    args: argparse.Namespace, scene: Scene, cameras: list[Camera] | None, options: EncodeOptions, kind: type[Stage]
+) -> tuple[State, Device]:
+    """What a stage alone makes of a scene, and the device that it was done on."""
+    device = Device(args.device)
+    with contextlib.closing(Progress()) as progress:
+        watch = Stopwatch(progress)
+        cameras = cameras or virtual_cameras(args, scene, watch)
+        run = Run(options, watch, device)
+        state = run.stages(State.of(scene, train_views(cameras)), [kind])
+    return state, run.device or device
 
 
 def add_prune(commands: Commands) -> None:
@@ -92,26 +94,20 @@ def add_prune(commands: Commands) -> None:
         metavar="FILE.npy",
         help="also write the order of removal: the scene's splat numbers, first removed first, kept ones last",
     )
-    add_pruning_options(p)
+    add_stage_flags(p, [Prune], without=["on"])
+    add_memory_option(p)
+    add_device_options(p)
     p.set_defaults(run=_prune)
 
 
 def _compact(args: argparse.Namespace) -> None:
-    options = EncodeOptions(
-        q=args.quality,
-        **compaction_choices(args),
-        sf_sh=args.sf_sh,
-        prune=False,
-        sweep=SweepOptions(memory=as_bytes(args.memory)),
-        background=parse_colour(args.background),
-    )
-    _ = options.parameters
+    options = _options(args, Compact)
+    if args.sf_sh is not None:
+        options = options.with_parameters(sf_sh=args.sf_sh)
+        _ = options.parameters
     cameras = given_cameras(args)
     scene = load_scene(args.scene)
-    device = Device(args.device)
-    with contextlib.closing(Progress()) as progress:
-        cameras = cameras or virtual_cameras(args, scene, progress)
-        compacted, _ = reduce_scene(scene, cameras, options, progress, device)
+    compacted = _run(args, scene, cameras, options, Compact)[0].scene
     ply.save(args.output, compacted)
     before, after = (100 * ac_sparsity(s.sh, options.parameters.sf_sh) for s in (scene, compacted))
     print(
@@ -125,7 +121,7 @@ def add_compact(commands: Commands) -> None:
     add_cameras_options(p)
     p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.ply")
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (sparsest) to 1; default 0.5")
-    add_compaction_options(p)
+    add_stage_flags(p, [Compact], without=["on", "at"])
     p.add_argument("--sf-sh", type=float, metavar="SF", help="steps a unit of the quantiser to expect")
     add_memory_option(p)
     add_device_options(p)
@@ -135,7 +131,6 @@ def add_compact(commands: Commands) -> None:
 def _refit(args: argparse.Namespace) -> None:
     background = parse_colour(args.background)
     options = RefitOptions(steps=args.steps, drop=args.drop, lam=args.lam, prior=args.prior)
-    memory = SweepOptions(memory=as_bytes(args.memory))
     if args.photos is not None and args.cameras is None:
         raise UsageError("--photos needs --cameras, the views that the photographs show")
     cameras = given_cameras(args)
@@ -149,13 +144,12 @@ def _refit(args: argparse.Namespace) -> None:
         cameras = cameras or virtual_cameras(args, reference, progress)
         views = train_views(cameras)
 
-        def work(device: Device, budget: EncodeOptions) -> Refitted:
-            how = dataclasses.replace(options, memory=budget.sweep.memory)
+        def work(device: Device, memory: int | None) -> Refitted:
+            how = dataclasses.replace(options, memory=memory)
             with contextlib.ExitStack() as stack:
                 targets: RenderedTargets | GroundTruthTargets
                 if ground_truth is None:
-                    rasterizer = Rasterizer(device, reference, background=background)
-                    stack.callback(rasterizer.free)
+                    rasterizer = stack.enter_context(Rasterizer(device, reference, background=background))
                     targets = RenderedTargets(rasterizer, views)
                 else:
                     targets = GroundTruthTargets(device, ground_truth, views)
@@ -166,7 +160,7 @@ def _refit(args: argparse.Namespace) -> None:
                 )  # fmt: skip
 
         progress("refit", 0.0)
-        refitted, device = on_device(device, EncodeOptions(sweep=memory), work)
+        refitted, device = on_device(device, as_bytes(args.memory), work)
         progress("refit", 1.0)
         result = dataclasses.replace(scene, sh=refitted.sh)
         ply.save(args.output, result)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import dataclasses
 import json
 import sys
 import time
@@ -12,21 +11,11 @@ from concurrent.futures import Future
 from pathlib import Path
 from typing import Any
 
-from potr_cl.cli.options import (
-    Commands,
-    add_compaction_options,
-    add_pruning_options,
-    compaction_choices,
-    count,
-    pruning_choices,
-    size_in_bytes,
-    sweep_options,
-)
+from potr_cl.cli.options import Commands, add_device_options, add_memory_option, as_bytes, size_in_bytes
 from potr_cl.cli.progress import Progress
+from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
-from potr_cl.codec.container import ENTROPY_CODERS, EntropyCoder
 from potr_cl.codec.decoder import PotrFile, decode
-from potr_cl.codec.quantize import PRESETS
 from potr_cl.errors import DeviceError, UsageError
 from potr_cl.formats import load_scene
 from potr_cl.formats.images import Colour, parse_colour
@@ -35,65 +24,38 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, test_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Stopwatch, encode, needs_views
+from potr_cl.pipeline.encode import Stopwatch, encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.presets import DEFAULT, PRESETS, PURPOSE
 from potr_cl.pipeline.search import Target, encode_to_target
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.report.html import PicturePair, html_report, views_to_show
 from potr_cl.report.summary import encode_report, format_encode_report, quality_report, search_report
+from potr_cl.stages.refit import Refit
 
 
 def _options(args: argparse.Namespace) -> EncodeOptions:
     if args.threads < 0:
         raise UsageError(f"--threads is {args.threads}, it must be 0 or more")
-    asked = {"iterations": args.iterations, "compact": args.compact, "refit": _refit_steps(args.refit)}
-    changes: dict[str, Any] = {name: value for name, value in asked.items() if value is not None}
-    if args.entropy is not None or args.zstd_level is not None:
-        changes["entropy"] = EntropyCoder(
-            args.entropy or "zstd", EntropyCoder.level if args.zstd_level is None else args.zstd_level
-        )
     options = EncodeOptions.for_preset(
         args.preset,
         q=args.quality,
-        delta_mse_max=args.delta_mse_max,
-        **pruning_choices(args),
-        **compaction_choices(args),
-        prune=not args.no_prune,
-        compact_at=args.compact_at,
-        drop=args.drop,
-        refit_at=tuple(args.refit_at),
-        ground_truth=args.photos,
-        sweep=sweep_options(args),
         background=parse_colour(args.background),
-        beta=args.beta,
-        gamma=args.gamma,
-        sf_dc=args.sf_dc,
-        sf_sh=args.sf_sh,
-        sf_opacity=args.sf_opacity,
-        sf_rotation=args.sf_rotation,
-        sf_scale=args.sf_scale,
+        memory=as_bytes(args.memory),
         threads=args.threads,
         source_bytes=args.scene.stat().st_size if args.scene.is_file() else None,
-        **changes,
+        **stage_choices(args),
     )
     _ = options.parameters  # a wrong option is told before a gigabyte is read
     return options
 
 
-def _refit_steps(wanted: str) -> int | None:
-    """The number of steps; None for the preset's."""
-    if wanted in ("auto", "off"):
-        return None if wanted == "auto" else 0
-    if not wanted.isdecimal():
-        raise UsageError(f"--refit is '{wanted}': give a number of steps, auto, or off")
-    return int(wanted)
-
-
 def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
     """Whether anything may be rendered: to encode, or to judge what was encoded."""
-    return options.prune or options.refit > 0 or options.compact or not (args.cameras is None or args.no_quality)
+    wanted = any(stage.on and stage.needs_views for stage in options.stages)
+    return wanted or not (args.cameras is None or args.no_quality)
 
 
 def _target(args: argparse.Namespace) -> Target | None:
@@ -105,7 +67,8 @@ def _target(args: argparse.Namespace) -> Target | None:
 def _encode(args: argparse.Namespace) -> None:
     began = time.perf_counter()
     options, target = _options(args), _target(args)
-    if options.ground_truth is not None and not (args.cameras and options.refit):
+    refit = options.stage(Refit)
+    if refit.ground_truth is not None and not (args.cameras and refit.on and refit.steps):
         raise UsageError("--photos needs --cameras, the views that the photographs show, and a re-fit")
     if args.report is None and args.report_view is not None:
         raise UsageError("--report-view needs --report, the page that shows it")
@@ -116,11 +79,10 @@ def _encode(args: argparse.Namespace) -> None:
         opened = stack.enter_context(thread_pool(1)).submit(Device, args.device) if _looks(args, options) else None
         cameras = given_cameras(args)
         ground_truth = None
-        if options.ground_truth is not None and cameras is not None:
-            ground_truth = GroundTruth(options.ground_truth, cameras, options.background)
+        if refit.ground_truth is not None and cameras is not None:
+            ground_truth = GroundTruth(refit.ground_truth, cameras, options.background)
         scene = load_scene(args.scene)
-        options = dataclasses.replace(options, count=count(args, len(scene)))
-        device = opened.result() if opened is not None and needs_views(scene, options) else None
+        device = opened.result() if opened is not None and options.look_at_views(scene) else None
         progress = stack.enter_context(contextlib.closing(Progress()))
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None
         placing = Stopwatch(progress)
@@ -233,10 +195,9 @@ def add_encode(commands: Commands) -> None:
     )
     p.add_argument(
         "--preset",
-        choices=PRESETS,
-        default="best",
-        help="paper: what the paper does; best: colours re-fitted, steps of equal worth, the context coder: the "
-        "smallest file; fast: the same in fewer iterations and steps, zstd 9; default best",
+        choices=tuple(PRESETS),
+        default=DEFAULT,
+        help="; ".join(f"{name}: {purpose}" for name, purpose in PURPOSE.items()) + f"; default: {DEFAULT}",
     )
     add_cameras_options(p)
     p.add_argument("--no-quality", action="store_true", help="do not judge the result; saves time")
@@ -248,71 +209,8 @@ def add_encode(commands: Commands) -> None:
         help="a page of its own with sizes, quality by view, pictures before and after, and the course of pruning",
     )
     p.add_argument("--report-view", metavar="NAME", help="a judging view to show besides the worst and the median one")
-    p.add_argument("--no-prune", action="store_true", help="keep every splat")
-    add_pruning_options(p)
-    p.set_defaults(iterations=None)  # the preset's
-    p.add_argument(
-        "--refit",
-        default="auto",
-        metavar="N",
-        help="steps in which the colours are re-fitted to the uncompressed scene's pictures, all splats together; off: "
-        "none; default auto, the preset's",
-    )
-    p.add_argument(
-        "--photos",
-        type=Path,
-        metavar="DIR",
-        help="photographs, named after the views: re-fit to them instead, for truth rather than fidelity",
-    )
-    p.add_argument(
-        "--refit-at",
-        type=float,
-        nargs="+",
-        default=(),
-        metavar="PART",
-        help="of the pruning iterations after which they are re-fitted too: a few percent smaller, and slower",
-    )
-    p.add_argument(
-        "--compact",
-        action=argparse.BooleanOptionalAction,
-        help="make the colours' coefficients sparse splat by splat; default: where there is no re-fit",
-    )
-    p.add_argument(
-        "--compact-at",
-        type=float,
-        default=EncodeOptions.compact_at,
-        metavar="PART",
-        help=f"of the pruning iterations after which colours are compacted; default {EncodeOptions.compact_at:g}",
-    )
-    p.add_argument(
-        "--entropy",
-        choices=ENTROPY_CODERS,
-        help="context: smallest, not for preset paper; zstd: decodes fastest; npz: deflate, as NumPy's compressed "
-        "files use; default: the preset's",
-    )
-    p.add_argument("--zstd-level", type=int, metavar="L", help="1 (fast) to 22 (small); default: the preset's")
+    add_stage_flags(p)
     p.add_argument("--threads", type=int, default=0, metavar="T", help="default: one a processor")
-    single = p.add_argument_group("single parameters (each is set by -q otherwise)")
-    single.add_argument(
-        "--drop",
-        type=float,
-        metavar="X",
-        help="give up a coefficient if the mean squared error grows by less; re-fit only",
-    )
-    single.add_argument("--gamma", type=float, metavar="UNITS", help="least distance a centre may move, world units")
-    single.add_argument(
-        "--beta",
-        type=float,
-        metavar="PART",
-        help="the same as a part of the nearest camera's distance; best, fast: of a typical splat's size there",
-    )
-    for name, what in (
-        ("dc", "a unit for constant SH coefficients"),
-        ("sh", "a unit for the other SH coefficients"),
-        ("opacity", "a unit for opacities; best, fast: for their logits"),
-        ("rotation", "a unit for quaternions; best, fast: times the root of the largest scale in steps"),
-        ("scale", "a unit for standard deviations; best, fast: in a typical splat's size"),
-    ):
-        single.add_argument(f"--sf-{name}", type=float, metavar="SF", help=f"steps {what}")
-    add_compaction_options(single)
+    add_memory_option(p)
+    add_device_options(p)
     p.set_defaults(run=_encode)

@@ -11,7 +11,7 @@ from potr_cl.formats import load_cameras
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import FEWEST, MOST, describe, place_cameras
-from potr_cl.pipeline.reduction import Progress
+from potr_cl.stages.stage import Progress
 
 
 def add_cameras_options(p: argparse.ArgumentParser) -> None:

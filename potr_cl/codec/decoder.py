@@ -1,4 +1,7 @@
-"""Decoder: from the bytes of a .potr file back to a scene, in order. Nothing in a file is trusted."""
+"""Decoder: from the bytes of a .potr file back to a scene (:func:`decode`, :class:`PotrFile`).
+
+Splats come in the order of the file. Nothing in a file is trusted.
+"""
 
 from __future__ import annotations
 
@@ -14,8 +17,14 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec import container, context_coder, octree, quantize
-from potr_cl.codec.container import Coder, Header, Property, Section
+from potr_cl.codec import container, octree, sections
+from potr_cl.codec.byte_planes import unpack_integers
+from potr_cl.codec.container import Header
+from potr_cl.codec.context.decoder import Reader, Stream
+from potr_cl.codec.context.lanes import Lanes
+from potr_cl.codec.context.model import Sizes
+from potr_cl.codec.sections import Coder, Property, Section
+from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
@@ -104,10 +113,10 @@ class PotrFile:
             depth=header.depth,
             occupancy=self._raw(Property.OCCUPANCY),
             several=self._raw(Property.SEVERAL),
-            multiplicities=container.unpack_integers(raw, planes, False, 0, count).astype(np.uint64),
+            multiplicities=unpack_integers(raw, planes, False, 0, count).astype(np.uint64),
             tail_lengths=self._raw(Property.TAIL_LENGTH),
             tails=self._raw(Property.TAIL),
-            absolute=header.version > 1,
+            absolute=self._version.absolute_leaf_levels,
         )
         return octree.parse(tree, header.splats)
 
@@ -120,7 +129,7 @@ class PotrFile:
     def quaternions(self) -> NDArray[np.float32]:
         """(N, 4) float32 unit quaternions w, x, y, z. Raises DataError if damaged."""
         out = np.empty((self.header.splats, 4), np.float32)
-        scales = self._streams(Property.SCALE) if self.header.version > 1 else []
+        scales = self._streams(Property.SCALE) if self._version.rotations_need_scales else []
         self._dequantize_rotations(self._streams(Property.ROTATION), scales, out)
         return out
 
@@ -196,6 +205,10 @@ class PotrFile:
 
     # ------------------------------------------------------------------------------------------ inside
 
+    @property
+    def _version(self) -> FormatVersion:
+        return VERSIONS[self.header.version]
+
     def _raw(self, prop: Property, index: int = 0) -> NDArray[np.uint8]:
         section = self.header.find(prop, index)
         return _EMPTY if section is None else container.read_section(self.data, section)
@@ -208,30 +221,27 @@ class PotrFile:
         section = self.header.find(prop, index)
         return section is not None and section.coder == Coder.CONTEXT
 
-    def _context_streams(
-        self, section: Section, history: context_coder.Sizes | None = None
-    ) -> Iterator[context_coder.Stream]:
+    def _context_streams(self, section: Section, history: Sizes | None = None) -> Iterator[Stream]:
         """The streams of a section of coder CONTEXT, one after another."""
-        yield from context_coder.Reader(
+        yield from Reader(
             container.stored_bytes(self.data, section),
-            section.raw_bytes // section.planes,
-            section.planes,
-            container.is_signed(section.kind),
-            container.is_predicted(section.kind, section.index),
+            section.integers // section.streams,
+            section.streams,
+            sections.is_signed(section.kind),
+            sections.is_predicted(section.kind, section.index),
             history,
             section.name,
         )
 
     def _streams(self, prop: Property, indices: range | None = None) -> list[_Stream]:
         """Some streams of one integer a splat, all of a property's by default."""
-        indices = range(container.indices(prop)) if indices is None else indices
+        indices = range(sections.stream_count(prop)) if indices is None else indices
         section = self.header.find(prop, indices[0])
         if section is not None and section.coder == Coder.CONTEXT:
             return [stream.part for stream in self._context_streams(section)]
-        signed = container.is_signed(prop)
+        signed = sections.is_signed(prop)
         return [
-            partial(container.unpack_integers, self._raw(prop, index), self._planes(prop, index), signed)
-            for index in indices
+            partial(unpack_integers, self._raw(prop, index), self._planes(prop, index), signed) for index in indices
         ]
 
     def _blocks(self, streams: list[_Stream]) -> Iterator[tuple[slice, list[NDArray[np.integer]]]]:
@@ -248,28 +258,26 @@ class PotrFile:
         submit(partial(self._dequantize_rotations, self._streams(Property.ROTATION), scales, quaternions))
 
     def _decode_opacities(self, out: NDArray[np.float32], submit: _Submit) -> None:
-        dequantize = quantize.dequantize_opacities if self.header.version == 1 else quantize.dequantize_logits
+        version = self._version
 
         def finish(streams: list[_Stream]) -> None:
-            for block, steps in self._blocks(streams):
-                out[block] = dequantize(steps[0], self.header.sf_opacity)
+            for block, levels in self._blocks(streams):
+                out[block] = version.dequantize_opacities(levels[0], self.header.sf_opacity)
 
         submit(partial(finish, self._streams(Property.OPACITY)))
 
     def _dequantize_scales(self, streams: list[_Stream], out: NDArray[np.float32]) -> None:
+        version = self._version
         for axis, stream in enumerate(streams):
-            for block, steps in self._blocks([stream]):
-                out[block, axis] = quantize.dequantize_scales(steps[0], self.header.sf_scale)
+            for block, levels in self._blocks([stream]):
+                out[block, axis] = version.dequantize_scales(levels[0], self.header.sf_scale)
 
     def _dequantize_rotations(self, streams: list[_Stream], scales: list[_Stream], out: NDArray[np.float32]) -> None:
-        """Quaternions; ``scales`` matter in format version 2 only."""
-        if self.header.version == 1:
-            for block, steps in self._blocks(streams):
-                quantize.dequantize_rotations(steps, self.header.sf_rotation, out[block])
-        else:
-            for block, steps in self._blocks([*streams, *scales]):
-                factors = quantize.rotation_factors(steps[3:], self.header.sf_rotation)
-                quantize.dequantize_rotations(steps[:3], factors, out[block])
+        """Quaternions; ``scales`` are looked at where the version's rotations need them."""
+        version = self._version
+        needed = scales if version.rotations_need_scales else []
+        for block, levels in self._blocks([*streams, *needed]):
+            version.dequantize_rotations(levels[:3], levels[3:], self.header.sf_rotation, out[block])
 
     def _empty_sh(self) -> NDArray[np.float32]:
         return np.empty((SH_COEFFICIENTS[self.header.sh_degree], 3, self.header.splats), np.float32)
@@ -277,17 +285,17 @@ class PotrFile:
     def _sh_jobs(self, planar: NDArray[np.float32]) -> list[tuple[bool, _Job]]:
         """What decodes all SH coefficients into ``planar`` (M, 3, N), and whether it takes the context coder."""
         chained = [s for s in self.header.sections if s.kind == Property.SH and s.coder == Coder.CONTEXT and s.index]
-        in_chain = {s.index // 3 + m for s in chained for m in range(s.planes // 3)}
+        in_chain = {s.index // 3 + m for s in chained for m in range(s.streams // 3)}
         alone = [m for m in range(len(planar)) if m not in in_chain]
         jobs: list[tuple[bool, _Job]] = [(True, partial(self._decode_chain, chained, planar))] if chained else []
         return jobs + [
             (self._contextual(Property.SH, 3 * m), partial(self._decode_coefficient, m, planar[m])) for m in alone
         ]
 
-    def _decode_chain(self, sections: list[Section], planar: NDArray[np.float32], submit: _Submit) -> None:
+    def _decode_chain(self, chain: list[Section], planar: NDArray[np.float32], submit: _Submit) -> None:
         """AC coefficients whose contexts are made of those before."""
-        history = context_coder.Sizes(context_coder.Lanes(self.header.splats))
-        for section in sorted(sections, key=lambda s: s.index):
+        history = Sizes(Lanes(self.header.splats))
+        for section in sorted(chain, key=lambda s: s.index):
             streams = self._context_streams(section, history)
             for m, channels in enumerate(zip(streams, streams, streams, strict=True), start=section.index // 3):
                 submit(partial(self._finish_coefficient, [s.part for s in channels], m, False, planar[m]))
@@ -300,15 +308,15 @@ class PotrFile:
 
     def _finish_coefficient(self, streams: list[_Stream], m: int, differences: bool, out: NDArray[np.float32]) -> None:
         last = [0, 0, 0]
-        for block, steps in self._blocks(streams):
+        for block, levels in self._blocks(streams):
             if differences:
-                channels = [s.astype(np.int64) for s in steps]
+                channels = [level.astype(np.int64) for level in levels]
                 for c, channel in enumerate(channels):
                     channel[0] += last[c]
                     np.cumsum(channel, out=channel)
                     last[c] = channel[-1]
             else:
-                channels = _wider(steps)
+                channels = _wider(levels)
             _to_rgb(channels, self.header.sf_dc if m == 0 else self.header.sf_ac, out[:, block])
 
 
@@ -324,15 +332,15 @@ def _now(work: Callable[[], None]) -> None:
     work()
 
 
-def _wider(steps: list[NDArray[np.integer]]) -> list[NDArray[Any]]:
-    """Integers of a type that holds the sums of three of them."""
-    most = max(s.dtype.itemsize for s in steps)
+def _wider(levels: list[NDArray[np.integer]]) -> list[NDArray[Any]]:
+    """Levels of a type that holds the sums of three of them."""
+    most = max(level.dtype.itemsize for level in levels)
     dtype: type[np.signedinteger] = np.int16 if most == 1 else np.int32 if most == 2 else np.int64
-    return [s.astype(dtype) for s in steps]
+    return [level.astype(dtype) for level in levels]
 
 
 def _to_rgb(channels: list[NDArray[Any]], factor: float, out: NDArray[np.float32]) -> None:
-    """Steps of Y, Co, Cg to R, G, B in ``out`` (3, n)."""
+    """Levels of Y, Co, Cg to R, G, B in ``out`` (3, n)."""
     divisor = np.float32(factor)
     y, co, cg = channels
     r = y - cg

@@ -1,4 +1,7 @@
-"""From a scene to the bytes of a .potr file: octree, quantised streams, entropy coding; the threads do not matter."""
+"""From a scene to the bytes of a .potr file (:func:`code_scene`): octree, quantised streams, entropy coding.
+
+The bytes do not depend on the number of threads.
+"""
 
 from __future__ import annotations
 
@@ -10,21 +13,21 @@ from functools import partial
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec import container, context_coder, octree, quantize
-from potr_cl.codec.container import EntropyCoder, Header, Property, Section
+from potr_cl.codec import container, octree, quantize, sections
+from potr_cl.codec.byte_planes import pack_integers
+from potr_cl.codec.container import EntropyCoder, Header
+from potr_cl.codec.context import encoder as context_encoder
 from potr_cl.codec.geometry import Geometry, quantise_geometry
+from potr_cl.codec.sections import Coder, Property, Section
+from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.host.threads import Run, thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 
-#: Splats worked on at a time where a stage needs large temporaries.
-_BLOCK = 1 << 14
-#: Splats whose SH coefficients are quantised at a time, for the same reason.
+#: Splats whose SH coefficients are quantised at a time: few enough for the temporaries to stay in a cache.
 _BLOCK = 1 << 14
 #: Of fewer splats the models of the context coder may weigh more than they save.
 _FEW = 1 << 15
-#: Streams of bytes, whose length means something.
-_BYTES = {Property.METADATA, Property.OCCUPANCY, Property.SEVERAL, Property.TAIL_LENGTH, Property.TAIL}
 
 
 @dataclass(frozen=True)
@@ -68,7 +71,10 @@ def code_scene(
 
     Raises:
         DataError: a value too large to quantise.
+        UsageError: the file's version cannot hold the parameters.
     """
+    version = VERSIONS[parameters.version]
+    version.check(parameters)
     report = progress or (lambda stage, done: None)
     coder = entropy or EntropyCoder()
     with thread_pool(threads) as pool:
@@ -82,13 +88,13 @@ def code_scene(
         plain = pool.map(partial(_plain_sections, coder=coder), groups)
         chains = _chains(geometry, _coefficients(scene, order, parameters, pool.map))
         report(stage, 0.2)
-        coded = _code_chains(chains, coder, parameters.version, pool, lambda done: report(stage, 0.2 + 0.7 * done))
-        coded += [section for sections in plain for section in sections]
+        coded = _code_chains(chains, coder, version, pool, lambda done: report(stage, 0.2 + 0.7 * done))
+        coded += [pair for pairs in plain for pair in pairs]
         report(stage, 1.0)
     coded.sort(key=lambda pair: (pair[0].kind, pair[0].index))
     pieces = container.assemble(
         Header(
-            version=parameters.version,
+            version=version.number,
             splats=len(scene),
             sh_degree=scene.sh_degree,
             origin=tree.origin,
@@ -113,65 +119,58 @@ class _Group:
     index: int
     streams: Sequence[NDArray[np.integer]]
 
-    @property
-    def contextual(self) -> bool:
-        return bool(container.context_groups(self.prop, 0))
-
 
 def _plain_sections(group: _Group, coder: EntropyCoder) -> list[tuple[Section, bytes]]:
     """A section a stream; none where all integers are 0, but for opacity, whose length vouches for that of others."""
-    signed = container.is_signed(group.prop)
-    sections = []
+    signed = sections.is_signed(group.prop)
+    coded = []
     for index, stream in enumerate(group.streams, start=group.index):
         if group.prop == Property.SH and index < 3:
             stream = stream.astype(np.int64)
             stream[1:] -= stream[:-1].copy()
-        if group.prop in _BYTES:
+        if sections.is_bytes(group.prop):
             raw, planes = stream.astype(np.uint8).tobytes(), 1
         else:
-            raw, planes = container.pack_integers(stream, signed)
+            raw, planes = pack_integers(stream, signed)
         if group.prop == Property.OPACITY and not raw:
             raw, planes = bytes(len(stream)), 1
         if raw:
-            sections.append(coder.section(group.prop, index, raw, planes))
-    return sections
+            coded.append(coder.section(group.prop, index, raw, planes))
+    return coded
 
 
 def _code_chains(
     chains: list[list[_Group]],
     coder: EntropyCoder,
-    version: int,
+    version: FormatVersion,
     pool: ThreadPoolExecutor,
     progress: Callable[[float], None],
 ) -> list[tuple[Section, bytes]]:
-    """Sections of some groups: those of a chain tell each other's contexts, where there are contexts."""
+    """Sections of some groups: those of a chain tell each other's contexts, where the context coder codes them."""
     plain = partial(_plain_sections, coder=coder)
     coded: list[tuple[Section, bytes]] = []
-    if coder.name != "context" or version == 1:
+    if coder.name != "context" or Coder.CONTEXT not in version.coders:
         # Each stream by itself, so that there is something to do for every thread.
         groups = [_Group(g.prop, g.index + k, [s]) for chain in chains for g in chain for k, s in enumerate(g.streams)]
-        for done, sections in enumerate(pool.map(plain, groups), start=1):
-            coded += sections
+        for done, made in enumerate(pool.map(plain, groups), start=1):
+            coded += made
             progress(done / len(groups))
         return coded
     kept = [[g for g in chain if g.prop == Property.OPACITY or any(s.any() for s in g.streams)] for chain in chains]
     # For few splats one has to try.
     few = len(chains[-1][0].streams[0]) < _FEW
     alternatives = [[pool.submit(plain, group) for group in chain] if few else [] for chain in kept]
-    stored = context_coder.encode(
+    streams = [
         [
-            [
-                context_coder.Streams(g.streams, container.is_signed(g.prop), container.is_predicted(g.prop, g.index))
-                for g in chain
-            ]
-            for chain in kept
-        ],
-        pool.map,
-        progress,
-    )
+            context_encoder.Streams(g.streams, sections.is_signed(g.prop), sections.is_predicted(g.prop, g.index))
+            for g in c
+        ]
+        for c in kept
+    ]
+    stored = context_encoder.encode(streams, pool.map, progress)
     for chain, groups, data, others in zip(chains, kept, stored, alternatives, strict=True):
-        made = None if data is None else _context_sections(groups, data, [other.result() for other in others])
-        coded += [section for group in chain for section in plain(group)] if made is None else made
+        contextual = None if data is None else _context_sections(groups, data, [other.result() for other in others])
+        coded += [pair for group in chain for pair in plain(group)] if contextual is None else contextual
     return coded
 
 
@@ -179,16 +178,16 @@ def _context_sections(
     groups: list[_Group], stored: list[bytes], others: list[list[tuple[Section, bytes]]]
 ) -> list[tuple[Section, bytes]] | None:
     """A section a group; None where one of the others, which are plain, is smaller, or the format does not allow it."""
-    sections = []
+    made = []
     for group, data in zip(groups, stored, strict=True):
         integers = len(group.streams) * len(group.streams[0])
         if integers > len(data) << 15:
             return None
-        sections.append(container.context_section(group.prop, group.index, len(group.streams), integers, data))
-    for (_, data), plain in zip(sections, others, strict=False):
+        made.append(container.context_section(group.prop, group.index, len(group.streams), integers, data))
+    for (_, data), plain in zip(made, others, strict=False):
         if sum(len(p) for _, p in plain) + 24 * (len(plain) - 1) < len(data):
             return None
-    return sections
+    return made
 
 
 def _octree_groups(tree: octree.OctreeStreams) -> list[_Group]:
@@ -205,9 +204,9 @@ def _octree_groups(tree: octree.OctreeStreams) -> list[_Group]:
 def _coefficients(
     scene: Scene, order: NDArray[np.int64], parameters: quantize.HyperParameters, run: Run
 ) -> NDArray[np.signedinteger]:
-    """(M, 3, N) integers of the SH coefficients' Y, Co, Cg."""
+    """(M, 3, N) levels of the SH coefficients' Y, Co, Cg."""
     count = scene.sh.shape[1]
-    steps: NDArray[np.signedinteger] = np.empty((count, 3, len(scene)), np.int16)
+    levels: NDArray[np.signedinteger] = np.empty((count, 3, len(scene)), np.int16)
     wide: list[tuple[tuple[int, int, slice], quantize.Integers]] = []
 
     def take(start: int) -> None:
@@ -218,17 +217,17 @@ def _coefficients(
             factor = parameters.sf_dc if m == 0 else parameters.sf_sh
             for c, values in enumerate(quantize.to_ycocg(rgb.astype(np.float64).T)):
                 made = quantize.quantize_sh(values, factor)
-                if made.dtype == steps.dtype:
-                    steps[m, c, block] = made
+                if made.dtype == levels.dtype:
+                    levels[m, c, block] = made
                 else:
                     wide.append(((m, c, block), made))
 
     list(run(take, range(0, len(scene), _BLOCK)))
     if wide:
-        steps = steps.astype(np.result_type(*{made.dtype for _, made in wide}))
+        levels = levels.astype(np.result_type(*{made.dtype for _, made in wide}))
         for where, made in wide:
-            steps[where] = made
-    return steps
+            levels[where] = made
+    return levels
 
 
 def _chains(geometry: Geometry, coefficients: NDArray[np.signedinteger]) -> list[list[_Group]]:

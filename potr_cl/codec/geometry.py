@@ -1,4 +1,4 @@
-"""Where a scene's splats are, how large, how turned and how opaque: as the integers of a file, and as decoded again.
+"""Where a scene's splats are, how large, how turned and how opaque: as the levels of a file, and as decoded again.
 
 That is all but the colours: a re-fit solves for these on the geometry that a decoder will see, and what is coded in the
 end is the same geometry.
@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import octree, quantize
+from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.scene import Scene
@@ -30,8 +31,8 @@ class Geometry:
         parameters: those in world units.
         tree: the centres.
         order: (N,) index in the scene of each splat of the file.
-        scales, rotations: of the three axes, (N,) each.
-        opacities: (N,).
+        scales, rotations: levels of the three axes, (N,) each.
+        opacities: (N,) levels.
     """
 
     asked: quantize.HyperParameters
@@ -46,16 +47,14 @@ class Geometry:
         """What a decoder makes of it, bit for bit, in the order of the scene, with colours (N, M, 3) of that order."""
         parameters, n = self.parameters, len(self.order)
         log_scales, quaternions = np.empty((n, 3), np.float32), np.empty((n, 4), np.float32)
-        for axis, steps in enumerate(self.scales):
-            log_scales[self.order, axis] = quantize.dequantize_scales(steps, parameters.sf_scale)
+        version = VERSIONS[parameters.version]
+        for axis, levels in enumerate(self.scales):
+            log_scales[self.order, axis] = version.dequantize_scales(levels, parameters.sf_scale)
         turned = np.empty((n, 4), np.float32)
-        sf = parameters.sf_rotation
-        factors = sf if parameters.version == 1 else quantize.rotation_factors(self.scales, sf)
-        quantize.dequantize_rotations(self.rotations, factors, turned)
+        version.dequantize_rotations(self.rotations, self.scales, parameters.sf_rotation, turned)
         quaternions[self.order] = turned
-        dequantize = quantize.dequantize_opacities if parameters.version == 1 else quantize.dequantize_logits
         opacity_logits = np.empty(n, np.float32)
-        opacity_logits[self.order] = dequantize(self.opacities, parameters.sf_opacity)
+        opacity_logits[self.order] = version.dequantize_opacities(self.opacities, parameters.sf_opacity)
         means = np.empty((n, 3), np.float32)
         means[self.order] = octree.parse(self.tree, n)
         return Scene(means, log_scales, quaternions, opacity_logits, sh)
@@ -80,22 +79,16 @@ def quantise_geometry(
     Raises:
         DataError: a value too large to quantise.
     """
+    version = VERSIONS[parameters.version]
     nearest = _nearest(scene.means, views, run)
-    world = _in_world_units(parameters, scene, nearest)
+    world = version.in_world_units(parameters, scene, nearest)
     tolerance = np.maximum(world.gamma, world.beta * nearest)
-    tree, order = octree.build(scene.means, tolerance, absolute=world.version > 1)
+    tree, order = octree.build(scene.means, tolerance, absolute=version.absolute_leaf_levels)
     imaginary, log_scales = _canonical(scene, order, run)
-    scales = list(run(lambda part: quantize.quantize_scales(part.astype(np.float64), world.sf_scale), log_scales.T))
+    scales = list(run(lambda part: version.quantize_scales(part.astype(np.float64), world.sf_scale), log_scales.T))
     logits = scene.opacity_logits[order].astype(np.float64)
-    if world.version == 1:
-        rotations = run(lambda part: quantize.quantize_rotations(part, world.sf_rotation), imaginary.T)
-        opacities = quantize.quantize_opacities(logits, world.sf_opacity)
-    else:
-        factors = quantize.rotation_factors(scales, world.sf_rotation)
-        # A splat that is decoded as a ball has no direction.
-        ball = (scales[0] == scales[1]) & (scales[1] == scales[2])
-        rotations = run(lambda part: np.where(ball, 0, quantize.quantize_rotations(part, factors)), imaginary.T)
-        opacities = quantize.quantize_logits(logits, world.sf_opacity)
+    rotations = version.quantize_rotations(imaginary, scales, world.sf_rotation, run)
+    opacities = version.quantize_opacities(logits, world.sf_opacity)
     return Geometry(parameters, world, tree, order, scales, list(rotations), opacities)
 
 
@@ -123,26 +116,6 @@ def _nearest(means: NDArray[np.float32], views: Sequence[Camera], run: Run) -> N
 
     list(run(find, range(0, len(means), _BLOCK)))
     return nearest
-
-
-def _in_world_units(
-    parameters: quantize.HyperParameters, scene: Scene, nearest: NDArray[np.float64]
-) -> quantize.HyperParameters:
-    """β, γ and SF_scale, which version 2 takes in sizes of a typical splat, so that the unit of length does not matter.
-
-    A splat's size is its largest standard deviation, the typical one their median; seen from the views, the median of
-    size over distance.
-    """
-    if parameters.version == 1:
-        return parameters
-    sizes = np.exp(np.clip(scene.log_scales.max(axis=1).astype(np.float64), -60, 60))
-    size = float(np.median(sizes))
-    sf_scale = min(max(parameters.sf_scale / size, 1e-3), 1e9)
-    seen = nearest > 0
-    if seen.any():
-        beta = parameters.beta * float(np.median(sizes[seen] / nearest[seen]))
-        return replace(parameters, beta=beta, sf_scale=sf_scale)
-    return replace(parameters, gamma=max(parameters.gamma, parameters.beta * size), sf_scale=sf_scale)
 
 
 def _canonical(scene: Scene, order: NDArray[np.int64], run: Run) -> tuple[NDArray[np.float64], NDArray[np.float32]]:

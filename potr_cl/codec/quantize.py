@@ -1,13 +1,15 @@
-"""Quantiser: scale factors, the hyper-parameters that one quality q sets, and the integers of every attribute.
+"""Quantiser: the hyper-parameters that one quality q sets, and the levels of every attribute.
 
-The integers are those of the *activated* values (paper section "Codec", eq. for quantisation and dequantisation):
-standard deviations, opacities after the sigmoid, unit quaternions without their real part, SH coefficients in YCoCg.
+A *level* is the integer that a value is rounded to; a *step* is the distance of two neighbouring levels' values, 1 / SF
+with the scale factor SF. Levels are those of the *activated* values (paper section "Codec", eq. for quantisation and
+dequantisation): standard deviations, opacities after the sigmoid, unit quaternions without their real part, SH
+coefficients in YCoCg. Which function an attribute takes is up to the file's version (:mod:`potr_cl.codec.versions`).
 """
 
 from __future__ import annotations
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
 from typing import Literal
 
@@ -27,7 +29,7 @@ PRESETS: tuple[Preset, ...] = ("paper", "fast", "best")
 
 #: Added to a quantised opacity before the division: the paper's shift of the reconstruction off the bin's centre.
 OPACITY_SHIFT = 0.25
-#: What the smallest logit stands for in version 2: such an opacity shows nowhere. And the largest told apart.
+#: Where logits are quantised themselves: the smallest, an opacity that shows nowhere, and the largest told apart.
 LEAST_LOGIT, _LARGEST_LOGIT = -8.0, 12.0
 #: A standard deviation that rounds to 0 comes back as this part of a step: its logarithm must stay finite.
 ZERO_SCALE = 0.25
@@ -42,7 +44,7 @@ class HyperParameters:
     """What one quality q sets; each can be replaced on its own.
 
     Attributes:
-        version: of the file format, 1 or 2: how integers are made of values (docs/format.md).
+        version: of the file format: how levels are made of values (:data:`potr_cl.codec.versions.VERSIONS`).
         lam: λ, how strongly SH compaction pulls AC coefficients to zero, pixels squared.
         alpha: two SH columns whose cosine exceeds it count as parallel.
         delta_mse_max: ΔMSE_MAX: a splat may go if its removal changes the mean squared error by less.
@@ -52,7 +54,7 @@ class HyperParameters:
         gamma: the least such distance, world units.
         sf_dc, sf_sh: scale factors of constant and of all other SH coefficients; a quantiser step is 1 / SF.
         sf_opacity: of opacities; version 2: of their logits.
-        sf_rotation: of quaternions; version 2: divided by the root of the splat's largest standard deviation in steps.
+        sf_rotation: of quaternions; version 2: times the root of the largest level of the splat's three scales.
         sf_scale: of standard deviations, world units; version 2: steps in a typical splat's size.
     """
 
@@ -84,12 +86,7 @@ class HyperParameters:
         if preset not in PRESETS:
             raise UsageError(f"preset '{preset}' is unknown: choose one of {', '.join(PRESETS)}")
         given = {k: float(v) for k, v in replaced.items() if v is not None}
-        if preset == "paper":
-            values = _paper(q)
-            given.setdefault("sf_dc", given.get("sf_sh", values.sf_dc))
-        else:
-            values = _balanced(q)
-        values = replace(values, **given)  # type: ignore[arg-type]
+        values = _VALUES[preset](q, given)
         for field in fields(values):
             value = getattr(values, field.name)
             low, high = (1e-30, 1e30) if field.name == "gamma" else (0.0, 1e30)
@@ -102,8 +99,10 @@ class HyperParameters:
         return values
 
 
-def _paper(q: float) -> HyperParameters:
-    return HyperParameters(
+def _paper(q: float, given: Mapping[str, float]) -> HyperParameters:
+    # The paper has one factor for all of SH.
+    sf_sh = given.get("sf_sh", 1 + 100 * q)
+    values = HyperParameters(
         version=1,
         lam=10**-q,
         alpha=1 / (1 + math.exp(-3 * q)),
@@ -111,23 +110,24 @@ def _paper(q: float) -> HyperParameters:
         drop=0.0,
         beta=1.4e-4 * q,
         gamma=5.0 * 10 ** (-3 - 5 * q),
-        sf_dc=1 + 100 * q,
-        sf_sh=1 + 100 * q,
+        sf_dc=sf_sh,
+        sf_sh=sf_sh,
         sf_opacity=1 + 200 * q,
         sf_rotation=1 + 400 * q,
         sf_scale=1 + 4000 * q,
     )
+    return replace(values, **given)  # type: ignore[arg-type]
 
 
-def _balanced(q: float) -> HyperParameters:
+def _balanced(q: float, given: Mapping[str, float]) -> HyperParameters:
     """Where a bit more buys the same everywhere; all errors grow with ΔMSE_MAX, so steps with its root.
 
     A coefficient is worth the part of a splat's bits that it takes, about a fourteenth.
     """
     finer = 10 ** (q - 0.5)
     delta_mse_max = 10 ** (-8.3 - 2 * q)
-    return replace(
-        _paper(q),
+    values = replace(
+        _paper(q, {}),
         version=2,
         delta_mse_max=delta_mse_max,
         drop=delta_mse_max / 14,
@@ -139,36 +139,45 @@ def _balanced(q: float) -> HyperParameters:
         sf_rotation=7.6 * finer,
         sf_scale=8.8 * finer,
     )
+    return replace(values, **given)  # type: ignore[arg-type]
 
 
-def _to_steps(values: F64, scale_factor: float | F32, what: str) -> Integers:
+#: What a quality means in each preset, with some values given.
+_VALUES: dict[Preset, Callable[[float, Mapping[str, float]], HyperParameters]] = {
+    "paper": _paper,
+    "fast": _balanced,
+    "best": _balanced,
+}
+
+
+def _to_levels(values: F64, scale_factor: float | F32, what: str) -> Integers:
     """⌊½ + x · SF⌋ in the smallest of the signed integer types that holds it."""
-    steps = values * scale_factor
-    steps += 0.5
-    np.floor(steps, out=steps)
-    largest = max(float(steps.max(initial=0)), -float(steps.min(initial=0)))
+    levels = values * scale_factor
+    levels += 0.5
+    np.floor(levels, out=levels)
+    largest = max(float(levels.max(initial=0)), -float(levels.min(initial=0)))
     if not largest < _LARGEST:
         raise DataError(
             f"a {what} of {np.abs(values).max():.3g} is too large to quantise: remove that splat or lower SF"
         )
     for dtype in (np.int16, np.int32):
         if largest <= np.iinfo(dtype).max:
-            return steps.astype(dtype)
-    return steps.astype(np.int64)
+            return levels.astype(dtype)
+    return levels.astype(np.int64)
 
 
 # ------------------------------------------------------------------------------------------------ scales
 
 
 def quantize_scales(log_scales: F64, sf_scale: float) -> Integers:
-    """Natural logarithms of standard deviations to steps of 1 / SF of the standard deviations themselves."""
+    """Natural logarithms of standard deviations to levels, in steps of 1 / SF of the standard deviations themselves."""
     with np.errstate(over="ignore"):
-        return _to_steps(np.exp(log_scales), sf_scale, "standard deviation")
+        return _to_levels(np.exp(log_scales), sf_scale, "standard deviation")
 
 
-def dequantize_scales(steps: NDArray[np.integer], sf_scale: float) -> F32:
-    """Steps to natural logarithms of standard deviations."""
-    scales = np.maximum(steps.astype(np.float32), np.float32(ZERO_SCALE)) / np.float32(sf_scale)
+def dequantize_scales(levels: NDArray[np.integer], sf_scale: float) -> F32:
+    """Levels to natural logarithms of standard deviations."""
+    scales = np.maximum(levels.astype(np.float32), np.float32(ZERO_SCALE)) / np.float32(sf_scale)
     logarithms: F32 = np.log(scales, dtype=np.float32)
     return logarithms
 
@@ -177,26 +186,26 @@ def dequantize_scales(steps: NDArray[np.integer], sf_scale: float) -> F32:
 
 
 def quantize_opacities(logits: F64, sf_opacity: float) -> Integers:
-    """Logits to steps of 1 / SF of the opacity."""
-    return _to_steps(1 / (1 + np.exp(-np.clip(logits, -500, 500))), sf_opacity, "opacity")
+    """Logits to levels, in steps of 1 / SF of the opacity."""
+    return _to_levels(1 / (1 + np.exp(-np.clip(logits, -500, 500))), sf_opacity, "opacity")
 
 
-def dequantize_opacities(steps: NDArray[np.integer], sf_opacity: float) -> F32:
-    """Steps to logits of (steps + 0.25) / SF, kept a float32 rounding away from an opacity of 1."""
-    opacity = (steps.astype(np.float32) + np.float32(OPACITY_SHIFT)) / np.float32(sf_opacity)
+def dequantize_opacities(levels: NDArray[np.integer], sf_opacity: float) -> F32:
+    """Levels to logits of (level + 0.25) / SF, kept a float32 rounding away from an opacity of 1."""
+    opacity = (levels.astype(np.float32) + np.float32(OPACITY_SHIFT)) / np.float32(sf_opacity)
     opacity = np.minimum(opacity, np.float32(1 - 2.0**-24))
     logits: F32 = np.log(opacity / (1 - opacity), dtype=np.float32)
     return logits
 
 
 def quantize_logits(logits: F64, sf_opacity: float) -> Integers:
-    """Logits to steps of 1 / SF above the least one (format version 2)."""
-    return _to_steps(np.clip(logits, LEAST_LOGIT, _LARGEST_LOGIT) - LEAST_LOGIT, sf_opacity, "opacity")
+    """Logits to levels, in steps of 1 / SF of the logit from the least one up."""
+    return _to_levels(np.clip(logits, LEAST_LOGIT, _LARGEST_LOGIT) - LEAST_LOGIT, sf_opacity, "opacity")
 
 
-def dequantize_logits(steps: NDArray[np.integer], sf_opacity: float) -> F32:
-    """Steps to logits (format version 2)."""
-    logits: F32 = steps.astype(np.float32) / np.float32(sf_opacity) + np.float32(LEAST_LOGIT)
+def dequantize_logits(levels: NDArray[np.integer], sf_opacity: float) -> F32:
+    """Levels of :func:`quantize_logits` to logits."""
+    logits: F32 = levels.astype(np.float32) / np.float32(sf_opacity) + np.float32(LEAST_LOGIT)
     return logits
 
 
@@ -271,27 +280,28 @@ def canonical_rotations(quaternions: F32, log_scales: F32) -> tuple[F64, F32]:
     return product, np.take_along_axis(log_scales, _PERMUTATIONS[best], axis=1)
 
 
-def rotation_factors(scale_steps: Sequence[NDArray[np.integer]], sf_rotation: float) -> F32:
-    """(N,) scale factor of each splat's rotation in format version 2: SF times the root of its largest scale in steps.
+def rotation_factors(scales: Sequence[NDArray[np.integer]], sf_rotation: float) -> F32:
+    """(N,) a scale factor for each splat's rotation: SF times the root of the largest of its three scales' levels.
 
-    Long splats need their direction more exactly; the root is the best power by measurement (docs/benchmarks.md).
+    Long splats need their direction more exactly; the root is the best power by measurement
+    (docs/benchmarks/quantisers.md).
     """
-    largest = np.maximum(np.maximum(scale_steps[0], scale_steps[1]), scale_steps[2])
+    largest = np.maximum(np.maximum(scales[0], scales[1]), scales[2])
     factors: F32 = np.sqrt(np.maximum(largest, 1).astype(np.float32)) * np.float32(sf_rotation)
     return factors
 
 
 def quantize_rotations(imaginary: F64, factor: float | F32) -> Integers:
-    """One imaginary part of unit quaternions to steps of 1 / factor, which may be one a splat."""
-    return _to_steps(imaginary, factor, "quaternion component")
+    """One imaginary part of unit quaternions to levels, in steps of 1 / factor, which may be one a splat."""
+    return _to_levels(imaginary, factor, "quaternion component")
 
 
-def dequantize_rotations(steps: Sequence[NDArray[np.integer]], factor: float | F32, out: F32) -> None:
-    """Steps of x, y, z to unit quaternions w, x, y, z in ``out`` (N, 4); w ≥ 0 is computed from the rest."""
+def dequantize_rotations(levels: Sequence[NDArray[np.integer]], factor: float | F32, out: F32) -> None:
+    """Levels of x, y, z to unit quaternions w, x, y, z in ``out`` (N, 4); w ≥ 0 is computed from the rest."""
     rest = np.ones(len(out), np.float32)
     factor = np.asarray(factor, np.float32)
-    for axis, step in enumerate(steps, start=1):
-        part = step.astype(np.float32) / factor
+    for axis, level in enumerate(levels, start=1):
+        part = level.astype(np.float32) / factor
         out[:, axis] = part
         rest -= part * part
     out[:, 0] = np.sqrt(np.maximum(rest, 0))
@@ -309,8 +319,8 @@ def to_ycocg(rgb: F64) -> tuple[F64, F64, F64]:
 
 
 def quantize_sh(values: F64, sf_sh: float) -> Integers:
-    """One channel of one SH coefficient (YCoCg) to steps of 1 / SF."""
-    return _to_steps(values, sf_sh, "SH coefficient")
+    """One channel of one SH coefficient (YCoCg) to levels, in steps of 1 / SF."""
+    return _to_levels(values, sf_sh, "SH coefficient")
 
 
 def ac_sparsity(sh: F32, sf_sh: float) -> float:

@@ -1,4 +1,4 @@
-"""One module a file format, each with load(path) and, where we write it, save(path, …)."""
+"""Files of scenes and cameras, in the formats that :mod:`potr_cl.formats.registry` lists: one module a format."""
 
 from __future__ import annotations
 
@@ -7,62 +7,55 @@ from collections.abc import Callable
 from functools import partial
 from pathlib import Path
 
-from potr_cl.codec.decoder import decode
 from potr_cl.errors import DataError, UsageError
-from potr_cl.formats.cameras import cameras_json, colmap, transforms
+from potr_cl.formats import registry
 from potr_cl.formats.cameras.view_files import read_json
-from potr_cl.formats.scenes import compressed_ply, ply, sog, spz
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 
+__all__ = ["load_cameras", "load_scene", "save_scene", "scene_writer"]
+
 
 def load_scene(path: str | os.PathLike[str]) -> Scene:
-    """Read a trained scene; the extension tells the format.
+    """Read a trained scene; the extension tells the format, the content where formats share an extension.
 
     Args:
-        path: of a .ply file, of a .potr file, which is decoded, or, with the extra ``convert``, of a compressed .ply,
-            an .spz or a .sog file.
+        path: of a file in one of ``registry.SCENE_FORMATS``. A .potr file is decoded.
 
     Raises:
         UsageError: the file cannot be opened, its extension is unknown, or it needs an extra.
         DataError: its content is damaged.
     """
     path = Path(path)
-    suffix = path.suffix.lower()
-    if suffix == ".ply":
-        return compressed_ply.load(path) if compressed_ply.is_compressed_ply(path) else ply.load(path)
-    if suffix == ".potr":
-        return decode(path)
-    if suffix == ".spz":
-        return spz.load(path)
-    if suffix == ".sog":
-        return sog.load(path)
-    raise UsageError(f"'{path}': unknown kind of scene, expected a .ply, .potr, .spz or .sog file")
+    return registry.reader_of(path)(path)
 
 
-def scene_writer(path: Path) -> Callable[[Scene], None]:
-    """What writes a scene to ``path`` in the format that its extension tells.
+def scene_writer(path: str | os.PathLike[str]) -> Callable[[Scene], None]:
+    """What writes a scene to ``path`` in the format that its suffixes tell; nothing is written yet.
 
     Raises:
-        UsageError: no format for whole scenes has this extension (a .potr file is what an encoder makes).
+        UsageError: no format that is written has these suffixes (a .potr file is what an encoder makes).
     """
     path = Path(path)
-    suffixes = [suffix.lower() for suffix in path.suffixes]
-    if suffixes[-2:] == [".compressed", ".ply"]:
-        return partial(compressed_ply.save, path)
-    if suffixes[-1:] == [".ply"]:
-        return partial(ply.save, path)
-    if suffixes[-1:] == [".spz"]:
-        return partial(spz.save, path)
-    raise UsageError(f"'{path}': scenes are written as .ply, .compressed.ply or .spz")
+    return partial(registry.writer_of(path), path)
+
+
+def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
+    """Write a scene in the format that the suffixes of ``path`` tell.
+
+    Raises:
+        UsageError: see :func:`scene_writer`; or ``path`` cannot be written to, or an extra is missing.
+        PotrError: the format cannot hold the scene, or the system failed to write.
+    """
+    scene_writer(path)(scene)
 
 
 def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     """Read the views of a scene; the content tells the format.
 
     Args:
-        path: of a cameras.json, a transforms.json (Blender or nerfstudio), a file of a COLMAP model, or of a folder
-            that holds such files or a COLMAP model in ``sparse/0`` or ``sparse``.
+        path: of a file in one of ``registry.CAMERA_FORMATS``, or of a folder that holds such files. A COLMAP model may
+            also be in the folder's ``sparse/0`` or ``sparse``.
 
     Returns:
         The views with their split into training and test views; at least one.
@@ -79,35 +72,25 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
 
 
 def _from_file(path: Path) -> list[Camera]:
-    kind = path.suffix.lower()
-    if kind in (".bin", ".txt") and colmap.is_model(path.parent):
-        return colmap.load(path.parent)
-    if kind == ".json":
-        content = read_json(path)
-        if isinstance(content, list):
-            return cameras_json.parse(content, path)
-        if isinstance(content, dict) and "frames" in content:
-            return transforms.parse([(content, path)])
-        raise DataError(f"'{path}' is neither a cameras.json (a list) nor a transforms.json (with 'frames')")
+    suffix = path.suffix.lower()
+    content = read_json(path) if suffix == ".json" else None
+    for entry in registry.CAMERA_FORMATS:
+        if suffix in entry.suffixes and entry.recognises(path, content):
+            return entry.load(path, content)
+    if suffix == ".json":
+        raise DataError(f"'{path}' is neither {registry.json_cameras()}")
     if not path.exists():
         raise UsageError(f"there is no file or folder '{path}'")
-    raise UsageError(f"'{path}': unknown kind of cameras, {_EXPECTED}")
+    raise UsageError(f"'{path}': unknown kind of cameras, expected {registry.cameras_read()}")
 
 
 def _from_folder(folder: Path) -> list[Camera]:
-    if colmap.is_model(folder):
-        return colmap.load(folder)
-    # cameras.json first: it lists just the views that a scene was trained with, as they were.
-    if (folder / "cameras.json").exists():
-        return cameras_json.load(folder / "cameras.json")
-    if (folder / "transforms_train.json").exists():
-        return transforms.load_folder(folder)
-    if (folder / "transforms.json").exists():
-        return transforms.load(folder / "transforms.json")
-    for model in (folder / "sparse" / "0", folder / "sparse"):
-        if colmap.is_model(model):
-            return colmap.load(model)
-    raise UsageError(f"the folder '{folder}' holds no cameras, {_EXPECTED}")
-
-
-_EXPECTED = "expected a cameras.json, a transforms.json, or a COLMAP model (cameras and images as .bin or .txt)"
+    """The folder itself is searched for every format before the subfolders of any."""
+    for entry in registry.CAMERA_FORMATS:
+        if entry.is_in(folder):
+            return entry.load_folder(folder)
+    for entry in registry.CAMERA_FORMATS:
+        for subfolder in entry.subfolders:
+            if entry.is_in(folder / subfolder):
+                return entry.load_folder(folder / subfolder)
+    raise UsageError(f"the folder '{folder}' holds no cameras, expected {registry.cameras_read()}")

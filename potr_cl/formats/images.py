@@ -1,4 +1,4 @@
-"""Pictures in files: photographs to judge against, PNG files to look at, and names of background colours."""
+"""Pictures in files: ground truth to compare with, PNG files to look at, and names of background colours."""
 
 from __future__ import annotations
 

@@ -1,33 +1,29 @@
-"""Encoder: the stages from a scene to the bytes of a .potr file, in order."""
+"""A whole encode: the stages of a preset in their order, each timed, told of, and done again where memory is short."""
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import os
 import time
 from collections.abc import Sequence
-from contextlib import ExitStack
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.encoder import code_scene
-from potr_cl.codec.geometry import Geometry, quantise_geometry
+from potr_cl.codec.encoder import Coded
 from potr_cl.host.atomic_write import replacing
-from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import is_virtual, place_cameras
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.reduction import Progress, reduce_scene
-from potr_cl.quality.ground_truth import GroundTruth
-from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
-from potr_cl.stages.refitting.refit import RefitOptions, Refitted, active_coefficients, refit_colours
-from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
+from potr_cl.stages.refitting.refit import Refitted
+from potr_cl.stages.stage import Interlude, Progress, Stage, State, Workbench
 
 
 @dataclass(frozen=True)
@@ -65,21 +61,119 @@ class Encoded:
                 file.write(piece)
 
 
-@dataclass(frozen=True)
-class Reduced:
-    """A scene between the two halves of an encode.
+def encode(
+    scene: Scene,
+    cameras: Sequence[Camera] | None = None,
+    options: EncodeOptions | None = None,
+    progress: Progress | None = None,
+    device: Device | None = None,
+) -> Encoded:
+    """Encode a scene.
+
+    Args:
+        scene: clean (:meth:`potr_cl.model.scene.Scene.cleaned`), at least one splat.
+        cameras: the training views among them decide which splats may go, and how coarse centres may be. None: virtual
+            ones are placed if the options ask for anything that looks at views; if not, γ alone decides about centres.
+        options: defaults to quality 0.5 of preset best.
+        progress: told how far each stage is.
+        device: to prune on; the best one there is by default. Where its memory is too small, less is kept in it, and
+            if that is not enough a CPU does the work; either is said by a warning.
+
+    Raises:
+        UsageError: options out of range, or cameras without a training view.
+        DataError: a value too large to quantise.
+        DeviceError: no device does the work.
+    """
+    options = options or EncodeOptions()
+    watch = Stopwatch(progress)
+    cameras = cameras_or_virtual(scene, cameras, options, watch)
+    run = Run(options, watch, device)
+    return run.finished(run.stages(State.of(scene, train_views(cameras) if cameras else [])))
+
+
+def cameras_or_virtual(
+    scene: Scene, cameras: Sequence[Camera] | None, options: EncodeOptions, watch: Stopwatch
+) -> Sequence[Camera] | None:
+    """The cameras, or virtual ones where there are none and the options ask for something that looks at views."""
+    if cameras is None and options.look_at_views(scene):
+        watch("place cameras", 0.0)
+        cameras = place_cameras(scene)
+        watch("place cameras", 1.0)
+    return cameras
+
+
+class Run:
+    """Stages run one after the other: from the beginning, or from any state that one of them has left.
+
+    Args:
+        options: of all stages.
+        watch: told how far each stage is, and keeps the time.
+        device: to begin with; the best one there is by default, opened when a stage looks at views.
 
     Attributes:
-        scene: what is left to code.
-        pruned, refitted, device: as :class:`Encoded` has them.
-        geometry: of the scene, if the colours were re-fitted on it.
+        device: that the last stage which looks at views ran on; None if there was none.
     """
 
-    scene: Scene
-    pruned: Pruned | None
-    refitted: Refitted | None
-    device: Device | None
-    geometry: Geometry | None = None
+    def __init__(self, options: EncodeOptions, watch: Stopwatch, device: Device | None = None) -> None:
+        self.device: Device | None = None
+        self._options, self._watch, self._given = options, watch, device
+
+    def stages(self, state: State, only: Sequence[type[Stage]] | None = None) -> State:
+        """Run the stages, or some of them, in their order.
+
+        Raises:
+            As :func:`encode`.
+        """
+        for stage in self._options.stages:
+            if only is None or isinstance(stage, tuple(only)):
+                state = self._one(stage, state)
+        return state
+
+    def _one(self, stage: Stage, state: State) -> State:
+        options = self._options
+        bench = Workbench(
+            options.parameters,
+            memory=options.memory,
+            background=options.background,
+            threads=options.threads,
+            interludes=self._interludes(stage, state),
+            metadata=lambda last: _metadata(last, options),
+            progress=self._watch,
+        )
+        if not stage.on:
+            return state
+        if not stage.needs_views:
+            return stage.run(state, bench)
+        if not state.views or not stage.looks_at(state.scene):
+            return state
+
+        def work(device: Device, memory: int | None) -> State:
+            return stage.run(state, dataclasses.replace(bench, device=device, memory=memory))
+
+        device = self.device or self._given or Device()
+        state, self.device = on_device(device, options.memory, work)
+        return state
+
+    def _interludes(self, stage: Stage, state: State) -> tuple[Interlude, ...]:
+        """What other stages want done while this one removes splats, in iterations."""
+        iterations: int | None = getattr(stage, "iterations", None)
+        if iterations is None:
+            return ()
+        others = [other for other in self._options.stages if other.looks_at(state.source)]
+        return tuple(interlude for other in others for interlude in other.interludes(iterations))
+
+    def finished(self, state: State) -> Encoded:
+        """What the stages have made, as the file that it is."""
+        coded: Coded = state.learnt["code"]
+        return Encoded(
+            pieces=coded.pieces,
+            nbytes=coded.nbytes,
+            order=state.survivors[coded.order],
+            pruned=state.learnt.get("prune"),
+            refitted=state.learnt.get("refit"),
+            device=self.device,
+            seconds=self._watch.seconds,
+        )
 
 
 class Stopwatch:
@@ -104,148 +198,22 @@ class Stopwatch:
             self._progress(stage, done)
 
 
-def encode(
-    scene: Scene,
-    cameras: Sequence[Camera] | None = None,
-    options: EncodeOptions | None = None,
-    progress: Progress | None = None,
-    device: Device | None = None,
-) -> Encoded:
-    """Encode a scene.
-
-    Args:
-        scene: clean (:meth:`potr_cl.model.scene.Scene.cleaned`), at least one splat.
-        cameras: the training views among them decide which splats may go, and how coarse centres may be. None: virtual
-            ones are placed if the options ask for anything that looks at views; if not, γ alone decides about centres.
-        options: defaults to quality 0.5 of preset best.
-        progress: told how far each stage is.
-        device: to prune on; the best one there is by default. Where its memory is too small, less is kept in it, and
-            if that is not enough a CPU does the work; either is said by a warning.
-
-    Raises:
-        UsageError: options out of range, or cameras without a training view.
-        DataError: a value too large to quantise.
-        DeviceError: no device does the work.
-    """
-    options = options or EncodeOptions.for_preset("best")
-    watch = Stopwatch(progress)
-    if cameras is None and needs_views(scene, options):
-        watch("place cameras", 0.0)
-        cameras = place_cameras(scene)
-        watch("place cameras", 1.0)
-    views = [] if cameras is None else train_views(cameras)
-    return code(scene, reduce(scene, views, options, watch, device), views, options, watch)
-
-
-def needs_views(scene: Scene, options: EncodeOptions) -> bool:
-    """Whether the options ask for a stage that looks at views."""
-    return options.prune or options.refit > 0 or (options.compact and scene.sh_degree > 0)
-
-
-def reduce(
-    scene: Scene, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch, device: Device | None = None
-) -> Reduced:
-    """The first half of :func:`encode`: fewer splats with sparser colours, as far as views and options allow."""
-    return refit(scene, thin(scene, views, options, watch, device), views, options, watch)
-
-
-def thin(
-    scene: Scene, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch, device: Device | None = None
-) -> Reduced:
-    """The part of :func:`reduce` that comes before the re-fit: pruning and compaction."""
-    if not views or not needs_views(scene, options):
-        return Reduced(scene, None, None, None)
-
-    def work(device: Device, options: EncodeOptions) -> Reduced:
-        return Reduced(*reduce_scene(scene, views, options, watch, device), None, device)
-
-    return on_device(device or Device(), options, work)[0]
-
-
-def refit(scene: Scene, thinned: Reduced, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch) -> Reduced:
-    """The rest of :func:`reduce`: re-fit the colours, if the options ask for it.
-
-    On the geometry and the opacities that a decoder will see, so that the colours make up for quantised geometry too.
-
-    Args:
-        scene: the uncompressed one.
-        thinned: of :func:`thin`; not changed, so that it may be re-fitted for other options again.
-        views, options, watch: as :func:`thin` takes them.
-    """
-    if not options.refit or thinned.device is None:
-        return thinned
-    watch("refit", 0.0)
-    with thread_pool(options.threads) as pool:
-        geometry = quantise_geometry(thinned.scene, options.parameters, views, pool.map)
-
-    def work(device: Device, options: EncodeOptions) -> Reduced:
-        refitted = _refit(scene, thinned.scene, geometry, views, options, watch, device)
-        return Reduced(replace(thinned.scene, sh=refitted.sh), thinned.pruned, refitted, device, geometry)
-
-    return on_device(thinned.device, options, work)[0]
-
-
-def _refit(
-    scene: Scene,
-    reduced: Scene,
-    geometry: Geometry,
-    views: Sequence[Camera],
-    options: EncodeOptions,
-    watch: Stopwatch,
-    device: Device,
-) -> Refitted:
-    watch("refit", 0.0)
-    parameters = options.parameters
-    decoded = geometry.decoded(reduced.sh)
-    active = active_coefficients(reduced.sh, parameters.sf_sh) if options.compact else None
-    how = RefitOptions(steps=options.refit, drop=parameters.drop, memory=options.sweep.memory)
-    targets: RenderedTargets | GroundTruthTargets
-    with ExitStack() as stack:
-        stack.callback(watch, "refit", 1.0)
-        if options.ground_truth is None:
-            rasterizer = Rasterizer(device, scene, background=options.background)
-            stack.callback(rasterizer.free)
-            targets = RenderedTargets(rasterizer, views)
-        else:
-            ground_truth = GroundTruth(options.ground_truth, views, options.background)
-            targets = GroundTruthTargets(device, ground_truth, views)
-        return refit_colours(
-            device,
-            decoded,
-            views,
-            targets,
-            how,
-            active,
-            options.background,
-            lambda done, steps: watch("refit", done / steps),
-        )
-
-
-def code(scene: Scene, reduced: Reduced, views: Sequence[Camera], options: EncodeOptions, watch: Stopwatch) -> Encoded:
-    """The second half of :func:`encode`: bytes."""
-    pruned = reduced.pruned
-    metadata = _metadata(scene, views, options, pruned)
-    geometry = reduced.geometry
-    if geometry is not None and geometry.asked != options.parameters:
-        geometry = None
-    coded = code_scene(
-        reduced.scene, options.parameters, views, metadata, options.entropy, options.threads, watch, geometry
-    )
-    order = coded.order if pruned is None else pruned.survivors[coded.order]
-    return Encoded(coded.pieces, coded.nbytes, order, pruned, reduced.refitted, reduced.device, watch.seconds)
-
-
-def _metadata(scene: Scene, views: Sequence[Camera], options: EncodeOptions, pruned: Pruned | None) -> bytes:
-    parameters = options.parameters
+def _metadata(state: State, options: EncodeOptions) -> bytes:
+    """What the file says of how it was made."""
+    parameters, views = options.parameters, state.views
+    by_name = {stage.name: stage for stage in options.stages if stage.on}
+    prune = by_name.get("prune")
+    by_threshold = isinstance(prune, Prune) and prune.count is None and prune.keep is None
+    compacts = bool(views) and "compact" in by_name
     facts = {
         "q": options.q,
         "cameras": ("virtual" if is_virtual(views) else "given") if views else None,
         "beta": parameters.beta if views else None,
         "gamma": parameters.gamma,
-        "delta_mse_max": parameters.delta_mse_max if pruned is not None and options.count is None else None,
-        "lambda": parameters.lam if views and options.compact else None,
-        "alpha": parameters.alpha if views and options.compact else None,
-        "source_splats": len(scene),
+        "delta_mse_max": parameters.delta_mse_max if by_threshold and "prune" in state.learnt else None,
+        "lambda": parameters.lam if compacts else None,
+        "alpha": parameters.alpha if compacts else None,
+        "source_splats": len(state.source),
         "source_bytes": options.source_bytes,
     }
     return json.dumps(facts, separators=(",", ":")).encode()

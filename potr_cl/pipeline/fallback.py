@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import dataclasses
 import logging
 from collections.abc import Callable
 from typing import TypeVar
@@ -10,7 +9,6 @@ from typing import TypeVar
 from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import choose_device
-from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.pruning.removal import default_memory
 
 logger = logging.getLogger("potr_cl")
@@ -21,13 +19,13 @@ T = TypeVar("T")
 _LESS = 8
 
 
-def on_device(device: Device, options: EncodeOptions, work: Callable[[Device, EncodeOptions], T]) -> tuple[T, Device]:
+def on_device(device: Device, memory: int | None, work: Callable[[Device, int | None], T]) -> tuple[T, Device]:
     """Do work that may not fit a device, again with less memory and in the end on a CPU; each is said by a warning.
 
     Args:
         device: to begin with.
-        options: those whose memory budget (``sweep.memory``) is made smaller.
-        work: called with the device and the options to take; called again after a DeviceMemoryError.
+        memory: bytes of its memory to keep views in; None: :func:`default_memory`.
+        work: called with the device and the memory to keep views in; called again after a DeviceMemoryError.
 
     Returns:
         What ``work`` returned, and the device that it was done on.
@@ -37,7 +35,7 @@ def on_device(device: Device, options: EncodeOptions, work: Callable[[Device, En
         DeviceError: the device failed for another reason.
     """
     try:
-        return _with_less(device, options, work), device
+        return _with_less(device, memory, work), device
     except DeviceMemoryError:
         if device.info.kind == "cpu":
             raise
@@ -49,18 +47,16 @@ def on_device(device: Device, options: EncodeOptions, work: Callable[[Device, En
             raise
     logger.warning("device %s has too little memory for this scene: going on with %s", device.info, other)
     device = Device(other)
-    return _with_less(device, options, work), device
+    return _with_less(device, memory, work), device
 
 
-def _with_less(device: Device, options: EncodeOptions, work: Callable[[Device, EncodeOptions], T]) -> T:
-    given = options.sweep.memory
+def _with_less(device: Device, given: int | None, work: Callable[[Device, int | None], T]) -> T:
     less = (default_memory(device) if given is None else given) // _LESS
     for memory, smaller in ((given, less), (less, 0), (0, None)):
-        sweep = dataclasses.replace(options.sweep, memory=memory)
         try:
             # A failure may leave buffers behind that nobody owns any more.
             with device.all_or_nothing(), device.errors("failed while encoding"):
-                return work(device, dataclasses.replace(options, sweep=sweep))
+                return work(device, memory)
         except DeviceMemoryError:
             if smaller is None:
                 raise

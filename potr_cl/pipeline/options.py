@@ -2,112 +2,145 @@
 
 from __future__ import annotations
 
-from dataclasses import dataclass, field
+import dataclasses
+from collections.abc import Mapping
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
-from potr_cl.codec import quantize
-from potr_cl.codec.container import EntropyCoder
-from potr_cl.stages.compaction.ridge import ColourModel, CompactionOptions, Weighting
-from potr_cl.stages.pruning.removal import SweepOptions
-from potr_cl.stages.pruning.schedule import PruningOptions
+from potr_cl.codec.quantize import HyperParameters, Preset
+from potr_cl.errors import UsageError
+from potr_cl.model.scene import Scene
+from potr_cl.pipeline.presets import DEFAULT, PRESETS
+from potr_cl.stages.stage import Stage, parameters
+
+S = TypeVar("S", bound=Stage)
+
+#: A stage's options by name; True and False switch it on and off.
+StageChanges = Mapping[str, Any] | bool
 
 
 @dataclass(frozen=True)
 class EncodeOptions:
-    """How to encode.
+    """How to encode. ``EncodeOptions()`` is what :func:`potr_cl.encode` does when it is told nothing.
+
+    The options of a stage are an attribute of its name: ``options.prune.iterations``. To choose some, see
+    :meth:`for_preset` and :meth:`changed`.
 
     Attributes:
-        q: quality, 0 to 1; sets every hyper-parameter that is not given on its own.
-        preset: how q sets them, and the file's version: :meth:`potr_cl.codec.quantize.HyperParameters.from_quality`.
-            What else belongs to a preset comes with :meth:`for_preset`.
-        lam, alpha, delta_mse_max, drop, beta, gamma, sf_dc, sf_sh, sf_opacity, sf_rotation, sf_scale: replace single
-            hyper-parameters (:class:`potr_cl.codec.quantize.HyperParameters`).
-        prune: remove splats; looks at views.
-        iterations, mapping_a, decay: of the pruning schedule
-            (:class:`potr_cl.stages.pruning.schedule.PruningOptions`).
-        compact: make the SH coefficients sparse; looks at views.
-        compact_at: the part of the pruning iterations after which that is done: later ones see its effect.
-        colour_model, weighting, two_pass: of the compaction
-            (:class:`potr_cl.stages.compaction.ridge.CompactionOptions`).
-        refit: conjugate-gradient steps of the joint re-fit of the colours; 0 leaves it out. Looks at views.
-        refit_at, refit_at_steps: the parts of the pruning iterations after which colours are re-fitted too, so that
-            later ones judge by colours that have made up for what went, and the steps of each.
-        photographs: folder of the views' photographs, named after them: what the last re-fit comes near to, instead of
-            the uncompressed scene's pictures.
-        count: number of splats to keep, instead of ΔMSE_MAX.
-        sweep: what measuring removal effects may skip.
-        background: R, G, B behind the scene in the views that pruning looks at.
-        entropy: the entropy stage.
-        threads: for the entropy stage; the bytes do not depend on it. 0: one a processor.
+        q: quality, 0 to 1; sets every hyper-parameter that no stage replaces.
+        preset: how q sets them, and the file's version
+            (:meth:`potr_cl.codec.quantize.HyperParameters.from_quality`).
+        stages: in their order, with their options; those of the preset unless others are given.
+        background: R, G, B behind the scene in the views that are looked at.
+        memory: bytes of device memory to keep views in; None: half of the device's, three tenths of a CPU's.
+        threads: for work on the host; the bytes do not depend on it. 0: one a processor.
         source_bytes: size of the file that the scene came from, for the metadata; None if it came from none.
     """
 
     q: float = 0.5
-    preset: quantize.Preset = "paper"
-    lam: float | None = None
-    alpha: float | None = None
-    delta_mse_max: float | None = None
-    drop: float | None = None
-    beta: float | None = None
-    gamma: float | None = None
-    sf_dc: float | None = None
-    sf_sh: float | None = None
-    sf_opacity: float | None = None
-    sf_rotation: float | None = None
-    sf_scale: float | None = None
-    prune: bool = True
-    iterations: int = 48
-    mapping_a: float = PruningOptions.a
-    decay: float = PruningOptions.decay
-    compact: bool = True
-    compact_at: float = 0.75
-    colour_model: ColourModel = CompactionOptions.colour_model
-    weighting: Weighting = CompactionOptions.weighting
-    two_pass: bool = CompactionOptions.two_pass
-    refit: int = 0
-    refit_at: tuple[float, ...] = ()
-    refit_at_steps: int = 3
-    ground_truth: Path | None = None
-    count: int | None = None
-    sweep: SweepOptions = field(default_factory=SweepOptions)
+    preset: Preset = DEFAULT
+    stages: tuple[Stage, ...] = ()
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
-    entropy: EntropyCoder = field(default_factory=EntropyCoder)
+    memory: int | None = None
     threads: int = 0
     source_bytes: int | None = None
 
+    def __post_init__(self) -> None:
+        if self.preset not in PRESETS:
+            raise UsageError(f"preset '{self.preset}' is unknown: choose one of {', '.join(PRESETS)}")
+        if not self.stages:
+            object.__setattr__(self, "stages", PRESETS[self.preset])
+
     @staticmethod
-    def for_preset(preset: quantize.Preset, **changes: Any) -> EncodeOptions:
-        """All that a preset means, with changes: keywords are attributes.
+    def for_preset(preset: Preset = DEFAULT, **changes: Any) -> EncodeOptions:
+        """All that a preset means, with changes as :meth:`changed` takes them.
 
-        Without a re-fit the colours are compacted, unless the changes say otherwise.
+        Where the changes leave the re-fit out and say nothing of the compaction, colours are compacted.
+
+        Raises:
+            UsageError: there is no such preset or option, or a value is out of range.
         """
-        given: dict[str, Any] = {"preset": preset}
-        if preset != "paper":
-            given["refit"] = 8 if preset == "best" else 4
-        if preset == "fast":
-            given |= {"iterations": 16, "entropy": EntropyCoder("zstd", 9)}
-        given |= changes
-        return EncodeOptions(**{"compact": not given.get("refit"), **given})
+        options = EncodeOptions(preset=preset).changed(**changes)
+        refit = options.refit
+        told = changes.get("compact")
+        silent = told is None or (isinstance(told, Mapping) and "on" not in told)
+        if silent and not (refit.on and refit.steps):
+            options = options.changed(compact=True)
+        return options
+
+    def changed(self, **changes: Any) -> EncodeOptions:
+        """The same with other options.
+
+        Args:
+            changes: attributes by name, and by a stage's name either a mapping of its options or a bool that switches
+                it on or off: ``changed(q=0.3, prune={"iterations": 16}, compact=True)``.
+
+        Raises:
+            UsageError: there is no such option, or a value is out of range.
+        """
+        stages = {stage.name: stage for stage in self.stages}
+        own: dict[str, Any] = {}
+        fields = {field.name for field in dataclasses.fields(self)}
+        for name, change in changes.items():
+            if name in stages:
+                stages[name] = stages[name].changed(**({"on": change} if isinstance(change, bool) else change))
+            elif name in fields:
+                own[name] = change
+            else:
+                raise UsageError(f"there is no option '{name}': there are {', '.join(sorted(fields | stages.keys()))}")
+        return dataclasses.replace(self, **{"stages": tuple(stages.values()), **own})
+
+    def stage(self, kind: type[S]) -> S:
+        """The options of a stage by its class.
+
+        Raises:
+            UsageError: the preset has no such stage.
+        """
+        for stage in self.stages:
+            if isinstance(stage, kind):
+                return stage
+        raise UsageError(f"preset '{self.preset}' has no stage '{kind.name}'")
+
+    def __getattr__(self, name: str) -> Any:
+        for stage in self.__dict__.get("stages", ()):
+            if stage.name == name:
+                return stage
+        raise AttributeError(f"encode options have no '{name}'")
 
     @property
-    def parameters(self) -> quantize.HyperParameters:
-        """The hyper-parameters that result."""
-        names = ("lam", "alpha", "delta_mse_max", "drop", "beta", "gamma")
-        factors = ("sf_dc", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale")
-        return quantize.HyperParameters.from_quality(
-            self.q, self.preset, **{name: getattr(self, name) for name in (*names, *factors)}
-        )
+    def parameters(self) -> HyperParameters:
+        """The hyper-parameters that q gives, but for those that a stage replaces.
 
-    @property
-    def compaction(self) -> CompactionOptions:
-        """How to compact with them."""
-        parameters = self.parameters
-        return CompactionOptions(
-            lam=parameters.lam,
-            alpha=parameters.alpha,
-            sf_sh=parameters.sf_sh,
-            two_pass=self.two_pass,
-            colour_model=self.colour_model,
-            weighting=self.weighting,
-        )
+        Raises:
+            UsageError: q or a replaced value is out of range.
+        """
+        given = {name: getattr(stage, name) for stage in self.stages for name in parameters(type(stage))}
+        return HyperParameters.from_quality(self.q, self.preset, **given)
+
+    def with_parameters(self, **values: float) -> EncodeOptions:
+        """The same with some hyper-parameters replaced, each in the stage that has it.
+
+        Raises:
+            UsageError: no stage has it.
+        """
+        changes: dict[str, dict[str, float]] = {}
+        for name, value in values.items():
+            owners = [stage.name for stage in self.stages if name in parameters(type(stage))]
+            if not owners:
+                raise UsageError(f"no stage replaces the hyper-parameter '{name}'")
+            changes.setdefault(owners[0], {})[name] = value
+        return self.changed(**changes)
+
+    def look_at_views(self, scene: Scene) -> bool:
+        """Whether the options ask for a stage that looks at views of this scene."""
+        return any(stage.looks_at(scene) for stage in self.stages)
+
+    def as_dict(self) -> dict[str, Any]:
+        """All choices by name, those of a stage as a mapping of their own; for reports, ready for JSON."""
+
+        def plain(values: dict[str, Any]) -> dict[str, Any]:
+            return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
+
+        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "stages"}
+        return own | {stage.name: plain(dataclasses.asdict(stage)) for stage in self.stages}

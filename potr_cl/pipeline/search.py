@@ -23,22 +23,24 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode
 from potr_cl.codec.quantize import Preset
 from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
-from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, Reduced, Stopwatch, code, needs_views, refit, thin
+from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, cameras_or_virtual
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.reduction import Progress
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
+from potr_cl.stages.code import Code
+from potr_cl.stages.compact import Compact
+from potr_cl.stages.prune import Prune
+from potr_cl.stages.refit import Refit
+from potr_cl.stages.stage import Progress, Stage, State, parameters
 
 #: Qualities, and what they give in a typical scene: bytes a splat of the source, and PSNR in decibels. Means of two
-#: scenes (docs/benchmarks.md, "Rate and distortion"), less sure below 0.1. Above all the rate of growth matters.
+#: scenes (docs/benchmarks/rate_distortion.md), less sure below 0.1. Above all the rate of growth matters.
 _TYPICAL_Q = (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1)
 _TYPICAL: dict[Preset, tuple[tuple[float, ...], tuple[float, ...]]] = {
     "paper": (
@@ -79,7 +81,7 @@ _TRIES = 3
 #: Bounds of a measured rate, as parts of the typical one, beyond the places that are known.
 _SLOWEST, _FASTEST = 0.25, 3.0
 #: What is only judged is coded so, which costs no time.
-_QUICK_CODER = EntropyCoder("zstd", 1)
+_QUICK_CODER = {"entropy": "zstd", "zstd_level": 1}
 #: Stands for the infinite PSNR of identical pictures, decibels.
 _IDENTICAL = 200.0
 #: The kinds of tries (:class:`Try`), and what is said of each; to be followed by a value.
@@ -208,23 +210,22 @@ def encode_to_target(
         DataError: a value too large to quantise.
         DeviceError: no device does the work.
     """
-    options = options or EncodeOptions.for_preset("best")
+    options = options or EncodeOptions()
     watch = Stopwatch(progress)
-    if cameras is None and needs_views(scene, options):
-        watch("place cameras", 0.0)
-        cameras = place_cameras(scene)
-        watch("place cameras", 1.0)
+    cameras = cameras_or_virtual(scene, cameras, options, watch)
     if target.min_psnr is not None and not cameras:
         raise UsageError("a PSNR can be reached with cameras only: without them there is no view to judge by")
 
-    def work(device: Device, options: EncodeOptions) -> Found:
-        search = _Search(scene, cameras or [], target, options, watch, device, tell or (lambda _line: None))
+    def work(device: Device, memory: int | None) -> Found:
+        search = _Search(
+            scene, cameras or [], target, options.changed(memory=memory), watch, device, tell or (lambda _line: None)
+        )
         try:
             return search.run()
         finally:
-            search.free()
+            search.close()
 
-    found, _ = on_device(device or Device(), options, work)
+    found, _ = on_device(device or Device(), options.memory, work)
     return found
 
 
@@ -233,15 +234,15 @@ class _Candidate:
     """Something that may be what is searched for.
 
     Attributes:
-        thinned: the scene before the re-fit.
-        reduced: and after it.
+        thinned: the scene before the stages that are done again for another q.
+        reduced: and after them, before it is coded.
         options: that lead there.
         value: of the file that they give.
         encoded: that file, if the value needed all of it.
     """
 
-    thinned: Reduced
-    reduced: Reduced
+    thinned: State
+    reduced: State
     options: EncodeOptions
     value: float
     encoded: Encoded | None
@@ -272,6 +273,7 @@ class _Search:
         self._axis = _Axis(options)
         self._scouted: tuple[float, float] | None = None  # where, and the value of a full encode, about
         self._evaluator: Evaluator | None = None
+        self._used: Device | None = None  # by the stages that look at views
 
     def run(self) -> Found:
         target = self._target
@@ -280,7 +282,7 @@ class _Search:
                 self._device, self._scene, EvaluationViews.of(self._cameras), self._options.background
             )
         q = self._scout(self._typical.quality(target.aim))
-        reduces = bool(self._views) and needs_views(self._scene, self._options)
+        reduces = bool(self._views) and self._options.look_at_views(self._scene)
         best: _Candidate | None = None
         for left in reversed(range(_ENCODES if reduces else _CHEAP_ENCODES)):
             found = self._encode(q)
@@ -298,7 +300,7 @@ class _Search:
                 break
         if best is None:
             raise UnreachableError(f"{target} cannot be reached: {self._extremes()}")
-        encoded = best.encoded or code(self._scene, best.reduced, self._views, best.options, self._watch)
+        encoded = best.encoded or self._code(best.reduced, best.options)
         return Found(encoded, best.options, best.value, self._tries)
 
     # ------------------------------------------------------------------------------------------ steps of the search
@@ -306,19 +308,19 @@ class _Search:
     def _scout(self, q: float) -> float:
         """The q to begin with, by a rough encode of one, if that takes less time than a full one."""
         rough = min(max(q, 1 - _SCOUT_END), _SCOUT_END)
-        options = dataclasses.replace(
-            self._options,
+        prune, refit = self._options.stage(Prune), self._options.stage(Refit)
+        options = self._options.changed(
             q=rough,
-            iterations=min(self._options.iterations, _SCOUT_ITERATIONS),
-            refit=min(self._options.refit, _SCOUT_STEPS),
-            refit_at=(),
+            prune={"iterations": min(prune.iterations, _SCOUT_ITERATIONS)},
+            refit={"steps": min(refit.steps, _SCOUT_STEPS), "at": ()},
         )
-        looks = self._options.prune and options.iterations < self._options.iterations
-        if not self._views or not (looks or options.refit < self._options.refit):
+        fewer_looks = prune.on and options.prune.iterations < prune.iterations
+        shorter_refit = self._fitted and options.refit.steps < refit.steps
+        if not self._views or not (fewer_looks or shorter_refit):
             return q
         thinned = self._thin(options)
         value = self._evaluate("scout", rough, thinned, self._refit(thinned, options), options).value
-        if options.refit < self._options.refit:
+        if shorter_refit:
             size, psnr = _SCOUT_MISSES
             value -= size if self._target.max_bytes is not None else psnr
         self._scouted = self._typical.value(rough), value
@@ -326,7 +328,7 @@ class _Search:
 
     def _encode(self, q: float) -> _Candidate:
         """A full encode."""
-        options = dataclasses.replace(self._options, q=q)
+        options = self._options.changed(q=q)
         thinned = self._thin(options)
         found = self._evaluate("encode", q, thinned, self._refit(thinned, options), options)
         self._encoded[q] = found.value
@@ -352,8 +354,7 @@ class _Search:
     def _approach(self, found: _Candidate, last: bool) -> _Candidate:
         """Come nearer to the aim with what a full encode has kept, unless that is too far, and not the last one."""
         target, typical = self._target, self._typical
-        fitted = self._options.refit > 0
-        reach, rate = (_NEAR, _NEAR_RATE) if fitted else (_MOST_STEPS, _STEPS_RATE)
+        reach, rate = (_NEAR, _NEAR_RATE) if self._fitted else (_MOST_STEPS, _STEPS_RATE)
         rate *= self._rate()
         start, best, q = found, found, found.options.q
         ends = [self._axis.quality(self._axis.fineness(q) + sign * reach) for sign in (-1, 1)]
@@ -370,7 +371,7 @@ class _Search:
                 return best
             if known:
                 break
-            near = self._again(start, q) if fitted else self._with_other_steps(start, q)
+            near = self._again(start, q) if self._fitted else self._with_other_steps(start, q)
             points[typical.value(q)] = near.value
             best = min(best, near, key=self._distance)
         return self._with_other_colours(best, _LAST_COLOUR_STEPS)
@@ -378,9 +379,9 @@ class _Search:
     def _again(self, start: _Candidate, q: float) -> _Candidate:
         """The splats of a candidate, re-fitted and quantised as another q would have it."""
         parameters = start.options.parameters
-        names = ["delta_mse_max", *(["lam", "alpha"] if self._options.compact else [])]
+        names = ["delta_mse_max", *(["lam", "alpha"] if self._options.compact.on else [])]
         kept = {name: getattr(parameters, name) for name in names}
-        options = dataclasses.replace(self._options, q=q, **kept)
+        options = self._options.changed(q=q).with_parameters(**kept)
         return self._evaluate("refit", q, start.thinned, self._refit(start.thinned, options), options)
 
     def _with_other_steps(self, start: _Candidate, q: float) -> _Candidate:
@@ -406,7 +407,7 @@ class _Search:
 
     def _colours_suffice(self, value: float) -> bool:
         """Whether other steps of colours will probably do."""
-        given = self._options.sf_dc is not None and self._options.sf_sh is not None
+        given = self._options.code.sf_dc is not None and self._options.code.sf_sh is not None
         low, high = self._target.window
         spare = (high - low) / 4
         reach = self._colour_rate * _MOST_COLOUR_STEPS
@@ -418,25 +419,38 @@ class _Search:
 
     # ------------------------------------------------------------------------------------------ parts of an encode
 
-    def _thin(self, options: EncodeOptions) -> Reduced:
-        thinned = thin(self._scene, self._views, options, self._watch, self._device)
-        self._device = thinned.device or self._device
-        return thinned
+    @property
+    def _fitted(self) -> bool:
+        """Whether there is a re-fit, which is then done again for another q."""
+        return self._options.stage(Refit).looks_at(self._scene)
 
-    def _refit(self, thinned: Reduced, options: EncodeOptions) -> Reduced:
-        reduced = refit(self._scene, thinned, self._views, options, self._watch)
-        self._device = reduced.device or self._device
-        return reduced
+    def _thin(self, options: EncodeOptions) -> State:
+        """The stages before those that are done again for another q."""
+        return self._run(State.of(self._scene, self._views), options, [Prune, Compact])
 
-    def _evaluate(self, kind: str, q: float, thinned: Reduced, reduced: Reduced, options: EncodeOptions) -> _Candidate:
+    def _refit(self, thinned: State, options: EncodeOptions) -> State:
+        """The stages that are done again for another q, but for the coding."""
+        return self._run(thinned, options, [Refit])
+
+    def _run(self, state: State, options: EncodeOptions, only: list[type[Stage]]) -> State:
+        run = Run(options, self._watch, self._device)
+        state = run.stages(state, only)
+        self._used = run.device or self._used
+        self._device = run.device or self._device
+        return state
+
+    def _code(self, state: State, options: EncodeOptions) -> Encoded:
+        run = Run(options, self._watch, self._device)
+        return dataclasses.replace(run.finished(run.stages(state, [Code])), device=self._used)
+
+    def _evaluate(self, kind: str, q: float, thinned: State, reduced: State, options: EncodeOptions) -> _Candidate:
         encoded: Encoded | None
         if self._evaluator is None:
-            encoded = code(self._scene, reduced, self._views, options, self._watch)
+            encoded = self._code(reduced, options)
             value = math.log(encoded.nbytes)
         else:
             encoded = None
-            quick = dataclasses.replace(options, entropy=_QUICK_CODER)
-            pieces = code(self._scene, reduced, self._views, quick, self._watch).pieces
+            pieces = self._code(reduced, options.changed(code=_QUICK_CODER)).pieces
             self._watch("evaluate tries", 0.0)
             value = min(self._evaluator.psnr(decode(b"".join(pieces))), _IDENTICAL)
             self._watch("evaluate tries", 1.0)
@@ -455,10 +469,10 @@ class _Search:
         low, high = map(self._target.describe, values)
         return f"quality 0 gives {low}, quality 1 gives {high}"
 
-    def free(self) -> None:
+    def close(self) -> None:
         """Give all device memory back."""
         if self._evaluator is not None:
-            self._evaluator.free()
+            self._evaluator.close()
 
 
 class _Typical:
@@ -481,11 +495,11 @@ class _Axis:
     """Qualities by the logarithm of the quantiser's fineness."""
 
     def __init__(self, options: EncodeOptions) -> None:
-        self._options = dataclasses.replace(options, sf_sh=None)
+        self._options = options.changed(code={"sf_sh": None})
 
     def fineness(self, q: float) -> float:
         """Of a quality from 0 to 1."""
-        return math.log(dataclasses.replace(self._options, q=q).parameters.sf_sh)
+        return math.log(self._options.changed(q=q).parameters.sf_sh)
 
     def quality(self, fineness: float) -> float:
         """The nearest q from 0 to 1, rounded to what matters."""
@@ -498,17 +512,14 @@ class _Axis:
 
 def _with_steps(options: EncodeOptions, q: float) -> EncodeOptions:
     """The options with the quantiser's parameters of another q, as far as they are not given on their own."""
-    parameters = dataclasses.replace(options, q=q).parameters
-    names = [field.name for field in dataclasses.fields(parameters)]
-    steps = [name for name in names if name.startswith("sf_") or name in ("beta", "gamma")]
-    return dataclasses.replace(options, **{name: getattr(parameters, name) for name in steps})
+    wanted = options.changed(q=q).parameters
+    return options.with_parameters(**{name: getattr(wanted, name) for name in parameters(Code)})
 
 
 def _with_colour_steps(options: EncodeOptions, given: EncodeOptions, finer: float) -> EncodeOptions:
     """The options with steps of colours that are finer by a factor, given by its logarithm, unless they are given."""
-    parameters = options.parameters
-    names = [name for name in ("sf_dc", "sf_sh") if getattr(given, name) is None]
-    return dataclasses.replace(options, **{name: getattr(parameters, name) * math.exp(finer) for name in names})
+    names = [name for name in ("sf_dc", "sf_sh") if getattr(given.code, name) is None]
+    return options.with_parameters(**{name: getattr(options.parameters, name) * math.exp(finer) for name in names})
 
 
 def _meet(points: dict[float, float], aim: float, rate: float) -> float:

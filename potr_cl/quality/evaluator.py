@@ -16,6 +16,7 @@ from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner
 from potr_cl.quality.compare import Comparison, compare
 from potr_cl.quality.metrics_device import Picture, Similarity, in_batches, rendered
 from potr_cl.raster.rasterizer import Rasterizer
@@ -73,7 +74,7 @@ class EvaluationViews:
         return f"{which} {self.available} training views, for the cameras name no test views"
 
 
-class Evaluator:
+class Evaluator(Owner):
     """Compares candidates with one uncompressed scene.
 
     Args:
@@ -155,6 +156,9 @@ class Evaluator:
             return [(self._reference.render(camera)[0], rasterizer.render(camera)[0]) for camera in cameras]
         finally:
             rasterizer.free()
+
+    def close(self) -> None:
+        self.free()
 
     def free(self) -> None:
         """Give all device memory back."""

@@ -31,7 +31,7 @@ from potr_cl.errors import DeviceError, DeviceMemoryError, UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Scratch
+from potr_cl.opencl.memory import Owner, Scratch
 from potr_cl.opencl.structs import struct_dtype
 
 TILE = 16
@@ -327,7 +327,7 @@ class ViewSet:
         self._buffers = []
 
 
-class Rasterizer:
+class Rasterizer(Owner):
     """Renders one scene on one device, with the scene and all scratch memory kept there.
 
     Args:
@@ -714,6 +714,9 @@ class Rasterizer:
             raise
         self._scratch = views
         return views
+
+    def close(self) -> None:
+        self.free()
 
     def free(self) -> None:
         """Give all device memory back; the rasterizer is of no use afterwards."""

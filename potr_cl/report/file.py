@@ -2,10 +2,11 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Any
 
-from potr_cl.codec.container import Property, Section
 from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.sections import Property, Section
 from potr_cl.model.scene import SH_COEFFICIENTS
 
 _GROUPS = {
@@ -20,6 +21,9 @@ _GROUPS = {
     Property.OPACITY: "opacity",
 }
 
+#: A line of the table of sections.
+_ROW = "{:<22}{:<14}{:>8}{:>12}{:>12}{:>12}{:>14}{:>8}"
+
 
 def _group(section: Section) -> str:
     if section.kind != Property.SH:
@@ -28,8 +32,24 @@ def _group(section: Section) -> str:
     return "colour: DC" if coefficient == 0 else f"colour: AC degree {int(coefficient**0.5)}"
 
 
+def _contents(sections: Sequence[Section]) -> dict[str, Any]:
+    """What some sections hold and take; no serialised size where integers are coded without being bytes first."""
+    raw = [section.raw_bytes for section in sections]
+    return {
+        "coders": sorted({section.coder.name.lower() for section in sections}),
+        "streams": sum(section.streams for section in sections),
+        "integers": sum(section.integers for section in sections),
+        "serialised_bytes": None if None in raw else sum(size for size in raw if size is not None),
+        "bytes": sum(section.stored_bytes for section in sections),
+    }
+
+
 def file_report(file: PotrFile) -> dict[str, Any]:
-    """Counts, parameters, bounding box and the bytes of each section.
+    """Counts, parameters, bounding box, and what the sections hold and take.
+
+    Of each group of sections: the coders; the number of streams and of integers in them (bytes, for streams of bytes);
+    the size of these as bytes before the coder, None where the context coder codes integers as they are; and the size
+    in the file. Of the header the sizes alone.
 
     Raises:
         DataError: the positions or the metadata are damaged.
@@ -37,13 +57,18 @@ def file_report(file: PotrFile) -> dict[str, Any]:
     header = file.header
     metadata = file.metadata
     means = file.means()
-    groups: dict[str, dict[str, float]] = {}
+    grouped: dict[str, list[Section]] = {}
     for section in header.sections:
-        entry = groups.setdefault(_group(section), {"serialised_bytes": 0, "bytes": 0})
-        entry["serialised_bytes"] += section.raw_bytes
-        entry["bytes"] += section.stored_bytes
-    stored = sum(s.stored_bytes for s in header.sections)
-    groups["header"] = {"serialised_bytes": len(file.data) - stored, "bytes": len(file.data) - stored}
+        grouped.setdefault(_group(section), []).append(section)
+    groups = {name: _contents(sections) for name, sections in grouped.items()}
+    header_bytes = len(file.data) - sum(section.stored_bytes for section in header.sections)
+    groups["header"] = {
+        "coders": [],
+        "streams": 0,
+        "integers": 0,
+        "serialised_bytes": header_bytes,
+        "bytes": header_bytes,
+    }
     for entry in groups.values():
         entry["bits_a_splat"] = 8 * entry["bytes"] / header.splats
     # The original layout: position, normal, colours, opacity, scales, rotation, all float32.
@@ -96,10 +121,22 @@ def format_report(report: dict[str, Any]) -> str:
     ]
     if report["ratio_to_source"] is not None:
         lines.append(f"source file     {report['source_bytes']} bytes, {report['ratio_to_source']:.1f} times as much")
-    lines += ["", f"{'section':<22}{'serialised':>12}{'bytes':>12}{'bits a splat':>14}{'share':>8}"]
+    lines += [
+        "",
+        _ROW.format("section", "coder", "streams", "integers", "serialised", "bytes", "bits a splat", "share"),
+    ]
     for name, entry in report["sections"].items():
+        serialised = entry["serialised_bytes"]
         lines.append(
-            f"{name:<22}{entry['serialised_bytes']:>12}{entry['bytes']:>12}{entry['bits_a_splat']:>14.2f}"
-            f"{100 * entry['bytes'] / report['bytes']:>7.1f}%"
+            _ROW.format(
+                name,
+                ", ".join(entry["coders"]),
+                entry["streams"] or "",
+                entry["integers"] or "",
+                "-" if serialised is None else serialised,
+                entry["bytes"],
+                f"{entry['bits_a_splat']:.2f}",
+                f"{100 * entry['bytes'] / report['bytes']:.1f}%",
+            )
         )
     return "\n".join(lines)

@@ -254,7 +254,12 @@ def _search(search: dict[str, Any]) -> str:
 
 def _settings(report: dict[str, Any]) -> str:
     rows = [[escape(name), f"{value:.6g}"] for name, value in report["parameters"].items()]
-    others = {name: value for name, value in report["options"].items() if name not in report["parameters"]}
+    others = {
+        name: {field: each for field, each in value.items() if field not in report["parameters"]}
+        if isinstance(value, dict)
+        else value
+        for name, value in report["options"].items()
+    }
     return (
         '<div class="columns">'
         + _table(["parameter", "value"], rows)

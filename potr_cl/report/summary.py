@@ -65,7 +65,7 @@ def encode_report(
         "quality": quality,
         "pruning": None,
         "search": search,
-        "options": dataclasses.asdict(options),
+        "options": options.as_dict(),
         "parameters": dataclasses.asdict(options.parameters),
         "device": None,
         "seconds": seconds,

@@ -24,7 +24,7 @@ from potr_cl.formats.scenes import ply
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DEVICE_VARIABLE, compiler_fault, list_devices
 from potr_cl.raster.rasterizer import GSPLAT, Rasterizer
-from tests.cases.scenes import random_scene, ring_of_cameras
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
 
 #: Options of an encode that keeps everything, and so looks at no views.
 KEEP = ["--no-prune", "--no-compact", "--refit", "off"]
@@ -307,7 +307,7 @@ def test_interrupted_pruning_leaves_nothing(tmp_path, scene_path, capsys, monkey
     def interrupted(*_args, **_kwargs):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr("potr_cl.pipeline.reduction.prune_scene", interrupted)
+    monkeypatch.setattr("potr_cl.stages.prune.prune_scene", interrupted)
     cameras = cameras_json(tmp_path / "cameras.json")
     before = sorted(tmp_path.iterdir())
     for command in ("prune", "encode"):

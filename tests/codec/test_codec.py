@@ -13,18 +13,20 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from potr_cl.codec import quantize
-from potr_cl.codec.container import Coder, EntropyCoder, Property
+from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.codec.sections import Coder, Property
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.camera import camera_centres, train_views
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from tests.cases.scenes import random_scene, ring_of_cameras
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from tests.cases.options import as_it_is
 from tests.oracles.decoder import decode as decode_independently
 
 FAST = EntropyCoder("zstd", 1)
-KEEP = EncodeOptions(prune=False, compact=False)
+KEEP = as_it_is()
 DATA = Path(__file__).parents[1] / "data"
 
 
@@ -73,9 +75,9 @@ def check_within_balanced_steps(source: Scene, data: bytes, order, tolerance):
     imaginary, log_scales = quantize.canonical_rotations(original.quaternions, original.log_scales)
     scales, scales_back = np.exp(log_scales.astype(np.float64)), np.exp(decoded.log_scales.astype(np.float64))
     assert (np.abs(scales_back - scales) <= 0.5 / header.sf_scale + 1e-5 * scales).all()
-    steps = np.round(scales_back * header.sf_scale)
-    factor = header.sf_rotation * np.sqrt(np.maximum(steps.max(axis=1, keepdims=True), 1))
-    ball = (steps.max(axis=1) == steps.min(axis=1))[:, None]
+    levels = np.round(scales_back * header.sf_scale)
+    factor = header.sf_rotation * np.sqrt(np.maximum(levels.max(axis=1, keepdims=True), 1))
+    ball = (levels.max(axis=1) == levels.min(axis=1))[:, None]
     assert ((np.abs(decoded.quaternions[:, 1:] - imaginary) <= 0.5 / factor + 1e-5) | ball).all()
 
     logits = np.clip(original.opacity_logits, -8, 12)
@@ -98,7 +100,7 @@ def typical_size(scene: Scene) -> float:
 @pytest.mark.parametrize("q", [0.0, 0.5, 1.0])
 def test_within_balanced_steps(degree, entropy, q):
     scene = random_scene(1500, degree, seed=degree)
-    options = dataclasses.replace(KEEP, preset="best", q=q, entropy=entropy)
+    options = as_it_is("best", entropy, q=q)
     encoded = encode(scene, options=options)
     data = joined(encoded)
     context = any(s.coder == Coder.CONTEXT for s in PotrFile.from_bytes(data).header.sections)
@@ -111,7 +113,7 @@ def test_balanced_steps_do_not_depend_on_the_unit_of_length():
     millimetres = dataclasses.replace(
         scene, means=scene.means * np.float32(1024), log_scales=scene.log_scales + np.float32(np.log(1024))
     )
-    options = dataclasses.replace(KEEP, preset="best")
+    options = as_it_is("best")
     sizes = [encode(s, options=options).nbytes for s in (scene, millimetres)]
     assert abs(sizes[0] - sizes[1]) < 0.002 * sizes[0]
     again = decode(joined(encode(millimetres, options=options)))
@@ -119,7 +121,7 @@ def test_balanced_steps_do_not_depend_on_the_unit_of_length():
 
 
 def test_version_1_has_no_context_coder():
-    data = joined(encode(random_scene(200), options=dataclasses.replace(KEEP, entropy=EntropyCoder("context"))))
+    data = joined(encode(random_scene(200), options=as_it_is(entropy=EntropyCoder("context"))))
     file = PotrFile.from_bytes(data)
     assert file.header.version == 1
     assert all(s.coder != Coder.CONTEXT for s in file.header.sections)
@@ -130,7 +132,7 @@ def test_version_1_has_no_context_coder():
 @pytest.mark.parametrize("q", [0.0, 0.5, 1.0])
 def test_within_steps(degree, entropy, q):
     scene = random_scene(500, degree, seed=degree)
-    options = dataclasses.replace(KEEP, q=q, entropy=entropy)
+    options = as_it_is(entropy=entropy, q=q)
     encoded = encode(scene, options=options)
     assert encoded.nbytes == len(joined(encoded))
     decoded = decode(joined(encoded))
@@ -141,7 +143,7 @@ def test_within_steps(degree, entropy, q):
 def test_within_the_criterion_of_the_cameras():
     scene = random_scene(2000, 0, extent=20)
     cameras = ring_of_cameras(12)
-    options = dataclasses.replace(KEEP, entropy=FAST)
+    options = as_it_is(entropy=FAST)
     centres = camera_centres(train_views(cameras))
     nearest = np.linalg.norm(scene.means[:, None].astype(np.float64) - centres, axis=2).min(axis=1)
     p = options.parameters
@@ -184,13 +186,13 @@ def test_any_scene(data, degree, splats, q, balanced):
         array(splats, st.floats(-50, 50, width=32)),
         array((splats, SH_COEFFICIENTS[degree], 3), st.floats(-1000, 1000, width=32)),
     )
-    options = dataclasses.replace(KEEP, q=q, entropy=FAST)
     if balanced:
         # Both coders; the steps themselves are checked on scenes that have a typical size.
         for entropy in (FAST, EntropyCoder("context")):
-            encoded = encode(scene, options=dataclasses.replace(options, preset="best", entropy=entropy))
+            encoded = encode(scene, options=as_it_is("best", entropy, q=q))
             assert len(decode(joined(encoded))) == splats
         return
+    options = as_it_is(entropy=FAST, q=q)
     encoded = encode(scene, options=options)
     check_within_steps(scene, decode(joined(encoded)), encoded.order, options.parameters, options.parameters.gamma)
 
@@ -198,9 +200,9 @@ def test_any_scene(data, degree, splats, q, balanced):
 @pytest.mark.parametrize("preset", ["paper", "best"])
 def test_same_input_same_bytes_whatever_the_threads(preset):
     scene = random_scene(3000)
-    first = joined(encode(scene, options=dataclasses.replace(KEEP, preset=preset, threads=1)))
+    first = joined(encode(scene, options=as_it_is(preset, threads=1)))
     for threads in (1, 2, 5):
-        assert joined(encode(scene, options=dataclasses.replace(KEEP, preset=preset, threads=threads))) == first
+        assert joined(encode(scene, options=as_it_is(preset, threads=threads))) == first
     a, b = decode(first), PotrFile.from_bytes(first).scene(threads=1)
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
         assert np.array_equal(getattr(a, name), getattr(b, name))
@@ -220,7 +222,7 @@ def test_strides_do_not_matter():
 
 def test_decoding_again_loses_nothing_more():
     """A decoded scene, encoded with the same steps, comes back the same: re-encoding does not wear a scene out."""
-    options = dataclasses.replace(KEEP, entropy=FAST)
+    options = as_it_is(entropy=FAST)
     once = decode(joined(encode(random_scene(400), options=options)))
     encoded = encode(once, options=options)
     twice = decode(joined(encoded))
@@ -233,7 +235,7 @@ def test_decoding_again_loses_nothing_more():
 @pytest.mark.parametrize("preset", ["paper", "best"])
 def test_sections_decode_alone(preset):
     scene = random_scene(2000)
-    data = joined(encode(scene, options=dataclasses.replace(KEEP, preset=preset)))
+    data = joined(encode(scene, options=as_it_is(preset)))
     whole = decode(data)
     assert np.array_equal(PotrFile.from_bytes(data).means(), whole.means)
     assert np.array_equal(PotrFile.from_bytes(data).log_scales(), whole.log_scales)
@@ -283,7 +285,7 @@ def test_independent_decoder_agrees(degree, preset):
     scene = random_scene(600, degree)
     scene = scene.subset(np.r_[np.arange(600), [0, 0, 7]])
     refitted = EncodeOptions.for_preset(preset, prune=False, compact=False)
-    as_they_are = dataclasses.replace(refitted, refit=0)  # without cameras: a re-fit would place hundreds
+    as_they_are = refitted.changed(refit=False)  # without cameras: a re-fit would place hundreds
     for cameras, options in ((None, as_they_are), (ring_of_cameras(8), refitted)):
         data = joined(encode(scene, cameras, options))
         agree(decode(data), decode_independently(data))

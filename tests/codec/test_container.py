@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import struct
 import zlib
 
@@ -11,8 +12,9 @@ from hypothesis import given
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
-from potr_cl.codec import container
-from potr_cl.codec.container import Coder, EntropyCoder, Header, Property
+from potr_cl.codec import byte_planes, container
+from potr_cl.codec.container import EntropyCoder, Header
+from potr_cl.codec.sections import Coder, Property, Section
 from potr_cl.errors import DataError, UsageError
 
 
@@ -23,10 +25,10 @@ from potr_cl.errors import DataError, UsageError
 )
 def test_signed_integers(values, shift, data):
     values >>= shift
-    raw, planes = container.pack_integers(values, signed=True)
+    raw, planes = byte_planes.pack_integers(values, signed=True)
     start = data.draw(st.integers(0, len(values)))
     stop = data.draw(st.integers(start, len(values)))
-    back = container.unpack_integers(np.frombuffer(raw, np.uint8), planes, True, start, stop)
+    back = byte_planes.unpack_integers(np.frombuffer(raw, np.uint8), planes, True, start, stop)
     assert np.array_equal(back, values[start:stop])
     assert len(raw) == planes * len(values)
 
@@ -34,9 +36,9 @@ def test_signed_integers(values, shift, data):
 @given(hnp.arrays(np.int64, st.integers(1, 60), elements=st.integers(0, 2**53)), st.integers(0, 53))
 def test_unsigned_integers(values, shift):
     values >>= shift
-    raw, planes = container.pack_integers(values, signed=False)
+    raw, planes = byte_planes.pack_integers(values, signed=False)
     assert planes == (int(values.max()).bit_length() + 7) // 8
-    back = container.unpack_integers(np.frombuffer(raw, np.uint8), planes, False, 0, len(values))
+    back = byte_planes.unpack_integers(np.frombuffer(raw, np.uint8), planes, False, 0, len(values))
     assert np.array_equal(back, values)
 
 
@@ -94,6 +96,32 @@ def test_header_roundtrip():
     assert [s.kind for s in header.sections] == [Property.OPACITY, Property.METADATA]
     assert header.find(Property.SCALE) is None
     assert (header.sf_dc, header.sf_ac) == (10.0, 10.0)  # version 1 has one factor for both
+
+
+def test_sections_come_back_as_they_were():
+    """The table's two fields of double meaning: planes and bytes, or streams and integers."""
+    splats = 5
+    header = Header(2, splats, 1, (0.0, 0.0, 0.0), 1.0, 3, 10.0, 10.0, 10.0, 10.0, 11.0)
+    coded = [
+        EntropyCoder("zstd", 3).section(Property.SCALE, 1, bytes(3 * splats), 3),
+        EntropyCoder("zstd", 3).section(Property.OPACITY, 0, bytes(range(splats)), 1),
+        container.context_section(Property.SH, 3, 9, 9 * splats, bytes(70)),
+    ]
+    data = b"".join(container.assemble(header, coded))
+    scale, opacity, sh = container.read_header(data, len(data)).sections
+    assert (scale.streams, scale.integers, scale.planes, scale.raw_bytes) == (1, splats, 3, 3 * splats)
+    assert (opacity.coder, opacity.integers, opacity.raw_bytes, opacity.stored_bytes) == (Coder.RAW, 5, 5, 5)
+    assert (sh.coder, sh.streams, sh.integers, sh.planes) == (Coder.CONTEXT, 9, 9 * splats, 0)
+    assert (sh.raw_bytes, sh.stored_bytes, sh.indices) == (None, 70, range(3, 12))
+    for section, (before, stored) in zip((scale, opacity, sh), coded, strict=True):
+        assert dataclasses.replace(section, offset=0) == before
+        assert bytes(container.stored_bytes(data, section)) == stored
+
+
+def test_what_the_context_coder_holds_is_not_read_as_bytes():
+    section, stored = container.context_section(Property.OPACITY, 0, 1, 4, zlib.compress(b"abcd"))
+    with pytest.raises(DataError, match="'opacity'"):
+        container.read_section(stored, section)
 
 
 def test_header_roundtrip_of_version_2():
@@ -179,8 +207,8 @@ def test_lies_in_the_header(name):
 
 
 def section_of(raw, coder, stored, **lies):
-    given_values = {"raw_bytes": len(raw), "crc": zlib.crc32(stored), **lies}
-    return container.Section(Property.TAIL, 0, coder, 1, given_values["crc"], given_values["raw_bytes"], len(stored))
+    said = {"integers": len(raw), "crc": zlib.crc32(stored), **lies}
+    return Section(Property.TAIL, 0, coder, streams=1, planes=1, stored_bytes=len(stored), **said)
 
 
 def test_sections_that_lie():
@@ -192,19 +220,19 @@ def test_sections_that_lie():
     deflated = zlib.compress(raw)
     for coder, stored, lies in [
         (Coder.ZSTD, frame, {"crc": 1}),
-        (Coder.ZSTD, frame, {"raw_bytes": 2999}),
-        (Coder.ZSTD, frame, {"raw_bytes": 3001}),
+        (Coder.ZSTD, frame, {"integers": 2999}),
+        (Coder.ZSTD, frame, {"integers": 3001}),
         (Coder.ZSTD, frame[:-1], {}),
         (Coder.ZSTD, frame + b"x", {}),
         (Coder.ZSTD, frame + frame, {}),
         (Coder.ZSTD, unsized, {}),
         (Coder.ZSTD, b"garbage" * 9, {}),
-        (Coder.DEFLATE, deflated, {"raw_bytes": 2999}),
-        (Coder.DEFLATE, deflated, {"raw_bytes": 3001}),
+        (Coder.DEFLATE, deflated, {"integers": 2999}),
+        (Coder.DEFLATE, deflated, {"integers": 3001}),
         (Coder.DEFLATE, deflated[:-1], {}),
         (Coder.DEFLATE, deflated + b"x", {}),
         (Coder.DEFLATE, b"garbage" * 9, {}),
-        (Coder.RAW, raw, {"raw_bytes": 2999}),
+        (Coder.RAW, raw, {"integers": 2999}),
     ]:
         with pytest.raises(DataError, match="section 'tail'"):
             container.read_section(stored, section_of(raw, coder, stored, **lies))

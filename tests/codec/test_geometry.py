@@ -14,7 +14,7 @@ from potr_cl.codec.geometry import quantise_geometry
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import train_views
 from potr_cl.pipeline.options import EncodeOptions
-from tests.cases.scenes import random_scene, ring_of_cameras
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
 
 
 def some_scene(kind):
@@ -48,10 +48,9 @@ def test_decoded_before_it_is_coded(kind, preset, cameras):
 @pytest.mark.parametrize("entropy", ["context", "zstd"])
 def test_a_file_of_geometry_that_was_there_is_the_same_file(entropy):
     scene = random_scene(700, 2)
-    options = EncodeOptions.for_preset("best", entropy=EntropyCoder(entropy))
-    geometry = quantise_geometry(scene, options.parameters, [])
+    parameters, coder = EncodeOptions().parameters, EntropyCoder(entropy)
+    geometry = quantise_geometry(scene, parameters, [])
     files = {
-        b"".join(code_scene(scene, options.parameters, entropy=options.entropy, geometry=known).pieces)
-        for known in (None, geometry)
+        b"".join(code_scene(scene, parameters, entropy=coder, geometry=known).pieces) for known in (None, geometry)
     }
     assert len(files) == 1

@@ -127,8 +127,8 @@ def test_opacities(logits, sf):
 @given(hnp.arrays(np.float64, (20, 3), elements=st.floats(-100, 100)), st.floats(1, 101))
 def test_sh(rgb, sf):
     for values in quantize.to_ycocg(rgb):
-        steps = quantize.quantize_sh(values, sf)
-        assert (np.abs(steps / sf - values) <= HALF / sf).all()
+        levels = quantize.quantize_sh(values, sf)
+        assert (np.abs(levels / sf - values) <= HALF / sf).all()
 
 
 def test_ycocg_is_undone_by_the_formats_sums():
@@ -142,8 +142,8 @@ def test_rotation_error_bounded_by_steps():
     quaternions = rng.normal(size=(5000, 4)).astype(np.float32)
     imaginary, _ = quantize.canonical_rotations(quaternions, np.zeros((5000, 3), np.float32))
     out = np.empty((5000, 4), np.float32)
-    steps = [quantize.quantize_rotations(imaginary[:, a], 201) for a in range(3)]
-    quantize.dequantize_rotations(steps, 201, out)
+    levels = [quantize.quantize_rotations(imaginary[:, a], 201) for a in range(3)]
+    quantize.dequantize_rotations(levels, 201, out)
     assert (np.abs(out[:, 1:] - imaginary) <= HALF / 201).all()
     assert np.allclose(np.linalg.norm(out, axis=1), 1, atol=1e-6)
 

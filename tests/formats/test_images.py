@@ -1,4 +1,4 @@
-"""Photographs of every kind and damage, PNG files, colours."""
+"""Ground truth of every kind and damage, PNG files, colours."""
 
 from __future__ import annotations
 

@@ -16,9 +16,9 @@ from potr_cl.model.virtual_cameras import describe, is_virtual, place_cameras, s
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import INRIA
-from tests.cases.scenes import random_scene
+from potr_cl.reference.raster import sh_basis
+from potr_cl.reference.scenes import random_scene
 from tests.cases.surfaces import box, flat_splats, sphere, together
-from tests.oracles.raster import sh_basis
 
 BALL = sphere(8000, 1.0, 0.03)
 ROOM = box(12000, (3, 4, 1.5), 0.08)
@@ -255,7 +255,7 @@ def test_the_basis_is_that_of_the_rasterizer():
 
 def test_encode_places_them_itself(monkeypatch):
     monkeypatch.setattr("potr_cl.pipeline.encode.place_cameras", lambda scene: place_cameras(scene, 6, 64))
-    scene, options = random_scene(150, 2), EncodeOptions(iterations=2)
+    scene, options = random_scene(150, 2), EncodeOptions.for_preset("paper", prune={"iterations": 2})
     given = encode(scene, place_cameras(scene, 6, 64), options)
     assert b"".join(encode(scene, None, options).pieces) == b"".join(given.pieces)
     assert given.pruned is not None

@@ -10,15 +10,18 @@ import pytest
 from potr_cl.codec.geometry import quantise_geometry
 from potr_cl.codec.quantize import ac_sparsity
 from potr_cl.errors import UsageError
-from potr_cl.pipeline.encode import Reduced, Stopwatch, code, encode
+from potr_cl.model.camera import train_views
+from potr_cl.pipeline.encode import Run, Stopwatch, encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.reduction import reduce_scene
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.removal import SweepOptions
-from tests.cases.scenes import random_scene, ring_of_cameras
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from potr_cl.stages.code import Code
+from potr_cl.stages.compact import Compact
+from potr_cl.stages.prune import Prune
+from potr_cl.stages.stage import State
 from tests.devices import KERNELS, open_device
 
-FEW = EncodeOptions(iterations=6)
+FEW = EncodeOptions.for_preset("paper", prune={"iterations": 6})
 
 
 @pytest.fixture(scope="module", params=KERNELS)
@@ -42,50 +45,57 @@ def psnr(device, a, b, cameras):
     return float(np.mean(-10 * np.log10(errors)))
 
 
+def reduced(scene, cameras, options, device):
+    """The scene after pruning and compaction, and what pruning did."""
+    run = Run(options, Stopwatch(), device)
+    state = run.stages(State.of(scene, train_views(cameras)), [Prune, Compact])
+    return state.scene, state.learnt.get("prune")
+
+
 def same(a, b):
     return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
 
 
 def test_pruning_and_compaction(device, lego_excerpt, views):
-    reduced, pruned = reduce_scene(lego_excerpt, views, FEW, device=device)
-    assert len(reduced) == pruned.kept < 0.9 * len(lego_excerpt)
-    assert ac_sparsity(reduced.sh, 51) > ac_sparsity(lego_excerpt.sh[pruned.survivors], 51) + 0.1
-    assert psnr(device, lego_excerpt, reduced, views) > 40
+    left, pruned = reduced(lego_excerpt, views, FEW, device)
+    assert len(left) == pruned.kept < 0.9 * len(lego_excerpt)
+    assert ac_sparsity(left.sh, 51) > ac_sparsity(lego_excerpt.sh[pruned.survivors], 51) + 0.1
+    assert psnr(device, lego_excerpt, left, views) > 40
     # All but the colours comes through untouched.
-    assert np.array_equal(reduced.means, lego_excerpt.means[pruned.survivors])
+    assert np.array_equal(left.means, lego_excerpt.means[pruned.survivors])
 
 
 def test_each_on_its_own(device, lego_excerpt, views):
-    only_pruned, pruned = reduce_scene(lego_excerpt, views, dataclasses.replace(FEW, compact=False), device=device)
+    only_pruned, pruned = reduced(lego_excerpt, views, FEW.changed(compact=False), device)
     assert same(only_pruned, lego_excerpt.subset(pruned.survivors))
-    compacted, none = reduce_scene(lego_excerpt, views, dataclasses.replace(FEW, prune=False), device=device)
+    compacted, none = reduced(lego_excerpt, views, FEW.changed(prune=False), device)
     assert none is None
     assert len(compacted) == len(lego_excerpt)
     assert not np.array_equal(compacted.sh, lego_excerpt.sh)
 
 
-@pytest.mark.parametrize("compact_at", [0.0, EncodeOptions.compact_at, 1.0])
+@pytest.mark.parametrize("compact_at", [0.0, Compact.at, 1.0])
 def test_a_small_memory_budget_gives_the_same_scene(device, lego_excerpt, views, compact_at):
     results = []
     for memory in (None, 48 * 1600, 0):
         # Views that are made anew each time are swept in full: so must those be that are kept.
-        options = dataclasses.replace(FEW, iterations=4, compact_at=compact_at, sweep=SweepOptions(0, 1, memory))
-        results.append(reduce_scene(lego_excerpt, views, options, device=device)[0])
+        options = FEW.changed(prune={"iterations": 4, "tolerance": 0}, compact={"at": compact_at}, memory=memory)
+        results.append(reduced(lego_excerpt, views, options, device)[0])
     assert same(results[0], results[1])
     assert same(results[0], results[2])
 
 
 def test_degree_0_has_nothing_to_compact(device, monkeypatch):
-    monkeypatch.setattr("potr_cl.pipeline.reduction.Compactor", None)  # would fail if it were asked
+    monkeypatch.setattr("potr_cl.stages.compact.Compactor", None)  # would fail if it were asked
     scene = random_scene(100, 0)
-    reduced, _ = reduce_scene(scene, ring_of_cameras(4), dataclasses.replace(FEW, count=50), device=device)
-    assert len(reduced) == 50
+    left, _ = reduced(scene, ring_of_cameras(4), FEW.changed(prune={"count": 50}), device)
+    assert len(left) == 50
 
 
 def test_nothing_to_do_needs_no_device(monkeypatch):
-    monkeypatch.setattr("potr_cl.pipeline.reduction.Device", None)
-    encode(random_scene(20, 0), ring_of_cameras(4), EncodeOptions(prune=False))
-    encode(random_scene(20, 3), None, EncodeOptions(prune=False, compact=False))
+    monkeypatch.setattr("potr_cl.pipeline.encode.Device", None)
+    encode(random_scene(20, 0), ring_of_cameras(4), EncodeOptions.for_preset("paper", prune=False))
+    encode(random_scene(20, 3), None, EncodeOptions.for_preset("paper", prune=False, compact=False))
 
 
 def test_same_bytes_every_time(device, lego_excerpt, views):
@@ -95,17 +105,18 @@ def test_same_bytes_every_time(device, lego_excerpt, views):
 
 def test_geometry_of_other_steps_is_not_coded():
     """As a search codes a reduced scene again in other steps than the re-fit saw."""
-    scene, options = random_scene(300), EncodeOptions(preset="best")
-    known = (None, *(quantise_geometry(scene, EncodeOptions(preset="best", q=q).parameters, []) for q in (0.5, 0.2)))
+    scene, options = random_scene(300), EncodeOptions()
+    known = (None, *(quantise_geometry(scene, EncodeOptions(q=q).parameters, []) for q in (0.5, 0.2)))
+    run = Run(options, Stopwatch())
     files = {
-        b"".join(code(scene, Reduced(scene, None, None, None, geometry), [], options, Stopwatch()).pieces)
+        b"".join(run.finished(run.stages(dataclasses.replace(State.of(scene), geometry=geometry), [Code])).pieces)
         for geometry in known
     }
     assert len(files) == 1
 
 
 def test_order_names_the_splats_of_the_source(device, lego_excerpt, views):
-    encoded = encode(lego_excerpt, views, dataclasses.replace(FEW, count=300), device=device)
+    encoded = encode(lego_excerpt, views, FEW.changed(prune={"count": 300}), device=device)
     assert len(encoded.order) == 300
     assert sorted(encoded.order) == encoded.pruned.survivors.tolist()
 
@@ -128,11 +139,14 @@ def test_a_stage_within_another_counts_for_itself(monkeypatch):
 def test_views_that_see_nothing(device):
     scene = random_scene(60, 1)
     away = [dataclasses.replace(c, translation=np.array([0, 0, -50.0])) for c in ring_of_cameras(2)]
-    reduced, _ = reduce_scene(scene, [dataclasses.replace(c, split="train") for c in away], FEW, device=device)
-    assert len(reduced) == 1  # an empty scene is no scene
+    left, _ = reduced(scene, [dataclasses.replace(c, split="train") for c in away], FEW, device)
+    assert len(left) == 1  # an empty scene is no scene
 
 
-@pytest.mark.parametrize("bad", [{"compact_at": -0.1}, {"compact_at": 1.1}, {"iterations": 0}, {"lam": -1}])
+@pytest.mark.parametrize(
+    "bad",
+    [{"compact": {"at": -0.1}}, {"refit": {"at": (1.1,)}}, {"prune": {"iterations": 0}}, {"compact": {"lam": -1}}],
+)
 def test_options_out_of_range(device, lego_excerpt, views, bad):
     with pytest.raises(UsageError):
-        reduce_scene(lego_excerpt, views, dataclasses.replace(FEW, **bad), device=device)
+        reduced(lego_excerpt, views, FEW.changed(**bad), device)

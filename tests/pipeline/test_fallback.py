@@ -13,12 +13,12 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.stages.pruning.removal import SweepOptions, default_memory
-from tests.cases.scenes import random_scene, ring_of_cameras
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from potr_cl.stages.pruning.removal import default_memory
 from tests.devices import skip_without_cpu
 
 # Tolerance 0: views that are made anew each time are swept in full, and so are those that are kept.
-OPTIONS = EncodeOptions(iterations=3, sweep=SweepOptions(tolerance=0))
+OPTIONS = EncodeOptions.for_preset("paper", prune={"iterations": 3, "tolerance": 0})
 SCENE = random_scene(400, 1)
 CAMERAS = ring_of_cameras(32, size=96)
 
@@ -48,8 +48,8 @@ def peak(options: EncodeOptions) -> int:
 @pytest.fixture(scope="module")
 def peaks():
     """Peak with everything kept, and with nothing kept."""
-    nothing = dataclasses.replace(OPTIONS, sweep=SweepOptions(tolerance=0, memory=0))
-    everything = dataclasses.replace(OPTIONS, sweep=SweepOptions(tolerance=0, memory=1 << 30))
+    nothing = OPTIONS.changed(memory=0)
+    everything = OPTIONS.changed(memory=1 << 30)
     return peak(everything), peak(nothing)
 
 
@@ -62,7 +62,7 @@ def test_less_is_kept_until_it_fits(peaks, wanted, caplog):
     everything, nothing = peaks
     assert nothing < 0.7 * everything
     device = with_memory(Device(), (everything + nothing) // 2)
-    generous = dataclasses.replace(OPTIONS, sweep=SweepOptions(tolerance=0, memory=1 << 30))
+    generous = OPTIONS.changed(memory=1 << 30)
     with caplog.at_level(logging.WARNING, "potr_cl"):
         encoded = encode(SCENE, CAMERAS, generous, device=device)
     assert b"".join(encoded.pieces) == wanted
@@ -102,12 +102,12 @@ def test_nothing_is_left_to_try(peaks, monkeypatch):
 def test_other_failures_are_not_tried_again():
     calls = []
 
-    def work(_device, _options):
+    def work(_device, _memory):
         calls.append(1)
         raise DeviceError("vanished")
 
     with pytest.raises(DeviceError, match="vanished"):
-        on_device(Device(), OPTIONS, work)
+        on_device(Device(), None, work)
     assert len(calls) == 1
 
 
@@ -117,13 +117,13 @@ def test_memory_errors_of_the_driver_count_too(caplog):
 
     budgets = []
 
-    def work(_device, options):
-        budgets.append(options.sweep.memory)
+    def work(_device, memory):
+        budgets.append(memory)
         if len(budgets) < 3:
             raise cl.MemoryError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES")
         return np.pi
 
     device = Device()
     with caplog.at_level(logging.WARNING, "potr_cl"):
-        assert on_device(device, OPTIONS, work) == (np.pi, device)
+        assert on_device(device, None, work) == (np.pi, device)
     assert budgets == [None, default_memory(device) // 8, 0]

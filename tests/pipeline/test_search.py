@@ -11,9 +11,9 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from potr_cl.codec.container import Coder
 from potr_cl.codec.decoder import PotrFile, decode
 from potr_cl.codec.quantize import PRESETS, HyperParameters
+from potr_cl.codec.sections import Coder
 from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.formats.images import to_8_bits, write_png
 from potr_cl.opencl.device import Device
@@ -31,11 +31,10 @@ from potr_cl.pipeline.search import (
 )
 from potr_cl.quality.compare import compare, mean_view
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.removal import SweepOptions
-from tests.cases.scenes import random_scene, ring_of_cameras
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from tests.devices import skip_without_cpu
 
-FEW = EncodeOptions(iterations=6)
+FEW = EncodeOptions.for_preset("paper", prune={"iterations": 6})
 AXIS = _Axis(FEW)
 
 
@@ -63,7 +62,7 @@ def psnr(device, scene, file, cameras):
 @pytest.mark.parametrize("size", [18_000, 24_000])
 def test_a_size_is_filled_and_not_passed(device, lego_excerpt, cameras, size, preset):
     lines = []
-    options = EncodeOptions.for_preset(preset, iterations=6)
+    options = EncodeOptions.for_preset(preset, prune={"iterations": 6})
     found = encode_to_target(lego_excerpt, cameras, Target(max_bytes=size), options, device=device, tell=lines.append)
     file = b"".join(found.encoded.pieces)
     assert 0.98 * size <= len(file) <= size
@@ -75,7 +74,7 @@ def test_a_size_is_filled_and_not_passed(device, lego_excerpt, cameras, size, pr
 
 @pytest.mark.parametrize("target", [Target(max_bytes=24_000), Target(min_psnr=46)])
 def test_colours_may_be_refitted_in_any_preset(device, lego_excerpt, cameras, target):
-    options = dataclasses.replace(FEW, compact=False, refit=3, drop=1e-10)
+    options = FEW.changed(compact=False, refit={"steps": 3, "drop": 1e-10})
     found = encode_to_target(lego_excerpt, cameras, target, options, device=device)
     low, high = target.window
     assert low <= found.value <= high
@@ -84,7 +83,7 @@ def test_colours_may_be_refitted_in_any_preset(device, lego_excerpt, cameras, ta
 
 @pytest.mark.parametrize(("preset", "wanted"), [("paper", 38.0), ("paper", 45.0), ("best", 46.0)])
 def test_a_psnr_is_reached_with_little_to_spare(device, lego_excerpt, cameras, preset, wanted):
-    options = EncodeOptions.for_preset(preset, iterations=6)
+    options = EncodeOptions.for_preset(preset, prune={"iterations": 6})
     found = encode_to_target(lego_excerpt, cameras, Target(min_psnr=wanted), options, device=device)
     reached = psnr(device, lego_excerpt, b"".join(found.encoded.pieces), cameras)
     assert wanted <= reached <= wanted + 0.1
@@ -98,13 +97,12 @@ def test_a_psnr_is_reached_with_little_to_spare(device, lego_excerpt, cameras, p
 )
 def test_what_is_found_is_what_a_plain_encode_makes(device, lego_excerpt, cameras, preset, target):
     """So it lies on the plain encodes' curve, as far as its parameters are those of one q."""
-    options = EncodeOptions.for_preset(preset, iterations=6)
+    options = EncodeOptions.for_preset(preset, prune={"iterations": 6})
     found = encode_to_target(lego_excerpt, cameras, target, options, device=device)
     assert encode(lego_excerpt, cameras, found.options, device=device).pieces == found.encoded.pieces
-    plain = dataclasses.replace(options, q=found.options.q)
-    for name in (field.name for field in dataclasses.fields(EncodeOptions)):
-        if name not in ("delta_mse_max", "sf_dc", "sf_sh"):
-            assert getattr(found.options, name) == getattr(plain, name), name
+    plain = options.changed(q=found.options.q)
+    free = {"prune": {"delta_mse_max": None}, "code": {"sf_dc": None, "sf_sh": None}}
+    assert found.options.changed(**free) == plain.changed(**free)
     pruning = math.log10(found.options.parameters.delta_mse_max / plain.parameters.delta_mse_max)
     assert abs(pruning) <= 2 * 0.12 / math.log(10) + 1e-4  # ΔMSE_MAX goes with the square of the steps
     colours = {getattr(found.options.parameters, name) / getattr(plain.parameters, name) for name in ("sf_dc", "sf_sh")}
@@ -116,10 +114,10 @@ def test_a_rough_encode_comes_first_where_it_saves_time(device, lego_excerpt, ca
     target = Target(max_bytes=20_000)
     for options, first in (
         (FEW, "encode"),
-        (dataclasses.replace(FEW, iterations=48), "scout"),
+        (FEW.changed(prune={"iterations": 48}), "scout"),
         (EncodeOptions.for_preset("fast"), "scout"),
-        (EncodeOptions.for_preset("best", iterations=6, refit=2), "encode"),
-        (dataclasses.replace(FEW, iterations=48, prune=False), "encode"),
+        (EncodeOptions.for_preset("best", prune={"iterations": 6}, refit={"steps": 2}), "encode"),
+        (FEW.changed(prune={"iterations": 48, "on": False}), "encode"),
     ):
         found = encode_to_target(lego_excerpt, cameras, target, options, device=device)
         kinds = [step.kind for step in found.tries]
@@ -130,7 +128,7 @@ def test_a_rough_encode_comes_first_where_it_saves_time(device, lego_excerpt, ca
 
 def test_a_try_is_not_what_is_found_by_it(device, lego_excerpt, cameras):
     """A scout is never the result, nor is the file that a PSNR was judged by."""
-    options = EncodeOptions.for_preset("best", iterations=6)
+    options = EncodeOptions.for_preset("best", prune={"iterations": 6})
     found = encode_to_target(lego_excerpt, cameras, Target(min_psnr=45), options, device=device)
     assert found.tries[0].kind == "scout"
     assert found.value in [step.value for step in found.tries[1:]]
@@ -145,10 +143,10 @@ def test_without_a_refit_only_the_steps_of_the_quantiser_may_be_of_another_q(dev
         for size in range(16_000, 30_000, 1_000)
     )
     found = next(run for run in runs if run.tries[-1].kind == "steps")
-    pruned = encode(lego_excerpt, cameras, dataclasses.replace(FEW, q=found.options.q), device=device).pruned
+    pruned = encode(lego_excerpt, cameras, FEW.changed(q=found.options.q), device=device).pruned
     assert np.array_equal(pruned.survivors, found.encoded.pruned.survivors)
     header = PotrFile.from_bytes(b"".join(found.encoded.pieces)).header
-    assert header.sf_ac == found.options.sf_sh == pytest.approx(1 + 100 * found.tries[-1].q)
+    assert header.sf_ac == found.options.code.sf_sh == pytest.approx(1 + 100 * found.tries[-1].q)
     parameters = HyperParameters.from_quality(found.options.q)
     for name in ("lam", "alpha", "delta_mse_max"):
         assert getattr(found.options.parameters, name) == getattr(parameters, name)
@@ -172,7 +170,7 @@ def test_the_same_file_every_time(device, lego_excerpt, cameras):
     ],
 )
 def test_targets_out_of_reach(device, lego_excerpt, cameras, target, said):
-    ends = (encode(lego_excerpt, cameras, dataclasses.replace(FEW, q=q), device=device).nbytes for q in (0.0, 1.0))
+    ends = (encode(lego_excerpt, cameras, FEW.changed(q=q), device=device).nbytes for q in (0.0, 1.0))
     with pytest.raises(UnreachableError, match=said.format(*(f"{nbytes:,}" for nbytes in ends))):
         encode_to_target(lego_excerpt, cameras, target, FEW, device=device)
 
@@ -185,7 +183,7 @@ def test_targets_that_every_quality_meets(device, lego_excerpt, cameras):
 
 
 def test_without_cameras_the_quantiser_alone_is_left(lego_excerpt):
-    options = dataclasses.replace(FEW, prune=False, compact=False)
+    options = FEW.changed(prune=False, compact=False)
     found = encode_to_target(lego_excerpt, None, Target(max_bytes=25_000), options)
     assert 24_500 <= found.encoded.nbytes <= 25_000
     assert len(found.encoded.order) == len(lego_excerpt)
@@ -194,7 +192,7 @@ def test_without_cameras_the_quantiser_alone_is_left(lego_excerpt):
 
 
 def test_what_is_given_stays(device, lego_excerpt, cameras):
-    options = dataclasses.replace(FEW, count=500, sf_scale=777.0, sweep=SweepOptions(memory=0))
+    options = FEW.changed(prune={"count": 500}, code={"sf_scale": 777.0}, memory=0)
     found = encode_to_target(lego_excerpt, cameras, Target(max_bytes=9_000), options, device=device)
     assert len(found.encoded.order) == 500
     assert found.options.parameters.sf_scale == 777
@@ -216,7 +214,7 @@ def test_colours_may_be_fitted_to_ground_truth(device, lego_excerpt, cameras, tm
         with (tmp_path / f"{camera.name}.png").open("wb") as file:
             write_png(file, to_8_bits(shown.render(camera)[0]))
     shown.free()
-    options = EncodeOptions.for_preset("fast", iterations=6, ground_truth=tmp_path)
+    options = EncodeOptions.for_preset("fast", prune={"iterations": 6}, refit={"ground_truth": tmp_path})
     target = Target(min_psnr=42)
     assert target.inside(encode_to_target(lego_excerpt, cameras, target, options, device=device).value)
     with pytest.raises(UnreachableError, match="quality 1 gives 4"):
@@ -226,7 +224,7 @@ def test_colours_may_be_fitted_to_ground_truth(device, lego_excerpt, cameras, tm
 def test_a_cpu_takes_over(lego_excerpt, cameras, caplog):
     """From a device whose memory does not hold the scene's views."""
     skip_without_cpu()
-    options = EncodeOptions.for_preset("fast", iterations=3)
+    options = EncodeOptions.for_preset("fast", prune={"iterations": 3})
     target = Target(max_bytes=20_000)
     wanted = encode_to_target(lego_excerpt, cameras, target, options)
     small = Device()
@@ -300,7 +298,7 @@ def test_typical_values_grow():
 
 
 def test_qualities_from_fineness():
-    for axis in (AXIS, _Axis(dataclasses.replace(FEW, sf_sh=7.0))):
+    for axis in (AXIS, _Axis(FEW.changed(code={"sf_sh": 7.0}))):
         for q in (0, 0.00123, 0.1, 0.5, 1):
             assert axis.quality(axis.fineness(q)) == pytest.approx(q, abs=1e-5)
         assert axis.quality(axis.fineness(0) - 1) == 0
@@ -308,24 +306,24 @@ def test_qualities_from_fineness():
 
 
 def test_steps_of_another_quality():
-    some = dataclasses.replace(FEW, q=0.5, sf_scale=9.0)
-    mixed, finer = _with_steps(some, 0.7).parameters, dataclasses.replace(some, q=0.7).parameters
+    some = FEW.changed(q=0.5, code={"sf_scale": 9.0})
+    mixed, finer = _with_steps(some, 0.7).parameters, some.changed(q=0.7).parameters
     for field in dataclasses.fields(mixed):
         source = finer if field.name.startswith("sf_") or field.name in ("beta", "gamma") else some.parameters
         assert getattr(mixed, field.name) == getattr(source, field.name), field.name
 
 
 def test_steps_of_colours():
-    plain = dataclasses.replace(FEW, q=0.5, sf_dc=9.0)
+    plain = FEW.changed(q=0.5, code={"sf_dc": 9.0})
     finer = _with_colour_steps(plain, plain, 0.1)
-    assert finer == dataclasses.replace(plain, sf_sh=plain.parameters.sf_sh * math.exp(0.1))
-    both = dataclasses.replace(plain, sf_sh=7.0)
+    assert finer == plain.changed(code={"sf_sh": plain.parameters.sf_sh * math.exp(0.1)})
+    both = plain.changed(code={"sf_sh": 7.0})
     assert _with_colour_steps(both, both, 0.1) == both
 
 
 def test_every_try_is_called_by_its_name(device, lego_excerpt, cameras):
     lines = []
-    options = EncodeOptions.for_preset("best", iterations=6)
+    options = EncodeOptions.for_preset("best", prune={"iterations": 6})
     found = encode_to_target(lego_excerpt, cameras, Target(min_psnr=47), options, device=device, tell=lines.append)
     assert len(lines) == len(found.tries)
     for line, step in zip(lines, found.tries, strict=True):

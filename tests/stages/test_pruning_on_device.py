@@ -9,11 +9,10 @@ import pytest
 
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.pruning.schedule import PruningOptions, SmoothedEffects, choose, prune
-from tests.cases.refit import visible_scene
-from tests.cases.scenes import ring_of_cameras
 from tests.devices import KERNELS, open_device
 
 OPTIONS = PruningOptions(2e-6, 8)

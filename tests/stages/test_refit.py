@@ -9,15 +9,12 @@ import pytest
 
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
+from potr_cl.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
+from potr_cl.reference.refit_cases import Case, Linearised, Pictures
+from potr_cl.reference.scenes import plain_splats, ring_of_cameras, straight_camera, tilted_camera, visible_scene
 from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, active_coefficients, refit_colours
-from tests.cases.refit import Case, Linearised, Pictures, visible_scene
-from tests.cases.scenes import ring_of_cameras
-from tests.cases.splats import camera as straight_camera
-from tests.cases.splats import splats as plain_splats
-from tests.cases.splats import tilted_camera
 from tests.devices import KERNELS, open_device
-from tests.oracles.refit import LENGTHS, selection, to_rgb, to_ycocg
 
 
 @pytest.fixture(scope="module", params=KERNELS)

@@ -11,12 +11,12 @@ from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import INRIA, Rasterizer
+from potr_cl.reference import raster as reference
+from potr_cl.reference.removal import BruteForce
+from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions, default_memory
 from potr_cl.stages.pruning.schedule import PruningOptions, prune
-from tests.cases.scenes import random_scene, ring_of_cameras
 from tests.devices import KERNELS, open_device
-from tests.oracles import raster as reference
-from tools.study.removal_exactness import BruteForce
 
 
 @pytest.fixture(scope="module", params=KERNELS)
@@ -24,17 +24,6 @@ def device(request):
     device = open_device(request.param)
     yield device
     assert device.allocated == 0, "a sweep did not give all its memory back"
-
-
-def visible_scene(splats: int, degree: int = 0, seed: int = 0) -> Scene:
-    """Few layers, splats of several pixels: no pixel ends early, so that brute force measures the same thing."""
-    scene = random_scene(splats, degree, seed)
-    rng = np.random.default_rng(seed + 100)
-    return dataclasses.replace(
-        scene,
-        log_scales=rng.normal(-2, 0.5, size=(splats, 3)).astype(np.float32),
-        opacity_logits=rng.normal(-1, 1.5, size=splats).astype(np.float32),
-    )
 
 
 def without(scene: Scene, gone) -> Scene:
@@ -91,7 +80,7 @@ def test_single_removals(device, background):
 
 def test_single_removals_when_others_are_gone(device):
     # Black twins in front of white splats; once they are gone, the picture is too bright.
-    scene = visible_scene(25, seed=3).subset(np.tile(np.arange(25), 2))
+    scene = visible_scene(25, 0, seed=3).subset(np.tile(np.arange(25), 2))
     scene.sh[:, 0] = np.where(np.arange(50) < 25, -2, 2)[:, None]
     scene.opacity_logits[:25] = 3
     cameras = ring_of_cameras(2, size=48)
@@ -241,7 +230,7 @@ def test_tightened_lists_change_no_result(device, lego_excerpt, lego_excerpt_cam
 
 def test_tightened_lists_keep_what_is_hidden(device):
     """Behind the end of all pixels, intersections stay: they come back when what hides them goes."""
-    scene = visible_scene(30, seed=4).subset(np.arange(60) % 30)
+    scene = visible_scene(30, 0, seed=4).subset(np.arange(60) % 30)
     scene.log_scales[:30], scene.opacity_logits[:30] = 3, 12  # thirty walls
     cameras = ring_of_cameras(2, size=32)
     effects = {}
@@ -260,7 +249,7 @@ def test_tightened_lists_keep_what_is_hidden(device):
 
 def test_a_removal_lets_pixels_go_on(device):
     """Where pixels end early, effects are those of the same limit on transmittance; small limits leave no jump."""
-    scene = visible_scene(300, seed=2).subset(np.repeat(np.arange(300), 3))
+    scene = visible_scene(300, 0, seed=2).subset(np.repeat(np.arange(300), 3))
     scene.opacity_logits[:] = 2
     cameras = ring_of_cameras(1, size=40)
     some = np.arange(0, 900, 10)
@@ -327,7 +316,7 @@ def test_options_out_of_range(bad):
 
 
 def test_a_view_that_sees_nothing_changes_only_the_mean(device):
-    scene = visible_scene(30)
+    scene = visible_scene(30, 0)
     cameras = ring_of_cameras(1, size=48)
     away = dataclasses.replace(cameras[0], name="away", translation=np.array([0, 0, -50.0]))
     rasterizer, removal = sweep(device, scene, cameras)
@@ -341,7 +330,7 @@ def test_a_view_that_sees_nothing_changes_only_the_mean(device):
 
 
 def test_views_of_different_sizes_count_the_same(device):
-    scene = visible_scene(30)
+    scene = visible_scene(30, 0)
     large = ring_of_cameras(2, size=96)[0]
     small = ring_of_cameras(2, size=48)[1]
     separate = []
@@ -359,7 +348,7 @@ def test_views_of_different_sizes_count_the_same(device):
 @pytest.mark.parametrize("share", [0.2, 0.3, 0.5, 0.7, 0.95])
 def test_the_memory_budget_is_used_and_not_exceeded(device, share):
     """Lists first, then geometry of as many views as there is room for; the effects are the same whatever is kept."""
-    scene = visible_scene(3000)
+    scene = visible_scene(3000, 0)
     cameras = ring_of_cameras(40, size=48)
     rasterizer = Rasterizer(device, scene)
 
@@ -384,7 +373,7 @@ def test_the_memory_budget_is_used_and_not_exceeded(device, share):
 
 
 def test_identical_splats_share_their_effect(device):
-    scene = visible_scene(1).subset(np.zeros(40, np.int64))
+    scene = visible_scene(1, 0).subset(np.zeros(40, np.int64))
     cameras = ring_of_cameras(2, size=48)
     rasterizer, removal = sweep(device, scene, cameras)
     effect, importance = removal.measure()
@@ -395,7 +384,7 @@ def test_identical_splats_share_their_effect(device):
 
 
 def test_pruning_to_one_splat(device):
-    scene = visible_scene(40)
+    scene = visible_scene(40, 0)
     cameras = ring_of_cameras(2, size=48)
     rasterizer, removal = sweep(device, scene, cameras)
     pruned = prune(removal, 40, PruningOptions(np.inf, 5))
@@ -422,7 +411,7 @@ def test_pruning_keeps_the_picture_better_than_importance(device, lego_excerpt, 
 
 
 def test_no_view_is_an_error(device):
-    rasterizer = Rasterizer(device, visible_scene(3))
+    rasterizer = Rasterizer(device, visible_scene(3, 0))
     with pytest.raises(UsageError, match="at least one view"):
         RemovalSweep(rasterizer, [])
     rasterizer.free()

@@ -1,4 +1,6 @@
-"""Speed of the rasterizer: python -m tools.bench.rasterizer frames SCENE … | growth | plot FILE LABEL=JSON …
+"""Speed of the rasterizer.
+
+    python -m tools.bench.rasterizer frames SCENE … | growth | plot FILE LABEL=JSON …
 
 frames: frames a second of a scene's training views, finished one by one with the picture left on the device, and the
 device's time a stage. A SCENE is a folder with point_cloud.ply and cameras.json; where it has reference/metrics.json,
@@ -6,7 +8,7 @@ gsplat's figure stands beside.
 growth: time against the number of splats, of pixels, and the overlap, on synthetic scenes. plot: draws what
 growth --json wrote, on one or several devices.
 
-Prints Markdown for docs/benchmarks.md, or JSON with --json.
+Prints Markdown for docs/benchmarks, or JSON with --json.
 """
 
 from __future__ import annotations

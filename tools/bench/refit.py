@@ -1,7 +1,7 @@
-"""What the joint re-fit of the colours brings and takes: python -m tools.bench.refit measure SCENE … --json OUT.json
+"""What the joint re-fit of the colours brings and takes.
 
-python -m tools.bench.refit measure SCENE … --json OUT.json [--removed PART …] [--drops X …] [--every N] [--quality Q]
-python -m tools.bench.refit report OUT.json [--images DIR]
+    python -m tools.bench.refit measure SCENE … --json OUT.json [--removed PART …] [--drops X …] [options]
+    python -m tools.bench.refit report OUT.json [--images DIR]
 
 A SCENE is a folder with point_cloud.ply, cameras.json with test views and, if it has any, photographs in images.
 ``measure`` looks at
@@ -41,14 +41,15 @@ from potr_cl.model.camera import test_views, train_views
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.reduction import reduce_scene
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, active_coefficients
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
-from tools.study.rate_distortion import size_at, write_json
+from tools.results import circumstances, write_json
+from tools.study.rate_distortion import size_at
+from tools.workloads import reduced, study_parser
 
 #: By name: whether splat by splat (the paper's compaction) comes first, and how the re-fit is done, if at all.
 WAYS = {
@@ -105,8 +106,9 @@ class Bench:
 
     def reduced(self, removed: float, compact: bool) -> Scene:
         count = max(round((1 - removed) * len(self.scene)), 1)
-        options = dataclasses.replace(self.options, count=count, compact=compact)
-        return reduce_scene(self.scene, self.train, options, device=self.device)[0]
+        return reduced(
+            self.scene, self.train, self.options.changed(prune={"count": count}, compact=compact), self.device
+        )
 
     def decoded(self, scene: Scene) -> tuple[int, Scene, NDArray[np.int64]]:
         """Bytes, the decoded scene, and the number in ``scene`` of each of its splats."""
@@ -241,11 +243,11 @@ def _seconds(work: Callable[[], Any]) -> float:
 
 def _measure(args: argparse.Namespace) -> None:
     device = Device(args.device)
-    options = EncodeOptions(q=args.quality, preset=args.preset, iterations=args.iterations)
+    options = EncodeOptions.for_preset(args.preset, q=args.quality, prune={"iterations": args.iterations})
     refit = RefitOptions(steps=args.steps, prior=args.prior)
     results: dict[str, Any] = {
-        "device": device.info.name, "q": args.quality, "preset": args.preset, "steps": args.steps,
-        "prior": args.prior, "every": args.every, "scenes": {},
+        **circumstances(device.info), "device": device.info.name, "q": args.quality, "preset": args.preset,
+        "steps": args.steps, "prior": args.prior, "every": args.every, "scenes": {},
     }  # fmt: skip
     for folder in args.scenes:
         bench = Bench(folder, device, options, refit, args.every)
@@ -353,11 +355,7 @@ def _plot(name: str, entry: dict[str, Any], keys: list[str], path: Path) -> None
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(required=True)
-    measure = commands.add_parser("measure")
-    measure.add_argument("scenes", nargs="+", type=Path)
-    measure.add_argument("--json", type=Path, required=True)
+    parser, measure, report = study_parser(__doc__, _measure, _report)
     measure.add_argument("--removed", nargs="+", type=float, default=REMOVED, help="parts of the splats")
     measure.add_argument("--drops", nargs="*", type=float, default=DROPS, help="mean squared errors a coefficient")
     measure.add_argument("--quality", type=float, default=0.5)
@@ -367,12 +365,7 @@ def main() -> None:
     measure.add_argument("--prior", type=float, default=RefitOptions.prior)
     measure.add_argument("--most-steps", type=int, default=max(STEPS), help="of the parts steps and cuts")
     measure.add_argument("--every", type=int, default=1, help="look at every N-th view only")
-    measure.add_argument("--device")
-    measure.set_defaults(run=_measure)
-    report = commands.add_parser("report")
-    report.add_argument("results", type=Path)
     report.add_argument("--images", type=Path)
-    report.set_defaults(run=_report)
     args = parser.parse_args()
     args.run(args)
 

@@ -1,4 +1,6 @@
-"""The rasterizer on every OpenCL runtime of this machine: python -m tools.stress.platforms [--scenes FOLDER]
+"""The rasterizer on every OpenCL runtime of this machine.
+
+    python -m tools.stress.platforms [--scenes FOLDER]
 
 Each device and kernel family runs in a process of its own, so that a runtime that crashes is one row of the table. What
 is checked: the device's self-check; small random scenes of every SH degree and both rules against the float64
@@ -34,17 +36,23 @@ from potr_cl.opencl.discovery import DeviceInfo, list_devices
 from potr_cl.quality.metrics import ssim
 from potr_cl.quality.metrics_device import Picture, Similarity
 from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.reference import raster as reference
+from potr_cl.reference.refit import Array, to_ycocg
+from potr_cl.reference.refit_cases import Case, Linearised, Pictures
+from potr_cl.reference.scenes import (
+    plain_splats,
+    random_splats,
+    ring_of_cameras,
+    straight_camera,
+    tilted_camera,
+    visible_scene,
+)
 from potr_cl.stages.compaction.ridge import Compactor, ViewWeights
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
 from potr_cl.stages.refitting.targets import RenderedTargets
-from tests.cases.refit import Case, Linearised, Pictures, visible_scene
-from tests.cases.scenes import ring_of_cameras
-from tests.cases.splats import camera, random_splats, splats, tilted_camera
-from tests.oracles import raster as reference
-from tests.oracles.refit import Array, to_ycocg
 
 #: As in the tests: pixels that come no nearer, relatively, to 1/255 and 1e-4 cannot flip.
 CLEAR = 1e-4
@@ -208,8 +216,8 @@ def simulate(what: str) -> None:
         for degree in (1, 2, 3):
             Compactor(device).compact(random_splats(60, degree, seed=2), camera_centres(views), weights)
         centres = np.random.default_rng(0).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (5000, 3))
-        kept.append(Rasterizer(device, splats(centres, sigma=1e-3, logit=1)))
-        kept[-1].render(camera(16, 16))  # a list longer than local memory
+        kept.append(Rasterizer(device, plain_splats(centres, sigma=1e-3, logit=1)))
+        kept[-1].render(straight_camera(16, 16))  # a list longer than local memory
         check_similarity(device)
 
 

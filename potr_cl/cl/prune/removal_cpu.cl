@@ -22,6 +22,7 @@
 #include "include/subtile_vectors.clh"
 #include "include/subtile_walk.clh"
 #include "prune/removal.clh"
+#include "prune/staleness_cpu.clh"
 
 /* Where a list's transmittances are kept at the most; of the segments between two of them those before are walked again. */
 #define CHECKPOINTS 16
@@ -235,24 +236,4 @@ kernel void removal(
         replace_sums(totals + TOTAL_WORDS * intersections[e], sums[e], (float2)(0.0f, 0.0f), scale, bound);
         sums[e] = (float2)(0.0f, 0.0f);
     }
-}
-
-/* Adds to each tile's staleness how much of its area the splats that have just gone (alive == 2) covered when it was last
-   swept. */
-kernel void staleness(
-    global const uchar *alive,
-    global const uint *begins,
-    global const uint *lengths,
-    global const uint *intersections,
-    global const float2 *sums,
-    uint first,
-    global float *stale)
-{
-    const uint tile = get_global_id(0);
-    const uint begin = begins[tile], end = begin + lengths[tile];
-    float gone = 0.0f;
-    for (uint e = begin; e < end; ++e)
-        if (alive[intersections[e]] == 2 && sums[e].y >= 0.0f)
-            gone += fmax(sums[e].y, LEAST_STALENESS);
-    stale[first + tile] += gone * (1.0f / (TILE * TILE));
 }

@@ -28,6 +28,7 @@ from potr_cl.formats.cameras.view_files import (
     stem,
     view_names,
 )
+from potr_cl.formats.declaration import CameraFormat
 from potr_cl.model.camera import Camera
 
 _log = logging.getLogger("potr_cl")
@@ -36,7 +37,7 @@ _log = logging.getLogger("potr_cl")
 def load(path: Path) -> list[Camera]:
     """Read the views of a cameras.json.
 
-    Photographs are looked for in the folder ``images`` beside it.
+    Ground truth is looked for in the folder ``images`` beside it.
 
     Args:
         path: of the file.
@@ -66,7 +67,19 @@ def parse(content: Any, path: Path) -> list[Camera]:
     ]
 
 
-def _camera(view: dict[str, Any], name: str, path: Path, photograph: Path | None, marked: bool) -> Camera:
+FORMAT = CameraFormat(
+    name="cameras.json",
+    suffixes=(".json",),
+    note="of the original implementation; a `split` entry a view, `train` or `test`, is honoured",
+    recognises=lambda path, content: isinstance(content, list),
+    load=lambda path, content: parse(content, path),
+    is_in=lambda folder: (folder / "cameras.json").exists(),
+    load_folder=lambda folder: load(folder / "cameras.json"),
+    json_mark="a list",
+)
+
+
+def _camera(view: dict[str, Any], name: str, path: Path, ground_truth: Path | None, marked: bool) -> Camera:
     where = f"'{path}', view '{name}'"
     for key in ("width", "height", "fx", "fy", "rotation", "position", *(["split"] if marked else [])):
         if key not in view:
@@ -89,7 +102,7 @@ def _camera(view: dict[str, Any], name: str, path: Path, photograph: Path | None
         rotation=rotation,
         translation=-rotation @ matrix(view["position"], [(3,)], f"{where}: 'position'"),
         split=split,
-        image_path=photograph,
+        image_path=ground_truth,
     )
 
 

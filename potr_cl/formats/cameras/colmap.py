@@ -27,7 +27,11 @@ from potr_cl.formats.cameras.view_files import (
     read_bytes,
     view_names,
 )
+from potr_cl.formats.declaration import CameraFormat, install_command
 from potr_cl.model.camera import Camera
+
+#: Of this package, which brings pycolmap.
+EXTRA = "colmap"
 
 #: COLMAP's pinhole models: their number in binary files and how many parameters they have.
 _PINHOLES = {"SIMPLE_PINHOLE": (0, 3), "PINHOLE": (1, 4)}
@@ -46,7 +50,7 @@ def is_model(folder: Path) -> bool:
 def load(folder: Path) -> list[Camera]:
     """Read the views of a sparse model.
 
-    Each 8th image by name is a test view, as in the field's benchmarks. Photographs are looked for in a folder
+    Each 8th image by name is a test view, as in the field's benchmarks. Ground truth is looked for in a folder
     ``images`` beside the model or up to two folders above it.
 
     Args:
@@ -72,7 +76,20 @@ def load(folder: Path) -> list[Camera]:
     ]
 
 
-def _camera(path: Path, image: Any, lens: Any, name: str, split: str, photograph: Path | None) -> Camera:
+FORMAT = CameraFormat(
+    name="COLMAP model (cameras and images as .bin or .txt)",
+    suffixes=(".bin", ".txt"),
+    note="binary or text, also in the folder `sparse/0` or `sparse`; every 8th view by name is a test view",
+    recognises=lambda path, content: is_model(path.parent),
+    load=lambda path, content: load(path.parent),
+    is_in=is_model,
+    load_folder=load,
+    subfolders=("sparse/0", "sparse"),
+    extra=EXTRA,
+)
+
+
+def _camera(path: Path, image: Any, lens: Any, name: str, split: str, ground_truth: Path | None) -> Camera:
     pose = image.cam_from_world()
     if not abs(math.hypot(*pose.rotation.quat) - 1) < 1e-3:  # zero would silently mean no rotation
         raise DataError(f"'{path}', view '{name}': its rotation is not a unit quaternion")
@@ -89,7 +106,7 @@ def _camera(path: Path, image: Any, lens: Any, name: str, split: str, photograph
         rotation=world_to_camera[:, :3],
         translation=world_to_camera[:, 3],
         split=split,
-        image_path=photograph if photograph and os.path.isfile(photograph) else None,
+        image_path=ground_truth if ground_truth and os.path.isfile(ground_truth) else None,
     )
 
 
@@ -126,7 +143,7 @@ def _pycolmap() -> ModuleType:
     try:
         import pycolmap
     except ImportError as error:
-        raise UsageError('reading COLMAP models needs pycolmap: pip install "potr-cl[colmap]"') from error
+        raise UsageError(f"reading COLMAP models needs pycolmap: {install_command(EXTRA)}") from error
     return pycolmap  # type: ignore[no-any-return]
 
 

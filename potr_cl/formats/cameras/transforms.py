@@ -23,7 +23,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from potr_cl.errors import DataError
 from potr_cl.formats.cameras.view_files import (
@@ -38,6 +37,7 @@ from potr_cl.formats.cameras.view_files import (
     read_json,
     view_names,
 )
+from potr_cl.formats.declaration import CameraFormat
 from potr_cl.model.camera import Camera
 
 _log = logging.getLogger("potr_cl")
@@ -88,10 +88,33 @@ def load(path: Path) -> list[Camera]:
     return parse([(read_json(path), path)])
 
 
+def is_in(folder: Path) -> bool:
+    """Whether a folder holds a transforms file under one of its usual names."""
+    return any((folder / name).exists() for name in ("transforms_train.json", "transforms.json"))
+
+
 def load_folder(folder: Path) -> list[Camera]:
-    """Read ``transforms_train.json`` and, if there is one, ``transforms_test.json``; see :func:`load`."""
+    """Read a folder's ``transforms_train.json`` and, if there is one, ``transforms_test.json``; see :func:`load`.
+
+    Without the former, read ``transforms.json``.
+    """
     paths = [folder / "transforms_train.json", folder / "transforms_test.json"]
+    if not paths[0].exists():
+        return load(folder / "transforms.json")
     return parse([(read_json(path), path) for path in paths if path.exists()])
+
+
+FORMAT = CameraFormat(
+    name="transforms.json",
+    suffixes=(".json",),
+    note="of Blender (`transforms_train.json`, `transforms_test.json`) and of nerfstudio, with its "
+    "`dataparser_transforms.json`",
+    recognises=lambda path, content: isinstance(content, dict) and "frames" in content,
+    load=lambda path, content: parse([(content, path)]),
+    is_in=is_in,
+    load_folder=load_folder,
+    json_mark="with 'frames'",
+)
 
 
 def parse(contents: list[tuple[Any, Path]]) -> list[Camera]:
@@ -200,6 +223,8 @@ def _image_size(frame: _Frame, image: Path) -> tuple[int, int]:
     width, height = frame.get("w"), frame.get("h")
     if width is not None and height is not None:
         return image_side(width, frame.where("w")), image_side(height, frame.where("h"))
+    from PIL import Image  # imported on use: most files name the size
+
     try:
         with Image.open(image) as header:  # reads no pixels
             return header.size

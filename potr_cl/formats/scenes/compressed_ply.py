@@ -6,7 +6,9 @@ import os
 import re
 
 from potr_cl.errors import DataError
-from potr_cl.formats.scenes.gsply_arrays import file_size, from_scene, library, reading, to_scene
+from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.scenes.gsply_arrays import EXTRA, from_scene, library, to_scene
+from potr_cl.formats.scenes.scene_files import file_size, reading
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 
@@ -51,6 +53,17 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
     gsply = library(path)
     with replacing(path) as file:
         file.write(gsply.compress_to_bytes(from_scene(gsply, scene)))
+
+
+FORMAT = SceneFormat(
+    name="compressed PLY",
+    suffixes=(".compressed.ply",),
+    note="of SuperSplat and splat-transform; a `.ply` with this content is read too",
+    load=load,
+    save=save,
+    extra=EXTRA,
+    recognises=is_compressed_ply,
+)
 
 
 def _check(path: str | os.PathLike[str], size: int) -> None:

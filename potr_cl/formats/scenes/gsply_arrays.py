@@ -1,21 +1,20 @@
-"""What the formats that the library gsply reads and writes share: the library itself, its arrays, its errors."""
+"""What the formats that the library gsply reads and writes share: the library itself, and its arrays."""
 
 from __future__ import annotations
 
-import contextlib
-import logging
 import os
-import stat
-from collections.abc import Iterator
 from typing import Any
 
 import numpy as np
 
 from potr_cl.codec import octree
-from potr_cl.errors import DataError, PotrError, UsageError
+from potr_cl.errors import UsageError
+from potr_cl.formats.declaration import install_command
+from potr_cl.formats.scenes.scene_files import cleaned, first_line
 from potr_cl.model.scene import Scene
 
-_log = logging.getLogger("potr_cl")
+#: Of this package, which brings the library.
+EXTRA = "convert"
 
 _LARGEST_LOGIT = np.float32(20)
 
@@ -32,38 +31,10 @@ def library(path: str | os.PathLike[str]) -> Any:
         import gsply.spz
     except ImportError as error:
         raise UsageError(
-            f"'{path}': this kind of file needs the library gsply, which cannot be loaded ({_one_line(error)}): "
-            'pip install "potr-cl[convert]"'
+            f"'{path}': this kind of file needs the library gsply, which cannot be loaded ({first_line(error)}): "
+            f"{install_command(EXTRA)}"
         ) from None
     return gsply
-
-
-def file_size(path: str | os.PathLike[str]) -> int:
-    """Bytes of a regular file.
-
-    Raises:
-        UsageError: there is none at ``path``.
-    """
-    try:
-        status = os.stat(path)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"cannot open '{path}': {getattr(error, 'strerror', None) or error}") from error
-    if not stat.S_ISREG(status.st_mode):
-        raise UsageError(f"'{path}' is not a regular file")
-    return status.st_size
-
-
-@contextlib.contextmanager
-def reading(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn whatever a library raises over a bad file into a DataError."""
-    try:
-        yield
-    except (PotrError, MemoryError):
-        raise
-    except PermissionError as error:
-        raise UsageError(f"cannot open '{path}': {error.strerror}") from error
-    except Exception as error:
-        raise DataError(f"'{path}' is damaged or of another kind: {_one_line(error)}") from error
 
 
 def to_scene(path: str | os.PathLike[str], data: Any) -> Scene:
@@ -88,15 +59,7 @@ def to_scene(path: str | os.PathLike[str], data: Any) -> Scene:
     scene = Scene(
         single(data.means), single(data.scales), single(data.quats), single(data.opacities).reshape(count), sh
     )
-    try:
-        scene, report = scene.cleaned()
-    except DataError as error:
-        raise DataError(f"'{path}': {error}") from error
-    if report.non_finite:
-        _log.warning("'%s': dropped %d splats with non-finite values", path, report.non_finite)
-    if report.zero_quaternions:
-        _log.warning("'%s': turned %d quaternions of length zero into no rotation", path, report.zero_quaternions)
-    return scene
+    return cleaned(path, scene)
 
 
 def from_scene(gsply: Any, scene: Scene) -> Any:
@@ -117,8 +80,3 @@ def from_scene(gsply: Any, scene: Scene) -> Any:
         shN=np.ascontiguousarray(scene.sh[:, 1:]) if scene.sh_degree else None,
         format="ply",
     )
-
-
-def _one_line(error: BaseException) -> str:
-    lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__

@@ -16,6 +16,8 @@ from numpy.typing import NDArray
 from plyfile import PlyData, PlyElement, PlyListProperty
 
 from potr_cl.errors import DataError, UsageError
+from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.scenes.scene_files import cleaned
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
@@ -76,17 +78,7 @@ def load(path: str | os.PathLike[str]) -> Scene:
             scene = _read(path, stream, status.st_size)
         except OSError as error:
             raise DataError(f"cannot read '{path}': {error.strerror or error}") from error
-    try:
-        scene, report = scene.cleaned()
-    except DataError as error:
-        raise DataError(f"'{path}': {error}") from error
-    if report.non_finite:
-        _log.warning("'%s': dropped %d splats with non-finite values", path, report.non_finite)
-    if report.infinite_opacities:
-        _log.warning("'%s': made %d infinite opacity logits finite", path, report.infinite_opacities)
-    if report.zero_quaternions:
-        _log.warning("'%s': turned %d quaternions of length zero into no rotation", path, report.zero_quaternions)
-    return scene
+    return cleaned(path, scene)
 
 
 def save(path: str | os.PathLike[str], scene: Scene) -> None:
@@ -123,6 +115,16 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
             block[:, -7:-4] = scene.log_scales[span]
             block[:, -4:] = scene.quaternions[span]
             file.write(block.data)
+
+
+FORMAT = SceneFormat(
+    name="3DGS PLY",
+    suffixes=(".ply",),
+    note="as the original implementation, gsplat, nerfstudio, Postshot, Brush and SuperSplat write it: SH degree 0 to "
+    "3, binary or ASCII, properties in any order; the original layout is written",
+    load=load,
+    save=save,
+)
 
 
 def _property_names(rest: int) -> list[str]:

@@ -9,10 +9,10 @@ import os
 import zipfile
 from typing import Any
 
-from PIL import Image
-
 from potr_cl.errors import DataError
-from potr_cl.formats.scenes.gsply_arrays import file_size, library, reading, to_scene
+from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.scenes.gsply_arrays import EXTRA, library, to_scene
+from potr_cl.formats.scenes.scene_files import file_size, reading
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 
 #: What is packed in a SOG file is compressed already; only its description shrinks.
@@ -39,8 +39,20 @@ def load(path: str | os.PathLike[str]) -> Scene:
     return to_scene(path, data)
 
 
+FORMAT = SceneFormat(
+    name="SOG",
+    suffixes=(".sog",),
+    note="of PlayCanvas; version 2 is read",
+    load=load,
+    not_written="nothing here writes .sog: convert to .ply, and that with splat-transform",
+    extra=EXTRA,
+)
+
+
 def _check(path: str | os.PathLike[str], size: int) -> None:
     """Check everything that the library believes: sizes of files and images, and what indexes what."""
+
+    from PIL import Image  # imported on use: few read this format
 
     def damaged(what: str) -> DataError:
         return DataError(f"'{path}' is damaged: {what}")

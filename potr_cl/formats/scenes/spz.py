@@ -19,7 +19,9 @@ import numpy as np
 import zstandard
 
 from potr_cl.errors import DataError
-from potr_cl.formats.scenes.gsply_arrays import file_size, from_scene, library, reading, to_scene
+from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.scenes.gsply_arrays import EXTRA, from_scene, library, to_scene
+from potr_cl.formats.scenes.scene_files import file_size, reading
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 
@@ -90,6 +92,16 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
         gsply.spz.write_spz(temporary, from_scene(gsply, scene), version=3, fractional_bits=bits)
         with temporary.open("rb") as written:
             shutil.copyfileobj(written, file)
+
+
+FORMAT = SceneFormat(
+    name="SPZ",
+    suffixes=(".spz",),
+    note="of Niantic; versions 1 to 4 are read, version 3, which every reader knows, is written",
+    load=load,
+    save=save,
+    extra=EXTRA,
+)
 
 
 def _check(path: str | os.PathLike[str], size: int) -> int:

@@ -23,6 +23,7 @@ from potr_cl.errors import DeviceMemoryError, UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner
 from potr_cl.raster.rasterizer import TILE, Rasterizer, ViewSet, camera_struct, gpu_limits, totals_limits
 from potr_cl.raster.view_cache import ViewCache
 
@@ -136,7 +137,7 @@ class _Swept:
             device.free(buffer)
 
 
-class RemovalSweep:
+class RemovalSweep(Owner):
     """Measures removal effects and importances while splats are taken out.
 
     Args:
@@ -648,6 +649,9 @@ class RemovalSweep:
         self._settle()
         if self._kept_tiles:
             cl.enqueue_fill_buffer(self._device.queue, self._stale, np.float32(np.inf), 0, 4 * self._kept_tiles)
+
+    def close(self) -> None:
+        self.free()
 
     def free(self) -> None:
         """Give all device memory back."""

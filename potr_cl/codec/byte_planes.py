@@ -1,0 +1,42 @@
+"""Integers to byte planes and back, as every coder but the context coder stores them (docs/format.md, "Integers")."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+
+def pack_integers(values: NDArray[np.integer], signed: bool) -> tuple[bytes, int]:
+    """Integers to byte planes, lowest byte first; zig-zag mapped (0, −1, 1, −2, …) if signed.
+
+    Returns:
+        The planes one after another, and their number: the fewest that hold the largest integer, 0 if all are 0.
+    """
+    wide = values.astype(np.int64)
+    mapped = ((wide << 1) ^ (wide >> 63)).view(np.uint64) if signed else wide.view(np.uint64)
+    planes = (int(mapped.max(initial=0)).bit_length() + 7) // 8
+    columns = mapped.astype("<u8", copy=False).view(np.uint8).reshape(-1, 8)
+    return b"".join(columns[:, p].tobytes() for p in range(planes)), planes
+
+
+def unpack_integers(raw: NDArray[np.uint8], planes: int, signed: bool, start: int, stop: int) -> NDArray[np.integer]:
+    """Integers ``start`` to ``stop`` of byte planes, in the narrowest integer type that holds that many planes."""
+    count = len(raw) // planes if planes else 0
+    if planes == 0:
+        return np.zeros(stop - start, np.int8)
+    if planes == 1:
+        mapped: NDArray[np.unsignedinteger] = raw[start:stop]
+    else:
+        dtype = np.uint16 if planes == 2 else np.uint32 if planes <= 4 else np.uint64
+        mapped = raw[(planes - 1) * count + start : (planes - 1) * count + stop].astype(dtype)
+        for p in reversed(range(planes - 1)):
+            mapped <<= dtype(8)
+            mapped |= raw[p * count + start : p * count + stop]
+    if not signed:
+        return mapped
+    half = mapped >> mapped.dtype.type(1)
+    sign = mapped & mapped.dtype.type(1)
+    # 0 − 1 wraps round to all ones, as it should.
+    np.subtract(mapped.dtype.type(0), sign, out=sign)
+    half ^= sign
+    return half.view(half.dtype.str.replace("u", "i"))

@@ -1,0 +1,184 @@
+"""The versions of the file format, one class each: :data:`VERSIONS`.
+
+A version says what integers are made of a scene's values and what values are made of the integers again: widths of
+steps, rotations, opacities, the octree's leaf levels; and what its files may hold. Everything else that reads or writes
+files asks the version and never compares its number. docs/format.md is the normative description.
+
+To add a version: a subclass of :class:`FormatVersion` with what differs, and a line in :data:`VERSIONS`. Which version
+is written follows from the hyper-parameters (:class:`potr_cl.codec.quantize.HyperParameters`).
+"""
+
+from __future__ import annotations
+
+import abc
+from collections.abc import Iterable, Sequence
+from dataclasses import replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec import quantize
+from potr_cl.codec.quantize import F32, F64, HyperParameters, Integers
+from potr_cl.codec.sections import Coder
+from potr_cl.errors import UsageError
+from potr_cl.host.threads import Run
+from potr_cl.model.scene import Scene
+
+Levels = NDArray[np.integer]
+
+
+class FormatVersion(abc.ABC):
+    """What sets a version of the format apart. Defaults are what all versions have in common so far.
+
+    Attributes:
+        number: that stands in the file.
+        coders: that its sections may be stored by. Without CONTEXT, the entropy coder "context" means zstd.
+        separate_ac_factor: whether the header has a scale factor of AC coefficients beside that of DC.
+        absolute_leaf_levels: whether tail lengths are levels of the octree, chosen by the tolerance alone
+            (``absolute`` of :func:`potr_cl.codec.octree.build`).
+        rotations_need_scales: whether rotations can be dequantised only with the levels of the scales at hand.
+    """
+
+    number: ClassVar[int]
+    coders: ClassVar[frozenset[Coder]]
+    separate_ac_factor: ClassVar[bool]
+    absolute_leaf_levels: ClassVar[bool]
+    rotations_need_scales: ClassVar[bool]
+
+    def check(self, parameters: HyperParameters) -> None:
+        """Refuse hyper-parameters that a file of this version cannot tell its decoder.
+
+        Raises:
+            UsageError: there are such.
+        """
+        if not self.separate_ac_factor and parameters.sf_dc != parameters.sf_sh:
+            raise UsageError(
+                f"the scale factors of DC and AC are {parameters.sf_dc:g} and {parameters.sf_sh:g}, but files of "
+                f"version {self.number} (preset paper) have one for both: set both alike or choose another preset"
+            )
+
+    @abc.abstractmethod
+    def in_world_units(self, parameters: HyperParameters, scene: Scene, nearest: F64) -> HyperParameters:
+        """Hyper-parameters whose β is a part of the distance to the nearest camera, and γ and SF_scale in world units.
+
+        Args:
+            parameters: as asked for.
+            scene: that is to be coded.
+            nearest: (N,) float64 distance of each splat to the nearest view, world units; 0 where there is no view.
+        """
+
+    def quantize_scales(self, log_scales: F64, sf_scale: float) -> Integers:
+        """(N,) natural logarithms of standard deviations along one axis to levels, >= 0."""
+        return quantize.quantize_scales(log_scales, sf_scale)
+
+    def dequantize_scales(self, levels: Levels, sf_scale: float) -> F32:
+        """(N,) levels of one axis to natural logarithms of standard deviations."""
+        return quantize.dequantize_scales(levels, sf_scale)
+
+    @abc.abstractmethod
+    def quantize_rotations(
+        self, imaginary: F64, scales: Sequence[Levels], sf_rotation: float, run: Run
+    ) -> Iterable[Integers]:
+        """(N, 3) imaginary parts of unit quaternions to levels of x, y and z, (N,) each; ``scales`` as quantised."""
+
+    @abc.abstractmethod
+    def dequantize_rotations(
+        self, levels: Sequence[Levels], scales: Sequence[Levels], sf_rotation: float, out: F32
+    ) -> None:
+        """Levels of x, y, z to unit quaternions w, x, y, z in ``out`` (N, 4).
+
+        Args:
+            levels: (N,) each.
+            scales: levels of the scales, (N,) for each axis; may be empty unless ``rotations_need_scales``.
+            sf_rotation: scale factor.
+            out: float32.
+        """
+
+    @abc.abstractmethod
+    def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
+        """(N,) logits of opacities to levels, >= 0."""
+
+    @abc.abstractmethod
+    def dequantize_opacities(self, levels: Levels, sf_opacity: float) -> F32:
+        """(N,) levels to logits of opacities."""
+
+
+class Version1(FormatVersion):
+    """The paper's quantiser: uniform steps of every activated value, lengths in world units."""
+
+    number = 1
+    coders = frozenset({Coder.RAW, Coder.ZSTD, Coder.DEFLATE})
+    separate_ac_factor = False
+    absolute_leaf_levels = False
+    rotations_need_scales = False
+
+    def in_world_units(self, parameters: HyperParameters, scene: Scene, nearest: F64) -> HyperParameters:
+        return parameters
+
+    def quantize_rotations(
+        self, imaginary: F64, scales: Sequence[Levels], sf_rotation: float, run: Run
+    ) -> Iterable[Integers]:
+        return run(lambda part: quantize.quantize_rotations(part, sf_rotation), imaginary.T)
+
+    def dequantize_rotations(
+        self, levels: Sequence[Levels], scales: Sequence[Levels], sf_rotation: float, out: F32
+    ) -> None:
+        quantize.dequantize_rotations(levels, sf_rotation, out)
+
+    def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
+        return quantize.quantize_opacities(logits, sf_opacity)
+
+    def dequantize_opacities(self, levels: Levels, sf_opacity: float) -> F32:
+        return quantize.dequantize_opacities(levels, sf_opacity)
+
+
+class Version2(FormatVersion):
+    """Steps of equal worth: finer rotations for longer splats, opacities as logits, lengths in sizes of a splat."""
+
+    number = 2
+    coders = frozenset(Coder)
+    separate_ac_factor = True
+    absolute_leaf_levels = True
+    rotations_need_scales = True
+
+    def in_world_units(self, parameters: HyperParameters, scene: Scene, nearest: F64) -> HyperParameters:
+        """β and SF_scale are given in sizes of a typical splat, so that the scene's unit of length does not matter.
+
+        A splat's size is its largest standard deviation, the typical one their median; seen from the views, the median
+        of size over distance.
+        """
+        sizes = np.exp(np.clip(scene.log_scales.max(axis=1).astype(np.float64), -60, 60))
+        size = float(np.median(sizes))
+        sf_scale = min(max(parameters.sf_scale / size, 1e-3), 1e9)
+        seen = nearest > 0
+        if seen.any():
+            beta = parameters.beta * float(np.median(sizes[seen] / nearest[seen]))
+            return replace(parameters, beta=beta, sf_scale=sf_scale)
+        return replace(parameters, gamma=max(parameters.gamma, parameters.beta * size), sf_scale=sf_scale)
+
+    def quantize_rotations(
+        self, imaginary: F64, scales: Sequence[Levels], sf_rotation: float, run: Run
+    ) -> Iterable[Integers]:
+        factors = quantize.rotation_factors(scales, sf_rotation)
+        # A splat that is decoded as a ball has no direction.
+        ball = (scales[0] == scales[1]) & (scales[1] == scales[2])
+        return run(lambda part: np.where(ball, 0, quantize.quantize_rotations(part, factors)), imaginary.T)
+
+    def dequantize_rotations(
+        self, levels: Sequence[Levels], scales: Sequence[Levels], sf_rotation: float, out: F32
+    ) -> None:
+        quantize.dequantize_rotations(levels, quantize.rotation_factors(scales, sf_rotation), out)
+
+    def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
+        return quantize.quantize_logits(logits, sf_opacity)
+
+    def dequantize_opacities(self, levels: Levels, sf_opacity: float) -> F32:
+        return quantize.dequantize_logits(levels, sf_opacity)
+
+
+#: All versions that are read, by their number.
+VERSIONS: dict[int, FormatVersion] = {
+    1: Version1(),
+    2: Version2(),
+}

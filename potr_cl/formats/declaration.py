@@ -1,0 +1,83 @@
+"""What a format says of itself. Each module in scenes/ and cameras/ that reads one declares it as ``FORMAT``."""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+
+
+@dataclass(frozen=True)
+class SceneFormat:
+    """A format of scene files.
+
+    Attributes:
+        name: as people call it.
+        suffixes: that its files have, in lower case, the usual one first. The last part of a suffix ("ply" of
+            ".compressed.ply") picks the format of a file that is read, the longest that fits the one of a file that is
+            written.
+        note: one line for people, in Markdown: who uses it, which versions are read and written.
+        load: reads a file. Raises UsageError if it cannot be opened or the extra is missing, DataError if it is
+            damaged.
+        save: writes a scene to a path, or None where the format is only read. Raises UsageError if the path cannot be
+            written to or the extra is missing.
+        not_written: what a user should do instead, as a clause, where ``save`` is None.
+        extra: of the package, which brings what the format needs; None if nothing is needed.
+        recognises: whether the content of a file is of this format; False for a file that cannot be read. For formats
+            that share the last part of a suffix: it decides which of them reads a file, and one of them has none, to
+            read what no other recognises.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    note: str
+    load: Callable[[Path], Scene]
+    save: Callable[[Path, Scene], None] | None = None
+    not_written: str = ""
+    extra: str | None = None
+    recognises: Callable[[Path], bool] | None = None
+
+    @property
+    def extensions(self) -> tuple[str, ...]:
+        """The last parts of the suffixes, with the point: ".ply" for ".compressed.ply"."""
+        return tuple("." + suffix.rpartition(".")[2] for suffix in self.suffixes)
+
+
+@dataclass(frozen=True)
+class CameraFormat:
+    """A format of camera files: of single ones, and of folders that hold them.
+
+    Attributes:
+        name: as people call it, with what tells it apart where that is of use: "COLMAP model (…)".
+        suffixes: that its files have, in lower case.
+        note: one line for people, in Markdown: who writes it, what is read of it.
+        recognises: whether a file is of this format, from its path and, for a .json, the value that it holds (else
+            None). Only asked about files with one of the suffixes.
+        load: reads a file that ``recognises`` accepted, from the same arguments. Raises UsageError if a file cannot be
+            opened or the extra is missing, DataError if one is damaged.
+        is_in: whether a folder holds files of this format under their usual names.
+        load_folder: reads a folder that ``is_in`` accepted. Raises what ``load`` raises.
+        json_mark: what in a .json makes it this format, for the message about one that is of none.
+        subfolders: where else, below the folder that a user names, the files may be; looked into in this order.
+        extra: of the package, which brings what the format needs; None if nothing is needed.
+    """
+
+    name: str
+    suffixes: tuple[str, ...]
+    note: str
+    recognises: Callable[[Path, Any], bool]
+    load: Callable[[Path, Any], list[Camera]]
+    is_in: Callable[[Path], bool]
+    load_folder: Callable[[Path], list[Camera]]
+    json_mark: str = ""
+    subfolders: tuple[str, ...] = ()
+    extra: str | None = None
+
+
+def install_command(extra: str) -> str:
+    """What a user types to get an extra of this package."""
+    return f'pip install "potr-cl[{extra}]"'

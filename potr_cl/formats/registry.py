@@ -1,0 +1,135 @@
+"""The formats of scenes and cameras: SCENE_FORMATS and CAMERA_FORMATS, and what people are told of them.
+
+A format is added by one module in scenes/ or cameras/ that declares ``FORMAT``, and by its line in the table here.
+Reading, writing, error messages, the help of the command line and docs/formats.md all follow the tables.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterable, Sequence
+from pathlib import Path
+
+from potr_cl.errors import UsageError
+from potr_cl.formats.cameras import cameras_json, colmap, transforms
+from potr_cl.formats.declaration import CameraFormat, SceneFormat, install_command
+from potr_cl.formats.scenes import compressed_ply, ply, potr, sog, spz
+from potr_cl.model.scene import Scene
+
+#: In the order in which people are told of them.
+SCENE_FORMATS: tuple[SceneFormat, ...] = (
+    ply.FORMAT,
+    potr.FORMAT,
+    compressed_ply.FORMAT,
+    spz.FORMAT,
+    sog.FORMAT,
+)
+
+#: In the order in which a folder is searched for them. cameras.json stands before transforms.json, for it lists just
+#: the views that a scene was trained with, as they were.
+CAMERA_FORMATS: tuple[CameraFormat, ...] = (
+    colmap.FORMAT,
+    cameras_json.FORMAT,
+    transforms.FORMAT,
+)
+
+
+def reader_of(path: Path) -> Callable[[Path], Scene]:
+    """What reads a scene file. Its format is told by its extension, and by its content where formats share that.
+
+    Raises:
+        UsageError: no format has this extension.
+    """
+    extension = path.suffix.lower()
+    having_it = [entry for entry in SCENE_FORMATS if extension in entry.extensions]
+    for entry in having_it:
+        if entry.recognises is not None and entry.recognises(path):
+            return entry.load
+    for entry in having_it:
+        if entry.recognises is None:
+            return entry.load
+    raise UsageError(f"'{path}': unknown kind of scene, expected a {suffixes_read()} file")
+
+
+def writer_of(path: Path) -> Callable[[Path, Scene], None]:
+    """What writes a scene in the format that the suffixes of the file to be written ask for.
+
+    Raises:
+        UsageError: no format has this suffix, or it is only read.
+    """
+    suffixes = "".join(path.suffixes).lower()
+    fitting = [
+        (len(suffix), entry) for entry in SCENE_FORMATS for suffix in entry.suffixes if suffixes.endswith(suffix)
+    ]
+    expected = f"scenes are written as {suffixes_written()}"
+    if not fitting:
+        raise UsageError(f"'{path}': {expected}")
+    _, entry = max(fitting, key=lambda found: found[0])
+    if entry.save is None:
+        raise UsageError(f"'{path}': {entry.not_written}; {expected}")
+    return entry.save
+
+
+def suffixes_read() -> str:
+    """For messages and help: the suffixes of all scenes that are read, ".a, .b or .c"."""
+    return listed(_scene_suffixes(SCENE_FORMATS))
+
+
+def suffixes_written() -> str:
+    """For messages and help: the suffixes of all scenes that are written, ".a, .b or .c"."""
+    return listed(_scene_suffixes(entry for entry in SCENE_FORMATS if entry.save is not None))
+
+
+def extras_needed() -> str:
+    """For help: which scenes need which extra, a clause for each extra."""
+    clauses = []
+    for extra in dict.fromkeys(entry.extra for entry in SCENE_FORMATS if entry.extra is not None):
+        suffixes = _scene_suffixes(entry for entry in SCENE_FORMATS if entry.extra == extra)
+        clauses.append(f"{listed(suffixes, 'and')} {'need' if suffixes[1:] else 'needs'} {install_command(extra)}")
+    return "; ".join(clauses)
+
+
+def cameras_read() -> str:
+    """For messages and help: the kinds of cameras that are read, "a x, a y or a z", those without an extra first."""
+    return listed([f"a {entry.name}" for entry in sorted(CAMERA_FORMATS, key=lambda entry: entry.extra is not None)])
+
+
+def json_cameras() -> str:
+    """For messages: the kinds of cameras in .json files, with what marks each, "a x (…) nor a y (…)"."""
+    return listed([f"a {entry.name} ({entry.json_mark})" for entry in CAMERA_FORMATS if entry.json_mark], "nor")
+
+
+def formats_table() -> str:
+    """All formats as Markdown, for docs/formats.md: a table of scenes and one of cameras."""
+    scenes = [
+        [
+            f"{entry.name} ({', '.join(f'`{suffix}`' for suffix in entry.suffixes)})",
+            "yes",
+            "no" if entry.save is None else "yes",
+            _needs(entry.extra),
+            entry.note,
+        ]
+        for entry in SCENE_FORMATS
+    ]
+    cameras = [
+        [entry.name, "yes", "no", _needs(entry.extra), entry.note]
+        for entry in sorted(CAMERA_FORMATS, key=lambda entry: entry.extra is not None)
+    ]
+    columns = ["reads", "writes", "needs", "note"]
+    return "\n\n".join([_table(["scenes", *columns], scenes), _table(["cameras", *columns], cameras)])
+
+
+def listed(items: Sequence[str], word: str = "or") -> str:
+    """Items as an English list: "a", "a or b", "a, b or c"."""
+    return f" {word} ".join([", ".join(items[:-1]), items[-1]]) if len(items) > 1 else "".join(items)
+
+
+def _scene_suffixes(formats: Iterable[SceneFormat]) -> list[str]:
+    return [suffix for entry in formats for suffix in entry.suffixes]
+
+
+def _needs(extra: str | None) -> str:
+    return "nothing" if extra is None else f"`{install_command(extra)}`"
+
+
+def _table(head: list[str], rows: list[list[str]]) -> str:
+    return "\n".join(f"| {' | '.join(row)} |" for row in [head, ["---"] * len(head), *rows])

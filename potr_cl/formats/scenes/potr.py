@@ -1,0 +1,14 @@
+"""Scenes from this package's own files. They are only read here: what makes them is the whole pipeline of encode."""
+
+from __future__ import annotations
+
+from potr_cl.codec.decoder import decode
+from potr_cl.formats.declaration import SceneFormat
+
+FORMAT = SceneFormat(
+    name="potr_cl",
+    suffixes=(".potr",),
+    note="this package's own: what `encode` makes of a scene in any of these formats; files of every version are read",
+    load=decode,
+    not_written="a .potr file is made by the command encode, which reads all that convert reads",
+)

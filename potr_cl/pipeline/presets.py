@@ -1,0 +1,55 @@
+"""The presets: which stages an encode has, in their order, and with which options. One line a stage."""
+
+from __future__ import annotations
+
+from potr_cl.codec.quantize import Preset
+from potr_cl.stages.code import Code
+from potr_cl.stages.compact import Compact
+from potr_cl.stages.prune import Prune
+from potr_cl.stages.refit import Refit
+from potr_cl.stages.stage import Stage
+
+#: The preset that is taken unless another is asked for.
+DEFAULT: Preset = "best"
+
+#: Stages by preset. Every preset has every stage, switched off where it is not wanted, so that any can be asked for.
+PRESETS: dict[Preset, tuple[Stage, ...]] = {
+    "paper": (Prune(), Compact(), Refit(steps=0), Code()),
+    "fast": (Prune(iterations=16), Compact(on=False), Refit(steps=4), Code(entropy="zstd", zstd_level=9)),
+    "best": (Prune(), Compact(on=False), Refit(steps=8), Code()),
+}
+
+#: What each preset is for, in a line.
+PURPOSE: dict[Preset, str] = {
+    "paper": "what the paper does: colours compacted splat by splat, its steps",
+    "fast": "as best, in fewer iterations and steps, with zstd 9: encodes and decodes faster",
+    "best": "colours re-fitted together, steps of equal worth, the context coder: the smallest file",
+}
+
+
+def stages_of(preset: Preset) -> tuple[type[Stage], ...]:
+    """The stages of a preset as classes, in their order."""
+    return tuple(type(stage) for stage in PRESETS[preset])
+
+
+def presets_table() -> str:
+    """The presets as a Markdown table, for the documentation."""
+    rows = [
+        "| preset | pruning iterations | colours | entropy coder | for |",
+        "|---|---|---|---|---|",
+    ]
+    for name, stages in PRESETS.items():
+        by_name = {stage.name: stage for stage in stages}
+        prune, compact, refit, code = (by_name[each] for each in ("prune", "compact", "refit", "code"))
+        assert isinstance(prune, Prune)
+        assert isinstance(refit, Refit)
+        assert isinstance(code, Code)
+        colours = f"re-fitted together in {refit.steps} steps" if refit.steps else "as they are"
+        if compact.on:
+            colours = "compacted splat by splat"
+        # The file's version that goes with the paper's steps has no context coder.
+        coder = "zstd" if name == "paper" else code.entropy
+        coder += f" {code.zstd_level}" if coder == "zstd" else ""
+        mark = " (default)" if name == DEFAULT else ""
+        rows.append(f"| `{name}`{mark} | {prune.iterations} | {colours} | {coder} | {PURPOSE[name]} |")
+    return "\n".join(rows)

@@ -1,0 +1,118 @@
+"""The stage "code": quantise what is left and make the bytes of a file of it."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+from potr_cl.codec.container import ENTROPY_CODERS, EntropyCoder
+from potr_cl.codec.encoder import code_scene
+from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
+
+
+@dataclass(frozen=True)
+class Code(Stage):
+    """Octree, quantised streams and entropy coding; the last stage, which is always done.
+
+    Attributes:
+        entropy, zstd_level: of the entropy stage (:class:`potr_cl.codec.container.EntropyCoder`).
+        gamma, beta, sf_dc, sf_sh, sf_opacity, sf_rotation, sf_scale: replace q's
+            (:class:`potr_cl.codec.quantize.HyperParameters`).
+
+    Raises:
+        UsageError: a value is out of range.
+    """
+
+    name = "code"
+    title = "quantiser and coder (each of the steps is set by -q otherwise)"
+    needs_views = False
+
+    entropy: str = option(
+        EntropyCoder.name,
+        Flag(
+            "--entropy",
+            "context: smallest, not for preset paper; zstd: decodes fastest; npz: deflate, as NumPy's compressed files "
+            "use",
+            choices=ENTROPY_CODERS,
+            default="the preset's",
+        ),
+    )
+    zstd_level: int = option(
+        EntropyCoder.level, Flag("--zstd-level", "1 (fast) to 22 (small)", "L", int, default="the preset's")
+    )
+    gamma: float | None = option(
+        None, Flag("--gamma", "least distance a centre may move, world units", "UNITS", float), parameter=True
+    )
+    beta: float | None = option(
+        None,
+        Flag(
+            "--beta",
+            "the same as a part of the nearest camera's distance; best, fast: of a typical splat's size there",
+            "PART",
+            float,
+        ),
+        parameter=True,
+    )
+    sf_dc: float | None = option(
+        None, Flag("--sf-dc", "steps a unit for constant SH coefficients", "SF", float), parameter=True
+    )
+    sf_sh: float | None = option(
+        None, Flag("--sf-sh", "steps a unit for the other SH coefficients", "SF", float), parameter=True
+    )
+    sf_opacity: float | None = option(
+        None,
+        Flag("--sf-opacity", "steps a unit for opacities; best, fast: for their logits", "SF", float),
+        parameter=True,
+    )
+    sf_rotation: float | None = option(
+        None,
+        Flag(
+            "--sf-rotation",
+            "steps a unit for quaternions; best, fast: times the root of the largest scale in steps",
+            "SF",
+            float,
+        ),
+        parameter=True,
+    )
+    sf_scale: float | None = option(
+        None,
+        Flag(
+            "--sf-scale",
+            "steps a unit for standard deviations; best, fast: in a typical splat's size",
+            "SF",
+            float,
+        ),
+        parameter=True,
+    )
+
+    def __post_init__(self) -> None:
+        _ = self.coder
+
+    @property
+    def coder(self) -> EntropyCoder:
+        """The entropy stage."""
+        return EntropyCoder(self.entropy, self.zstd_level)
+
+    @classmethod
+    def from_flags(cls, given: dict[str, Any]) -> dict[str, Any]:
+        # A level alone asks for zstd, and a coder alone for its own level rather than the preset's.
+        if given.keys() & {"entropy", "zstd_level"}:
+            return {"entropy": "zstd", "zstd_level": EntropyCoder.level, **given}
+        return given
+
+    def run(self, state: State, bench: Workbench) -> State:
+        """Code; ``learnt`` gets a :class:`potr_cl.codec.encoder.Coded`."""
+        geometry = state.geometry
+        if geometry is not None and geometry.asked != bench.parameters:
+            geometry = None
+        coded = code_scene(
+            state.scene,
+            bench.parameters,
+            state.views,
+            bench.metadata(state),
+            self.coder,
+            bench.threads,
+            bench.progress,
+            geometry,
+        )
+        return state.having_learnt(self.name, coded)

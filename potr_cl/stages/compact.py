@@ -1,0 +1,114 @@
+"""The stage "compact": sparse colours, splat by splat (paper section "Spherical harmonics energy compaction")."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import get_args
+
+import numpy as np
+
+from potr_cl.errors import UsageError
+from potr_cl.model.scene import Scene
+from potr_cl.model.virtual_cameras import standpoints
+from potr_cl.stages.compaction.ridge import ColourModel, CompactionOptions, Compactor, ViewWeights, Weighting
+from potr_cl.stages.pruning.measured import Measured, measurement
+from potr_cl.stages.pruning.removal import SweepOptions
+from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
+
+
+@dataclass(frozen=True)
+class Compact(Stage):
+    """Make the SH coefficients sparse; looks at views.
+
+    Attributes:
+        at: the part of the pruning iterations after which it is done, so that later ones see its effect.
+        lam, alpha: replace q's λ and α.
+        colour_model, weighting, two_pass: see :class:`potr_cl.stages.compaction.ridge.CompactionOptions`.
+
+    Raises:
+        UsageError: a value is out of range.
+    """
+
+    name = "compact"
+    title = "compaction of the colours"
+
+    on: bool = option(
+        True,
+        Flag("--compact", "make the colours' coefficients sparse splat by splat", default="where there is no re-fit"),
+    )
+    at: float = option(
+        0.75, Flag("--compact-at", "of the pruning iterations after which colours are compacted", "PART", float)
+    )
+    lam: float | None = option(
+        None, Flag("--lambda", "how strongly AC coefficients are pulled to 0", "X", float), parameter=True
+    )
+    alpha: float | None = option(
+        None, Flag("--alpha", "cosine above which two coefficients count as one; 1: never", "X", float), parameter=True
+    )
+    colour_model: ColourModel = option(
+        CompactionOptions.colour_model,
+        Flag(
+            "--colour-model",
+            "channels to make sparse, each on its own; ycocg pulls Co and Cg three times as hard",
+            choices=get_args(ColourModel),
+        ),
+    )
+    weighting: Weighting = option(
+        CompactionOptions.weighting,
+        Flag(
+            "--weighting",
+            "a view counts as much as it shows of the splat (importance), or as any other that sees it (visibility)",
+            choices=get_args(Weighting),
+        ),
+    )
+    two_pass: bool = option(
+        CompactionOptions.two_pass,
+        Flag("--one-pass", "do not solve again without the coefficients that would be quantised to 0"),
+    )
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.at <= 1:
+            raise UsageError(f"compact_at is {self.at:g}, it must lie between 0 and 1")
+        _ = CompactionOptions(colour_model=self.colour_model, weighting=self.weighting)
+
+    def looks_at(self, scene: Scene) -> bool:
+        return self.on and scene.sh_degree > 0
+
+    def interludes(self, iterations: int) -> Sequence[Interlude]:
+        return [Interlude(max(math.ceil(self.at * iterations), 1), self, always=True)] if self.on else []
+
+    def run(self, state: State, bench: Workbench) -> State:
+        """Give what is left of the uncompressed scene sparse colours."""
+        if self.name in state.learnt or state.scene.sh_degree == 0:
+            return state
+        options = CompactionOptions(
+            lam=bench.parameters.lam,
+            alpha=bench.parameters.alpha,
+            sf_sh=bench.parameters.sf_sh,
+            two_pass=self.two_pass,
+            colour_model=self.colour_model,
+            weighting=self.weighting,
+        )
+        with _effects(state, bench) as effects:
+            bench.progress("compact", 0.0)
+            weights = ViewWeights.from_importances(len(state.scene), effects.view_importances())
+            scene = state.source.subset(state.survivors)
+            places = standpoints(state.views, state.source.means)
+            sh = Compactor(bench.opened).compact(scene, places, weights, options).sh
+            bench.progress("compact", 1.0)
+        return state.recoloured(sh).having_learnt(self.name, True)
+
+
+@contextmanager
+def _effects(state: State, bench: Workbench) -> Iterator[Measured]:
+    """The importances: those at hand while splats are being removed, else measured for this."""
+    if state.effects is not None:
+        yield state.effects
+        return
+    bench.progress("prepare views", 0.0)
+    with measurement(state, bench, SweepOptions(memory=bench.memory)) as removal:
+        removal.measure()
+        yield Measured(removal, np.arange(len(state.scene)))

@@ -1,0 +1,160 @@
+"""The stage "prune": remove the splats whose removal does no harm (paper section "Iterative pruning")."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.errors import UsageError
+from potr_cl.stages.pruning.measured import Measured, measurement
+from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
+from potr_cl.stages.pruning.schedule import PruningOptions
+from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
+
+
+@dataclass(frozen=True)
+class Prune(Stage):
+    """Remove splats, fewer at a time in many iterations; look at views.
+
+    What other stages want done between iterations (:meth:`potr_cl.stages.stage.Stage.interludes`) is done here.
+
+    Attributes:
+        keep, count: part or number of the splats to keep, exactly, instead of ``delta_mse_max``.
+        delta_mse_max: replaces q's ΔMSE_MAX.
+        iterations, decay, mapping_a: of the schedule (:class:`potr_cl.stages.pruning.schedule.PruningOptions`).
+        tolerance, turns, tighten, transmittance_threshold, sample, sampled, seed: of the measurements
+            (:class:`potr_cl.stages.pruning.removal.SweepOptions`).
+
+    Raises:
+        UsageError: a value is out of range.
+    """
+
+    name = "prune"
+    title = "pruning"
+
+    on: bool = option(True, Flag("--no-prune", "keep every splat"))
+    keep: float | None = option(
+        None, Flag("--keep", "of the splats, exactly, instead of -q's", "FRACTION", float, group="how many")
+    )
+    count: int | None = option(
+        None, Flag("--count", "splats to keep, exactly, instead of -q's", "N", int, group="how many")
+    )
+    delta_mse_max: float | None = option(
+        None,
+        Flag("--delta-mse-max", "remove a splat if the mean squared error grows by less", "X", float, group="how many"),
+        parameter=True,
+    )
+    iterations: int = option(48, Flag("--iterations", "rounds in which effects are measured anew", "N", int))
+    tolerance: float = option(
+        SweepOptions.tolerance,
+        Flag(
+            "--tolerance", "part of a tile that must have been removed before it is looked at again; 0: any", "X", float
+        ),
+    )
+    turns: int = option(
+        SweepOptions.turns, Flag("--turns", "look at a view again in every N-th iteration only", "N", int)
+    )
+    decay: float = option(
+        PruningOptions.decay,
+        Flag(
+            "--damping",
+            "decay of the exponential moving average by which splats are ranked: what a splat's effect in one "
+            "iteration counts against the next iteration's; 0: only the newest counts, as in the paper",
+            "X",
+            float,
+        ),
+    )
+    mapping_a: float = option(
+        PruningOptions.a,
+        Flag(
+            "--mapping-a",
+            "the smaller, the later go splats whose removal improves the match; the paper has 10",
+            "X",
+            float,
+        ),
+    )
+    tighten: bool = option(SweepOptions.tighten)
+    transmittance_threshold: float | None = option(SweepOptions.transmittance_threshold)
+    sample: float = option(SweepOptions.sample)
+    sampled: int = option(SweepOptions.sampled)
+    seed: int = option(SweepOptions.seed)
+
+    def __post_init__(self) -> None:
+        if self.keep is not None and not 0 < self.keep <= 1:
+            raise UsageError(f"--keep is {self.keep:g}, it must be above 0 and at most 1")
+        if self.keep is not None and self.count is not None:
+            raise UsageError("give either the part or the number of splats to keep")
+        _ = self._sweep_options(None), self._schedule(0.0, 1)  # refuse what is out of range at once
+
+    def _sweep_options(self, memory: int | None) -> SweepOptions:
+        return SweepOptions(
+            tolerance=self.tolerance,
+            turns=self.turns,
+            memory=memory,
+            tighten=self.tighten,
+            transmittance_threshold=self.transmittance_threshold,
+            sample=self.sample,
+            sampled=self.sampled,
+            seed=self.seed,
+        )
+
+    def _schedule(self, delta_mse_max: float, splats: int) -> PruningOptions:
+        count = self.count if self.keep is None else max(round(self.keep * splats), 1)
+        return PruningOptions(delta_mse_max, self.iterations, a=self.mapping_a, count=count, decay=self.decay)
+
+    def run(self, state: State, bench: Workbench) -> State:
+        """Remove splats; ``learnt`` gets a :class:`potr_cl.stages.pruning.schedule.Pruned`."""
+        waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
+        schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene))
+        bench.progress("prepare views", 0.0)
+        with measurement(state, bench, self._sweep_options(bench.memory)) as removal:
+            course = _Course(state, removal)
+
+            def after_iteration(iteration: int) -> None:
+                while waiting and iteration + 1 >= waiting[0].after:
+                    course.visit(waiting.pop(0).stage, np.flatnonzero(removal.alive), bench)
+                    removal.replace_sh(course.sh)
+
+            bench.progress("prune", 0.0)
+            pruned = prune_scene(
+                removal,
+                schedule,
+                lambda done, kept: bench.progress("prune", min(done / self.iterations, 0.99)),
+                after_iteration,
+            )
+            bench.progress("prune", 1.0)
+            for interlude in waiting:
+                if interlude.always:
+                    course.visit(interlude.stage, pruned.survivors, bench)
+            return course.left(pruned.survivors).having_learnt(self.name, pruned)
+
+
+class _Course:
+    """The scene while splats are being removed.
+
+    Args:
+        state: before.
+        removal: measures, and knows what is left.
+
+    Attributes:
+        sh: (N, M, 3) the colours of all splats of the state's scene, as far as they have changed.
+    """
+
+    def __init__(self, state: State, removal: RemovalSweep) -> None:
+        self._state, self._removal = state, removal
+        self.sh = state.scene.sh
+
+    def left(self, splats: NDArray[np.int64]) -> State:
+        """The state in which only these splats are left."""
+        scene = replace(self._state.scene.subset(splats), sh=self.sh[splats])
+        return replace(self._state, scene=scene, survivors=self._state.survivors[splats])
+
+    def visit(self, stage: Stage, splats: NDArray[np.int64], bench: Workbench) -> None:
+        """Have another stage work on these splats, and go on with the colours that it gives them."""
+        then = stage.run(replace(self.left(splats), effects=Measured(self._removal, splats)), bench)
+        self.sh = self.sh.copy()
+        self.sh[splats] = then.scene.sh
+        self._state = replace(self._state, learnt=then.learnt)

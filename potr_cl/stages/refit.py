@@ -1,0 +1,162 @@
+"""The stage "refit": colours of all splats together, so that the pictures look again as the uncompressed scene's."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+from pathlib import Path
+from typing import Any
+
+from potr_cl.codec.geometry import quantise_geometry
+from potr_cl.errors import UsageError
+from potr_cl.host.threads import thread_pool
+from potr_cl.model.scene import Scene
+from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.refitting.refit import RefitOptions, active_coefficients, refit_colours
+from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
+from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
+
+
+def _steps(text: str) -> int | None:
+    if text in ("auto", "off"):
+        return None if text == "auto" else 0
+    # A number of thousands of digits is no number of steps, and Python refuses to make one of it.
+    if not text.isdecimal() or len(text) > 9:
+        raise UsageError(f"--refit is '{text[:40]}': give a number of steps, auto, or off")
+    return int(text)
+
+
+@dataclass(frozen=True)
+class Refit(Stage):
+    """Re-fit the colours on the geometry and opacities that a decoder will see; looks at views.
+
+    Attributes:
+        steps: conjugate-gradient steps at the most; 0 leaves it out.
+        drop: replaces q's.
+        at, at_steps: parts of the pruning iterations after which colours are re-fitted too, so that later ones see
+            colours that have made up for what went, and the steps of each.
+        ground_truth: folder of the views' photographs, named after them: what the pictures come near to, instead of
+            the uncompressed scene's.
+
+    Raises:
+        UsageError: a value is out of range.
+    """
+
+    name = "refit"
+    title = "re-fit of the colours"
+
+    steps: int = option(
+        8,
+        Flag(
+            "--refit",
+            "steps in which the colours are re-fitted to the uncompressed scene's pictures, all splats together; off: "
+            "none",
+            "N",
+            _steps,
+            default="auto, the preset's",
+        ),
+    )
+    drop: float | None = option(
+        None,
+        Flag("--drop", "give up a coefficient if the mean squared error grows by less; re-fit only", "X", float),
+        parameter=True,
+    )
+    at: tuple[float, ...] = option(
+        (),
+        Flag(
+            "--refit-at",
+            "of the pruning iterations after which they are re-fitted too: a few percent smaller, and slower",
+            "PART",
+            float,
+            many=True,
+            default="none",
+        ),
+    )
+    at_steps: int = option(3)
+    ground_truth: Path | None = option(
+        None,
+        Flag(
+            "--photos",
+            "photographs, named after the views: re-fit to them instead, for truth rather than fidelity",
+            "DIR",
+            Path,
+            default="the uncompressed scene's pictures",
+        ),
+    )
+
+    def __post_init__(self) -> None:
+        for part in self.at:
+            if not 0 <= part <= 1:
+                raise UsageError(f"refit_at is {part:g}, it must lie between 0 and 1")
+        _ = RefitOptions(steps=self.steps), RefitOptions(steps=self.at_steps)
+
+    @classmethod
+    def from_flags(cls, given: dict[str, Any]) -> dict[str, Any]:
+        given = {**given, **({"at": tuple(given["at"])} if "at" in given else {})}
+        return {name: value for name, value in given.items() if not (name == "steps" and value is None)}
+
+    def looks_at(self, scene: Scene) -> bool:
+        return self.on and self.steps > 0
+
+    def interludes(self, iterations: int) -> Sequence[Interlude]:
+        times = sorted({max(round(part * iterations), 1) for part in self.at})
+        return [Interlude(after, RefitOnTheWay(steps=self.at_steps)) for after in times]
+
+    def run(self, state: State, bench: Workbench) -> State:
+        """Re-fit; ``learnt`` gets a :class:`potr_cl.stages.refitting.refit.Refitted`."""
+        bench.progress("refit", 0.0)
+        parameters = bench.parameters
+        geometry = state.geometry
+        if geometry is None or geometry.asked != parameters:
+            with thread_pool(bench.threads) as pool:
+                geometry = quantise_geometry(state.scene, parameters, state.views, pool.map)
+        decoded = geometry.decoded(state.scene.sh)
+        compacted = "compact" in state.learnt
+        active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
+        with ExitStack() as stack:
+            stack.callback(bench.progress, "refit", 1.0)
+            targets: RenderedTargets | GroundTruthTargets
+            if self.ground_truth is None:
+                rasterizer = stack.enter_context(Rasterizer(bench.opened, state.source, background=bench.background))
+                targets = RenderedTargets(rasterizer, state.views)
+            else:
+                ground_truth = GroundTruth(self.ground_truth, state.views, bench.background)
+                targets = GroundTruthTargets(bench.opened, ground_truth, state.views)
+            refitted = refit_colours(
+                bench.opened,
+                decoded,
+                state.views,
+                targets,
+                RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory),
+                active,
+                bench.background,
+                lambda done, steps: bench.progress("refit", done / steps),
+            )
+        return replace(state.recoloured(refitted.sh), geometry=geometry).having_learnt(self.name, refitted)
+
+
+@dataclass(frozen=True)
+class RefitOnTheWay(Stage):
+    """A short re-fit while splats are being removed, of the geometry as it is; gives up no coefficient."""
+
+    name = "refit on the way"
+    title = ""
+
+    steps: int = 3
+
+    def run(self, state: State, bench: Workbench) -> State:
+        bench.progress("refit", 0.0)
+        with Rasterizer(bench.opened, state.source, background=bench.background) as rasterizer:
+            refitted = refit_colours(
+                bench.opened,
+                state.scene,
+                state.views,
+                RenderedTargets(rasterizer, state.views),
+                RefitOptions(steps=self.steps, memory=bench.memory),
+                background=bench.background,
+                progress=lambda done, steps: bench.progress("refit", 0.99 * done / steps),
+            )
+        bench.progress("refit", 1.0)
+        return state.recoloured(refitted.sh)

@@ -1,0 +1,157 @@
+"""COLMAP models, binary and text."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import struct
+import sys
+from collections.abc import Callable
+from pathlib import Path
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from potr_cl import UsageError
+from potr_cl.formats import load_cameras
+from tests.cases.cameras import load_or_refuse, refused, write_image
+
+
+@pytest.fixture
+def model(data: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(data / "plush_sparse_binary", tmp_path / "sparse" / "0"))
+
+
+@pytest.fixture
+def text_model(data: Path, tmp_path: Path) -> Path:
+    return Path(shutil.copytree(data / "plush_sparse_text", tmp_path / "sparse" / "0"))
+
+
+@pytest.fixture
+def text_model_lines(data: Path, tmp_path: Path) -> Callable[[str], Path]:
+    def write(cameras: str) -> Path:
+        folder = tmp_path / "text"
+        shutil.copytree(data / "plush_sparse_text", folder, dirs_exist_ok=True)
+        (folder / "cameras.txt").write_text(cameras)
+        return folder
+
+    return write
+
+
+@pytest.mark.parametrize("write", ["write_binary", "write_text"])
+def test_a_model_with_points_rigs_and_several_cameras(write: str, tmp_path: Path) -> None:
+    """Against what pycolmap itself reads from the whole model."""
+    pycolmap = pytest.importorskip("pycolmap")
+    options = pycolmap.SyntheticDatasetOptions()
+    options.camera_model_id = pycolmap.CameraModelId.SIMPLE_PINHOLE
+    options.camera_params = [900.0, 500.0, 380.0]
+    options.num_cameras_per_rig, options.num_frames_per_rig, options.num_points3D = 2, 9, 60
+    options.sensor_from_rig_translation_stddev = 0.1
+    options.sensor_from_rig_rotation_stddev = 5.0
+    reconstruction = pycolmap.synthesize_dataset(options)
+    getattr(reconstruction, write)(tmp_path)
+    expected = {Path(image.name).stem: image for image in reconstruction.images.values()}
+    assert sum(image.num_points3D for image in expected.values()) > 100
+    cameras = load_cameras(tmp_path)
+    assert sorted(camera.name for camera in cameras) == sorted(expected)
+    for camera in cameras:
+        pose = expected[camera.name].cam_from_world().matrix()
+        np.testing.assert_allclose(np.column_stack([camera.rotation, camera.translation]), pose, atol=1e-9)
+        assert (camera.fx, camera.fy, camera.cx, camera.cy) == (900, 900, 500, 380)
+    in_order = [camera.split for camera in sorted(cameras, key=lambda camera: camera.name)]
+    assert [i for i, split in enumerate(in_order) if split == "test"] == list(range(0, len(cameras), 8))
+
+
+def test_ground_truth_of_a_model(model: Path, tmp_path: Path) -> None:
+    assert load_cameras(model)[0].image_path is None
+    image = write_image(tmp_path / "images" / "20240212_003919.jpg")
+    assert [c.image_path for c in load_cameras(tmp_path)] == [image, *[None] * 16]
+
+
+def test_folders_in_image_names_tell_views_apart(text_model: Path) -> None:
+    images = text_model / "images.txt"
+    renamed = images.read_text().replace("20240212_003920.jpg", "right/20240212_003919.jpg")
+    images.write_text(renamed)
+    names = [camera.name for camera in load_cameras(text_model)]
+    assert names[0] == "20240212_003919"
+    assert names[-1] == "right/20240212_003919"
+    images.write_text(renamed.replace("20240212_003921", "20240212_003919"))
+    refused(text_model, r"more than one view has the image '20240212_003919\.jpg'")
+
+
+def test_distorted_camera_models(model: Path, text_model_lines: Callable[[str], Path]) -> None:
+    data = (model / "cameras.bin").read_bytes()
+    for number, name in ((2, "SIMPLE_RADIAL"), (4, "OPENCV"), (5, "OPENCV_FISHEYE"), (99, "number 99")):
+        (model / "cameras.bin").write_bytes(data[:12] + struct.pack("<i", number) + data[16:])
+        refused(
+            model, f"camera 1 has the model '{name}', only SIMPLE_PINHOLE and PINHOLE .* 'colmap image_undistorter'"
+        )
+    refused(text_model_lines("1 OPENCV 990 742 800 800 495 371 0 0 0 0\n"), "'1' has the model 'OPENCV', only")
+
+
+def test_damaged_text_models(text_model_lines: Callable[[str], Path]) -> None:
+    for line in ("1 PINHOLE 990\n", "1 PINHOLE 990 742 800 800 495\n", "PINHOLE\n"):
+        refused(text_model_lines(line), r"cameras\.txt' is truncated, or is no file of a COLMAP model")
+    for line in ("", "# nothing\n", "2 PINHOLE 990 742 800 800 495 371\n", "1 PINHOLE x y 800 800 495 371\n"):
+        refused(text_model_lines(line), "is a damaged COLMAP model: ")
+    refused(text_model_lines("1 PINHOLE 990 742 nan 800 495 371\n"), "intrinsics|damaged")
+    refused(
+        text_model_lines("1 PINHOLE 990 99999999 800 800 495 371\n"),
+        "the height of its camera is 99999999, not a number of pixels",
+    )
+
+
+def test_every_truncation_of_a_binary_model(model: Path) -> None:
+    """The library itself would take the missing bytes from whatever is in memory, or never return."""
+    for name in ("cameras.bin", "images.bin"):
+        data = (model / name).read_bytes()
+        for size in range(0, len(data), 1 if name == "cameras.bin" else 13):
+            (model / name).write_bytes(data[:size])
+            refused(model, f"{name}' is truncated, or is no file of a COLMAP model")
+        (model / name).write_bytes(data + b"\0")
+        refused(model, f"{name}' is truncated, or is no file of a COLMAP model")
+        (model / name).write_bytes(struct.pack("<Q", 1 << 60) + data[8:])
+        refused(model, f"{name}' is truncated, or is no file of a COLMAP model")
+        (model / name).write_bytes(data)
+    assert len(load_cameras(model)) == 17
+
+
+def test_unusable_values_in_a_binary_model(model: Path) -> None:
+    data = (model / "images.bin").read_bytes()
+    for at, value, message in [
+        (12, struct.pack("<d", np.nan), "view '20240212_003919': its rotation is not a unit quaternion"),
+        (12, bytes(32), "view '20240212_003919': its rotation is not a unit quaternion"),
+        (44, struct.pack("<d", np.inf), "the pose holds a non-finite value"),
+        (68, struct.pack("<I", 77), "is a damaged COLMAP model"),
+        (72, b"\xff\xfe", "the name of an image is not UTF-8"),
+        (72, b"\n", "not the name of an image"),
+    ]:
+        (model / "images.bin").write_bytes(data[:at] + value + data[at + len(value) :])
+        refused(model, message)
+    (model / "images.bin").write_bytes(bytes(8))
+    refused(model, "holds no view")
+    os.remove(model / "images.bin")
+    refused(model, r"cannot read '.*images\.bin': No such file", UsageError)
+
+
+def test_without_pycolmap(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setitem(sys.modules, "pycolmap", None)
+    refused(model, r'needs pycolmap: pip install "potr-cl\[colmap\]"', UsageError)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("model", ["plush_sparse_binary", "plush_sparse_text"])
+@given(draw=st.data())
+@settings(max_examples=200, deadline=None)
+def test_mutated_models(model: str, draw: st.DataObject, data: Path, tmp_path_factory: pytest.TempPathFactory) -> None:
+    folder = tmp_path_factory.getbasetemp() / f"fuzz_{model}"
+    folder.mkdir(exist_ok=True)
+    for source in (data / model).iterdir():
+        content = bytearray(source.read_bytes())
+        for _ in range(draw.draw(st.integers(0, 4))):
+            at = draw.draw(st.integers(0, len(content)))
+            content[at : at + draw.draw(st.integers(0, 9))] = draw.draw(st.binary(max_size=9))
+        (folder / source.name).write_bytes(content)
+    load_or_refuse(folder)

@@ -1,0 +1,167 @@
+"""transforms.json of Blender and of nerfstudio."""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from potr_cl.formats import load_cameras
+from tests.cases.cameras import IDENTITY, nerfstudio, pixel, refused, write_image, write_json
+
+
+def test_transforms_have_opengl_axes(tmp_path: Path) -> None:
+    """The camera looks along -z, its up is +y."""
+    (camera,) = load_cameras(write_json(tmp_path / "transforms.json", nerfstudio(["a.png"])))
+    assert camera.name == "a"
+    assert pixel(camera, [0, 0, -10]) == pytest.approx((21, 14))
+    assert pixel(camera, [1, 0, -10]) == pytest.approx((26, 14))
+    assert pixel(camera, [0, 1, -10]) == pytest.approx((21, 8))
+
+
+def test_blender_intrinsics_come_from_the_angle_and_the_image(tmp_path: Path) -> None:
+    write_image(tmp_path / "train" / "r_0.png", 80, 60)
+    frames = [{"file_path": "./train/r_0", "transform_matrix": IDENTITY}]
+    content = {"camera_angle_x": 2 * np.arctan(0.5), "frames": frames}
+    (camera,) = load_cameras(write_json(tmp_path / "transforms_train.json", content))
+    assert (camera.width, camera.height, camera.cx, camera.cy) == (80, 60, 40, 30)
+    assert (camera.fx, camera.fy) == pytest.approx((80, 80))
+    assert camera.image_path == tmp_path / "train" / "r_0.png"
+    os.remove(tmp_path / "train" / "r_0.png")
+    refused(
+        tmp_path / "transforms_train.json", r"frame 0: the size of the view is unknown: .*r_0\.png' cannot be opened"
+    )
+    (tmp_path / "train" / "r_0.png").write_bytes(b"no image")
+    refused(tmp_path / "transforms_train.json", "the size of the view is unknown")
+    (camera,) = load_cameras(write_json(tmp_path / "transforms_train.json", content | {"w": 80, "h": 60.0}))
+    assert (camera.width, camera.height, camera.fx) == pytest.approx((80, 60, 80))
+
+
+def test_equal_names_in_the_train_and_test_folder(tmp_path: Path) -> None:
+    for split in ("train", "test"):
+        frames = [{"file_path": f"./{split}/r_{i}", "transform_matrix": IDENTITY} for i in range(2)]
+        write_json(tmp_path / f"transforms_{split}.json", {"camera_angle_x": 1, "w": 8, "h": 8, "frames": frames})
+    cameras = load_cameras(tmp_path)
+    assert [camera.name for camera in cameras] == ["train/r_0", "train/r_1", "test/r_0", "test/r_1"]
+    assert [camera.split for camera in cameras] == ["train", "train", "test", "test"]
+
+
+def test_a_frame_has_its_own_intrinsics(tmp_path: Path) -> None:
+    content = nerfstudio(["a.png", "b.png", "c.png"])
+    content["frames"][1] |= {"fl_x": 70, "w": 44, "cx": 23.5}
+    a, b, c = load_cameras(write_json(tmp_path / "transforms.json", content))
+    assert (b.fx, b.fy, b.cx, b.cy, b.width, b.height) == (70, 60, 23.5, 14, 44, 30)
+    assert (a.fx, a.cx, a.width) == (c.fx, c.cx, c.width) == (50, 21, 40)
+
+
+def test_each_eighth_image_by_name_is_a_test_view(tmp_path: Path) -> None:
+    files = [f"{i:02}.jpg" for i in range(17)]
+    cameras = load_cameras(write_json(tmp_path / "transforms.json", nerfstudio(files[::-1])))
+    assert sorted(c.name for c in cameras if c.split == "test") == ["00", "08", "16"]
+
+
+@pytest.mark.parametrize(
+    ("lists", "test"),
+    [
+        ({"train_filenames": ["a", "b"], "val_filenames": ["c"], "test_filenames": ["c"]}, "cd"),
+        ({"train_filenames": ["a", "b", "c", "d"], "test_filenames": ["a"]}, ""),
+        ({"val_filenames": ["b"], "test_filenames": ["c"]}, "bc"),
+        ({"train_filenames": ["b", "c", "d"]}, "a"),
+    ],
+)
+def test_splits_that_the_file_lists(lists: dict[str, list[str]], test: str, tmp_path: Path) -> None:
+    lists = {key: [f"images/{name}.png" for name in names] for key, names in lists.items()}
+    content = nerfstudio([f"{name}.png" for name in "abcd"], **lists)
+    cameras = load_cameras(write_json(tmp_path / "transforms.json", content))
+    assert [c.name for c in cameras if c.split == "test"] == list(test)
+
+
+def test_views_are_moved_to_nerfstudios_training_space(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    """Nerfstudio orients, centres and scales what the file holds, and notes that step after the applied one."""
+    rng = np.random.default_rng(5)
+
+    def rigid() -> np.ndarray:
+        q, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+        pose = np.eye(4)
+        pose[:3, :3], pose[:3, 3] = q * np.linalg.det(q), rng.normal(size=3)
+        return pose
+
+    applied, oriented, pose = rigid(), rigid(), rigid()
+    applied_scale, scale = 2.0, 0.3
+    content = nerfstudio(["a.png"], applied_transform=applied[:3].tolist(), applied_scale=applied_scale)
+    content["frames"][0]["transform_matrix"] = pose.tolist()
+    path = write_json(tmp_path / "transforms.json", content)
+    (plain,) = load_cameras(path)
+    noted = {"transform": (oriented @ applied)[:3].tolist(), "scale": scale * applied_scale}
+    write_json(tmp_path / "dataparser_transforms.json", noted)
+    (moved,) = load_cameras(path)
+    assert "moved the views to the training space" in caplog.text
+
+    seen = plain.centre + plain.rotation.T @ [0.1, -0.2, 3.0]
+    trained = scale * (oriented @ [*seen, 1])[:3]
+    assert pixel(moved, trained) == pytest.approx(pixel(plain, seen))
+    np.testing.assert_allclose(moved.centre, scale * (oriented @ [*plain.centre, 1])[:3])
+
+
+@pytest.mark.parametrize(
+    ("changes", "message"),
+    [
+        ({"k1": 0.01}, r"frame 0: 'k1' is 0\.01, only undistorted views .*'colmap image_undistorter'"),
+        ({"k4": -1e-9}, "'k4' is -1e-09"),
+        ({"camera_model": "OPENCV_FISHEYE"}, "'camera_model' is 'OPENCV_FISHEYE', only pinhole cameras"),
+        ({"camera_model": "EQUIRECTANGULAR"}, "only pinhole cameras"),
+        ({"is_fisheye": True}, "'is_fisheye' is set"),
+        ({"fl_x": None}, "frame 0: neither 'fl_x' nor 'camera_angle_x' is given"),
+        ({"fl_x": None, "camera_angle_x": 4}, "'camera_angle_x' is 4.0, not an angle"),
+        ({"fl_x": -1}, "camera 'a': intrinsics"),
+        ({"fl_x": "50"}, "'fl_x' is '50', not a finite number"),
+        ({"w": 0}, "'w' is 0.*not a number of pixels"),
+        ({"h": 1 << 40}, "not a number of pixels from 1 to"),
+        ({"frames": []}, "holds no view"),
+        ({"frames": {}}, "not an object with a list 'frames'"),
+        ({"frames": [7]}, "frame 0 is 7, not an object"),
+        ({"frames": [{}]}, "frame 0: 'file_path' is missing"),
+        ({"frames": [{"file_path": "a"}]}, "frame 0: 'transform_matrix' is missing"),
+        ({"frames": [{"file_path": "a\nb"}]}, "not the name of an image"),
+        ({"frames": [{"file_path": 3}]}, "'file_path' is 3"),
+        ({"train_filenames": ["images/z.png"]}, "'train_filenames' names 'images/z.png', which is the file_path of no"),
+        ({"train_filenames": 3}, "'train_filenames' is 3, not a list"),
+    ],
+)
+def test_bad_transforms(changes: dict[str, Any], message: str, tmp_path: Path) -> None:
+    refused(write_json(tmp_path / "transforms.json", nerfstudio(["a.png"], **changes)), message)
+
+
+@pytest.mark.parametrize(
+    ("pose", "message"),
+    [
+        ([[1, 0, 0]], "is a list of 1, not 4 x 4 or 3 x 4 numbers"),
+        (np.diag([2.0, 2, 2, 1]).tolist(), "camera 'a': the pose's 3 x 3 part is not a rotation"),
+        (np.diag([1.0, 1, -1, 1]).tolist(), "not a rotation"),
+        (np.diag([1.0, 1, 1, 2]).tolist(), "its last row is not 0 0 0 1"),
+        (np.full((4, 4), np.nan).tolist(), "holds a non-finite value"),
+        ([[1, 0, 0, 10**400], [0, 1, 0, 0], [0, 0, 1, 0]], "not 4 x 4 or 3 x 4 numbers"),
+        ([["a"] * 4] * 4, "not 4 x 4 or 3 x 4 numbers"),
+        ([[1, 2], [3]], "not 4 x 4 or 3 x 4 numbers"),
+    ],
+)
+def test_bad_poses(pose: Any, message: str, tmp_path: Path) -> None:
+    content = nerfstudio(["a.png"])
+    content["frames"][0]["transform_matrix"] = pose
+    refused(write_json(tmp_path / "transforms.json", content), message)
+
+
+def test_bad_dataparser_transforms(tmp_path: Path) -> None:
+    path = write_json(tmp_path / "transforms.json", nerfstudio(["a.png"]))
+    for content, message in [
+        ([], "it is not an object"),
+        ({"scale": 1}, "'transform' is missing"),
+        ({"transform": np.diag([2, 2, 2, 1]).tolist(), "scale": 1}, "not a rotation and a translation"),
+        ({"transform": IDENTITY, "scale": 0}, "'scale' is 0.0, not above 0"),
+        ({"transform": IDENTITY, "scale": float("nan")}, "'scale' is nan, not a finite number"),
+    ]:
+        write_json(tmp_path / "dataparser_transforms.json", content)
+        refused(path, message)

@@ -1,0 +1,147 @@
+"""Camera files of every kind: their kind is found, they agree with each other, and bad ones say what is wrong."""
+
+from __future__ import annotations
+
+import shutil
+from pathlib import Path
+from typing import Any
+
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+from PIL import Image
+
+from potr_cl import UsageError
+from potr_cl.formats import load_cameras
+from potr_cl.formats.cameras import view_files
+from potr_cl.model.camera import test_views as views_for_judging
+from potr_cl.model.camera import train_views
+from tests.cases.cameras import assert_same_views, load_or_refuse, nerfstudio, refused, view, write_image, write_json
+
+# The same views in different formats ---------------------------------------------------------------------------------
+
+
+def test_lego_excerpt_as_cameras_json_and_as_transforms(data: Path, tmp_path: Path) -> None:
+    shutil.copytree(data / "lego_transforms", tmp_path, dirs_exist_ok=True)
+    expected = load_cameras(data / "lego_cameras.json")
+    for camera in expected:
+        write_image(tmp_path / "images" / f"{camera.name}.png", 400, 400)
+    loaded = load_cameras(tmp_path)
+    assert_same_views(loaded, expected)
+    assert len(train_views(loaded)) == 9
+    assert len(views_for_judging(loaded)) == 3
+    assert loaded[0].image_path == tmp_path / "images" / f"{loaded[0].name}.png"
+    assert [c.name for c in load_cameras(tmp_path / "transforms_test.json")] == [c.name for c in loaded[9:]]
+
+
+@pytest.mark.parametrize("model", ["plush_sparse_binary", "plush_sparse_text"])
+def test_plush_excerpt_as_cameras_json_and_as_colmap_model(model: str, data: Path) -> None:
+    expected = load_cameras(data / "plush_cameras.json")
+    assert_same_views(load_cameras(data / model), expected, 1e-9)
+    assert [c.split for c in load_cameras(data / model)].count("test") == 3
+    some_file = next((data / model).iterdir())
+    assert_same_views(load_cameras(some_file), expected, 1e-9)
+
+
+def test_whole_lego(lego: Path) -> None:
+    from_json = load_cameras(lego / "cameras.json")
+    train, test = (load_cameras(lego / f"transforms_{split}.json") for split in ("train", "test"))
+    assert_same_views(from_json, train + test)
+    assert len(train_views(from_json)) == 100
+    assert all(camera.image_path == other.image_path for camera, other in zip(from_json, train + test, strict=True))
+
+
+def test_whole_plush(plush: Path) -> None:
+    from_json, from_model = load_cameras(plush / "cameras.json"), load_cameras(plush / "sparse" / "0")
+    assert_same_views(from_json, from_model)
+    assert len(views_for_judging(from_model)) == 13
+    for camera in from_model:
+        assert camera.image_path is not None
+        with Image.open(camera.image_path) as image:
+            assert image.size == (camera.width, camera.height)
+
+
+# Finding the kind ----------------------------------------------------------------------------------------------------
+
+
+def test_folders(data: Path, tmp_path: Path) -> None:
+    refused(tmp_path, "holds no cameras, expected a cameras.json, a transforms.json or a COLMAP model", UsageError)
+    shutil.copytree(data / "plush_sparse_binary", tmp_path / "sparse")
+    assert len(load_cameras(tmp_path)) == 17
+    write_json(tmp_path / "transforms.json", nerfstudio(["a.png", "b.png"]))
+    assert len(load_cameras(tmp_path)) == 2
+    write_json(tmp_path / "cameras.json", [view()])
+    assert len(load_cameras(tmp_path)) == 1
+
+
+def test_any_file_name(data: Path, tmp_path: Path) -> None:
+    shutil.copy(data / "plush_cameras.json", tmp_path / "views of mine.JSON")
+    assert len(load_cameras(tmp_path / "views of mine.JSON")) == 17
+    write_json(tmp_path / "poses.json", nerfstudio(["a.png"]))
+    assert len(load_cameras(tmp_path / "poses.json")) == 1
+
+
+@pytest.mark.parametrize(
+    ("content", "message"),
+    [
+        (b"", "is not valid JSON"),
+        (b"{", "is not valid JSON"),
+        (b"\xff\xfe\x00", "is not valid JSON"),
+        (b"[" * 200_000, "is nested too deeply"),
+        (b"[" + b"9" * 5000 + b"]", "is not valid JSON|not a list of views"),
+        (b"3", "is neither a cameras.json"),
+        (b'{"a": 1}', "is neither a cameras.json"),
+        (b"[]", "holds no view"),
+        (b"[1]", "not a list of views"),
+        (b"[{}]", "view 0: 'img_name' is missing"),
+        (b'[{"img_name": "a"}]', "view 'a': 'width' is missing"),
+        (b'[{"img_name": "\\ud800"}]', "not the name of an image"),
+    ],
+)
+def test_json_of_no_known_kind(content: bytes, message: str, tmp_path: Path) -> None:
+    (tmp_path / "a.json").write_bytes(content)
+    refused(tmp_path / "a.json", message)
+
+
+def test_paths_of_no_known_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    refused(tmp_path / "missing.json", "cannot read '.*missing.json': No such file", UsageError)
+    refused(tmp_path / "missing", "there is no file or folder", UsageError)
+    (tmp_path / "notes.txt").write_bytes(b"")
+    refused(tmp_path / "notes.txt", "unknown kind of cameras", UsageError)
+    (tmp_path / "a.json").mkdir()
+    refused(tmp_path / "a.json", "holds no cameras", UsageError)
+    monkeypatch.setattr(view_files, "_MAX_JSON_BYTES", 10)
+    refused(write_json(tmp_path / "b.json", [view()]), "too large for a camera file")
+
+
+# Fuzzing -------------------------------------------------------------------------------------------------------------
+
+JSON = st.recursive(
+    st.none() | st.booleans() | st.integers() | st.floats() | st.text(max_size=5) | st.just(10**400),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text(max_size=3), inner, max_size=3),
+    max_leaves=8,
+)
+
+
+def replace_somewhere(draw: st.DataObject, value: Any) -> Any:
+    """The JSON value with one of its parts replaced by another value, or dropped."""
+    keys = list(value) if isinstance(value, dict) else list(range(len(value))) if isinstance(value, list) else []
+    if not keys or draw.draw(st.integers(0, 9)) == 0:
+        return draw.draw(JSON)
+    key = draw.draw(st.sampled_from(keys))
+    copy = value.copy()
+    if draw.draw(st.integers(0, 9)) == 0:
+        del copy[key]
+    else:
+        copy[key] = replace_somewhere(draw, value[key])
+    return copy
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize("content", [[view(), view(img_name="b", split="test")], nerfstudio(["a.png", "b.png"])])
+@given(draw=st.data())
+@settings(max_examples=300, deadline=None)
+def test_json_with_replaced_parts(content: Any, draw: st.DataObject, tmp_path_factory: pytest.TempPathFactory) -> None:
+    for _ in range(draw.draw(st.integers(1, 3))):
+        content = replace_somewhere(draw, content)
+    load_or_refuse(write_json(tmp_path_factory.getbasetemp() / "fuzz.json", content))

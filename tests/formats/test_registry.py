@@ -1,0 +1,265 @@
+"""The tables of formats: what is declared holds, and everything that people see follows the tables."""
+
+from __future__ import annotations
+
+import builtins
+import importlib
+import pkgutil
+import re
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, Phase, given, settings
+from hypothesis import strategies as st
+
+from potr_cl import Scene, UsageError, cli
+from potr_cl.formats import cameras, load_cameras, load_scene, registry, save_scene, scene_writer, scenes
+from potr_cl.formats.declaration import CameraFormat, SceneFormat, install_command
+from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS, listed
+from potr_cl.reference.scenes import random_scene
+from tests.cases.cameras import nerfstudio, view, write_json
+from tests.cases.scenes import in_order_of
+
+ROOT = Path(__file__).parents[2]
+WRITTEN = [entry for entry in SCENE_FORMATS if entry.save is not None]
+WITH_EXTRA: list[SceneFormat | CameraFormat] = [f for f in (*SCENE_FORMATS, *CAMERA_FORMATS) if f.extra is not None]
+
+
+def name(entry: Any) -> str:
+    return str(entry.name)
+
+
+# Declarations --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize(("package", "table"), [(scenes, SCENE_FORMATS), (cameras, CAMERA_FORMATS)])
+def test_every_declared_format_is_in_its_table(package: Any, table: tuple[Any, ...]) -> None:
+    modules = [
+        importlib.import_module(f"{package.__name__}.{each.name}") for each in pkgutil.iter_modules(package.__path__)
+    ]
+    declared = [module.FORMAT for module in modules if hasattr(module, "FORMAT")]
+    assert sorted(map(name, declared)) == sorted(map(name, table))
+    assert all(entry in table for entry in declared)
+
+
+def test_no_two_formats_claim_one_suffix_without_a_recogniser() -> None:
+    suffixes = Counter(suffix for entry in SCENE_FORMATS for suffix in entry.suffixes)
+    assert set(suffixes.values()) == {1}
+    for extension in {extension for entry in SCENE_FORMATS for extension in entry.extensions}:
+        having_it = [entry for entry in SCENE_FORMATS if extension in entry.extensions]
+        assert sum(entry.recognises is None for entry in having_it) == 1, extension
+
+
+def test_declarations_are_complete() -> None:
+    extras = re.findall(r"^([a-z-]+) = \[", (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
+    for entry in (*SCENE_FORMATS, *CAMERA_FORMATS):
+        assert all(re.fullmatch(r"(\.[a-z0-9]+)+", suffix) for suffix in entry.suffixes), entry.name
+        assert entry.suffixes, entry.name
+        assert entry.note, entry.name
+        assert not {"\n", "|"} & set(entry.name + entry.note), "it would break the documentation's table"
+        assert entry.extra is None or entry.extra in extras, entry.name
+    for entry in SCENE_FORMATS:
+        assert bool(entry.not_written) == (entry.save is None), entry.name
+    for each in CAMERA_FORMATS:
+        assert bool(each.json_mark) == (".json" in each.suffixes), each.name
+
+
+def test_formats_import_no_heavy_library() -> None:
+    program = "import sys, potr_cl.formats; print(sorted({'gsply', 'pycolmap', 'PIL'} & set(sys.modules)))"
+    result = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True)
+    assert result.stdout.strip() == "[]"
+
+
+# Reading and writing -------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("entry", WRITTEN, ids=name)
+@given(splats=st.integers(1, 400), degree=st.integers(0, 3), seed=st.integers(0, 99))
+@settings(
+    max_examples=12,
+    deadline=None,
+    suppress_health_check=[HealthCheck.function_scoped_fixture],
+    phases=[Phase.explicit, Phase.reuse, Phase.generate],  # a format that fails does so for nearly every scene
+)
+def test_every_format_reads_what_it_writes(
+    entry: SceneFormat, splats: int, degree: int, seed: int, tmp_path: Path
+) -> None:
+    if entry.extra == "convert":
+        pytest.importorskip("gsply", reason="the extra convert is not installed")
+    scene = random_scene(splats, degree, seed)
+    for suffix in entry.suffixes:
+        path = tmp_path / f"scene{suffix}"
+        save_scene(path, scene)
+        assert registry.reader_of(path) is entry.load
+        back = in_order_of(scene, load_scene(path))
+        assert back.sh.shape == scene.sh.shape
+        # The coarsest steps of all formats, and some; a format's own test knows its steps.
+        assert np.abs(back.means - scene.means).max() < 0.01
+        assert np.abs(back.opacities - scene.opacities).max() < 0.01
+        assert np.quantile(np.abs(back.log_scales - scene.log_scales), 0.9) < 0.1
+        unit, unit_back = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in (scene.quaternions, back.quaternions))
+        assert np.abs(np.einsum("ij,ij->i", unit, unit_back)).min() > 0.999
+        assert np.quantile(np.abs(back.sh - scene.sh), 0.9) < 0.05
+
+
+@pytest.mark.parametrize("suffix", [suffix for entry in WRITTEN for suffix in entry.suffixes])
+def test_suffixes_in_capitals_and_after_points(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / f"v1.2{suffix.upper()}"
+    assert registry.writer_of(path) == next(entry.save for entry in WRITTEN if suffix in entry.suffixes)
+
+
+def test_content_decides_between_formats_of_one_extension(data: Path, tmp_path: Path) -> None:
+    plain, compressed = (
+        next(entry for entry in SCENE_FORMATS if suffix in entry.suffixes) for suffix in (".ply", ".compressed.ply")
+    )
+    for name in ("a.ply", "a.compressed.ply"):
+        shutil.copy(data / "lego_excerpt.ply", tmp_path / name)
+        assert registry.reader_of(tmp_path / name) is plain.load
+        shutil.copy(data / "foreign" / "degree_0.compressed.ply", tmp_path / name)
+        assert registry.reader_of(tmp_path / name) is compressed.load
+    assert registry.reader_of(tmp_path / "missing.compressed.ply") is plain.load
+
+
+def test_unknown_suffixes(tmp_path: Path) -> None:
+    known = [suffix for entry in SCENE_FORMATS for suffix in entry.suffixes]
+    for unknown in ("a.obj", "a", ".ply.d"):
+        with pytest.raises(UsageError, match="unknown kind of scene, expected a") as caught:
+            load_scene(tmp_path / unknown)
+        assert all(suffix in str(caught.value) for suffix in known)
+        with pytest.raises(UsageError, match="scenes are written as") as caught:
+            scene_writer(tmp_path / unknown)
+        assert all(suffix in str(caught.value) for entry in WRITTEN for suffix in entry.suffixes)
+        assert not any(tmp_path.iterdir())
+
+
+def test_formats_that_are_not_written_say_what_to_do(tmp_path: Path) -> None:
+    for entry in SCENE_FORMATS:
+        if entry.save is None:
+            with pytest.raises(UsageError, match=re.escape(entry.not_written)):
+                save_scene(tmp_path / f"a{entry.suffixes[0]}", random_scene(3))
+
+
+# Extras --------------------------------------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def no_extras(monkeypatch: pytest.MonkeyPatch) -> None:
+    """As if no library that an extra brings were installed."""
+    real = builtins.__import__
+
+    def without(name: str, *args: Any, **kwargs: Any) -> Any:
+        if name.split(".")[0] in ("gsply", "pycolmap"):
+            raise ImportError(f"No module named '{name}'")
+        return real(name, *args, **kwargs)
+
+    monkeypatch.setattr(builtins, "__import__", without)
+
+
+@pytest.mark.usefixtures("no_extras")
+@pytest.mark.parametrize("entry", WITH_EXTRA, ids=name)
+def test_a_missing_extra_is_named(entry: SceneFormat | CameraFormat, tmp_path: Path) -> None:
+    assert entry.extra is not None
+    expected = re.escape(install_command(entry.extra))
+    if isinstance(entry, CameraFormat):
+        with pytest.raises(UsageError, match=expected):
+            entry.load_folder(tmp_path)
+        return
+    path = tmp_path / f"a{entry.suffixes[0]}"
+    if entry.save is not None:
+        with pytest.raises(UsageError, match=expected):
+            entry.save(path, random_scene(3))
+        assert not path.exists()
+    path.write_bytes(b"")
+    with pytest.raises(UsageError, match=expected):
+        entry.load(path)
+
+
+@pytest.mark.usefixtures("no_extras")
+def test_a_missing_library_is_named(tmp_path: Path, data: Path, lego_excerpt: Scene) -> None:
+    for name in ("version_3.spz", "degree_3.sog", "degree_3.compressed.ply"):
+        with pytest.raises(UsageError, match=r"potr-cl\[convert\]"):
+            load_scene(data / "foreign" / name)
+    with pytest.raises(UsageError, match=r"potr-cl\[convert\]"):
+        scene_writer(tmp_path / "x.spz")(lego_excerpt)
+    assert not list(tmp_path.iterdir())
+
+
+# Cameras -------------------------------------------------------------------------------------------------------------
+
+
+def test_order_in_which_a_folder_is_searched(data: Path, tmp_path: Path) -> None:
+    """From the last place to the first: each new file wins over those that were there."""
+    pytest.importorskip("pycolmap", reason="the extra colmap is not installed")
+    one, two = ([f"{i}.png" for i in range(n)] for n in (1, 2))
+
+    def rewrite(model: Path, source: str) -> None:
+        shutil.copytree(data / source, model, dirs_exist_ok=True)
+
+    def names() -> list[str]:
+        return [camera.name for camera in load_cameras(tmp_path)]
+
+    rewrite(tmp_path / "sparse", "plush_sparse_text")
+    (tmp_path / "sparse" / "images.txt").write_text(
+        (data / "plush_sparse_text" / "images.txt").read_text().replace("20240212", "outer")
+    )
+    assert names()[0].startswith("outer")
+    rewrite(tmp_path / "sparse" / "0", "plush_sparse_binary")
+    assert names()[0].startswith("20240212")
+    write_json(tmp_path / "transforms.json", nerfstudio(one))
+    assert names() == ["0"]
+    write_json(tmp_path / "transforms_train.json", nerfstudio(two))
+    assert names() == ["0", "1"]
+    write_json(tmp_path / "cameras.json", [view(img_name="a")])
+    assert names() == ["a"]
+    rewrite(tmp_path, "plush_sparse_binary")
+    assert names()[0].startswith("20240212")
+
+
+# What people see -----------------------------------------------------------------------------------------------------
+
+
+def test_the_documentation_has_the_table() -> None:
+    text = (ROOT / "docs" / "formats.md").read_text(encoding="utf-8")
+    found = re.findall(r"<!-- generated: formats -->\n(.*?)\n<!-- end -->", text, re.DOTALL)
+    assert found == [registry.formats_table()], "run: python -m tools.make.docs"
+
+
+def test_a_format_is_one_line_of_the_table(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    """Reading, writing, messages, help and documentation know a format as soon as the table does."""
+
+    def save(path: Path, scene: Scene) -> None:
+        np.save(path.open("wb"), scene.means)
+
+    def load(path: Path) -> Scene:
+        scene = random_scene(3, 0)
+        return Scene(np.load(path), scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh)
+
+    added = SceneFormat("Centres", (".centres",), "of this test", load, save, extra="centres")
+    monkeypatch.setattr(registry, "SCENE_FORMATS", (*SCENE_FORMATS, added))
+    scene = random_scene(3, 0)
+    save_scene(tmp_path / "a.ply", scene)
+    assert cli.main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "a.centres")]) == 0
+    np.testing.assert_array_equal(load_scene(tmp_path / "a.centres").means, scene.means)
+    assert cli.main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "a.obj")]) == 2
+    assert "or .centres" in capsys.readouterr().err
+    assert cli.main(["convert", str(tmp_path / "a.obj"), str(tmp_path / "b.ply")]) == 2
+    assert "or .centres" in capsys.readouterr().err
+    with pytest.raises(SystemExit):
+        cli.main(["convert", "--help"])
+    said = " ".join(capsys.readouterr().out.split())
+    assert said.count("or .centres") == 2
+    assert ".centres needs pip install" in said
+    assert "| Centres (`.centres`) | yes | yes | `pip install" in registry.formats_table()
+
+
+def test_lists_for_people() -> None:
+    assert [listed(list("abc")[:n]) for n in range(4)] == ["", "a", "a or b", "a, b or c"]
+    assert listed(["a", "b"], "and") == "a and b"

@@ -1,0 +1,98 @@
+"""What a file's report says of its sections: streams, integers and bytes are three different things."""
+
+from __future__ import annotations
+
+import json
+from functools import cache
+
+import pytest
+
+from potr_cl.codec.container import EntropyCoder
+from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.encoder import code_scene
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.reference.scenes import random_scene
+from potr_cl.report.file import file_report, format_report
+
+#: Enough for the context coder to be taken without trying others.
+SPLATS = 33_000
+#: Streams of one integer a splat in a scene of SH degree 1.
+STREAMS = {
+    "scale": 3,
+    "rotation": 3,
+    "opacity": 1,
+    "colour: DC": 3,
+    "colour: AC degree 1": 9,
+}
+
+
+@cache
+def report_of(preset, entropy):
+    parameters = HyperParameters.from_quality(0.5, preset)
+    pieces = code_scene(random_scene(SPLATS, 1), parameters, metadata=b'{"q": 0.5}', entropy=entropy).pieces
+    return file_report(PotrFile.from_bytes(b"".join(pieces)))
+
+
+@pytest.mark.parametrize(
+    ("preset", "entropy", "coder"),
+    [
+        ("best", EntropyCoder("context", 1), "context"),
+        ("best", EntropyCoder("zstd", 1), "zstd"),
+        ("paper", EntropyCoder("npz"), "deflate"),
+    ],
+)
+def test_streams_and_integers(preset, entropy, coder):
+    sections = report_of(preset, entropy)["sections"]
+    assert {name: sections[name]["streams"] for name in STREAMS} == STREAMS
+    for name, streams in STREAMS.items():
+        assert sections[name]["integers"] == SPLATS * streams
+        assert set(sections[name]["coders"]) <= {coder, "raw"}
+    assert sections["metadata"]["integers"] == sections["metadata"]["serialised_bytes"] == 10
+    assert sections["header"]["streams"] == sections["header"]["integers"] == 0
+
+
+def test_what_the_context_coder_holds_was_never_serialised():
+    report = report_of("best", EntropyCoder("context", 1))
+    for name in STREAMS:
+        assert report["sections"][name]["coders"] == ["context"]
+        assert report["sections"][name]["serialised_bytes"] is None
+    octree = report["sections"]["position: octree"]
+    assert octree["serialised_bytes"] >= octree["bytes"]
+    assert json.loads(json.dumps(report)) == report
+
+
+def test_serialised_sizes_are_those_of_whole_integers():
+    sections = report_of("best", EntropyCoder("zstd", 1))["sections"]
+    for name in STREAMS:
+        entry = sections[name]
+        assert entry["integers"] <= entry["serialised_bytes"] <= 4 * entry["integers"]
+        assert entry["bytes"] <= entry["serialised_bytes"]
+    # Scales of the paper's steps take two bytes each.
+    paper = report_of("paper", EntropyCoder("zstd", 1))["sections"]["scale"]
+    assert paper["serialised_bytes"] == 2 * paper["integers"]
+
+
+@pytest.mark.parametrize("entropy", ["context", "zstd"])
+def test_bytes_add_up_to_the_file(entropy):
+    report = report_of("best", EntropyCoder(entropy, 1))
+    assert sum(entry["bytes"] for entry in report["sections"].values()) == report["bytes"]
+    assert sum(entry["bits_a_splat"] for entry in report["sections"].values()) == pytest.approx(
+        8 * report["bytes_a_splat"]
+    )
+
+
+def row(report, name):
+    line = next(line for line in format_report(report).splitlines() if line.startswith(name))
+    return line.removeprefix(name).split()
+
+
+def test_the_table_for_people():
+    context, zstd = (report_of("best", EntropyCoder(name, 1)) for name in ("context", "zstd"))
+    titles = row(context, "section")
+    assert titles[:5] == ["coder", "streams", "integers", "serialised", "bytes"]
+    for report, coder in ((context, "context"), (zstd, "zstd")):
+        entry = report["sections"]["rotation"]
+        cells = row(report, "rotation")
+        assert cells[:3] == [coder, "3", str(3 * SPLATS)]
+        assert cells[3] == ("-" if coder == "context" else str(entry["serialised_bytes"]))
+        assert cells[4] == str(entry["bytes"])

@@ -1,0 +1,130 @@
+"""The scripts that measure size against quality: what they compute of their own."""
+
+from __future__ import annotations
+
+import json
+import shutil
+import sys
+
+import numpy as np
+import pytest
+
+from potr_cl.errors import UsageError
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.reference.scenes import random_scene
+from tools.study import ablation, compare_formats, rate_distortion
+
+
+@pytest.fixture
+def folder(tmp_path, data):
+    """The excerpt as a scene's folder."""
+    scene = tmp_path / "excerpt"
+    scene.mkdir()
+    shutil.copy(data / "lego_excerpt.ply", scene / "point_cloud.ply")
+    shutil.copy(data / "lego_cameras.json", scene / "cameras.json")
+    return scene
+
+
+def call(monkeypatch, tool, *arguments):
+    monkeypatch.setattr(sys, "argv", ["tool", *map(str, arguments)])
+    tool.main()
+
+
+def test_series():
+    name, options = rate_distortion.parse_series("no colours:refit=False,prune.iterations=8,compact.colour_model=rgb")
+    assert (name, options) == ("no colours", {"refit": False, "prune.iterations": 8, "compact.colour_model": "rgb"})
+    chosen = rate_distortion.encode_options(options)
+    assert (chosen.refit.on, chosen.prune.iterations, chosen.compact.colour_model) == (False, 8, "rgb")
+    assert rate_distortion.encode_options({}) == EncodeOptions()
+    with pytest.raises(UsageError, match="'speed' is no option"):
+        rate_distortion.parse_series("a:speed=1")
+
+
+def test_a_curve_is_measured_written_and_continued(monkeypatch, folder, tmp_path, capsys):
+    pytest.importorskip("matplotlib", reason="the extra bench is not installed")
+    out, images = tmp_path / "out.json", tmp_path / "images"
+    call(monkeypatch, rate_distortion, "measure", folder, "--json", out, "--qualities", 0.3)
+    first = json.loads(out.read_text())["scenes"]["excerpt"]["series"]["default"]["encodes"]
+    call(monkeypatch, rate_distortion, "measure", folder, "--json", out, "--qualities", 0.1, 0.3)
+    points = json.loads(out.read_text())["scenes"]["excerpt"]["series"]["default"]["encodes"]
+    assert [p["q"] for p in points] == [0.1, 0.3]
+    assert points[1] == first[0], "measured again"
+    assert points[0]["bytes"] < points[1]["bytes"]
+    assert sum(points[0]["sections"].values()) == points[0]["bytes"]
+    capsys.readouterr()
+    call(monkeypatch, rate_distortion, "report", out, "--images", images)
+    assert f"{points[0]['psnr']:.2f} dB" in capsys.readouterr().out
+    assert (images / "rate_distortion_excerpt.png").stat().st_size > 1000
+
+
+def test_series_of_the_sweeps_options_and_their_gaps(monkeypatch, folder, tmp_path, capsys):
+    _, options = rate_distortion.parse_series("lazy:preset=fast,prune.tolerance=0.1,prune.iterations=8")
+    lazy = rate_distortion.encode_options({**options, "q": 0.4})
+    assert (lazy.prune.tolerance, lazy.prune.iterations, lazy.q, lazy.preset) == (0.1, 8, 0.4, "fast")
+    out = tmp_path / "out.json"
+    series = tuple(f"{name}:preset=paper,prune.iterations=4" for name in ("plain", "same"))
+    series += ("lazy:preset=paper,prune.iterations=4,prune.tolerance=0.5",)
+    call(monkeypatch, rate_distortion, "measure", folder, "--json", out, "--qualities", 0.4, 0.6, "--series", *series)
+    capsys.readouterr()
+    call(monkeypatch, rate_distortion, "report", out, "--against", "plain", "--at", 0.4)
+    said = capsys.readouterr().out
+    rows = {line.split(" | ")[0].strip("| "): line for line in said.splitlines()[2:]}
+    assert "+0.0 %" in rows["plain"]
+    assert "+0.0 %" in rows["same"]
+    assert "+0.0 %" not in rows["lazy"]
+    for name, quality in (("plane", 0.4), ("plain", 0.5)):
+        with pytest.raises(UsageError, match=f"no encode of '{name}' at quality {quality}"):
+            call(monkeypatch, rate_distortion, "report", out, "--against", name, "--at", quality)
+
+
+def test_interpolation_along_a_curve():
+    points = [{"bytes": b, "psnr": p} for b, p in ((4000, 40.0), (1000, 30.0), (16000, 45.0))]
+    assert rate_distortion.size_at(points, "psnr", 35.0) == pytest.approx(2000)
+    assert rate_distortion.value_at(points, "psnr", 2000) == pytest.approx(35)
+    assert rate_distortion.value_at(points, "psnr", 16000) == 45
+    assert rate_distortion.size_at(points, "psnr", 45.1) is None
+    assert rate_distortion.value_at(points, "psnr", 999) is None
+
+
+def test_the_report_on_formats(monkeypatch, tmp_path, capsys):
+    ours = [{"bytes": b, "psnr": p, "psnr_loss": 50 - p} for b, p in ((1_000_000, 30.0), (4_000_000, 40.0))]
+    theirs = [
+        {"format": ".a", "bytes": 4_000_000, "psnr": 35.0, "psnr_loss": 15.0, "measured": True},
+        {"format": ".b", "bytes": 9_000_000, "psnr": 41.0, "psnr_loss": 9.0, "measured": True},
+        {"format": "c", "bytes": 8_000_000, "psnr": 20.0, "psnr_loss": 30.0, "measured": False},
+    ]
+    formats, curve = tmp_path / "formats.json", tmp_path / "curve.json"
+    formats.write_text(json.dumps({"tool": "t 1", "scenes": {"s": {"formats": theirs}}}))
+    curve.write_text(json.dumps({"scenes": {"s": {"series": {"default": {"encodes": ours}}}}}))
+    call(monkeypatch, compare_formats, "report", formats, curve)
+    a, b, c = (line for line in capsys.readouterr().out.splitlines() if line.startswith(("| .", "| c")))
+    assert a.count("2.00 MB, 2.0 ×") == 2
+    assert "40.00 dB" in a
+    assert "10.00 dB" in a
+    assert b.count("beyond our best") == 2
+    assert "| c * |" in c
+    assert c.count("more than 8.0 ×") == 2
+
+
+def test_rgb_streams_keep_r_g_and_b():
+    scene = random_scene(50, 2)
+    steps = ablation.as_channels(scene)
+    y, co, cg = ablation.quantize.to_ycocg(steps.sh.reshape(-1, 3).astype(np.float64))
+    assert np.allclose(np.stack([y, co, cg], -1).reshape(scene.sh.shape), scene.sh, atol=1e-5)
+    assert np.allclose(ablation.from_channels(steps).sh, scene.sh, atol=1e-5)
+    assert ablation.from_channels(steps).sh.dtype == np.float32
+
+
+def test_ablation(monkeypatch, folder, tmp_path, capsys):
+    out = tmp_path / "out.json"
+    call(monkeypatch, ablation, "measure", folder, "--json", out)
+    steps = json.loads(out.read_text())["scenes"]["excerpt"]["steps"]
+    sizes = [step["bytes"] for step in steps]
+    assert len(steps) == 6
+    assert sizes == sorted(sizes, reverse=True), "a part of the codec adds bytes"
+    assert steps[0]["psnr"] == steps[1]["psnr"]
+    for step in steps[1:]:
+        listed = sum(step["bytes_a_splat"].values()) * step["splats"]
+        assert 0 < step["bytes"] - listed < 3000, "more than the header is missing"
+    call(monkeypatch, ablation, "report", out)
+    assert "| AC | 180 |" in capsys.readouterr().out
