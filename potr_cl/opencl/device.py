@@ -122,7 +122,7 @@ class Device:
             handle = cl.Kernel(self.program(source, **defines), name)
         return Kernel(self, handle, source, self._variants)
 
-    def shared_kernel(self, source: str, name: str, types: Any = None, **defines: str | int | float) -> Kernel:
+    def shared_kernel(self, source: str, name: str, **defines: str | int | float) -> Kernel:
         """A kernel object that is made once a device: who takes it binds all its arguments before each launch.
 
         Args:
