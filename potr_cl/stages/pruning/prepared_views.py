@@ -137,7 +137,7 @@ class PreparedViews(Owner):
         for prepared in self.cached:
             prepared.close()
         self.cached = []
-        self._cache.free()
+        self._cache.close()
 
 
 class PreparedSet(Owner):
@@ -210,5 +210,5 @@ class PreparedSet(Owner):
 
     def close(self) -> None:
         """Give the memory back, that of the views too."""
-        self.views.free()
+        self.views.close()
         self._memory.close()

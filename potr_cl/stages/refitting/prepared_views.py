@@ -72,7 +72,7 @@ class PreparedViews(Owner):
             kept = self.budget.keep(views)
         finally:
             if not kept:
-                views.free()
+                views.close()
         if kept:
             self._kept[numbers] = views
 
@@ -96,11 +96,11 @@ class PreparedViews(Owner):
                 yield views, projected or kept is None
         finally:
             if kept is None:
-                views.free()
+                views.close()
 
     def close(self) -> None:
         """Give all device memory back."""
         for views in self._kept.values():
-            views.free()
+            views.close()
         self._kept = {}
-        self.budget.free()
+        self.budget.close()
