@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
@@ -96,7 +96,9 @@ class Compact(Stage):
         with _effects(state, bench) as effects:
             bench.progress("compact", 0.0)
             weights = ViewWeights.from_importances(len(state.scene), effects.view_importances())
-            scene = state.source.subset(state.survivors)
+            scene = state.scene
+            if not state.original_colours:
+                scene = replace(scene, sh=state.source.sh[state.survivors])
             places = standpoints(state.views, state.source.means)
             sh = Compactor(bench.opened).compact(scene, places, weights, options).sh
             bench.progress("compact", 1.0)
