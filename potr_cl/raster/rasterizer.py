@@ -299,8 +299,6 @@ class Rasterizer(Owner):
         for owner in (self._scene, self._bounds, self._counts, self._keys, self._image, self._transmittance):
             owner.close()
 
-    free = close
-
 
 def render(
     scene: Scene,

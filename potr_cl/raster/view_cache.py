@@ -101,5 +101,3 @@ class ViewCache(Owner):
         """Give back what views share; they themselves are their owners' to close."""
         self._memory.close()
         self.shared, self._whole = None, []
-
-    free = close

@@ -157,8 +157,6 @@ class ViewSet(Owner):
     def close(self) -> None:
         self._memory.close()
 
-    free = close
-
 
 class View(Owner):
     """One camera's part of a :class:`ViewSet`; the only view of a set stands for the set, buffers and all.
@@ -219,8 +217,6 @@ class View(Owner):
 
     def close(self) -> None:
         self._alone.close()
-
-    free = close
 
 
 @lru_cache(maxsize=4096)

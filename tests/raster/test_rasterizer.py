@@ -14,6 +14,7 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory
 from potr_cl.raster.rasterizer import Rasterizer, render
 from potr_cl.raster.rules import GSPLAT, INRIA, RasterRules
 from potr_cl.raster.view_set import TILE, View, ViewSet
@@ -186,11 +187,10 @@ def test_pictures_of_several_views_in_one_buffer(
     cameras = [tilted_camera(1, 64, 64), tilted_camera(2, 50, 33), *(tilted_camera(seed, 17, 15) for seed in range(3))]
     wanted = [rasterizer.render(view)[0].reshape(-1, 3) for view in cameras]
     pixels = sum(map(len, wanted))
-    buffer = device.allocate(12 * pixels, "pictures")
-    rasterizer.render_into(cameras, buffer)
-    assert np.array_equal(device.download(buffer, (pixels, 3), np.float32), np.concatenate(wanted))
-    device.free(buffer)
-    rasterizer.close()
+    with rasterizer, Memory(device) as memory:
+        buffer = memory.allocate(12 * pixels, "pictures")
+        rasterizer.render_into(cameras, buffer)
+        assert np.array_equal(device.download(buffer, (pixels, 3), np.float32), np.concatenate(wanted))
 
 
 def test_lists_that_do_not_fit_are_made_again(device: Device) -> None:

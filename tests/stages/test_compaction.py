@@ -426,13 +426,9 @@ def test_fp64_is_refused_where_there_is_none(device: Device, monkeypatch: pytest
 
 
 def measured_weights(device: Device, scene: Scene, cameras: list[Camera]) -> ViewWeights:
-    rasterizer = Rasterizer(device, scene)
-    sweep = RemovalSweep(rasterizer, cameras)
-    sweep.measure()
-    weights = ViewWeights.from_importances(len(scene), sweep.view_importances())
-    sweep.free()
-    rasterizer.close()
-    return weights
+    with Rasterizer(device, scene) as rasterizer, RemovalSweep(rasterizer, cameras) as sweep:
+        sweep.measure()
+        return ViewWeights.from_importances(len(scene), sweep.view_importances())
 
 
 def zeros(sh: NDArray[np.floating]) -> float:

@@ -25,9 +25,8 @@ def device(request):
 
 @pytest.fixture
 def rasterizer(device, lego_excerpt):
-    rasterizer = Rasterizer(device, lego_excerpt)
-    yield rasterizer
-    rasterizer.free()
+    with Rasterizer(device, lego_excerpt) as rasterizer:
+        yield rasterizer
 
 
 @pytest.fixture

@@ -25,16 +25,13 @@ def cameras(lego_excerpt_cameras):
 
 
 def run(device, scene, cameras, options, sweep=None, on_device=True, after_iteration=None):
-    rasterizer = Rasterizer(device, scene)
-    removal = RemovalSweep(rasterizer, cameras, sweep or SweepOptions())
-    assert removal.steering is not None
-    if on_device:
-        result = prune_scene(removal, options, after_iteration=after_iteration and after_iteration(removal))
-    else:
-        result = prune(removal, len(scene), options)
-    left, sweeps = removal.alive, removal.sweeps
-    removal.free()
-    rasterizer.close()
+    with Rasterizer(device, scene) as rasterizer, RemovalSweep(rasterizer, cameras, sweep or SweepOptions()) as removal:
+        assert removal.steering is not None
+        if on_device:
+            result = prune_scene(removal, options, after_iteration=after_iteration and after_iteration(removal))
+        else:
+            result = prune(removal, len(scene), options)
+        left, sweeps = removal.alive, removal.sweeps
     assert np.flatnonzero(left).tolist() == result.survivors.tolist() or result.kept == 1
     return result, sweeps
 
@@ -64,22 +61,19 @@ def test_the_same_splats_go_as_in_numpy(gpu, lego_excerpt, cameras, decay):
 def test_each_iteration_spends_its_budget(gpu, lego_excerpt, cameras):
     """Against the rules themselves: what went scores less than what stayed, and just reaches the budget."""
     found, _ = run(gpu, lego_excerpt, cameras, OPTIONS)
-    rasterizer = Rasterizer(gpu, lego_excerpt)
-    removal = RemovalSweep(rasterizer, cameras, SweepOptions())
-    smoothed = SmoothedEffects(removal, OPTIONS.decay)
-    alive = np.arange(len(lego_excerpt))
-    start = 0
-    for iteration in range(3):
-        delta_mse, importance = smoothed.measure()
-        gone = found.order[start : start + (found.iteration_of == iteration).sum()]
-        expected = choose(delta_mse, importance, alive, OPTIONS.iterations - iteration, OPTIONS)
-        assert abs(len(gone) - len(expected)) <= 1
-        assert len(np.setxor1d(gone, expected)) <= 1
-        smoothed.remove(gone)
-        alive = np.setdiff1d(alive, gone)
-        start += len(gone)
-    removal.free()
-    rasterizer.close()
+    with Rasterizer(gpu, lego_excerpt) as rasterizer, RemovalSweep(rasterizer, cameras, SweepOptions()) as removal:
+        smoothed = SmoothedEffects(removal, OPTIONS.decay)
+        alive = np.arange(len(lego_excerpt))
+        start = 0
+        for iteration in range(3):
+            delta_mse, importance = smoothed.measure()
+            gone = found.order[start : start + (found.iteration_of == iteration).sum()]
+            expected = choose(delta_mse, importance, alive, OPTIONS.iterations - iteration, OPTIONS)
+            assert abs(len(gone) - len(expected)) <= 1
+            assert len(np.setxor1d(gone, expected)) <= 1
+            smoothed.remove(gone)
+            alive = np.setdiff1d(alive, gone)
+            start += len(gone)
 
 
 def test_order_and_history_fit_the_iterations(gpu, lego_excerpt, cameras):
@@ -162,13 +156,10 @@ def test_the_same_without_atomics_on_64_bits(gpu, lego_excerpt, cameras):
 
 
 def test_options_that_only_the_host_knows(gpu, lego_excerpt, cameras):
-    rasterizer = Rasterizer(gpu, lego_excerpt)
-    for sweep in (SweepOptions(turns=2), SweepOptions(sample=0.5), SweepOptions(memory=0)):
-        removal = RemovalSweep(rasterizer, cameras, sweep)
-        assert removal.steering is None
-        assert prune_scene(removal, OPTIONS).kept < 1500
-        removal.free()
-    removal = RemovalSweep(rasterizer, cameras)
-    assert prune_scene(removal, PruningOptions(0, 3, count=700)).kept == 700
-    removal.free()
-    rasterizer.close()
+    with Rasterizer(gpu, lego_excerpt) as rasterizer:
+        for sweep in (SweepOptions(turns=2), SweepOptions(sample=0.5), SweepOptions(memory=0)):
+            with RemovalSweep(rasterizer, cameras, sweep) as removal:
+                assert removal.steering is None
+                assert prune_scene(removal, OPTIONS).kept < 1500
+        with RemovalSweep(rasterizer, cameras) as removal:
+            assert prune_scene(removal, PruningOptions(0, 3, count=700)).kept == 700

@@ -149,8 +149,7 @@ class ColourRefit(Owner):
             raise UsageError("a re-fit needs at least one view")
         with ExitStack() as owned:
             # The rasterizer's own colours are never looked at.
-            rasterizer = Rasterizer(device, replace(scene, sh=scene.sh[:, :1]), rules)
-            owned.callback(rasterizer.free)
+            rasterizer = owned.enter_context(Rasterizer(device, replace(scene, sh=scene.sh[:, :1]), rules))
             launcher = launcher_for(device, rules)
             layout = Layout(len(scene), rasterizer.stride, scene.sh.shape[1], launcher.lanes)
             self.coefficients = owned.enter_context(Coefficients(device, layout))
