@@ -19,12 +19,12 @@ from potr_cl.stages.code import Code
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import State
-from tests.devices import KERNELS, open_device
+from tests.devices import FAMILIES, open_device
 
 FEW = EncodeOptions.for_preset("paper", prune={"iterations": 6})
 
 
-@pytest.fixture(scope="module", params=KERNELS)
+@pytest.fixture(scope="module", params=FAMILIES)
 def device(request):
     device = open_device(request.param)
     yield device

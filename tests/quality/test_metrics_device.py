@@ -120,6 +120,7 @@ def test_rendered_pictures_are_those_of_the_rasterizer(device):
     assert device.allocated == before
 
 
+@pytest.mark.one_runtime
 def test_batches_hold_every_view_once_and_bounded_bytes(device):
     views = [camera(64, 64, focal) for focal in range(60, 160)]
     batches = list(in_batches(device, views))

@@ -401,6 +401,7 @@ def test_everything_at_once_stays_finite(device: Device) -> None:
             assert transmittance.max() <= 1
 
 
+@pytest.mark.one_runtime
 def test_lists_larger_than_the_device_give_an_error(device: Device) -> None:
     scene = splats(np.tile([0.0, 0, 2], (2000, 1)), sigma=100, logit=-5)
     rasterizer = Rasterizer(device, scene)
@@ -424,6 +425,7 @@ def make_and_prepare(device: Device, scene: Scene, view: Camera) -> None:
         rasterizer.close()
 
 
+@pytest.mark.one_runtime
 def test_what_does_not_fit_leaves_nothing_behind(device: Device) -> None:
     """Wherever in making a rasterizer or a view the memory runs out."""
     scene, view = random_splats(3000, 3, seed=1), tilted_camera(1, 100, 100)
@@ -446,6 +448,7 @@ def test_what_does_not_fit_leaves_nothing_behind(device: Device) -> None:
         assert device.allocated == before
 
 
+@pytest.mark.one_runtime
 def test_image_with_too_many_tiles_is_refused(device: Device) -> None:
     with pytest.raises(UsageError, match="1048577 x 1"):
         render(splats([0, 0, 2]), camera(1 << 20 | 1, 1), device)

@@ -58,6 +58,7 @@ def test_the_same_splats_go_as_in_numpy(gpu, lego_excerpt, cameras, decay):
         assert one.effect == pytest.approx(other.effect, rel=0.05, abs=1e-7)
 
 
+@pytest.mark.one_runtime
 def test_each_iteration_spends_its_budget(gpu, lego_excerpt, cameras):
     """Against the rules themselves: what went scores less than what stayed, and just reaches the budget."""
     found, _ = run(gpu, lego_excerpt, cameras, OPTIONS)
@@ -76,6 +77,7 @@ def test_each_iteration_spends_its_budget(gpu, lego_excerpt, cameras):
             start += len(gone)
 
 
+@pytest.mark.one_runtime
 def test_order_and_history_fit_the_iterations(gpu, lego_excerpt, cameras):
     found, _ = run(gpu, lego_excerpt, cameras, OPTIONS)
     assert np.sort(found.order).tolist() == list(range(1500))
@@ -92,6 +94,7 @@ def test_twice_the_same(gpu, lego_excerpt, cameras):
     assert one.history == other.history
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize("limit", [0.0, 1e9])
 def test_only_improvements_and_everything(gpu, lego_excerpt, cameras, limit):
     options = PruningOptions(limit, 3)
@@ -102,6 +105,7 @@ def test_only_improvements_and_everything(gpu, lego_excerpt, cameras, limit):
         assert found.kept == 1
 
 
+@pytest.mark.one_runtime
 def test_nothing_to_remove(gpu):
     scene = visible_scene(40)
     found, sweeps = run(gpu, scene, ring_of_cameras(2, size=48), PruningOptions(1e-30, 5))
@@ -110,6 +114,7 @@ def test_nothing_to_remove(gpu):
     assert sweeps == 1
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize("tolerance", [-1.0, 0.0, 0.3])
 def test_tiles_are_swept_again_by_the_tolerance(gpu, lego_excerpt, cameras, tolerance):
     sweep = SweepOptions(tolerance)
@@ -121,6 +126,7 @@ def test_tiles_are_swept_again_by_the_tolerance(gpu, lego_excerpt, cameras, tole
         assert sweeps == found.iterations
 
 
+@pytest.mark.one_runtime
 def test_host_and_device_take_turns(gpu, lego_excerpt, cameras):
     """Reading weights of views or giving new colours in between leaves the device's lists as they should be."""
     seen = []
@@ -155,6 +161,7 @@ def test_the_same_without_atomics_on_64_bits(gpu, lego_excerpt, cameras):
     assert other.history == found.history
 
 
+@pytest.mark.one_runtime
 def test_options_that_only_the_host_knows(gpu, lego_excerpt, cameras):
     with Rasterizer(gpu, lego_excerpt) as rasterizer:
         for sweep in (SweepOptions(turns=2), SweepOptions(sample=0.5), SweepOptions(memory=0)):

@@ -143,6 +143,7 @@ def test_sums_kept_over_removals_are_those_of_a_new_sweep(device, lego_excerpt, 
         assert np.array_equal(a[left], b[left])
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
 def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, lego_excerpt, lego_excerpt_cameras, share):
     cameras = lego_excerpt_cameras[:4]
@@ -162,6 +163,7 @@ def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, lego_ex
     assert np.array_equal(*results)
 
 
+@pytest.mark.one_runtime
 def test_buffers_too_small_for_all_views_change_nothing(device, lego_excerpt, lego_excerpt_cameras, monkeypatch):
     """A device that allows no large buffer has fewer views at a time, and keeps them all."""
     cameras, results = lego_excerpt_cameras[:7], []
@@ -178,6 +180,7 @@ def test_buffers_too_small_for_all_views_change_nothing(device, lego_excerpt, le
     assert np.array_equal(*results)
 
 
+@pytest.mark.one_runtime
 def test_views_in_turns(device, lego_excerpt, lego_excerpt_cameras):
     with (
         Rasterizer(device, lego_excerpt) as rasterizer,
@@ -188,6 +191,7 @@ def test_views_in_turns(device, lego_excerpt, lego_excerpt_cameras):
         assert removal.sweeps == pytest.approx(1 + 0.5 + 0.5)
 
 
+@pytest.mark.one_runtime
 def test_tolerance_saves_sweeps(device, lego_excerpt, lego_excerpt_cameras):
     sweeps = []
     for tolerance in (-1, 0, 0.05):
@@ -264,6 +268,7 @@ def test_a_removal_lets_pixels_go_on(device):
     assert shares[SweepOptions.transmittance_threshold] > 0.98
 
 
+@pytest.mark.one_runtime
 def test_a_random_sample_of_tiles(device, lego_excerpt, lego_excerpt_cameras):
     """Reproducible, fewer sweeps, every tile when sampling is over."""
     results, sweeps = [], []
@@ -339,6 +344,7 @@ def test_views_of_different_sizes_count_the_same(device):
         assert np.allclose(together[i], (separate[0][i] + separate[1][i]) / 2, rtol=1e-5, atol=1e-13)
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize("share", [0.2, 0.3, 0.5, 0.7, 0.95])
 def test_the_memory_budget_is_used_and_not_exceeded(device, share):
     """Lists first, then geometry of as many views as there is room for; the effects are the same whatever is kept."""
@@ -363,6 +369,7 @@ def test_the_memory_budget_is_used_and_not_exceeded(device, share):
     assert (effects[:, left] == expected[:, left]).all()
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
 def test_a_failure_gives_all_memory_back(device, monkeypatch, share):
     """Wherever the device's memory ends while a sweep is made."""
@@ -390,6 +397,7 @@ def test_identical_splats_share_their_effect(device):
     assert (np.diff(importance) <= 1e-12).all()
 
 
+@pytest.mark.one_runtime
 def test_pruning_to_one_splat(device):
     scene = visible_scene(40, 0)
     cameras = ring_of_cameras(2, size=48)
@@ -398,6 +406,7 @@ def test_pruning_to_one_splat(device):
     assert pruned.kept == 1
 
 
+@pytest.mark.one_runtime
 def test_pruning_keeps_the_picture_better_than_importance(device, lego_excerpt, lego_excerpt_cameras):
     cameras = [c for c in lego_excerpt_cameras if c.split == "train"][:4]
     with sweep(device, lego_excerpt, cameras) as removal:
@@ -412,11 +421,13 @@ def test_pruning_keeps_the_picture_better_than_importance(device, lego_excerpt, 
     assert error(pruned.survivors) < 0.5 * error(by_importance)
 
 
+@pytest.mark.one_runtime
 def test_no_view_is_an_error(device):
     with Rasterizer(device, visible_scene(3, 0)) as rasterizer, pytest.raises(UsageError, match="at least one view"):
         RemovalSweep(rasterizer, [])
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize(
     ("kind", "integrated", "share"), [("gpu", False, 0.5), ("gpu", True, 0.3), ("cpu", True, 0.3), ("cpu", False, 0.3)]
 )

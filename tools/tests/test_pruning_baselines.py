@@ -14,13 +14,13 @@ from potr_cl.reference import raster as reference
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from tests.devices import KERNELS, open_device
+from tests.devices import FAMILIES, open_device
 from tools.bench.pruning import pareto
 from tools.study import pruning_baselines as baselines
 from tools.study.pruning_baselines import mesongs_power, removal_order, scores, transmittance_sums
 
 
-@pytest.fixture(scope="module", params=KERNELS)
+@pytest.fixture(scope="module", params=FAMILIES)
 def device(request):
     chosen = open_device(request.param)
     device = Device(chosen.info, family=chosen.family, variants=baselines.KERNELS)
