@@ -1,0 +1,61 @@
+"""Programs about the package, not of it: what they answer, and the command that does it.
+
+Run them from the checkout's root, as in ``python -m tools.bench.search --help``. A SCENE is a folder that holds
+point_cloud.ply and cameras.json. They print Markdown; most keep their figures with --json, for docs/benchmarks.
+
+How fast, how large, how much memory (``bench``):
+
+=====================  =================================================================================================
+bench.encode           run time against error of every stage and variant on every device: what is on the Pareto front?
+bench.rasterizer       frames a second, and time against splats, pixels and overlap
+bench.pruning          what does pruning keep, against other pruners, and what may its sweeps skip?
+bench.refit            what does the re-fit of the colours bring, and what does it take?
+bench.compaction       speed of the compaction, and its error against float64
+bench.compact_at       when within the pruning schedule to compact?
+bench.codec            speed, memory and size of the codec alone
+bench.search           what does encoding to a size or a PSNR cost, against one plain encode?
+bench.virtual_cameras  what does encoding without cameras cost?
+bench.needs            what is a scene charged for splats, views and tiles that nobody needs?
+bench.busy             how busy is the device during an encode, stage by stage?
+bench.kernels          processor time of each kernel, on machines that do other work too
+bench.memory           host memory of one encode, stage by stage
+bench.memory_growth    peak memory against splats and views, and whether --memory is obeyed
+=====================  =================================================================================================
+
+What a choice costs or brings, against the alternatives (``study``):
+
+=========================  =============================================================================================
+study.rate_distortion      size against quality: the curves that other studies compare with
+study.ablation             what does each part of the codec contribute?
+study.compare_formats      what would people use instead?
+study.rates                where do the bits go, and what do they buy?
+study.compaction_curves    what does the compaction do to sparsity and pictures?
+study.removal_exactness    how far are predicted removal effects from removals in float64?
+study.removal_formulas     back to front or prefix sums: which formula of removal effects?
+study.composite_yardstick  the compositing kernel beside a loop in C
+=========================  =============================================================================================
+
+What happens at the limits (``stress``):
+
+=================  =====================================================================================================
+stress.run         every kernel against float64 on the worst inputs: what error is the kernel's own?
+stress.platforms   the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
+stress.fuzz        does any changed file do more than be refused or decode to finite numbers?
+=================  =====================================================================================================
+
+What tests and pages are made of (``make``):
+
+====================  ==================================================================================================
+make.large_scene      a scene of any size with the statistics of a real one
+make.test_data        the excerpts in tests/data
+make.foreign_files    the excerpt in other tools' formats
+make.golden_files     files that every later decoder must read to the same values
+make.benchmark_pages  the tables and plots of docs/benchmarks, from the results beside them
+====================  ==================================================================================================
+
+Shared: :mod:`tools.results` (tables that say what they are of), :mod:`tools.workloads` (scenes, views, repeated work),
+:mod:`tools.study.evaluation` (what a candidate loses to its scene), :mod:`tools.study.pruning_baselines` (the orders of
+other pruners), :mod:`tools.stress.cases` (inputs at their worst). Tools import the package and its float64 definitions
+(:mod:`potr_cl.reference`), never the tests; kernels of their own are given to a
+:class:`potr_cl.opencl.device.Device` as variants. Their own tests are in tools/tests.
+"""

@@ -67,12 +67,13 @@ def _run(argv: Sequence[str]) -> None:
     if argv and argv[0] in _ON_A_DEVICE and not {"-h", "--help"} & set(argv):
         # Drivers take as long to load as the command's modules to be imported.
         in_background(import_module("potr_cl.opencl.discovery").list_devices)
-    args = _parser(argv).parse_args(argv)
+    args = command_parser(argv).parse_args(argv)
     guard.check(args)
     args.run(args)
 
 
-def _parser(argv: Sequence[str]) -> argparse.ArgumentParser:
+def command_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
+    """The parser of the command that ``argv`` begins with; of all commands where it begins with none."""
     parser = CommandParser(
         prog="potr-cl", description="Compress trained 3D Gaussian Splatting scenes without retraining."
     )

@@ -29,12 +29,13 @@ from potr_cl.pipeline.encode import Run, Stopwatch
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from potr_cl.quality.ground_truth import GroundTruth, GroundTruthTargets
+from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
-from potr_cl.stages.refitting.refit import RefitOptions, Refitted, RenderedTargets, active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit import RefitOptions, Refitted, active_coefficients, refit_colours
+from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
 from potr_cl.stages.stage import Stage, State
 
 #: Coefficients that round to 0 at so many steps a unit are 0, but for what storing R, G and B leaves of them.
@@ -152,7 +153,7 @@ def _refit(args: argparse.Namespace) -> None:
                     rasterizer = stack.enter_context(Rasterizer(device, reference, background=background))
                     targets = RenderedTargets(rasterizer, views)
                 else:
-                    targets = stack.enter_context(GroundTruthTargets(device, ground_truth, views))
+                    targets = GroundTruthTargets(device, ground_truth, views)
                 active = active_coefficients(scene.sh, _ZERO_SF)
                 return refit_colours(
                     device, scene, views, targets, how, active, background,

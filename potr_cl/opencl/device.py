@@ -5,8 +5,9 @@ from __future__ import annotations
 import logging
 import threading
 import warnings
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -41,6 +42,9 @@ class Device:
         profiling: record a pair of device timestamps for every launch, see :attr:`timings`.
         family: run the kernels of this family instead of the device's own (for tests and benchmarks).
         build_options: compiler flags for every program; the kernels' accuracy is known without any.
+        variants: kernel files and headers to read in place of those of these names in ``cl/``, or under names that it
+            does not have (for experiments); what they include is looked up in the same way.
+        macros: values that the kernels' macros have in every program, whatever the package asks for (for experiments).
 
     Attributes:
         info, context, queue.
@@ -60,6 +64,8 @@ class Device:
         profiling: bool = False,
         family: Family | None = None,
         build_options: Sequence[str] = (),
+        variants: Mapping[str, Path] | None = None,
+        macros: Mapping[str, str | int | float] | None = None,
     ) -> None:
         self.info = info if isinstance(info, DeviceInfo) else choose_device(info)
         if compiler_fault(self.info) is not None:
@@ -71,6 +77,8 @@ class Device:
         self._unfinished: dict[int, list[list[cl.Buffer]]] = {}  # by thread
         self._profiling = profiling
         self._build_options = tuple(build_options)
+        self._variants = dict(variants or {})
+        self._macros = dict(macros or {})
         self._programs: dict[tuple[str, tuple[tuple[str, str], ...]], cl.Program] = {}
         self._of_this_thread = threading.local()
         with self.errors("cannot be opened"):
@@ -114,20 +122,20 @@ class Device:
         Raises:
             DeviceError: the device's compiler refused it.
         """
-        macros = tuple(sorted((name, _literal(value)) for name, value in defines.items()))
+        macros = tuple(sorted((name, _literal(value)) for name, value in {**defines, **self._macros}.items()))
         key = (source, macros)
         if key not in self._programs:
             options = ["-cl-std=CL1.2", *self._build_options, *(f"-D{name}={value}" for name, value in macros)]
             with self.errors(f"failed to build {source}"), warnings.catch_warnings():
                 warnings.simplefilter("ignore", cl.CompilerWarning)  # some drivers chat without being asked
-                self._programs[key] = cl.Program(self.context, kernel_source(source)).build(options)
+                self._programs[key] = cl.Program(self.context, kernel_source(source, self._variants)).build(options)
         return self._programs[key]
 
     def kernel(self, source: str, name: str, **defines: str | int | float) -> Kernel:
         """A new kernel object of :meth:`program`; keep it, making one is slow."""
         with self.errors(f"failed to build {source}"):
             handle = cl.Kernel(self.program(source, **defines), name)
-        return Kernel(self, handle, source)
+        return Kernel(self, handle, source, self._variants)
 
     def shared_kernel(self, source: str, name: str, types: Any = None, **defines: str | int | float) -> Kernel:
         """A kernel object that is made once a device and thread.

@@ -3,7 +3,9 @@
 from __future__ import annotations
 
 import re
+from collections.abc import Mapping
 from dataclasses import dataclass
+from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -34,6 +36,7 @@ class Kernel:
         device: that it was built for.
         handle: pyopencl's kernel.
         source: the file below potr_cl/cl that declares it.
+        variants: see :func:`potr_cl.opencl.source.kernel_source`.
 
     Attributes:
         name: of the function. parameters: its arguments, in the order of the declaration.
@@ -42,10 +45,12 @@ class Kernel:
         TypeError: the declaration has an argument of a kind that is not known here.
     """
 
-    def __init__(self, device: Device, handle: cl.Kernel, source: str) -> None:
+    def __init__(
+        self, device: Device, handle: cl.Kernel, source: str, variants: Mapping[str, Path] | None = None
+    ) -> None:
         self.handle = handle
         self.name: str = handle.function_name
-        self.parameters = declared_parameters(source, self.name)
+        self.parameters = declared_parameters(source, self.name, variants)
         self._device = device
         self._places = {parameter.name: place for place, parameter in enumerate(self.parameters)}
         if handle.num_args != len(self.parameters):
@@ -143,30 +148,32 @@ class Parameter:
     dtype: np.dtype[Any] | None
 
 
-_declared: dict[tuple[str, str], tuple[Parameter, ...]] = {}
+_declared: dict[tuple[Any, ...], tuple[Parameter, ...]] = {}
 
 
-def declared_parameters(source: str, name: str) -> tuple[Parameter, ...]:
+def declared_parameters(source: str, name: str, variants: Mapping[str, Path] | None = None) -> tuple[Parameter, ...]:
     """The arguments of a kernel, read from its declaration.
 
     Args:
         source: the file below potr_cl/cl that declares it, or includes what does.
         name: of the kernel.
+        variants: see :func:`potr_cl.opencl.source.kernel_source`.
 
     Raises:
         TypeError: it is not declared there, or has an argument of a kind that is not known here.
     """
-    key = source, name
+    key = source, name, *sorted((variants or {}).items())
     if key not in _declared:
-        text = re.sub(r"/\*.*?\*/|//[^\n]*", " ", kernel_source(source), flags=re.DOTALL)
+        text = re.sub(r"/\*.*?\*/|//[^\n]*", " ", kernel_source(source, variants), flags=re.DOTALL)
         found = re.search(r"\bkernel\b[^;{}]*?\bvoid\s+" + re.escape(name) + r"\s*\(([^{]*)\)\s*\{", text)
         if found is None:
             raise TypeError(f"potr_cl/cl/{source} declares no kernel '{name}'")
-        _declared[key] = tuple(_parameter(source, name, " ".join(part.split())) for part in found[1].split(","))
+        parts = [" ".join(part.split()) for part in found[1].split(",")]
+        _declared[key] = tuple(_parameter(source, name, part, variants) for part in parts)
     return _declared[key]
 
 
-def _parameter(source: str, kernel: str, text: str) -> Parameter:
+def _parameter(source: str, kernel: str, text: str, variants: Mapping[str, Path] | None) -> Parameter:
     found = re.fullmatch(r"(.*?[\s*])(\w+)", text)
     if found is None:
         raise TypeError(f"potr_cl/cl/{source}: kernel {kernel} has an argument that cannot be read: '{text}'")
@@ -174,4 +181,5 @@ def _parameter(source: str, kernel: str, text: str) -> Parameter:
     if "*" in declaration:
         return Parameter(name, declaration, None)
     kind = declaration.removeprefix("const ").strip()
-    return Parameter(name, declaration, np.dtype(_NUMBERS[kind]) if kind in _NUMBERS else struct_dtype(source, kind))
+    dtype = np.dtype(_NUMBERS[kind]) if kind in _NUMBERS else struct_dtype(source, kind, variants)
+    return Parameter(name, declaration, dtype)

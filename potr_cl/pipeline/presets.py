@@ -12,18 +12,18 @@ from potr_cl.stages.stage import Stage
 #: The preset that is taken unless another is asked for.
 DEFAULT: Preset = "best"
 
-#: Stages by preset. Every preset has every stage, switched off where it is not wanted, so that any can be asked for.
+#: Stages by preset, in their order. Those that are switched off are there to be asked for.
 PRESETS: dict[Preset, tuple[Stage, ...]] = {
-    "paper": (Prune(), Compact(), Refit(steps=0), Code()),
-    "fast": (Prune(iterations=16), Compact(on=False), Refit(steps=4), Code(entropy="zstd", zstd_level=9)),
     "best": (Prune(), Compact(on=False), Refit(steps=8), Code()),
+    "fast": (Prune(iterations=16), Compact(on=False), Refit(steps=4), Code(entropy="zstd", zstd_level=9)),
+    "paper": (Prune(), Compact(), Refit(steps=0), Code()),
 }
 
 #: What each preset is for, in a line.
 PURPOSE: dict[Preset, str] = {
-    "paper": "what the paper does: colours compacted splat by splat, its steps",
-    "fast": "as best, in fewer iterations and steps, with zstd 9: encodes and decodes faster",
     "best": "colours re-fitted together, steps of equal worth, the context coder: the smallest file",
+    "fast": "as best, in fewer iterations and steps, with zstd 9: encodes and decodes faster",
+    "paper": "what the paper does: colours compacted splat by splat, its steps",
 }
 
 

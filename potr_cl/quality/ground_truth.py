@@ -1,4 +1,4 @@
-"""Photographs of a scene's views: to judge pictures by, and as targets of the colours' re-fit."""
+"""Photographs of a scene's views: to judge pictures by. As targets of a re-fit: stages/refitting/targets.py."""
 
 from __future__ import annotations
 
@@ -6,13 +6,10 @@ from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
-import pyopencl as cl
 
 from potr_cl.formats.images import Colour, read_ground_truth
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
-from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Owner
 from potr_cl.quality.compare import find_ground_truth
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
@@ -52,35 +49,3 @@ class GroundTruth:
             DeviceError: a view does not fit the device.
         """
         return float(np.mean([psnr(rasterizer.render(camera)[0], self.picture(camera)) for camera in cameras]))
-
-
-class GroundTruthTargets(Owner):
-    """The photographs as targets of :class:`potr_cl.stages.refitting.refit.ColourRefit`.
-
-    Args:
-        device: that the re-fit computes on.
-        photographs: of all the cameras.
-        cameras: the views.
-
-    Raises:
-        DeviceError: a photograph does not fit the device.
-    """
-
-    def __init__(self, device: Device, ground_truth: GroundTruth, cameras: Sequence[Camera]) -> None:
-        self._device = device
-        self._ground_truth = ground_truth
-        self._cameras = list(cameras)
-        self._buffer = device.allocate(12 * max(c.width * c.height for c in cameras), "a photograph")
-
-    def __call__(self, number: int) -> cl.Buffer:
-        picture = np.ascontiguousarray(self._ground_truth.picture(self._cameras[number]))
-        with self._device.errors("failed to take a photograph"):
-            cl.enqueue_copy(self._device.queue, self._buffer, picture, is_blocking=True)
-        return self._buffer
-
-    def close(self) -> None:
-        self.free()
-
-    def free(self) -> None:
-        """Give the device's memory back."""
-        self._device.free(self._buffer)

@@ -15,7 +15,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import standpoints
 from potr_cl.stages.compaction.ridge import ColourModel, CompactionOptions, Compactor, ViewWeights, Weighting
 from potr_cl.stages.pruning.measured import Measured, measurement
-from potr_cl.stages.pruning.removal import SweepOptions
+from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 

@@ -10,8 +10,9 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.stages.pruning.measured import Measured, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
+from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
+from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
 
@@ -26,7 +27,7 @@ class Prune(Stage):
         delta_mse_max: replaces q's ΔMSE_MAX.
         iterations, decay, mapping_a: of the schedule (:class:`potr_cl.stages.pruning.schedule.PruningOptions`).
         tolerance, turns, tighten, transmittance_threshold, sample, sampled, seed: of the measurements
-            (:class:`potr_cl.stages.pruning.removal.SweepOptions`).
+            (:class:`potr_cl.stages.pruning.sweep_options.SweepOptions`).
 
     Raises:
         UsageError: a value is out of range.

@@ -12,14 +12,10 @@ from potr_cl.codec.geometry import quantise_geometry
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import Scene
-from potr_cl.quality.ground_truth import GroundTruth, GroundTruthTargets
+from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.refitting.refit import (
-    RefitOptions,
-    RenderedTargets,
-    active_coefficients,
-    refit_colours,
-)
+from potr_cl.stages.refitting.refit import RefitOptions, active_coefficients, refit_colours
+from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 
@@ -127,7 +123,7 @@ class Refit(Stage):
                 targets = RenderedTargets(rasterizer, state.views)
             else:
                 ground_truth = GroundTruth(self.ground_truth, state.views, bench.background)
-                targets = stack.enter_context(GroundTruthTargets(bench.opened, ground_truth, state.views))
+                targets = GroundTruthTargets(bench.opened, ground_truth, state.views)
             refitted = refit_colours(
                 bench.opened,
                 decoded,

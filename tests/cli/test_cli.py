@@ -24,7 +24,7 @@ from potr_cl.formats.scenes import ply
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DEVICE_VARIABLE, compiler_fault, list_devices
 from potr_cl.raster.rasterizer import GSPLAT, Rasterizer
-from tests.cases.scenes import random_scene, ring_of_cameras
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
 
 #: Options of an encode that keeps everything, and so looks at no views.
 KEEP = ["--no-prune", "--no-compact", "--refit", "off"]

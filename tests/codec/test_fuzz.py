@@ -12,8 +12,8 @@ import pytest
 
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.pipeline.encode import encode
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from tests.cases.options import as_it_is
-from tests.cases.scenes import random_scene, ring_of_cameras
 
 ROOT = Path(__file__).parents[2]
 

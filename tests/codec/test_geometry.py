@@ -14,7 +14,7 @@ from potr_cl.codec.geometry import quantise_geometry
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import train_views
 from potr_cl.pipeline.options import EncodeOptions
-from tests.cases.scenes import random_scene, ring_of_cameras
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
 
 
 def some_scene(kind):

@@ -22,8 +22,9 @@ from potr_cl import Scene, UsageError, cli
 from potr_cl.formats import cameras, load_cameras, load_scene, registry, save_scene, scene_writer, scenes
 from potr_cl.formats.declaration import CameraFormat, SceneFormat, install_command
 from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS, listed
+from potr_cl.reference.scenes import random_scene
 from tests.cases.cameras import nerfstudio, view, write_json
-from tests.cases.scenes import in_order_of, random_scene
+from tests.cases.scenes import in_order_of
 
 ROOT = Path(__file__).parents[2]
 WRITTEN = [entry for entry in SCENE_FORMATS if entry.save is not None]

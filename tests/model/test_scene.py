@@ -9,7 +9,7 @@ import pytest
 
 from potr_cl.errors import DataError
 from potr_cl.model.scene import Scene
-from tests.cases.scenes import random_scene
+from potr_cl.reference.scenes import random_scene
 
 
 def test_degrees_and_sizes():

@@ -16,9 +16,9 @@ from potr_cl.model.virtual_cameras import describe, is_virtual, place_cameras, s
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import INRIA
-from tests.cases.scenes import random_scene
+from potr_cl.reference.raster import sh_basis
+from potr_cl.reference.scenes import random_scene
 from tests.cases.surfaces import box, flat_splats, sphere, together
-from tests.oracles.raster import sh_basis
 
 BALL = sphere(8000, 1.0, 0.03)
 ROOM = box(12000, (3, 4, 1.5), 0.08)

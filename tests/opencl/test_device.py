@@ -358,6 +358,42 @@ def test_headers_are_included_once() -> None:
     assert source.count("#define TILE ") == 1
 
 
+def test_a_variant_takes_the_place_of_a_file(tmp_path: Path, device: Device) -> None:
+    """Of a kernel file, of a header, and under a name of its own; what a variant includes comes from the package."""
+    (tmp_path / "probe.cl").write_text(
+        '#include "mine/twice.clh"\nkernel void f(global float *x) { x[0] *= TWICE * TILE; }'
+    )
+    (tmp_path / "tile.clh").write_text("#define TILE 3\n")
+    (tmp_path / "twice.clh").write_text('#include "include/subtiles.clh"\n#define TWICE 2\n')
+    changed = Device(
+        device.info,
+        variants={
+            "mine/probe.cl": tmp_path / "probe.cl",
+            "mine/twice.clh": tmp_path / "twice.clh",
+            "include/subtiles.clh": tmp_path / "tile.clh",
+        },
+    )
+    buffer = changed.upload(np.ones(1, np.float32), "a number")
+    kernel = changed.kernel("mine/probe.cl", "f")
+    kernel.bind(x=buffer).launch((1,))
+    assert changed.download(buffer, (1,), np.float32) == 6
+    changed.free(buffer)
+    assert "#define TILE 3" not in kernel_source("raster/project.cl")
+
+
+def test_a_macro_and_flags_of_a_variant_reach_the_compiler(device: Device) -> None:
+    def options(of: Device) -> str:
+        program = of.program("raster/sort_gpu.cl", SORT_CAPACITY=2048)
+        return str(program.get_build_info(of.info.handle, cl.program_build_info.OPTIONS))
+
+    changed = Device(device.info, build_options=["-cl-mad-enable"], macros={"SORT_CAPACITY": 1024})
+    assert "-DSORT_CAPACITY=1024" in options(changed)
+    assert "SORT_CAPACITY=2048" not in options(changed)
+    assert "-cl-mad-enable" in options(changed)
+    assert "-DSORT_CAPACITY=2048" in options(device)
+    assert "-cl-mad-enable" not in options(device)
+
+
 def test_failing_build_names_the_device(device: Device) -> None:
     """And the compiler's reason, in one line."""
     with pytest.raises(DeviceError, match=r"failed to build opencl/probe.cl \(.*error.*--device") as error:

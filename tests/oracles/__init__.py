@@ -1,3 +1,1 @@
-"""Independent references in float64, and a decoder written from docs/format.md alone: what results are compared
-with.
-"""
+"""What only tests compare with: a decoder written from docs/format.md alone."""

@@ -2,13 +2,17 @@
 
 It is kept to prove that the page suffices to write a decoder; the package never uses it. It is plain and slow on
 purpose: one loop for each sentence of the page, and Python integers, which cannot overflow.
+
+python -m tests.oracles.decoder FILE.potr VALUES.npz     writes what a file yields, as the golden files' values are kept
 """
 
 import json
 import math
 import struct
+import sys
 import zlib
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import Any, NamedTuple
 
 import numpy as np
@@ -695,3 +699,14 @@ def check(condition: bool, message: str) -> None:
     """Raise ValueError with the message unless the condition holds."""
     if not condition:
         raise ValueError(message)
+
+
+def main() -> None:
+    """Write the arrays that a file yields."""
+    source, values = map(Path, sys.argv[1:])
+    decoded = decode(source.read_bytes())
+    np.savez_compressed(values, **{name: value for name, value in decoded.items() if isinstance(value, np.ndarray)})
+
+
+if __name__ == "__main__":
+    main()

@@ -14,11 +14,11 @@ from potr_cl.model.camera import train_views
 from potr_cl.pipeline.encode import Run, Stopwatch, encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.code import Code
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import State
-from tests.cases.scenes import random_scene, ring_of_cameras
 from tests.devices import KERNELS, open_device
 
 FEW = EncodeOptions.for_preset("paper", prune={"iterations": 6})

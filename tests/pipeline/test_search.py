@@ -31,7 +31,7 @@ from potr_cl.pipeline.search import (
 )
 from potr_cl.quality.compare import compare, mean_view
 from potr_cl.raster.rasterizer import Rasterizer
-from tests.cases.scenes import random_scene, ring_of_cameras
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from tests.devices import skip_without_cpu
 
 FEW = EncodeOptions.for_preset("paper", prune={"iterations": 6})

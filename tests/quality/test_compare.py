@@ -31,7 +31,7 @@ from potr_cl.quality.compare import (
 )
 from potr_cl.quality.metrics import psnr, ssim
 from potr_cl.raster.rasterizer import Rasterizer
-from tests.cases.scenes import ring_of_cameras
+from potr_cl.reference.scenes import ring_of_cameras
 
 BACKGROUND = (0.25, 0.5, 1.0)
 

@@ -10,11 +10,12 @@ import pytest
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.images import to_8_bits, write_png
 from potr_cl.opencl.device import Device
-from potr_cl.quality.ground_truth import GroundTruth, GroundTruthTargets
+from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.refitting.refit import RefitOptions, RenderedTargets, refit_colours
-from tests.cases.scenes import random_scene, ring_of_cameras
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
+from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
 
 
 @pytest.fixture(scope="module")
@@ -61,7 +62,6 @@ def test_a_refit_to_ground_truth_is_one_to_what_they_show(device, scene, cameras
     options = RefitOptions(steps=20, gain=0, prior=1)
     targets = GroundTruthTargets(device, GroundTruth(folder, cameras), cameras)
     refitted = refit_colours(device, dimmed, cameras, targets, options)
-    targets.free()
     rasterizer = Rasterizer(device, scene)
     wanted = refit_colours(device, dimmed, cameras, RenderedTargets(rasterizer, cameras), options)
     rasterizer.free()
@@ -85,4 +85,3 @@ def test_a_damaged_photograph(device, scene, cameras, folder):
     targets = GroundTruthTargets(device, GroundTruth(folder, cameras), cameras)
     with pytest.raises(DataError, match=r"view_2\.png"):
         refit_colours(device, scene, cameras, targets)
-    targets.free()

@@ -10,7 +10,8 @@ import pytest
 from potr_cl.quality.metrics import psnr, ssim
 from potr_cl.quality.metrics_device import Similarity, in_batches, place_pictures, rendered
 from potr_cl.raster.rasterizer import Rasterizer
-from tests.cases.splats import camera, random_splats
+from potr_cl.reference.scenes import random_splats
+from potr_cl.reference.scenes import straight_camera as camera
 from tests.devices import KERNELS, open_device
 
 

@@ -15,9 +15,11 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import GSPLAT, INRIA, TILE, Rasterizer, RasterRules, View, ViewSet, render
-from tests.cases.splats import camera, random_splats, splats, tilted_camera
+from potr_cl.reference import raster as reference
+from potr_cl.reference.scenes import plain_splats as splats
+from potr_cl.reference.scenes import random_splats, tilted_camera
+from potr_cl.reference.scenes import straight_camera as camera
 from tests.devices import KERNELS, open_device
-from tests.oracles import raster as reference
 
 #: A pixel whose every alpha and transmittance stays this far, relatively, from 1/255 and 1e-4 cannot flip.
 CLEAR = 1e-4

@@ -17,11 +17,7 @@ from potr_cl.model.camera import Camera, camera_centres, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS, CompactionOptions, Compactor, ViewWeights, Weighting
-from potr_cl.stages.pruning.removal import RemovalSweep
-from tests.cases.scenes import random_scene
-from tests.devices import KERNELS, open_device
-from tests.oracles.ridge import (
+from potr_cl.reference.ridge import (
     YCOCG,
     Ridges,
     compact_channel,
@@ -32,6 +28,10 @@ from tests.oracles.ridge import (
     usable_columns_of,
     weighted_basis,
 )
+from potr_cl.reference.scenes import random_scene
+from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS, CompactionOptions, Compactor, ViewWeights, Weighting
+from potr_cl.stages.pruning.removal import RemovalSweep
+from tests.devices import KERNELS, open_device
 
 #: Colour error, in colour units, that is a matter of rounding: 1/2000 of a step of 8 bits.
 ROUNDING = 2e-6

@@ -9,11 +9,11 @@ import pytest
 
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
+from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions, SmoothedEffects, choose, prune
-from tests.cases.refit import visible_scene
-from tests.cases.scenes import ring_of_cameras
+from potr_cl.stages.pruning.sweep_options import SweepOptions
 from tests.devices import KERNELS, open_device
 
 OPTIONS = PruningOptions(2e-6, 8)
@@ -27,7 +27,7 @@ def cameras(lego_excerpt_cameras):
 def run(device, scene, cameras, options, sweep=None, on_device=True, after_iteration=None):
     rasterizer = Rasterizer(device, scene)
     removal = RemovalSweep(rasterizer, cameras, sweep or SweepOptions())
-    assert removal.steerable
+    assert removal.steering is not None
     if on_device:
         result = prune_scene(removal, options, after_iteration=after_iteration and after_iteration(removal))
     else:
@@ -165,7 +165,7 @@ def test_options_that_only_the_host_knows(gpu, lego_excerpt, cameras):
     rasterizer = Rasterizer(gpu, lego_excerpt)
     for sweep in (SweepOptions(turns=2), SweepOptions(sample=0.5), SweepOptions(memory=0)):
         removal = RemovalSweep(rasterizer, cameras, sweep)
-        assert not removal.steerable
+        assert removal.steering is None
         assert prune_scene(removal, OPTIONS).kept < 1500
         removal.free()
     removal = RemovalSweep(rasterizer, cameras)

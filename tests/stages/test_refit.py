@@ -9,15 +9,12 @@ import pytest
 
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
+from potr_cl.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
+from potr_cl.reference.refit_cases import Case, Linearised, Pictures
+from potr_cl.reference.scenes import plain_splats, ring_of_cameras, straight_camera, tilted_camera, visible_scene
 from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, active_coefficients
-from tests.cases.refit import Case, Linearised, Pictures, visible_scene
-from tests.cases.scenes import ring_of_cameras
-from tests.cases.splats import camera as straight_camera
-from tests.cases.splats import splats as plain_splats
-from tests.cases.splats import tilted_camera
 from tests.devices import KERNELS, open_device
-from tests.oracles.refit import LENGTHS, selection, to_rgb, to_ycocg
 
 
 @pytest.fixture(scope="module", params=KERNELS)
@@ -64,8 +61,7 @@ def test_the_transposed_map(device, degree, dim):
         rendered = reference.pictures(reference.start)
         images = [p - t.reshape(-1, 3) for p, t in zip(rendered, targets, strict=True)]
         with Pictures(device, targets) as buffers, Linearised(case, buffers) as linear:
-            # The residual is minus the gradient.
-            transposed = -linear.vector(linear.refit._residual)
+            transposed = linear.gradient
         assert relative(transposed, reference.transposed(images)) < 1e-5
         direction = rng.normal(size=scene.sh.shape)
         forward = reference.forward(direction)
@@ -88,12 +84,12 @@ def test_the_normal_matrix(device, degree):
         with Linearised(case) as linear:
             normal_a, normal_b = linear.normal(a), linear.normal(b)
             wanted = reference.gram()
-            blocks = linear.gram()
+            blocks = linear.blocks
         assert relative(normal_a, reference.transposed(reference.forward(a))) < 1e-5
         # Symmetric, and so A and its transpose belong together, cuts included.
         size = np.sqrt(np.sum(a * normal_a) * np.sum(b * normal_b))
         assert abs(np.sum(b * normal_a) - np.sum(a * normal_b)) < 1e-5 * size
-        assert np.abs(blocks - np.triu(wanted)).max() < 1e-5 * wanted.max()
+        assert np.abs(blocks - wanted).max() < 1e-5 * wanted.max()
 
 
 def test_lists_of_more_splats_than_are_walked_at_a_time(device):
@@ -108,24 +104,45 @@ def test_lists_of_more_splats_than_are_walked_at_a_time(device):
         images = [p - t.reshape(-1, 3) for p, t in zip(rendered, case.pictures, strict=True)]
         direction = rng.normal(size=scene.sh.shape)
         with Linearised(case) as linear:
-            transposed = -linear.vector(linear.refit._residual)
+            transposed = linear.gradient
             normal = linear.normal(direction)
-            blocks = linear.gram()
+            blocks = linear.blocks
         assert relative(transposed, reference.transposed(images)) < 1e-5
         assert relative(normal, reference.transposed(reference.forward(direction))) < 1e-5
-        assert np.abs(blocks - np.triu(reference.gram())).max() < 1e-5 * blocks.max()
+        assert np.abs(blocks - reference.gram()).max() < 1e-5 * blocks.max()
 
 
 def test_the_length_of_a_picture_is_the_product_with_the_normal_matrix(device):
-    """d · Aᵀ A d = |A d|², both from the kernels: the forward map's picture and the transposed map's sums."""
+    """d · Aᵀ A d = |A d|², both from the kernels: the transposed map's sums, and the error that d makes in the picture.
+
+    A third of the colours are cut at 0 before and after, the others are far above.
+    """
     scene = visible_scene(60, 3, seed=2)
+    scene.sh[:, 0] += np.where(np.arange(60) % 3 == 0, -60, 40).astype(np.float32)[:, None]
+    direction = np.random.default_rng(0).normal(size=scene.sh.shape)
+    moved = dataclasses.replace(scene, sh=to_rgb(to_ycocg(scene.sh) + direction).astype(np.float32))
     for camera in ring_of_cameras(3, size=50):
         with Case(device, scene, scene, [camera]) as case, Linearised(case) as linear:
-            direction = np.random.default_rng(0).normal(size=scene.sh.shape)
             normal = linear.normal(direction)
-            tiles = linear.refit.device.download(linear.refit._errors, (16,), np.float32)
-        squared = REFERENCE_PIXELS / 2500 * tiles.sum(dtype=np.float64) * np.abs(direction).max() ** 2
+            (free,) = case.reference().free
+        with Case(device, moved, scene, [camera]) as case, Linearised(case) as linear:
+            squared = linear.error
+            assert np.array_equal(case.reference().free, [free])
+            assert free.mean() == pytest.approx(2 / 3)
         assert np.sum(direction * normal) == pytest.approx(squared, rel=1e-5)
+
+
+def test_a_direction_that_is_0_changes_nothing(case):
+    with Linearised(case) as linear:
+        assert not linear.normal(np.zeros(case.scene.sh.shape)).any()
+
+
+def test_a_direction_of_any_length(case):
+    direction = np.random.default_rng(0).normal(size=case.scene.sh.shape)
+    with Linearised(case) as linear:
+        wanted = linear.normal(direction)
+        for length in (1e-12, 1e12):
+            assert relative(linear.normal(length * direction), length * wanted) < 1e-6
 
 
 def test_errors_are_those_of_the_pictures(case):
@@ -168,10 +185,10 @@ def test_inactive_coefficients_stay_zero_and_the_others_solve_their_own_problem(
 def test_held_coefficients_keep_their_values(case):
     active = np.zeros(case.scene.sh.shape, bool)
     active[:20, 0] = True
-    refit = ColourRefit(case.device, case.scene, case.cameras, RefitOptions(steps=100, gain=0, prior=10))
-    refit.set_coefficients(case.scene.sh, active, hold=True)
-    x = to_ycocg(refit.solve(case.targets).sh)
-    refit.free()
+    with ColourRefit(case.device, case.scene, case.cameras) as refit:
+        options = RefitOptions(steps=100, gain=0, prior=10)
+        x = to_ycocg(refit.solve(case.scene.sh, case.targets, options, active, hold=True).sh)
+        assert np.array_equal(refit.active(), active)
     reference = case.reference(prior=10, active=active, hold=True)
     assert np.abs(x - reference.start)[~active].max() < 1e-6
     solution = reference.solution()
@@ -214,10 +231,26 @@ def test_it_stops_where_single_precision_ends(device, degree):
 
 def test_progress(case):
     told = []
-    refit = ColourRefit(case.device, case.scene, case.cameras, RefitOptions(steps=3, gain=0))
-    refit.solve(case.targets, lambda done, total: told.append((done, total)))
-    refit.free()
+    options = RefitOptions(steps=3, gain=0)
+    with ColourRefit(case.device, case.scene, case.cameras) as refit:
+        refit.solve(case.scene.sh, case.targets, options, progress=lambda done, total: told.append((done, total)))
     assert told == [(1, 3), (2, 3), (3, 3)]
+
+
+def test_solutions_of_one_map_do_not_depend_on_each_other(case):
+    """Other targets, other options, other starts in between: the same bytes as on its own."""
+    options = RefitOptions(steps=3, gain=0, drop=1e-7)
+    wanted = case.solve(options)
+    black = [np.zeros_like(picture) for picture in case.pictures]
+    with (
+        ColourRefit(case.device, case.scene, case.cameras) as refit,
+        Pictures(case.device, black) as others,
+    ):
+        for _ in range(2):
+            refitted = refit.solve(case.scene.sh, case.targets, options)
+            assert np.array_equal(refitted.sh, wanted.sh)
+            assert refitted.errors == wanted.errors
+            assert refit.solve(0.5 * case.scene.sh, others, RefitOptions(steps=1)).errors != wanted.errors
 
 
 def test_the_target_itself_is_left_alone(device):
@@ -252,10 +285,8 @@ def test_the_memory_budget_is_used_and_not_exceeded(device, share):
     with Case(device, visible_scene(2000), visible_scene(60, 1, seed=7), cameras) as case:
 
         def taken(memory):
-            seen = Linearised(case, options=RefitOptions(steps=0, memory=memory))
-            nbytes, room = device.allocated, seen.refit._cache.room
-            seen.refit.free()
-            return nbytes, room
+            with Linearised(case, memory=memory) as linear:
+                return device.allocated, linear.room
 
         plenty = 10**9
         wanted = plenty - taken(plenty)[1]
@@ -287,12 +318,12 @@ def test_selection_keeps_what_costs_more(device, degree):
         options = RefitOptions(steps=0, selection_steps=0, prior=1.0, drop=1e-8)
         active = np.random.default_rng(0).random(scene.sh.shape) < 0.9
         active[:, 0] = True
-        with Linearised(case, options=options) as linear:
-            linear.refit.set_coefficients(scene.sh, active)
-            sh = linear.refit.solve(case.targets).sh
-            kept, blocks = linear.active(), linear.gram()
+        with Linearised(case) as linear:
+            blocks = linear.blocks
+        with ColourRefit(device, scene, cameras) as refit:
+            sh = refit.solve(scene.sh, case.targets, options, active).sh
+            kept = refit.active()
     x = to_ycocg(sh)
-    blocks = blocks + np.triu(blocks, 1).transpose(0, 2, 1)
     start = to_ycocg(scene.sh) * active
     least = options.drop * 3 * REFERENCE_PIXELS * len(cameras)
     clear = 0

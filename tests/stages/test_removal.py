@@ -7,16 +7,17 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl.errors import UsageError
+from potr_cl.errors import DeviceMemoryError, UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import INRIA, Rasterizer
-from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions, default_memory
+from potr_cl.reference import raster as reference
+from potr_cl.reference.removal import BruteForce
+from potr_cl.reference.scenes import ring_of_cameras, visible_scene
+from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions, prune
-from tests.cases.scenes import random_scene, ring_of_cameras
+from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
 from tests.devices import KERNELS, open_device
-from tests.oracles import raster as reference
-from tools.study.removal_exactness import BruteForce
 
 
 @pytest.fixture(scope="module", params=KERNELS)
@@ -24,17 +25,6 @@ def device(request):
     device = open_device(request.param)
     yield device
     assert device.allocated == 0, "a sweep did not give all its memory back"
-
-
-def visible_scene(splats: int, degree: int = 0, seed: int = 0) -> Scene:
-    """Few layers, splats of several pixels: no pixel ends early, so that brute force measures the same thing."""
-    scene = random_scene(splats, degree, seed)
-    rng = np.random.default_rng(seed + 100)
-    return dataclasses.replace(
-        scene,
-        log_scales=rng.normal(-2, 0.5, size=(splats, 3)).astype(np.float32),
-        opacity_logits=rng.normal(-1, 1.5, size=splats).astype(np.float32),
-    )
 
 
 def without(scene: Scene, gone) -> Scene:
@@ -71,7 +61,7 @@ def sweep(device, scene, cameras, tolerance=0.0, background=(0.0, 0.0, 0.0)):
 
 
 def finish(rasterizer, removal):
-    removal.free()
+    removal.close()
     rasterizer.free()
 
 
@@ -91,7 +81,7 @@ def test_single_removals(device, background):
 
 def test_single_removals_when_others_are_gone(device):
     # Black twins in front of white splats; once they are gone, the picture is too bright.
-    scene = visible_scene(25, seed=3).subset(np.tile(np.arange(25), 2))
+    scene = visible_scene(25, 0, seed=3).subset(np.tile(np.arange(25), 2))
     scene.sh[:, 0] = np.where(np.arange(50) < 25, -2, 2)[:, None]
     scene.opacity_logits[:25] = 3
     cameras = ring_of_cameras(2, size=48)
@@ -177,7 +167,7 @@ def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, lego_ex
 
 def test_buffers_too_small_for_all_views_change_nothing(device, lego_excerpt, lego_excerpt_cameras, monkeypatch):
     """A device that allows no large buffer has fewer views at a time, and keeps them all."""
-    cameras, results, sets = lego_excerpt_cameras[:7], [], []
+    cameras, results = lego_excerpt_cameras[:7], []
     for largest in (device.info.largest_buffer, 3 * 12 * cameras[0].width * cameras[0].height):
         monkeypatch.setattr(device, "info", dataclasses.replace(device.info, largest_buffer=largest))
         rasterizer = Rasterizer(device, lego_excerpt)
@@ -186,10 +176,8 @@ def test_buffers_too_small_for_all_views_change_nothing(device, lego_excerpt, le
         removal.remove(np.arange(0, 1500, 10))
         results.append(np.stack(removal.measure())[:, np.arange(1, 1500, 10)])
         assert removal.cached_views == 7
-        sets.append(len(removal._kept))
         finish(rasterizer, removal)
     assert np.array_equal(*results)
-    assert sets == ([7, 7] if device.family == "cpu" else [1, 4])  # of at most two views
 
 
 def test_views_in_turns(device, lego_excerpt, lego_excerpt_cameras):
@@ -214,11 +202,6 @@ def test_tolerance_saves_sweeps(device, lego_excerpt, lego_excerpt_cameras):
     assert sweeps[0] > sweeps[1] > sweeps[2] >= 1
 
 
-def intersections_in_lists(removal: RemovalSweep) -> int:
-    lengths = [removal._device.download(s.lengths, (s.views.tiles,), np.uint32) for s in removal._kept]
-    return int(np.concatenate(lengths).sum())
-
-
 def test_tightened_lists_change_no_result(device, lego_excerpt, lego_excerpt_cameras):
     results, intersections = {}, {}
     for tighten in (False, True):
@@ -228,7 +211,7 @@ def test_tightened_lists_change_no_result(device, lego_excerpt, lego_excerpt_cam
         for start in (0, 3, 5):
             removal.remove(np.arange(start, 1500, 7))
             measured.append(removal.measure())
-        intersections[tighten] = intersections_in_lists(removal)
+        intersections[tighten] = removal.intersections_left()
         views = [np.concatenate([splats, weights]) for _, splats, weights in removal.view_importances()]
         results[tighten] = np.concatenate([np.ravel(measured), *views])
         finish(rasterizer, removal)
@@ -241,7 +224,7 @@ def test_tightened_lists_change_no_result(device, lego_excerpt, lego_excerpt_cam
 
 def test_tightened_lists_keep_what_is_hidden(device):
     """Behind the end of all pixels, intersections stay: they come back when what hides them goes."""
-    scene = visible_scene(30, seed=4).subset(np.arange(60) % 30)
+    scene = visible_scene(30, 0, seed=4).subset(np.arange(60) % 30)
     scene.log_scales[:30], scene.opacity_logits[:30] = 3, 12  # thirty walls
     cameras = ring_of_cameras(2, size=32)
     effects = {}
@@ -260,7 +243,7 @@ def test_tightened_lists_keep_what_is_hidden(device):
 
 def test_a_removal_lets_pixels_go_on(device):
     """Where pixels end early, effects are those of the same limit on transmittance; small limits leave no jump."""
-    scene = visible_scene(300, seed=2).subset(np.repeat(np.arange(300), 3))
+    scene = visible_scene(300, 0, seed=2).subset(np.repeat(np.arange(300), 3))
     scene.opacity_logits[:] = 2
     cameras = ring_of_cameras(1, size=40)
     some = np.arange(0, 900, 10)
@@ -327,7 +310,7 @@ def test_options_out_of_range(bad):
 
 
 def test_a_view_that_sees_nothing_changes_only_the_mean(device):
-    scene = visible_scene(30)
+    scene = visible_scene(30, 0)
     cameras = ring_of_cameras(1, size=48)
     away = dataclasses.replace(cameras[0], name="away", translation=np.array([0, 0, -50.0]))
     rasterizer, removal = sweep(device, scene, cameras)
@@ -341,7 +324,7 @@ def test_a_view_that_sees_nothing_changes_only_the_mean(device):
 
 
 def test_views_of_different_sizes_count_the_same(device):
-    scene = visible_scene(30)
+    scene = visible_scene(30, 0)
     large = ring_of_cameras(2, size=96)[0]
     small = ring_of_cameras(2, size=48)[1]
     separate = []
@@ -359,7 +342,7 @@ def test_views_of_different_sizes_count_the_same(device):
 @pytest.mark.parametrize("share", [0.2, 0.3, 0.5, 0.7, 0.95])
 def test_the_memory_budget_is_used_and_not_exceeded(device, share):
     """Lists first, then geometry of as many views as there is room for; the effects are the same whatever is kept."""
-    scene = visible_scene(3000)
+    scene = visible_scene(3000, 0)
     cameras = ring_of_cameras(40, size=48)
     rasterizer = Rasterizer(device, scene)
 
@@ -370,7 +353,7 @@ def test_the_memory_budget_is_used_and_not_exceeded(device, share):
         removal.measure()
         removal.remove(np.arange(0, 3000, 3))
         effects = np.stack(removal.measure())
-        removal.free()
+        removal.close()
         return taken, effects
 
     nothing, _ = measured(0)
@@ -383,8 +366,26 @@ def test_the_memory_budget_is_used_and_not_exceeded(device, share):
     assert (effects[:, left] == expected[:, left]).all()
 
 
+@pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
+def test_a_failure_gives_all_memory_back(device, monkeypatch, share):
+    """Wherever the device's memory ends while a sweep is made."""
+    cameras, keep_all = ring_of_cameras(5, size=48), SweepOptions(memory=1 << 40)
+    rasterizer = Rasterizer(device, visible_scene(3000))
+    before = device.allocated
+    with RemovalSweep(rasterizer, cameras, keep_all) as removal:
+        needed = device.allocated - before
+        assert removal.cached_views == 5
+    scratch = device.allocated - before
+    limit = int(before + scratch + share * (needed - scratch))
+    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, memory=limit))
+    with pytest.raises(DeviceMemoryError):
+        RemovalSweep(rasterizer, cameras, keep_all)
+    rasterizer.free()  # its scratch memory may have grown meanwhile
+    assert device.allocated == 0
+
+
 def test_identical_splats_share_their_effect(device):
-    scene = visible_scene(1).subset(np.zeros(40, np.int64))
+    scene = visible_scene(1, 0).subset(np.zeros(40, np.int64))
     cameras = ring_of_cameras(2, size=48)
     rasterizer, removal = sweep(device, scene, cameras)
     effect, importance = removal.measure()
@@ -395,7 +396,7 @@ def test_identical_splats_share_their_effect(device):
 
 
 def test_pruning_to_one_splat(device):
-    scene = visible_scene(40)
+    scene = visible_scene(40, 0)
     cameras = ring_of_cameras(2, size=48)
     rasterizer, removal = sweep(device, scene, cameras)
     pruned = prune(removal, 40, PruningOptions(np.inf, 5))
@@ -408,7 +409,7 @@ def test_pruning_keeps_the_picture_better_than_importance(device, lego_excerpt, 
     rasterizer, removal = sweep(device, lego_excerpt, cameras)
     _, importance = removal.measure()
     pruned = prune(removal, 1500, PruningOptions(0, 12, count=750))
-    removal.free()
+    removal.close()
     by_importance = np.sort(np.argsort(importance)[-750:])
 
     def error(kept):
@@ -422,7 +423,7 @@ def test_pruning_keeps_the_picture_better_than_importance(device, lego_excerpt, 
 
 
 def test_no_view_is_an_error(device):
-    rasterizer = Rasterizer(device, visible_scene(3))
+    rasterizer = Rasterizer(device, visible_scene(3, 0))
     with pytest.raises(UsageError, match="at least one view"):
         RemovalSweep(rasterizer, [])
     rasterizer.free()

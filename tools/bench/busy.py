@@ -1,4 +1,6 @@
-"""How busy the device is during an encode, stage by stage: python -m tools.bench.busy --scene SCENE.ply --cameras PATH
+"""How busy the device is during an encode, stage by stage.
+
+    python -m tools.bench.busy --scene SCENE.ply --cameras PATH
 
 The device is busy while at least one of its kernels runs, by the timestamps of a run that records them; the stages'
 wall times are the medians of runs that do not. Everything has been built and used once before. Prints Markdown.
@@ -18,6 +20,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from tools.make.large_scene import DEFAULT_SCENE, EXCERPT, cameras_beside
+from tools.results import Column, Results
 
 
 class StageEvents:
@@ -54,6 +57,7 @@ def main() -> None:
     parser.add_argument("--preset", choices=PRESETS, default="best")
     parser.add_argument("--device")
     parser.add_argument("--repeats", type=int, default=5)
+    parser.add_argument("--json", type=Path, help="also keep the results here")
     args = parser.parse_args()
     scene, _ = load_scene(args.scene).cleaned()
     cameras = load_cameras(args.cameras or cameras_beside(args.scene))
@@ -68,22 +72,33 @@ def main() -> None:
     stages = StageEvents(watching)
     encode(scene, cameras, options, stages, watching)
     watching.queue.finish()
-    print(
-        f"{device.info}, {args.scene.parent.name}, {len(scene):,} splats, preset {args.preset}: "
-        f"{runs[0].nbytes:,} bytes\n"
+    results = Results(device.info, args.json)
+    what = f"{args.scene.parent.name}, {len(scene):,} splats, preset {args.preset}, {runs[0].nbytes:,} bytes"
+    table = results.table(
+        "stages",
+        f"An encode's stages: {what}",
+        Column("stage"),
+        Column("wall", "ms", ".0f"),
+        Column("device busy", "ms", ".0f"),
+        Column("share", format=".0%"),
+        Column("launches"),
     )
-    print("| stage | wall ms | device busy ms | share | launches |\n|---|---|---|---|---|")
     for stage, events in stages.events.items():
         wall = statistics.median(run.seconds[stage] for run in runs)
         ran = busy(events)
-        print(f"| {stage} | {1e3 * wall:.0f} | {1e3 * ran:.0f} | {100 * ran / wall:.0f} % | {len(events)} |")
-    print(f"| all | {1e3 * statistics.median(sum(run.seconds.values()) for run in runs):.0f} | | | |")
+        table.add(stage, 1e3 * wall, 1e3 * ran, ran / wall, len(events))
+    table.add("all", 1e3 * statistics.median(sum(run.seconds.values()) for run in runs), None, None, None)
     names: dict[str, float] = {}
     for name, event in watching.timings:
         names[name] = names.get(name, 0.0) + (event.profile.end - event.profile.start) * 1e-9
-    print("\n| kernel | ms, launches that overlap counted each |\n|---|---|")
+    table = results.table(
+        "kernels",
+        f"Its kernels, launches that overlap counted each: {what}",
+        Column("kernel"),
+        Column("time", "ms", ".1f"),
+    )
     for name, seconds in sorted(names.items(), key=lambda item: -item[1]):
-        print(f"| {name} | {1e3 * seconds:.1f} |")
+        table.add(name, 1e3 * seconds)
 
 
 if __name__ == "__main__":

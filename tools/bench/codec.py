@@ -1,4 +1,6 @@
-"""Speed, memory and size of the codec without pruning: python -m tools.bench.codec [PART …] [--splats N]
+"""Speed, memory and size of the codec without pruning.
+
+    python -m tools.bench.codec [PART …] [--splats N]
 
 Parts: decode, encode, octree, sizes (all by default). Prints Markdown for docs/benchmarks. Every measurement that
 concerns memory runs in a process of its own.
@@ -7,7 +9,6 @@ concerns memory runs in a process of its own.
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import json
 import os
 import platform
@@ -17,7 +18,6 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable
-from datetime import date
 from pathlib import Path
 from typing import Any
 
@@ -26,6 +26,7 @@ import numpy as np
 from potr_cl.codec import octree
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.quantize import Preset
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.formats.scenes import ply
 from potr_cl.pipeline.encode import encode
@@ -33,15 +34,15 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
 from tools.bench.memory import reset_peak, resident
 from tools.make.large_scene import DEFAULT_SCENE, EXCERPT, large_scene
+from tools.results import circumstances
 
 SCENES = DEFAULT_SCENE.parents[1]
 
 
-def _processor() -> str:
-    for line in Path("/proc/cpuinfo").read_text().splitlines() if Path("/proc/cpuinfo").exists() else []:
-        if line.startswith("model name"):
-            return line.split(":")[1].strip()
-    return platform.processor()
+def as_it_is(preset: Preset, coder: EntropyCoder | None = None) -> EncodeOptions:
+    """Options that keep every splat and every colour; coder: another than the preset's."""
+    options = EncodeOptions.for_preset(preset, prune=False, compact=False, refit=False)
+    return options if coder is None else options.changed(code={"entropy": coder.name, "zstd_level": coder.level})
 
 
 class _Peak:
@@ -123,7 +124,7 @@ def _child_encode(scene_path: str, cameras: str, level: str) -> dict[str, Any]:
     scene = load_scene(Path(scene_path))
     peak = _Peak()
     started = time.perf_counter()
-    encoded = encode(scene, views, EncodeOptions(entropy=EntropyCoder("zstd", int(level)), prune=False, compact=False))
+    encoded = encode(scene, views, as_it_is("paper", EntropyCoder("zstd", int(level))))
     seconds = time.perf_counter() - started
     return {
         "seconds": seconds,
@@ -144,9 +145,9 @@ def _like() -> tuple[Path, Path | None]:
 
 
 def bench_decode(splats: int, folder: Path) -> None:
-    plain = EncodeOptions(entropy=EntropyCoder("zstd", 9), prune=False, compact=False)
+    plain = as_it_is("paper", EntropyCoder("zstd", 9))
     _bench_decode("paper's steps, zstd 9", plain, splats, folder)
-    context = EncodeOptions.for_preset("best", refit=0, prune=False, compact=False)
+    context = as_it_is("best")
     _bench_decode("preset best, context coder", context, splats, folder)
 
 
@@ -235,10 +236,8 @@ def bench_sizes(_: int, __: Path) -> None:
             ("npz", EntropyCoder("npz")),
             ("best", None),
         ):
-            options = EncodeOptions.for_preset(
-                "best" if coder is None else "paper", prune=False, compact=False, refit=0
-            )
-            encoded = encode(scene, cameras, dataclasses.replace(options, entropy=coder or options.entropy))
+            options = as_it_is("best" if coder is None else "paper", coder)
+            encoded = encode(scene, cameras, options)
             columns[label] = file_report(PotrFile.from_bytes(b"".join(encoded.pieces)))
         first = columns["zstd 9"]
         print("| | serialised | " + " | ".join(columns) + " |\n|---|---|" + "---|" * len(columns))
@@ -262,12 +261,13 @@ def main() -> None:
     if sys.argv[1:2] == ["--child"]:
         print(json.dumps(CHILDREN[sys.argv[2]](*sys.argv[3:])))
         return
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("parts", nargs="*", choices=[[], *PARTS], default=[])
     parser.add_argument("--splats", type=int, default=10**6)
     args = parser.parse_args()
-    print(f"{date.today()}, {_processor()}, {os.cpu_count()} processors, Python {platform.python_version()}, ", end="")
-    print(f"numpy {np.__version__}; python -m tools.bench.codec {' '.join(sys.argv[1:])}".rstrip())
+    about = circumstances()
+    print("{machine}, {date}, commit {commit}".format(**about), end=", ")
+    print(f"Python {platform.python_version()}, numpy {np.__version__}; {about['command'][0]}")
     with tempfile.TemporaryDirectory() as folder:
         for part in args.parts or PARTS:
             PARTS[part](args.splats, Path(folder))

@@ -1,4 +1,6 @@
-"""When to compact the colours within the pruning schedule: python -m tools.bench.compact_at SCENE … [--device D]
+"""When to compact the colours within the pruning schedule.
+
+    python -m tools.bench.compact_at SCENE … [--device D]
 
 A SCENE is a folder with point_cloud.ply and cameras.json. For each part of the schedule: splats, bytes, AC sparsity,
 and PSNR on test views against the uncompressed scene's renders, after quantisation. Prints Markdown.
@@ -6,54 +8,47 @@ and PSNR on test views against the uncompressed scene's renders, after quantisat
 
 from __future__ import annotations
 
-import argparse
-from pathlib import Path
-
 import numpy as np
 
 from potr_cl.codec.decoder import decode
 from potr_cl.codec.quantize import ac_sparsity
-from potr_cl.formats import load_cameras, load_scene
-from potr_cl.model.camera import Camera, test_views
-from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.camera import test_views
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.metrics import psnr
-from potr_cl.raster.rasterizer import Rasterizer
-
-
-def pictures(device: Device, scene: Scene, views: list[Camera]) -> list[FloatArray]:
-    """Renders, clamped to [0, 1]."""
-    rasterizer = Rasterizer(device, scene)
-    images = [np.clip(rasterizer.render(view)[0], 0, 1) for view in views]
-    rasterizer.free()
-    return images
+from tools.results import Column, Results
+from tools.workloads import pictures, read, scene_parser
 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+", type=Path)
-    parser.add_argument("--device")
-    args = parser.parse_args()
+    args = scene_parser(__doc__).parse_args()
     device = Device(args.device)
-    print(f"{device.info}\n\n| scene | compact at | splats | bytes | AC zeros | PSNR |\n|---|---|---|---|---|---|")
+    table = Results(device.info, args.json).table(
+        "compact_at",
+        "After which part of the pruning schedule the colours are compacted",
+        Column("scene"),
+        Column("compact at"),
+        Column("splats", format=","),
+        Column("bytes", format=","),
+        Column("AC zeros", format=".1%"),
+        Column("PSNR", "dB", ".2f"),
+    )
     for folder in args.scenes:
-        scene, cameras = load_scene(folder / "point_cloud.ply"), load_cameras(folder / "cameras.json")
+        scene, cameras = read(folder)
         views = test_views(cameras)
         wanted = pictures(device, scene, views)
-        settings = [(f"{part:g}", EncodeOptions(compact_at=part)) for part in (0, 0.25, 0.5, 0.75, 1)]
-        for label, options in [*settings, ("never", EncodeOptions(compact=False))]:
+        settings = [
+            (f"{part:g}", EncodeOptions.for_preset("paper", compact={"at": part})) for part in (0, 0.25, 0.5, 0.75, 1)
+        ]
+        for label, options in [*settings, ("never", EncodeOptions.for_preset("paper", compact=False))]:
             encoded = encode(scene, cameras, options, device=device)
             decoded = decode(b"".join(encoded.pieces))
             got = pictures(device, decoded, views)
             mean = float(np.mean([psnr(a, b) for a, b in zip(wanted, got, strict=True)]))
-            zeros = 100 * ac_sparsity(decoded.sh, options.parameters.sf_sh)
-            print(
-                f"| {folder.name} | {label} | {len(decoded)} | {encoded.nbytes} | {zeros:.1f} % | {mean:.2f} dB |",
-                flush=True,
-            )
+            zeros = ac_sparsity(decoded.sh, options.parameters.sf_sh)
+            table.add(folder.name, label, len(decoded), encoded.nbytes, float(zeros), mean)
 
 
 if __name__ == "__main__":

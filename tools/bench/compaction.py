@@ -1,4 +1,6 @@
-"""Speed and accuracy of the SH energy compaction: python -m tools.bench.compaction PART … [options]
+"""Speed and accuracy of the SH energy compaction.
+
+    python -m tools.bench.compaction PART … [options]
 
 Parts:
   speed     synthetic splats, each seen by --views views; needs no files
@@ -10,7 +12,6 @@ tools.study.compaction_curves.
 from __future__ import annotations
 
 import argparse
-import os
 import platform
 import time
 from dataclasses import dataclass
@@ -25,10 +26,11 @@ from potr_cl.model.camera import camera_centres, train_views
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.reference.ridge import YCOCG, Mask, Ridges, triangles, usable_columns_of
+from potr_cl.reference.scenes import random_scene
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision, ViewWeights
-from tests.cases.scenes import random_scene
-from tests.oracles.ridge import YCOCG, Mask, Ridges, triangles, usable_columns_of
 from tools.make.large_scene import DEFAULT_SCENE
+from tools.results import threads
 from tools.study.compaction_curves import measured_weights
 
 F64 = NDArray[np.float64]
@@ -55,13 +57,9 @@ def operations(views: int, degree: int) -> dict[str, float]:
     }
 
 
-def _threads() -> int:
-    return len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-
-
 def _heading(device: Device) -> None:
     print(f"\n{device.info}, {device.family} kernels of {device.vector_width} lanes; {platform.machine()}, ", end="")
-    print(f"{_threads()} CPU thread(s)\n")
+    print(f"{threads()} CPU thread(s)\n")
 
 
 def _timed(
@@ -215,7 +213,7 @@ def _accuracy(device: Device, folder: Path, every: int, precisions: list[Precisi
         "| largest AC coefficient / max(1, norm) |"
     )
     print("|---|---|---|---|---|---|---|---|---|---|")
-    parameters = EncodeOptions().parameters
+    parameters = EncodeOptions.for_preset("paper").parameters
     violators: list[str] = []
     for lam, alpha in ((1.0, 0.9), (parameters.lam, parameters.alpha), (0.01, 1.0)):
         for precision in precisions:

@@ -1,16 +1,15 @@
-"""Run time against error of all stages and whole encodes, on every OpenCL device: python -m tools.bench.encode
-[options]
+"""Run time against error of all stages and whole encodes, on every OpenCL device.
+
+    python -m tools.bench.encode                           every device, the scenes lego and plush
+    python -m tools.bench.encode --quick                   the best device, the bundled excerpt; under two minutes
+    python -m tools.bench.encode --scenes FOLDER …         folders with point_cloud.ply and cameras.json
+    python -m tools.bench.encode --stages sort ridge       some stages only
+    python -m tools.bench.encode --from benchmark.json     tables and plots again
 
 For each stage the variants that exist: kernel family, compiler flags, formula, precision, sort, skips, iterations,
 steps, entropy coder, preset; each with its time and its error against float64 or against the full computation. A
 variant is on the Pareto front if no other of its stage is at least as good in time, error and bytes and better in one
 by more than the noise of 5 %.
-
-  python -m tools.bench.encode                           every device, the scenes lego and plush
-  python -m tools.bench.encode --quick                   the best device, the bundled excerpt; under two minutes
-  python -m tools.bench.encode --scenes FOLDER …         folders with point_cloud.ply and cameras.json
-  python -m tools.bench.encode --stages sort ridge       some stages only
-  python -m tools.bench.encode --from benchmark.json     tables and plots again
 
 Every device runs in a process of its own. Times of the rasterizer's kernels and of the ridge are the device's own, the
 others the clock's. Each is the best of some. Prints Markdown; --json keeps the figures, --plots draws them.
@@ -35,7 +34,6 @@ from pathlib import Path
 from typing import Any, get_args
 
 import numpy as np
-import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.codec.container import EntropyCoder
@@ -50,14 +48,19 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.reference import raster as reference
+from potr_cl.reference.removal import BruteForce
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
-from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
-from potr_cl.stages.refitting.refit import RefitOptions, RenderedTargets, refit_colours
-from tests.oracles import raster as reference
-from tools.bench.pruning import Bench, halved, skips
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
+from potr_cl.stages.refitting.targets import RenderedTargets
+from tools.bench.pruning import Bench, skips
+from tools.results import circumstances, processor
 from tools.study.compaction_curves import measured_weights
-from tools.study.removal_exactness import SCENES, BruteForce, choose_splats
-from tools.study.removal_formulas import PrefixSumsDevice
+from tools.study.removal_exactness import choose_splats
+from tools.study.removal_formulas import PREFIX_SUMS
+from tools.workloads import SCENES, best_of, scaled
 
 F64 = NDArray[np.float64]
 
@@ -116,16 +119,9 @@ STAGES = {
 }
 
 
-class VariantDevice(Device):
-    """A device on which macros of the kernels have other values than the package gives them."""
-
-    def __init__(self, info: DeviceInfo, family: Family, flags: Sequence[str] = (), **macros: int) -> None:
-        self._macros = macros
-        super().__init__(info, profiling=True, family=family, build_options=flags)
-
-    def program(self, source: str, **defines: str | int | float) -> cl.Program:
-        changed = {name: value for name, value in self._macros.items() if name in defines}
-        return super().program(source, **{**defines, **changed})
+def profiled(info: DeviceInfo, family: Family, flags: Sequence[str] = (), **macros: int) -> Device:
+    """A device whose kernels are timed, with compiler flags and other values of the kernels' macros."""
+    return Device(info, profiling=True, family=family, build_options=flags, macros=macros)
 
 
 @dataclasses.dataclass
@@ -152,7 +148,7 @@ class Workload:
         """A scene's folder, or the excerpt's files put into one."""
         cameras = load_cameras(folder / "cameras.json")
         if quick:
-            cameras = [halved(camera) for camera in cameras]
+            cameras = [scaled(camera, 0.5) for camera in cameras]
         train, test = train_views(cameras), test_views(cameras)
         scene = load_scene(folder / "point_cloud.ply")
         return Workload(folder, scene, train, test, 2 if quick else 5, 3 if quick else 7, 8 if quick else 48)
@@ -166,17 +162,6 @@ class Workload:
 def families(info: DeviceInfo) -> tuple[Family, ...]:
     """The device's own kernel family first."""
     return ("cpu", "gpu") if info.family == "cpu" else ("gpu",)
-
-
-def best_of(repeats: int, work: Callable[[], Any]) -> float:
-    """Seconds by the clock, after one run that is not counted."""
-    work()
-    times = []
-    for _ in range(repeats):
-        started = time.perf_counter()
-        work()
-        times.append(time.perf_counter() - started)
-    return min(times)
 
 
 # ------------------------------------------------------------------------------------------ stages
@@ -203,15 +188,15 @@ def kernel_variants(info: DeviceInfo, quick: bool) -> Iterator[tuple[str, bool, 
         for name, flags in FLAGS.items():
             if quick and name not in ("no flags", "mad", "fast relaxed"):
                 continue
-            yield f"{family}, {name}", family == info.family and not flags, VariantDevice(info, family, flags)
+            yield f"{family}, {name}", family == info.family and not flags, profiled(info, family, flags)
         if family == "gpu":
             for capacity in CAPACITIES:
                 if capacity != 2048 and 8 * capacity <= info.local_memory:
-                    device = VariantDevice(info, family, SORT_CAPACITY=capacity)
+                    device = profiled(info, family, SORT_CAPACITY=capacity)
                     yield f"{family}, sorts {capacity} at a time", False, device
-            default = VariantDevice(info, family).native_exp2
+            default = profiled(info, family).native_exp2
             name = "polynomial" if default else "native exponential"
-            yield f"{family}, {name}", False, VariantDevice(info, family, NATIVE_EXP2=int(not default))
+            yield f"{family}, {name}", False, profiled(info, family, NATIVE_EXP2=int(not default))
 
 
 class RasterizerTruth:
@@ -291,11 +276,11 @@ def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]
     for family in families(info):
         own = family == info.family
         for name in flags:
-            flagged = VariantDevice(info, family, FLAGS[name])
+            flagged = profiled(info, family, FLAGS[name])
             variants.append((f"{family}, {name}", own and name == "no flags", flagged, default))
-        prefix_sums = PrefixSumsDevice(info, profiling=True, family=family)
+        prefix_sums = Device(info, profiling=True, family=family, variants=PREFIX_SUMS)
         variants.append((f"{family}, prefix sums", False, prefix_sums, default))
-        plain = VariantDevice(info, family)
+        plain = profiled(info, family)
         other = dataclasses.replace(default, tighten=not default.tighten)
         variants.append((f"{family}, {'not ' if default.tighten else ''}tightened", False, plain, other))
         for stop in stops:
@@ -345,7 +330,7 @@ def ridge_errors(scene: Scene, compacted: Scene, centres: F64, weights: Any, opt
 
     Relative to the largest coefficient or 1.
     """
-    from tests.oracles.ridge import YCOCG, Ridges, triangles  # needs scipy
+    from potr_cl.reference.ridge import YCOCG, Ridges, triangles  # needs scipy
 
     before, after = scene.sh @ YCOCG.T, compacted.sh @ YCOCG.T
     largest = np.maximum(np.abs(before).max(axis=1), 1)
@@ -371,7 +356,7 @@ def ridge_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
     scene, centres = load.scene.subset(np.sort(chosen)), camera_centres(views)
     weights = measured_weights(Device(info), scene, views)
     for family in families(info):
-        device = VariantDevice(info, family)
+        device = profiled(info, family)
         doubles = "cl_khr_fp64" in info.handle.extensions.split()
         for precision in get_args(Precision):
             if precision == "fp64" and not doubles:
@@ -400,7 +385,7 @@ def refit_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
     removal.free()
     rasterizer.free()
     kept = load.scene.subset(np.sort(np.argsort(importance)[len(importance) // 2 :]))
-    default = EncodeOptions.for_preset("best").refit
+    default = EncodeOptions.for_preset("best").refit.steps
     for family in families(info)[: 1 if quick else 2]:
         device = Device(info, family=family)
         rasterizer = Rasterizer(device, load.scene)
@@ -434,7 +419,7 @@ def code_rows(load: Workload, quick: bool) -> Iterator[Row]:
             ("decode", lambda d=data: decode(d)),
         ):
             seconds = best_of(1 if stage == "code" else load.repeats, work)
-            yield Row(stage, name, seconds, len(data), coder == EncodeOptions.for_preset("best").entropy)
+            yield Row(stage, name, seconds, len(data), coder == EncodeOptions.for_preset("best").code.coder)
 
 
 def encode_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
@@ -445,15 +430,15 @@ def encode_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
         "paper": {"preset": "paper"},
         "fast": {"preset": "fast"},
         "best": {"preset": "best"},
-        "paper, 12 iterations": {"preset": "paper", "iterations": 12},
-        "paper, 4 iterations": {"preset": "paper", "iterations": 4},
-        "paper, every removal effect anew": {"preset": "paper", "sweep": SweepOptions(tolerance=-1)},
+        "paper, 12 iterations": {"preset": "paper", "prune": {"iterations": 12}},
+        "paper, 4 iterations": {"preset": "paper", "prune": {"iterations": 4}},
+        "paper, every removal effect anew": {"preset": "paper", "prune": {"tolerance": -1}},
         "paper, no compaction": {"preset": "paper", "compact": False},
         "paper, no pruning": {"preset": "paper", "prune": False},
         "paper, neither": {"preset": "paper", "prune": False, "compact": False},
-        "paper, re-fit of 8 steps": {"preset": "paper", "refit": 8},
-        "best, re-fit of 4 steps": {"preset": "best", "refit": 4},
-        "best, re-fit of 16 steps": {"preset": "best", "refit": 16},
+        "paper, re-fit of 8 steps": {"preset": "paper", "refit": {"steps": 8}},
+        "best, re-fit of 4 steps": {"preset": "best", "refit": {"steps": 4}},
+        "best, re-fit of 16 steps": {"preset": "best", "refit": {"steps": 16}},
     }
     for number, (name, changes) in enumerate(variants.items()):
         options = EncodeOptions.for_preset(**changes)
@@ -491,11 +476,6 @@ def measure(info: DeviceInfo, load: Workload, quick: bool, stages: Sequence[str]
 
 def header(info: DeviceInfo) -> dict[str, str]:
     """The machine and the versions."""
-    processor = platform.processor() or platform.machine()
-    cpuinfo = Path("/proc/cpuinfo")
-    if cpuinfo.exists():
-        models = [line.split(":")[1].strip() for line in cpuinfo.read_text().splitlines() if "model name" in line]
-        processor = models[0] if models else processor
     packages = ("potr-cl", "pyopencl", "numpy", "zstandard")
     versions = []
     for package in packages:
@@ -505,7 +485,7 @@ def header(info: DeviceInfo) -> dict[str, str]:
             versions.append(f"{package} not installed")
     return {
         "device": f"{info.name}, {info.platform}, {info.version}, driver {info.handle.driver_version}",
-        "machine": f"{processor}, {os.cpu_count()} processors, {platform.system()} {platform.release()}",
+        "machine": f"{processor()}, {os.cpu_count()} processors, {platform.system()} {platform.release()}",
         "versions": f"Python {platform.python_version()}, " + ", ".join(versions),
         "date": time.strftime("%Y-%m-%d"),
     }
@@ -645,7 +625,7 @@ def main() -> None:
                 scenes = {folder.name: folder for folder in (SCENES / "lego", SCENES / "plush") if folder.exists()}
             scenes = scenes or {"excerpt": excerpt(Path(scratch) / "excerpt")}
             results = [
-                in_process(info, folder, name, args.quick, args.stages)
+                {**circumstances(info), **in_process(info, folder, name, args.quick, args.stages)}
                 for info in infos
                 for name, folder in scenes.items()
             ]

@@ -1,4 +1,6 @@
-"""Processor time of each kernel of a pruning and of a re-fit: python -m tools.bench.kernels SCENE … --device NAME
+"""Processor time of each kernel of a pruning and of a re-fit.
+
+    python -m tools.bench.kernels SCENE …
 
 For CPU devices on machines that do other work too: a launch's time is that of the process, and of REPEATS runs of the
 same work the least. Each SCENE is a folder with point_cloud.ply and cameras.json. Prints Markdown: milliseconds a
@@ -7,24 +9,26 @@ launch, which is one view or, of vectors, all of them.
 
 from __future__ import annotations
 
-import argparse
 import functools
 import time
 from collections import defaultdict
 from collections.abc import Callable
-from pathlib import Path
 
 import numpy as np
 import pyopencl as cl
 
-from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.kernel import Kernel
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
+from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions, prune
-from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, RenderedTargets
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
+from potr_cl.stages.refitting.targets import RenderedTargets
+from tools.results import Column, Results
+from tools.workloads import read, scene_parser
 
 ITERATIONS = 8
 DELTA_MSE_MAX = 1e-9
@@ -45,7 +49,7 @@ class TimedDevice(Device):
 
     def launch(
         self,
-        kernel: cl.Kernel,
+        kernel: Kernel,
         items: tuple[int, ...],
         group: tuple[int, ...] | None = None,
         queue: cl.CommandQueue | None = None,
@@ -54,7 +58,7 @@ class TimedDevice(Device):
         start = time.process_time()
         super().launch(kernel, items, group, queue)
         (queue or self.queue).finish()
-        self.launches.append((kernel.function_name, time.process_time() - start))
+        self.launches.append((kernel.name, time.process_time() - start))
 
 
 def pruning(device: Device, scene: Scene, cameras: list[Camera]) -> Scene:
@@ -70,9 +74,9 @@ def pruning(device: Device, scene: Scene, cameras: list[Camera]) -> Scene:
 def refit(device: Device, scene: Scene, left: Scene, cameras: list[Camera]) -> None:
     """Re-fit what is left to the whole scene's pictures."""
     rasterizer = Rasterizer(device, scene)
-    solver = ColourRefit(device, left, cameras, RefitOptions(steps=STEPS, drop=1e-10, gain=0))
-    solver.solve(RenderedTargets(rasterizer, cameras))
-    solver.free()
+    refit_colours(
+        device, left, cameras, RenderedTargets(rasterizer, cameras), RefitOptions(steps=STEPS, drop=1e-10, gain=0)
+    )
     rasterizer.free()
 
 
@@ -93,17 +97,23 @@ def least_times(device: TimedDevice, work: Callable[[], object]) -> dict[str, tu
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", type=Path, nargs="+", metavar="SCENE")
-    parser.add_argument("--device")
+    parser = scene_parser(__doc__)
     parser.add_argument("--views", type=int, default=4, help="training views, spread evenly (default %(default)s)")
-    arguments = parser.parse_args()
-    device = TimedDevice(arguments.device)
-    print("| scene | stage | kernel | launches | ms of processors a launch |\n|---|---|---|---|---|")
-    for folder in arguments.scenes:
-        scene = load_scene(folder / "point_cloud.ply")
-        views = train_views(load_cameras(folder / "cameras.json"))
-        cameras = [views[k] for k in np.linspace(0, len(views) - 1, arguments.views).round().astype(int)]
+    args = parser.parse_args()
+    device = TimedDevice(args.device)
+    table = Results(device.info, args.json).table(
+        "kernels",
+        f"Processor time of the kernels, the least of {REPEATS} runs on {args.views} views",
+        Column("scene"),
+        Column("stage"),
+        Column("kernel"),
+        Column("launches"),
+        Column("of processors a launch", "ms", ".2f"),
+    )
+    for folder in args.scenes:
+        scene, cameras = read(folder)
+        views = train_views(cameras)
+        cameras = [views[k] for k in np.linspace(0, len(views) - 1, args.views).round().astype(int)]
         left = pruning(device, scene, cameras)
         stages: dict[str, Callable[[], object]] = {
             "prune": functools.partial(pruning, device, scene, cameras),
@@ -111,7 +121,7 @@ def main() -> None:
         }
         for stage, work in stages.items():
             for name, (count, taken) in sorted(least_times(device, work).items(), key=lambda item: -item[1][1]):
-                print(f"| {folder.name} | {stage} | {name} | {count} | {1e3 * taken / count:.2f} |")
+                table.add(folder.name, stage, name, count, 1e3 * taken / count)
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""Host memory of an encode, stage by stage: python -m tools.bench.memory SCENE.ply CAMERAS.json [--iterations N] …
+"""Host memory of an encode, stage by stage.
+
+    python -m tools.bench.memory SCENE.ply CAMERAS.json [--iterations N] …
 
 The peak of every stage is the kernel's own (Linux only): it is reset when a stage begins. On CPU devices the device's
 memory is the host's and counts. Prints Markdown. tools.make.large_scene makes scenes of any size.
@@ -7,7 +9,6 @@ memory is the host's and counts. Prints Markdown. tools.make.large_scene makes s
 from __future__ import annotations
 
 import argparse
-import os
 import time
 from pathlib import Path
 
@@ -16,7 +17,7 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.stages.pruning.removal import SweepOptions
+from tools.results import Column, Results, Table
 
 
 def resident(field: str) -> float:
@@ -39,7 +40,8 @@ class StagePeaks:
         rows: stage, its peak in gigabytes, what was resident when it ended, its seconds.
     """
 
-    def __init__(self, first: str) -> None:
+    def __init__(self, first: str, table: Table) -> None:
+        self._table = table
         self.rows: list[tuple[str, float, float, float]] = []
         self._stage, self._began = first, time.perf_counter()
         reset_peak()
@@ -48,7 +50,7 @@ class StagePeaks:
         if stage != self._stage:
             now = time.perf_counter()
             self.rows.append((self._stage, resident("VmHWM"), resident("VmRSS"), now - self._began))
-            print("| {} | {:.2f} | {:.2f} | {:.0f} s |".format(*self.rows[-1]), flush=True)
+            self._table.add(*self.rows[-1])
             self._stage, self._began = stage, now
             reset_peak()
 
@@ -57,20 +59,29 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scene", type=Path)
     parser.add_argument("cameras", type=Path)
-    parser.add_argument("--iterations", type=int, default=EncodeOptions.iterations)
+    parser.add_argument("--iterations", type=int, help="of pruning; default: the preset's")
     parser.add_argument("--preset", choices=PRESETS, default=EncodeOptions.preset)
     parser.add_argument("--views", type=int, metavar="N", help="the first so many only")
     parser.add_argument("--memory", type=float, metavar="GB", help="as encode's")
     parser.add_argument("--device")
+    parser.add_argument("--json", type=Path, help="also keep the results here")
     args = parser.parse_args()
     device = Device(args.device)
-    print(f"{device.info}, {os.cpu_count()} processors\n\n| stage | peak GB | at its end | time |\n|---|---|---|---|")
-    peaks = StagePeaks("read")
+    table = Results(device.info, args.json).table(
+        "stages",
+        f"Host memory of an encode of {args.scene.name}, preset {args.preset}, {args.iterations} iterations",
+        Column("stage"),
+        Column("peak", "GB", ".2f"),
+        Column("at its end", "GB", ".2f"),
+        Column("time", "s", ".0f"),
+    )
+    peaks = StagePeaks("read", table)
     scene = load_scene(args.scene)
     cameras = load_cameras(args.cameras)[: args.views]
     memory = None if args.memory is None else int(args.memory * 2**30)
-    sweep = SweepOptions(memory=memory)
-    options = EncodeOptions.for_preset(args.preset, iterations=args.iterations, sweep=sweep)
+    options = EncodeOptions.for_preset(args.preset, memory=memory)
+    if args.iterations is not None:
+        options = options.changed(prune={"iterations": args.iterations})
     encoded = encode(scene, cameras, options, peaks, device)
     peaks("end")
     most = max(row[1] for row in peaks.rows)

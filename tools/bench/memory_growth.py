@@ -1,5 +1,6 @@
-"""Peak memory of an encode against splats and views, and whether --memory is obeyed: python -m
-tools.bench.memory_growth
+"""Peak memory of an encode against splats and views, and whether --memory is obeyed.
+
+    python -m tools.bench.memory_growth [--splats N …] [--views N …] [--size WxH] [options]
 
 Scenes of any size are drawn from a trained one (tools.make.large_scene). Each encode runs in a process of its own, so
 that its peak is its own; the host's is the kernel's figure (Linux only) less what the process held before the encode,
@@ -33,9 +34,9 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.stages.pruning.removal import SweepOptions
 from tools.bench.memory import reset_peak, resident
 from tools.make.large_scene import DEFAULT_SCENE, EXCERPT, cameras_beside, large_scene, more_views
+from tools.results import circumstances, write_json
 
 #: Parts of what the views would take that --memory is tried with.
 SHARES = (0.0, 0.1, 0.3, 0.6, 0.9)
@@ -82,8 +83,7 @@ def measure(point: Point, like: Path, size: tuple[int, int], preset: Preset, rou
         path.write_text(json.dumps(entries))
         cameras = load_cameras(path)
     device = CountingDevice(spec)
-    sweep = SweepOptions(memory=point.memory)
-    options = EncodeOptions.for_preset(preset, iterations=rounds, sweep=sweep)
+    options = EncodeOptions.for_preset(preset, prune={"iterations": rounds}, memory=point.memory)
     before = resident("VmRSS")
     reset_peak()
     encode(scene, cameras, options, device.enter, device)
@@ -181,7 +181,8 @@ def main() -> None:
     print_budgets(budgets, middle)
     if args.json:
         content = {"growth": points, "budgets": budgets}
-        args.json.write_text(json.dumps(content, default=dataclasses.asdict, indent=1))
+        figures = {name: [dataclasses.asdict(point) for point in points] for name, points in content.items()}
+        write_json(args.json, {**circumstances(device.info), **figures})
 
 
 if __name__ == "__main__":

@@ -1,4 +1,6 @@
-"""What a scene does not need, and what leaving it out saves: python -m tools.bench.needs [SCENE …] [--views N]
+"""What a scene does not need, and what leaving it out saves.
+
+    python -m tools.bench.needs [SCENE …] [--views N]
 
 Each line compares two runs of the same work, in turn: with and without what is skipped where that can be switched, and
 else of the scene and of the scene with so much more of what nobody needs: then the ratio says what the skip leaves to
@@ -27,13 +29,15 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
+from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
+from potr_cl.stages.pruning.sweep_options import SweepOptions
 from tools.bench.encode import excerpt
 
 #: ΔMSE_MAX at q = 0.5.
-DELTA_MSE_MAX = EncodeOptions().parameters.delta_mse_max
+DELTA_MSE_MAX = EncodeOptions.for_preset("paper").parameters.delta_mse_max
 
 
 @dataclasses.dataclass(frozen=True)
@@ -88,7 +92,7 @@ class Needs:
 
     def encode(self, scene: Scene, views: Sequence[Camera] | None = None, **changes: Any) -> int:
         """Bytes of an encode."""
-        options = EncodeOptions.for_preset("paper", **{"iterations": self.iterations, **changes})
+        options = EncodeOptions.for_preset("paper", **{"prune": {"iterations": self.iterations}, **changes})
         return encode(scene, views or self.views, options, device=self.device).nbytes
 
     def schedule(self, sweep: SweepOptions, threshold: float = DELTA_MSE_MAX) -> tuple[float, int]:
@@ -248,7 +252,7 @@ class Needs:
     def nothing_at_all(self) -> Iterator[Line]:
         """A scene that needs no stage: pruned until nothing goes any more, degree 0."""
         bare = dataclasses.replace(self.scene, sh=np.ascontiguousarray(self.scene.sh[:, :1]))
-        options = EncodeOptions.for_preset("paper", iterations=self.iterations)
+        options = EncodeOptions.for_preset("paper", prune={"iterations": self.iterations})
         needless, before = bare, len(bare) + 1
         while len(needless) < before:  # without its least splats a scene may have others to spare
             before = len(needless)
@@ -263,7 +267,7 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("scenes", type=Path, nargs="*", metavar="SCENE")
     parser.add_argument("--views", type=int, default=8, metavar="N", help="of the training views, spread evenly")
-    parser.add_argument("--iterations", type=int, default=EncodeOptions.iterations)
+    parser.add_argument("--iterations", type=int, default=Prune.iterations)
     parser.add_argument("--repeats", type=int, default=2)
     parser.add_argument("--device")
     args = parser.parse_args()

@@ -1,4 +1,6 @@
-"""Quality, cost and gain of pruning: python -m tools.bench.pruning SCENE … [options] | --plot FILE …
+"""Quality, cost and gain of pruning.
+
+    python -m tools.bench.pruning SCENE … [options] | --plot FILE …
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, for --truth, images. Parts (all by default):
 
@@ -37,9 +39,12 @@ from potr_cl.opencl.device import Device
 from potr_cl.quality.compare import find_ground_truth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
+from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Pruned, PruningOptions, prune
-from tools.study.pruning_baselines import mesongs_power, removal_order, scores, transmittance_sums
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from tools.results import circumstances
+from tools.study.pruning_baselines import KERNELS, mesongs_power, removal_order, scores, transmittance_sums
+from tools.workloads import scaled
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -59,22 +64,6 @@ IMAGES = Path(__file__).parents[2] / "docs" / "images"
 def log(text: str) -> None:
     """Progress, to standard error."""
     print(f"[{time.strftime('%H:%M:%S')}] {text}", file=sys.stderr, flush=True)
-
-
-def halved(camera: Camera) -> Camera:
-    """The same view at half the resolution."""
-    width, height = max(camera.width // 2, 1), max(camera.height // 2, 1)
-    across, down = width / camera.width, height / camera.height
-    return dataclasses.replace(
-        camera,
-        width=width,
-        height=height,
-        fx=camera.fx * across,
-        fy=camera.fy * down,
-        cx=camera.cx * across,
-        cy=camera.cy * down,
-        image_path=None,
-    )
 
 
 def squared_error(image: Image, reference: Image) -> float:
@@ -159,7 +148,7 @@ class Bench:
         sweeps."""
         started = time.perf_counter()
         removal = RemovalSweep(self.rasterizer, cameras, sweep)
-        small = RemovalSweep(self.rasterizer, [halved(c) for c in cameras], sweep) if half else None
+        small = RemovalSweep(self.rasterizer, [scaled(c, 0.5) for c in cameras], sweep) if half else None
         prepared = time.perf_counter()
         if small:
             result = prune(HalfSizeFirst(removal, small, half), len(self.scene), options)
@@ -315,7 +304,7 @@ def skips(bench: Bench, iterations: Sequence[int]) -> list[Row]:
         options = PruningOptions(DELTA_MSE_MAX, setting.iterations, **setting.pruning)
         views = bench.train[:: setting.every]
         if setting.half < 0:
-            views = [halved(c) for c in views]
+            views = [scaled(c, 0.5) for c in views]
         result, cost = bench.pruned(views, options, setting.sweep, max(setting.half, 0))
         cost["sweeps"] *= sum(c.width * c.height for c in views) / sum(c.width * c.height for c in bench.train)
         kept = rows[0]["kept"] if rows else result.kept
@@ -573,8 +562,9 @@ def merged(files: Sequence[Path]) -> Row:
 
 def run(arguments: argparse.Namespace) -> Row:
     """Measure what the command line asks for."""
-    device = Device(arguments.device)
-    results: Row = {"device": device.info.name, "quick": arguments.quick, "scenes": {}}
+    device = Device(arguments.device, variants=KERNELS)
+    about = circumstances(device.info)
+    results: Row = {**about, "device": device.info.name, "quick": arguments.quick, "scenes": {}}
     for folder in arguments.scenes:
         started = time.perf_counter()
         bench = Bench(folder, device, arguments.quick, arguments.truth)

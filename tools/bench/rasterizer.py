@@ -1,4 +1,6 @@
-"""Speed of the rasterizer: python -m tools.bench.rasterizer frames SCENE … | growth | plot FILE LABEL=JSON …
+"""Speed of the rasterizer.
+
+    python -m tools.bench.rasterizer frames SCENE … | growth | plot FILE LABEL=JSON …
 
 frames: frames a second of a scene's training views, finished one by one with the picture left on the device, and the
 device's time a stage. A SCENE is a folder with point_cloud.ply and cameras.json; where it has reference/metrics.json,

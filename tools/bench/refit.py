@@ -1,7 +1,7 @@
-"""What the joint re-fit of the colours brings and takes: python -m tools.bench.refit measure SCENE … --json OUT.json
+"""What the joint re-fit of the colours brings and takes.
 
-python -m tools.bench.refit measure SCENE … --json OUT.json [--removed PART …] [--drops X …] [--every N] [--quality Q]
-python -m tools.bench.refit report OUT.json [--images DIR]
+    python -m tools.bench.refit measure SCENE … --json OUT.json [--removed PART …] [--drops X …] [options]
+    python -m tools.bench.refit report OUT.json [--images DIR]
 
 A SCENE is a folder with point_cloud.ply, cameras.json with test views and, if it has any, photographs in images.
 ``measure`` looks at
@@ -19,8 +19,8 @@ DIR/refit_SCENE.png from such a file.
 from __future__ import annotations
 
 import argparse
-import contextlib
 import dataclasses
+import functools
 import json
 import math
 import sys
@@ -41,13 +41,16 @@ from potr_cl.model.camera import test_views, train_views
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.reduction import reduce_scene
-from potr_cl.quality.ground_truth import GroundTruth, GroundTruthTargets
+from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
-from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, RenderedTargets, Targets, active_coefficients
-from tools.study.rate_distortion import size_at, write_json
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, active_coefficients
+from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
+from tools.results import circumstances, write_json
+from tools.study.rate_distortion import size_at
+from tools.workloads import reduced, study_parser
 
 #: By name: whether splat by splat (the paper's compaction) comes first, and how the re-fit is done, if at all.
 WAYS = {
@@ -104,8 +107,9 @@ class Bench:
 
     def reduced(self, removed: float, compact: bool) -> Scene:
         count = max(round((1 - removed) * len(self.scene)), 1)
-        options = dataclasses.replace(self.options, count=count, compact=compact)
-        return reduce_scene(self.scene, self.train, options, device=self.device)[0]
+        return reduced(
+            self.scene, self.train, self.options.changed(prune={"count": count}, compact=compact), self.device
+        )
 
     def decoded(self, scene: Scene) -> tuple[int, Scene, NDArray[np.int64]]:
         """Bytes, the decoded scene, and the number in ``scene`` of each of its splats."""
@@ -140,12 +144,8 @@ class Bench:
         self, scene: Scene, targets: Targets, options: RefitOptions, active: NDArray[np.bool_] | None
     ) -> tuple[Scene, dict[str, Any]]:
         began = time.perf_counter()
-        refit = ColourRefit(self.device, self.on_decoded_geometry(scene), self.train, options)
-        try:
-            refit.set_coefficients(scene.sh, active)
-            result = refit.solve(targets)
-        finally:
-            refit.free()
+        with ColourRefit(self.device, self.on_decoded_geometry(scene), self.train) as refit:
+            result = refit.solve(scene.sh, targets, options, active)
         facts = {"steps": result.steps, "errors": result.errors, "seconds": time.perf_counter() - began}
         return dataclasses.replace(scene, sh=result.sh), facts
 
@@ -164,18 +164,15 @@ class Bench:
             for name, (compact, how) in WAYS.items():
                 scene = scenes[compact]
                 facts: dict[str, Any] = {}
-                with contextlib.ExitStack() as stack:
-                    targets: Targets = self.targets
-                    if how == "ground_truth":
-                        if self.ground_truth is None:
-                            continue
-                        ground_truth = GroundTruthTargets(self.device, self.ground_truth, self.train)
-                        stack.callback(ground_truth.free)
-                        targets = ground_truth
-                    if how is not None:
-                        options = dataclasses.replace(self.refit, lam=lam) if how == "lambda" else self.refit
-                        active = self.active(scene) if compact else None
-                        scene, facts = self.refitted(scene, targets, options, active)
+                targets: Targets = self.targets
+                if how == "ground_truth":
+                    if self.ground_truth is None:
+                        continue
+                    targets = GroundTruthTargets(self.device, self.ground_truth, self.train)
+                if how is not None:
+                    options = dataclasses.replace(self.refit, lam=lam) if how == "lambda" else self.refit
+                    active = self.active(scene) if compact else None
+                    scene, facts = self.refitted(scene, targets, options, active)
                 add(name, scene, facts)
             for drop in drops:
                 options = dataclasses.replace(self.refit, drop=drop)
@@ -184,36 +181,31 @@ class Bench:
 
     # -------------------------------------------------------------------------------------- the solver
 
-    def solver(self, scene: Scene, memory: int | None = None) -> ColourRefit:
-        return ColourRefit(self.device, scene, self.train, dataclasses.replace(self.refit, gain=0, memory=memory))
+    def options_of(self, steps: int) -> RefitOptions:
+        """So many steps, however little they gain."""
+        return dataclasses.replace(self.refit, gain=0, steps=steps)
 
     def steps(self, scene: Scene, most: int) -> list[dict[str, Any]]:
         """Errors after so many steps, before the quantiser."""
         active, rows = self.active(scene), []
-        refit = self.solver(scene)
-        for steps in (s for s in STEPS if s <= most):
-            refit.options = dataclasses.replace(refit.options, steps=steps)
-            refit.set_coefficients(scene.sh, active)
-            result = refit.solve(self.targets)
-            rows.append(self._row(scene, result.sh, result.errors[1], steps=result.steps))
-            log(f"{self.name} {rows[-1]}")
-        refit.free()
+        with ColourRefit(self.device, scene, self.train) as refit:
+            for steps in (s for s in STEPS if s <= most):
+                result = refit.solve(scene.sh, self.targets, self.options_of(steps), active)
+                rows.append(self._row(scene, result.sh, result.errors[1], steps=result.steps))
+                log(f"{self.name} {rows[-1]}")
         return rows
 
     def cuts(self, scene: Scene, most: int) -> list[dict[str, Any]]:
         """The same number of steps in runs of different lengths: each run begins with a new linearisation."""
         active, rows = self.active(scene), []
-        refit = self.solver(scene)
-        for runs in (1, 2, 4, 8):
-            refit.options = dataclasses.replace(refit.options, steps=max(most // runs, 1))
-            sh = scene.sh
-            for _ in range(runs):
-                refit.set_coefficients(sh, active)
-                result = refit.solve(self.targets)
-                sh = result.sh
-            rows.append(self._row(scene, sh, result.errors[1], runs=runs, steps=max(most // runs, 1)))
-            log(f"{self.name} {rows[-1]}")
-        refit.free()
+        with ColourRefit(self.device, scene, self.train) as refit:
+            for runs in (1, 2, 4, 8):
+                options, sh = self.options_of(max(most // runs, 1)), scene.sh
+                for _ in range(runs):
+                    result = refit.solve(sh, self.targets, options, active)
+                    sh = result.sh
+                rows.append(self._row(scene, sh, result.errors[1], runs=runs, steps=options.steps))
+                log(f"{self.name} {rows[-1]}")
         return rows
 
     def _row(self, scene: Scene, sh: FloatArray, error: float, **facts: Any) -> dict[str, Any]:
@@ -228,17 +220,12 @@ class Bench:
         removal.free()
         rasterizer.free()
         began = time.perf_counter()
-        refit = self.solver(scene)
-        prepared = time.perf_counter() - began
-        solves: dict[int, float] = {}
-        for steps in (2, 6):
-            refit.options = dataclasses.replace(refit.options, steps=steps)
-            runs = []
-            for _ in range(3):
-                refit.set_coefficients(scene.sh, self.active(scene))
-                runs.append(_seconds(lambda: refit.solve(self.targets)))
-            solves[steps] = min(runs)
-        refit.free()
+        with ColourRefit(self.device, scene, self.train) as refit:
+            prepared = time.perf_counter() - began
+            active, solves = self.active(scene), {}
+            for steps in (2, 6):
+                solve = functools.partial(refit.solve, scene.sh, self.targets, self.options_of(steps), active)
+                solves[steps] = min(_seconds(solve) for _ in range(3))
         step = (solves[6] - solves[2]) / 4
         return {
             "sweep": min(sweeps),
@@ -257,11 +244,11 @@ def _seconds(work: Callable[[], Any]) -> float:
 
 def _measure(args: argparse.Namespace) -> None:
     device = Device(args.device)
-    options = EncodeOptions(q=args.quality, preset=args.preset, iterations=args.iterations)
+    options = EncodeOptions.for_preset(args.preset, q=args.quality, prune={"iterations": args.iterations})
     refit = RefitOptions(steps=args.steps, prior=args.prior)
     results: dict[str, Any] = {
-        "device": device.info.name, "q": args.quality, "preset": args.preset, "steps": args.steps,
-        "prior": args.prior, "every": args.every, "scenes": {},
+        **circumstances(device.info), "device": device.info.name, "q": args.quality, "preset": args.preset,
+        "steps": args.steps, "prior": args.prior, "every": args.every, "scenes": {},
     }  # fmt: skip
     for folder in args.scenes:
         bench = Bench(folder, device, options, refit, args.every)
@@ -369,11 +356,7 @@ def _plot(name: str, entry: dict[str, Any], keys: list[str], path: Path) -> None
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(required=True)
-    measure = commands.add_parser("measure")
-    measure.add_argument("scenes", nargs="+", type=Path)
-    measure.add_argument("--json", type=Path, required=True)
+    parser, measure, report = study_parser(__doc__, _measure, _report)
     measure.add_argument("--removed", nargs="+", type=float, default=REMOVED, help="parts of the splats")
     measure.add_argument("--drops", nargs="*", type=float, default=DROPS, help="mean squared errors a coefficient")
     measure.add_argument("--quality", type=float, default=0.5)
@@ -383,12 +366,7 @@ def main() -> None:
     measure.add_argument("--prior", type=float, default=RefitOptions.prior)
     measure.add_argument("--most-steps", type=int, default=max(STEPS), help="of the parts steps and cuts")
     measure.add_argument("--every", type=int, default=1, help="look at every N-th view only")
-    measure.add_argument("--device")
-    measure.set_defaults(run=_measure)
-    report = commands.add_parser("report")
-    report.add_argument("results", type=Path)
     report.add_argument("--images", type=Path)
-    report.set_defaults(run=_report)
     args = parser.parse_args()
     args.run(args)
 

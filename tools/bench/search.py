@@ -1,4 +1,6 @@
-"""Encoding to a size or a PSNR: python -m tools.bench.search SCENE … [--sizes B …] [--psnrs DB …] [--device D]
+"""Encoding to a size or a PSNR.
+
+    python -m tools.bench.search SCENE … [--sizes B …] [--psnrs DB …] [--device D]
 
 A SCENE is a folder with point_cloud.ply and cameras.json. For each target: what was reached, the steps, what the file
 loses to a plain encode of its size, and how many times such an encode's time the search took. Both are read off curves
@@ -21,12 +23,13 @@ import numpy as np
 from potr_cl.codec.decoder import decode
 from potr_cl.codec.quantize import PRESETS
 from potr_cl.errors import UnreachableError
-from potr_cl.formats import load_cameras, load_scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import Encoded, encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.search import Target, encode_to_target
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
+from tools.results import Column, Results
+from tools.workloads import read, scene_parser
 
 
 class Timed:
@@ -51,80 +54,100 @@ class _Plain:
     processors: float
 
 
-def _against(plain: list[_Plain], size: float, psnr: float, took: Timed) -> tuple[str, str, str]:
-    """What is gained on a plain encode of a size, and the times in such encodes."""
+def _against(
+    plain: list[_Plain], size: float, psnr: float, took: Timed
+) -> tuple[float, float, float] | tuple[None, None, None]:
+    """Decibels gained on a plain encode of a size, and the times in such encodes; None beyond the plain ones."""
     sizes = [each.size for each in plain]
     if not sizes or not sizes[0] <= size <= sizes[-1]:
-        return "–", f"{took.clock:.1f} s", f"{took.processors:.1f} s"
+        return None, None, None
     usual, clock, processors = (
         float(np.interp(size, sizes, [getattr(each, name) for each in plain]))
         for name in ("psnr", "clock", "processors")
     )
-    return f"{psnr - usual:+.3f} dB", f"{took.clock / clock:.2f}", f"{took.processors / processors:.2f}"
+    return psnr - usual, took.clock / clock, took.processors / processors
 
 
-def bench(folder: Path, device: Device, args: argparse.Namespace) -> None:
+def bench(folder: Path, device: Device, results: Results, args: argparse.Namespace) -> None:
     """One scene."""
-    scene, cameras = load_scene(folder / "point_cloud.ply"), load_cameras(folder / "cameras.json")
+    scene, cameras = read(folder)
     cameras = [c for split in ("train", "test") for c in [c for c in cameras if c.split == split][:: args.every]]
     evaluator = Evaluator(device, scene, EvaluationViews.of(cameras), (0.0, 0.0, 0.0))
     options = EncodeOptions.for_preset(args.preset)
     few = [camera for camera in cameras if camera.split == "train"][:4]
-    encode(scene, few, replace(options, iterations=1), device=device)  # builds the kernels
+    encode(scene, few, options.changed(prune={"iterations": 1}), device=device)  # builds the kernels
 
     def measured(encoded: Encoded) -> float:
         return evaluator.psnr(decode(b"".join(encoded.pieces)))
 
-    print(
-        f"\n{folder.name}, plain encodes:\n\n| quality | bytes | PSNR | time | of processors |\n|---|---|---|---|---|"
+    table = results.table(
+        f"{folder.name}_plain",
+        f"{folder.name}: plain encodes, preset {args.preset}",
+        Column("quality", format="g"),
+        Column("bytes", format=","),
+        Column("PSNR", "dB", ".3f"),
+        Column("time", "s", ".1f"),
+        Column("of processors", "s", ".1f"),
     )
     plain: list[_Plain] = []
     for q in sorted(args.qualities):
         with Timed() as took:
             encoded = encode(scene, cameras, replace(options, q=q), device=device)
         plain.append(_Plain(math.log(encoded.nbytes), measured(encoded), took.clock, took.processors))
-        print(
-            f"| {q:g} | {encoded.nbytes:,} | {plain[-1].psnr:.3f} dB | {took.clock:.1f} s | {took.processors:.1f} s |",
-            flush=True,
-        )
+        table.add(q, encoded.nbytes, plain[-1].psnr, took.clock, took.processors)
 
-    print("\n| target | bytes | PSNR | against plain | quality | steps | time, in plain encodes | of processors |")
-    print("|---|---|---|---|---|---|---|---|")
+    table = results.table(
+        f"{folder.name}_targets",
+        f"{folder.name}: searches for a size or a PSNR, preset {args.preset}",
+        Column("target"),
+        Column("bytes", format=","),
+        Column("PSNR", "dB", ".3f"),
+        Column("against plain", "dB", "+.3f"),
+        Column("quality", format=".4f"),
+        Column("steps"),
+        Column("time", "s", ".1f"),
+        Column("in plain encodes", format=".2f"),
+        Column("of processors, in plain encodes", format=".2f"),
+    )
     targets = [Target(max_bytes=int(size)) for size in args.sizes] + [Target(min_psnr=psnr) for psnr in args.psnrs]
     for target in targets:
         try:
             with Timed() as took:
                 found = encode_to_target(scene, cameras, target, options, device=device)
         except UnreachableError as error:
-            print(f"| {error} | | | | | | | |", flush=True)
+            table.add(str(error), *[None] * 8)
             continue
         psnr = measured(found.encoded)
         kinds = Counter(step.kind for step in found.tries)
         gain, clock, processors = _against(plain, math.log(found.encoded.nbytes), psnr, took)
         steps = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
-        print(
-            f"| {target} | {found.encoded.nbytes:,} | {psnr:.3f} dB | {gain} | {found.options.q:.4f} | {steps} | "
-            f"{clock} | {processors} |",
-            flush=True,
+        table.add(
+            str(target),
+            found.encoded.nbytes,
+            psnr,
+            gain,
+            found.options.q,
+            steps,
+            took.clock,
+            clock,
+            processors,
         )
     evaluator.free()
 
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+", type=Path)
+    parser = scene_parser(__doc__)
     parser.add_argument("--sizes", nargs="*", type=float, default=[1.2e6, 2e6, 3e6, 5e6], help="bytes")
     parser.add_argument("--psnrs", nargs="*", type=float, default=[38, 42, 45], help="dB")
     parser.add_argument("--qualities", nargs="*", type=float, default=[0, 0.05, *(k / 10 for k in range(1, 11))])
     parser.add_argument("--preset", choices=PRESETS, default="best")
     parser.add_argument("--every", type=int, default=1, metavar="N", help="only every N-th view")
-    parser.add_argument("--device")
     args = parser.parse_args()
     device = Device(args.device)
-    print(f"{device.info}, preset {args.preset}")
+    results = Results(device.info, args.json)
     for folder in args.scenes:
-        bench(folder, device, args)
+        bench(folder, device, results, args)
 
 
 if __name__ == "__main__":

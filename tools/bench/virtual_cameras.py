@@ -1,4 +1,6 @@
-"""What encoding without cameras costs: python -m tools.bench.virtual_cameras SCENE … [options]
+"""What encoding without cameras costs.
+
+    python -m tools.bench.virtual_cameras SCENE … [options]
 
 A SCENE is a folder with point_cloud.ply and cameras.json. Each is encoded at several qualities, once with its training
 cameras and once with the cameras that :mod:`potr_cl.model.virtual_cameras` places. PSNR is the mean over the true test
@@ -11,19 +13,15 @@ CPU, not for publication.
 
 from __future__ import annotations
 
-import argparse
 import dataclasses
-import json
 import math
 import sys
 import time
 from collections.abc import Sequence
-from pathlib import Path
 
 import numpy as np
 
 from potr_cl.codec.decoder import decode
-from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.virtual_cameras import place_cameras
@@ -31,7 +29,8 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.metrics import psnr
-from potr_cl.raster.rasterizer import Rasterizer
+from tools.results import Column, Results
+from tools.workloads import pictures, read, scaled, scene_parser
 
 QUALITIES = (0.1, 0.3, 0.5, 0.7, 0.9)
 #: Bytes are compared at the PSNR that the true cameras reach at these.
@@ -47,30 +46,6 @@ class Point:
     nbytes: int
     psnr: float
     seconds: float
-
-
-def scaled(camera: Camera, factor: float) -> Camera:
-    """The same view at another resolution."""
-    width, height = max(round(camera.width * factor), 1), max(round(camera.height * factor), 1)
-    across, down = width / camera.width, height / camera.height
-    return dataclasses.replace(
-        camera,
-        width=width,
-        height=height,
-        fx=camera.fx * across,
-        fy=camera.fy * down,
-        cx=camera.cx * across,
-        cy=camera.cy * down,
-        image_path=None,
-    )
-
-
-def pictures(device: Device, scene: Scene, views: Sequence[Camera]) -> list[FloatArray]:
-    """Renders, clamped to [0, 1]."""
-    rasterizer = Rasterizer(device, scene)
-    images = [np.clip(rasterizer.render(view)[0], 0, 1) for view in views]
-    rasterizer.free()
-    return images
 
 
 def curve(
@@ -106,27 +81,23 @@ def bytes_at(points: Sequence[Point], decibels: float) -> float:
 
 def main() -> None:
     """Command line."""
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", nargs="+", type=Path)
+    parser = scene_parser(__doc__)
     parser.add_argument("--qualities", nargs="+", type=float, default=QUALITIES)
     parser.add_argument("--count", type=int, help="virtual views; default as encode places")
     parser.add_argument("--size", type=int, help="of their images, in pixels; default as encode's")
     parser.add_argument("--quick", action="store_true", help="few iterations, few and small views")
-    parser.add_argument("--json", type=Path, help="also write the raw results here")
-    parser.add_argument("--device")
     args = parser.parse_args()
     device = Device(args.device)
-    raw = {}
-    print(f"{device.info}\n")
+    results = Results(device.info, args.json)
     for folder in args.scenes:
-        scene, cameras = load_scene(folder / "point_cloud.ply"), load_cameras(folder / "cameras.json")
+        scene, cameras = read(folder)
         true, judges = train_views(cameras), test_views(cameras)
         began = time.perf_counter()
         placed = place_cameras(scene, args.count, args.size)
         placing = time.perf_counter() - began
         options = EncodeOptions.for_preset("best")
         if args.quick:
-            options = dataclasses.replace(options, iterations=8)
+            options = options.changed(prune={"iterations": 8})
             judges = [scaled(c, 0.5) for c in judges[::3]]
             true, placed = [scaled(c, 0.5) for c in true], [scaled(c, 0.5) for c in placed]
         wanted = pictures(device, scene, judges)
@@ -134,22 +105,34 @@ def main() -> None:
             name: curve(device, scene, views, judges, wanted, args.qualities, options)
             for name, views in (("true", true), ("virtual", placed))
         }
-        raw[folder.name] = {name: [dataclasses.asdict(p) for p in points] for name, points in curves.items()}
-        print(
-            f"### {folder.name}: {len(true)} true, {len(train_views(placed))} virtual views placed in {placing:.1f} s"
+        table = results.table(
+            folder.name,
+            f"{folder.name}: {len(true)} true, {len(train_views(placed))} virtual views placed in {placing:.1f} s",
+            Column("q", format="g"),
+            *(
+                Column(f"{name} {what}", unit, form)
+                for name in curves
+                for what, unit, form in (
+                    ("splats", "", ","),
+                    ("bytes", "", ","),
+                    ("PSNR", "dB", ".2f"),
+                    ("time", "s", ".1f"),
+                )
+            ),
         )
-        print("\n| q | true: splats | bytes | PSNR | time | virtual: splats | bytes | PSNR | time |")
-        print("|---|---|---|---|---|---|---|---|---|")
         for a, b in zip(*curves.values(), strict=True):
-            cells = [f"{p.splats} | {p.nbytes} | {p.psnr:.2f} dB | {p.seconds:.1f} s" for p in (a, b)]
-            print(f"| {a.q:g} | {' | '.join(cells)} |")
+            table.add(a.q, *(figure for p in (a, b) for figure in (p.splats, p.nbytes, p.psnr, p.seconds)))
+        table = results.table(
+            f"{folder.name}_at_equal_psnr",
+            f"{folder.name}: bytes with virtual cameras at the PSNR that true ones reach",
+            Column("q with true cameras", format="g"),
+            Column("PSNR", "dB", ".2f"),
+            Column("bytes", format="+.1%"),
+        )
         for p in curves["true"]:
             if p.q in COMPARED:
-                more = 100 * (bytes_at(curves["virtual"], p.psnr) / p.nbytes - 1)
-                print(f"\nAt {p.psnr:.2f} dB (q = {p.q:g} with true cameras): {more:+.1f} % bytes.", flush=True)
-        print()
-    if args.json is not None:
-        args.json.write_text(json.dumps(raw, indent=1))
+                virtual = bytes_at(curves["virtual"], p.psnr)
+                table.add(p.q, p.psnr, None if math.isnan(virtual) else virtual / p.nbytes - 1)
 
 
 if __name__ == "__main__":

@@ -1,6 +1,8 @@
 """Make tests/data/foreign: the excerpt in the formats of another tool, to test that they are read as that tool means.
 
-python -m tools.make.foreign_files --transform COMMAND     (splat-transform, npm install @playcanvas/splat-transform)
+    python -m tools.make.foreign_files [--transform COMMAND]
+
+COMMAND is splat-transform (npm install @playcanvas/splat-transform).
 """
 
 from __future__ import annotations

@@ -1,7 +1,6 @@
 """A scene of any size with the statistics of a real one: splats of a trained scene, drawn again with jitter.
 
-python -m tools.make.large_scene SPLATS -o OUT.ply [--like SCENE.ply] [--split] [--cameras OUT.json --views N --size
-WxH]
+    python -m tools.make.large_scene SPLATS -o OUT.ply [--like SCENE.ply] [--split] [--cameras OUT.json] [options]
 
 The views are those of the cameras.json beside the scene, drawn again with jitter too.
 """

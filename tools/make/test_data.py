@@ -1,6 +1,6 @@
 """Cut the small excerpts in tests/data out of the full scenes.
 
-    python tools/make_test_data.py SCENES
+    python -m tools.make.test_data SCENES
 
 SCENES holds the folders ``lego`` and ``plush``, each with point_cloud.ply and cameras.json, lego with its
 transforms_train.json and transforms_test.json, plush with a COLMAP model in sparse/0. Every run writes the same bytes.

@@ -18,10 +18,16 @@ from numpy.typing import NDArray
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import GSPLAT, INRIA, RasterRules
+from potr_cl.reference.scenes import (
+    plain_splats,
+    random_scene,
+    random_splats,
+    ring_of_cameras,
+    straight_camera,
+    tilted_camera,
+)
 from potr_cl.stages.compaction.ridge import CompactionOptions
 from potr_cl.stages.refitting.refit import RefitOptions
-from tests.cases.scenes import random_scene, ring_of_cameras
-from tests.cases.splats import camera, random_splats, splats, tilted_camera
 
 F64 = NDArray[np.float64]
 
@@ -74,14 +80,16 @@ def known_cases() -> Iterator[Case]:
         ("on the near plane", near),
         ("a last digit behind the near plane", np.nextafter(near, np.float32(1))),
     ):
-        yield Case(f"one splat {label}", splats([0.01, 0.01, depth], sigma=0.02, logit=3), camera())
+        yield Case(f"one splat {label}", plain_splats([0.01, 0.01, depth], sigma=0.02, logit=3), straight_camera())
     yield Case(
         "close to the camera centre and to the side",
-        splats([[3, 2, 0.25], [-0.5, 0.1, 0.21], [0.3, -4, 0.3]], sigma=0.3, logit=2),
-        camera(),
+        plain_splats([[3, 2, 0.25], [-0.5, 0.1, 0.21], [0.3, -4, 0.3]], sigma=0.3, logit=2),
+        straight_camera(),
     )
     for sigma in (1e-30, 1e-6, 10, 1e3, 1e6, 1e20, 1e38):
-        yield Case(f"sigma {sigma:g}", splats([[0, 0, 2], [0.3, 0.2, 3]], sigma=sigma, logit=1), camera())
+        yield Case(
+            f"sigma {sigma:g}", plain_splats([[0, 0, 2], [0.3, 0.2, 3]], sigma=sigma, logit=1), straight_camera()
+        )
     rng = np.random.default_rng(0)
     needles = random_splats(40, 0, seed=9)
     for label, thin, long in (("1 : 1e5", -9.0, 3.0), ("1 : 1e9, flat", -20.0, 2.0), ("1 : 1e13", -20.0, 10.0)):
@@ -92,7 +100,9 @@ def known_cases() -> Iterator[Case]:
     for logit in (-200.0, -50.0, -5.6, -5.5373, -5.5, 0.0, 16.118095, 50.0, 200.0):
         for rules in (GSPLAT, INRIA):
             name = f"opacity logit {logit:g}, alpha cap {rules.alpha_cap:g}"
-            yield Case(name, splats([[0.01, 0.02, 2], [0, 0, 3]], sigma=0.3, logit=logit), camera(), rules)
+            yield Case(
+                name, plain_splats([[0.01, 0.02, 2], [0, 0, 3]], sigma=0.3, logit=logit), straight_camera(), rules
+            )
     for length in (1e-12, 1e-3, 1e6, 1e18):
         scene = random_splats(30, 0, seed=11)
         unit = scene.quaternions / np.linalg.norm(scene.quaternions, axis=1, keepdims=True)
@@ -102,35 +112,41 @@ def known_cases() -> Iterator[Case]:
     layers = np.zeros((5000, 3))
     layers[:, 2] = rng.uniform(1, 5, 5000)
     colours = rng.uniform(0, 1, (5000, 3))
-    yield Case("5000 layers of alpha 0.0055", splats(layers, 5, -5.2, colours), camera(4, 4))
+    yield Case("5000 layers of alpha 0.0055", plain_splats(layers, 5, -5.2, colours), straight_camera(4, 4))
     for in_front in (0, 10, 100, 300):
         yield layered(in_front)
-    yield Case("40 identical splats", splats(np.tile([0.0, 0, 2], (40, 1)), 0.2, -2, colours[:40]), camera())
-    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 12), np.linspace(-1, 1, 12), [2.0]), axis=-1).reshape(-1, 3)
-    yield Case("144 splats of one depth", splats(grid, 0.2, -1, colours[:144]), camera())
     yield Case(
-        "144 splats of one depth, tilted", splats(grid - [0, 0, 2], 0.2, -1, colours[:144]), tilted_camera(3, 50, 40)
+        "40 identical splats", plain_splats(np.tile([0.0, 0, 2], (40, 1)), 0.2, -2, colours[:40]), straight_camera()
+    )
+    grid = np.stack(np.meshgrid(np.linspace(-1, 1, 12), np.linspace(-1, 1, 12), [2.0]), axis=-1).reshape(-1, 3)
+    yield Case("144 splats of one depth", plain_splats(grid, 0.2, -1, colours[:144]), straight_camera())
+    yield Case(
+        "144 splats of one depth, tilted",
+        plain_splats(grid - [0, 0, 2], 0.2, -1, colours[:144]),
+        tilted_camera(3, 50, 40),
     )
     for width, height in ((1, 1), (1, 40), (16384, 4), (4, 16384), (17, 16)):
         longest = float(max(width, height))
-        view = camera(width, height, focal=longest, fy=longest)
+        view = straight_camera(width, height, focal=longest, fy=longest)
         rng = np.random.default_rng(width)
         n = 30 if longest < 1000 else 6
         places = np.ones((n, 3))
         places[:, :2] = rng.uniform(-0.6, 0.6, (n, 2)) * (width, height) / longest
         spread = rng.uniform(1e-3, 3e-2, (n, 3))
-        yield Case(f"{width} x {height} pixels", splats(places, spread, rng.normal(0, 2, n), colours[:n]), view)
+        yield Case(f"{width} x {height} pixels", plain_splats(places, spread, rng.normal(0, 2, n), colours[:n]), view)
     for offset in (1e3, 1e5, 1e6):
         scene = random_splats(100, 3, seed=12)
         scene = dataclasses.replace(scene, means=scene.means + np.array([offset, 0, 0], np.float32))
         yield Case(f"{offset:g} from the origin", scene, tilted_camera(12, 60, 50, offset))
     rng = np.random.default_rng(4)
-    far = splats(rng.uniform(-1e6, 1e6, (500, 3)), np.exp(rng.normal(5, 5, (500, 3))), 1, colours[:500])
-    yield Case("coordinates up to 1e6", far, camera())
+    far = plain_splats(rng.uniform(-1e6, 1e6, (500, 3)), np.exp(rng.normal(5, 5, (500, 3))), 1, colours[:500])
+    yield Case("coordinates up to 1e6", far, straight_camera())
     for brightness in (1e3, 1e10, 1e30):
-        yield Case(f"colours of {brightness:g}", splats(grid, 0.2, -1, brightness * colours[:144]), camera())
+        yield Case(
+            f"colours of {brightness:g}", plain_splats(grid, 0.2, -1, brightness * colours[:144]), straight_camera()
+        )
     for label, mean in (("behind", [0, 0, -3]), ("beside", [100, 0, 1]), ("in the camera centre", [0, 0, 0])):
-        yield Case(f"a view that sees nothing: {label}", splats(mean), camera())
+        yield Case(f"a view that sees nothing: {label}", plain_splats(mean), straight_camera())
     for degree, rules in itertools.product(range(4), (INRIA, GSPLAT)):
         name = f"100 random splats of degree {degree}, alpha cap {rules.alpha_cap:g}"
         yield Case(name, random_splats(100, degree, seed=degree), tilted_camera(degree, 45, 37), rules)
@@ -138,7 +154,11 @@ def known_cases() -> Iterator[Case]:
         yield Case("extremes of every parameter", extremes(300), tilted_camera(seed, 40, 30))
     n = 5_000
     means = np.concatenate([rng.uniform(-0.05, 0.05, (n, 2)), rng.uniform(1, 2, (n, 1))], axis=1)
-    yield Case("a tile with 5000 intersections", splats(means, 1e-3, -2, rng.uniform(0, 1, (n, 3))), camera(4, 4))
+    yield Case(
+        "a tile with 5000 intersections",
+        plain_splats(means, 1e-3, -2, rng.uniform(0, 1, (n, 3))),
+        straight_camera(4, 4),
+    )
 
 
 def layered(in_front: int) -> Case:
@@ -150,7 +170,10 @@ def layered(in_front: int) -> Case:
     means[:, 2] = np.linspace(2, 6, layers)
     colours = np.random.default_rng(0).uniform(0, 1.5, (layers, 3))
     return Case(
-        f"alpha at the cap behind {in_front} layers", splats(means, 1.6, logits, colours), camera(16, 16), INRIA
+        f"alpha at the cap behind {in_front} layers",
+        plain_splats(means, 1.6, logits, colours),
+        straight_camera(16, 16),
+        INRIA,
     )
 
 
@@ -239,7 +262,7 @@ def known_refits() -> Iterator[RefitCase]:
         yield RefitCase(f"prior {prior:g}, λ {lam:g}", scene, other, views, options)
     rank_deficient = dataclasses.replace(plain, prior=0)
     yield RefitCase("one view, λ and prior 0: rank deficient", scene, other, views[1:2], rank_deficient)
-    yield RefitCase("one pixel", scene, other, [camera(1, 1, focal=1.0)], plain)
+    yield RefitCase("one pixel", scene, other, [straight_camera(1, 1, focal=1.0)], plain)
     for brightness in (-30.0, 0.0, 100.0):
         changed = visible(30, 1, 1, brightness)
         yield RefitCase(f"DC about {brightness:g}", changed, other, views, plain)
@@ -255,9 +278,9 @@ def known_refits() -> Iterator[RefitCase]:
     column = np.zeros((3000, 3))
     column[:, 2] = np.linspace(2, 6, 3000)
     colours = np.random.default_rng(5).uniform(0.2, 1, (3000, 3))
-    tower = splats(column, 0.5, -5.3, colours)
+    tower = plain_splats(column, 0.5, -5.3, colours)
     dim = dataclasses.replace(tower, sh=(0.5 * tower.sh).astype(np.float32))
-    yield RefitCase("3000 layers", dim, tower, [camera(4, 4)], plain)
+    yield RefitCase("3000 layers", dim, tower, [straight_camera(4, 4)], plain)
     opaque = dataclasses.replace(scene, opacity_logits=np.full(len(scene), 20, np.float32))
     yield RefitCase("opaque splats", opaque, other, views, plain)
     away = dataclasses.replace(scene, means=scene.means + np.array([0, 0, 1e4], np.float32))

@@ -1,4 +1,6 @@
-"""Decode files that were changed at random: python -m tools.stress.fuzz COUNT SEED FILE.potr …
+"""Decode files that were changed at random.
+
+    python -m tools.stress.fuzz COUNT SEED FILE.potr …
 
 Takes COUNT times one of the given files, changes something in it (mostly so that checksums are right again, so that the
 code behind them is met), decodes it and makes its report. A changed file may be refused or decode to finite numbers;

@@ -1,4 +1,6 @@
-"""The rasterizer on every OpenCL runtime of this machine: python -m tools.stress.platforms [--scenes FOLDER]
+"""The rasterizer on every OpenCL runtime of this machine.
+
+    python -m tools.stress.platforms [--scenes FOLDER]
 
 Each device and kernel family runs in a process of its own, so that a runtime that crashes is one row of the table. What
 is checked: the device's self-check; small random scenes of every SH degree and both rules against the float64
@@ -34,16 +36,24 @@ from potr_cl.opencl.discovery import DeviceInfo, list_devices
 from potr_cl.quality.metrics import ssim
 from potr_cl.quality.metrics_device import Picture, Similarity
 from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.reference import raster as reference
+from potr_cl.reference.refit import Array, to_ycocg
+from potr_cl.reference.refit_cases import Case, Linearised, Pictures
+from potr_cl.reference.scenes import (
+    plain_splats,
+    random_splats,
+    ring_of_cameras,
+    straight_camera,
+    tilted_camera,
+    visible_scene,
+)
 from potr_cl.stages.compaction.ridge import Compactor, ViewWeights
 from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
+from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
-from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, RenderedTargets
-from tests.cases.refit import Case, Linearised, Pictures, visible_scene
-from tests.cases.scenes import ring_of_cameras
-from tests.cases.splats import camera, random_splats, splats, tilted_camera
-from tests.oracles import raster as reference
-from tests.oracles.refit import Array, to_ycocg
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
+from potr_cl.stages.refitting.targets import RenderedTargets
 
 #: As in the tests: pixels that come no nearer, relatively, to 1/255 and 1e-4 cannot flip.
 CLEAR = 1e-4
@@ -104,10 +114,9 @@ def check_refit(device: Device) -> dict[str, Any]:
             targets = [(p - rng.uniform(-1, 1, size=p.shape)).astype(np.float32) for p in rendered]
             images = [(p - t).reshape(-1, 3) for p, t in zip(rendered, targets, strict=True)]
             direction = rng.normal(size=case.scene.sh.shape)
-            with Pictures(device, targets) as pictures, Linearised(case, pictures, RefitOptions(lam=0)) as linear:
-                transposed = -linear.vector(linear.refit._residual)
-                normal, blocks = linear.normal(direction), linear.gram()
-            forward, back, gram = wanted.forward(direction), wanted.transposed(images), np.triu(wanted.gram())
+            with Pictures(device, targets) as pictures, Linearised(case, pictures) as linear:
+                transposed, normal, blocks = linear.gradient, linear.normal(direction), linear.blocks
+            forward, back, gram = wanted.forward(direction), wanted.transposed(images), wanted.gram()
             weights = [view.weight for view in wanted.views]
             product = sum(w * float(np.sum(a * b)) for w, a, b in zip(weights, forward, images, strict=True))
             lengths = [
@@ -202,14 +211,14 @@ def simulate(what: str) -> None:
         removal.remove(np.arange(0, 60, 5))
         removal.measure()
         prune_scene(RemovalSweep(kept[-1], views, SweepOptions(0)), PruningOptions(1e-4, 3))
-        refit = ColourRefit(device, scene, views, RefitOptions(steps=2, gain=0, drop=1e-9))
-        refit.solve(RenderedTargets(kept[-1], views))
+        refit_options = RefitOptions(steps=2, gain=0, drop=1e-9)
+        refit_colours(device, scene, views, RenderedTargets(kept[-1], views), refit_options)
         weights = ViewWeights.from_importances(len(scene), removal.view_importances())
         for degree in (1, 2, 3):
             Compactor(device).compact(random_splats(60, degree, seed=2), camera_centres(views), weights)
         centres = np.random.default_rng(0).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (5000, 3))
-        kept.append(Rasterizer(device, splats(centres, sigma=1e-3, logit=1)))
-        kept[-1].render(camera(16, 16))  # a list longer than local memory
+        kept.append(Rasterizer(device, plain_splats(centres, sigma=1e-3, logit=1)))
+        kept[-1].render(straight_camera(16, 16))  # a list longer than local memory
         check_similarity(device)
 
 

@@ -1,7 +1,7 @@
-"""What each part of the codec contributes, one added after the other: python -m tools.study.ablation measure|report …
+"""What each part of the codec contributes, one added after the other.
 
-python -m tools.study.ablation measure SCENE … --json OUT.json [--quality Q]
-python -m tools.study.ablation report OUT.json
+    python -m tools.study.ablation measure SCENE … --json OUT.json [--quality Q]
+    python -m tools.study.ablation report OUT.json
 
 The steps are those of the paper's table "Ablation study": serialisation and quantisation, entropy coding, pruning,
 SH compaction, YCoCg; those before YCoCg quantise R, G and B. The last is ours: balanced steps and a context coder, the
@@ -14,7 +14,6 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -25,11 +24,11 @@ from potr_cl.codec.encoder import code_scene
 from potr_cl.model.camera import train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Stopwatch, reduce
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
+from tools.results import circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
-from tools.study.rate_distortion import write_json
+from tools.workloads import reduced, study_parser
 
 #: The paper's properties, the sections of a file that hold each, and float32 values a splat in a PLY of degree 3.
 PROPERTIES = {
@@ -57,7 +56,7 @@ def from_channels(scene: Scene) -> Scene:
 def _coded(evaluator: EvaluatedScene, scene: Scene, options: EncodeOptions, rgb: bool) -> dict[str, Any]:
     """Code a scene as R, G, B or as Y, Co, Cg; what the file takes by property, and what it keeps."""
     views = train_views(evaluator.cameras)
-    coded = code_scene(as_channels(scene) if rgb else scene, options.parameters, views, entropy=options.entropy)
+    coded = code_scene(as_channels(scene) if rgb else scene, options.parameters, views, entropy=options.code.coder)
     file = PotrFile.from_bytes(b"".join(coded.pieces))
     sections = file_report(file)["sections"]
     decoded = from_channels(file.scene()) if rgb else file.scene()
@@ -82,19 +81,20 @@ def measure_steps(evaluator: EvaluatedScene, device: Device, q: float) -> list[d
     serialised = {**plain, "bytes": plain["serialised_bytes"], "bytes_a_splat": plain["serialised_bytes_a_splat"]}
     steps = [{"step": "serialisation and quantisation", **serialised}, {"step": "entropy coding", **plain}]
     for name, changed, rgb in (
-        ("pruning", dataclasses.replace(options, compact=False), True),
-        ("SH compaction", dataclasses.replace(options, colour_model="rgb"), True),
+        ("pruning", options.changed(compact=False), True),
+        ("SH compaction", options.changed(compact={"colour_model": "rgb"}), True),
         ("RGB → YCoCg", options, False),
         ("preset best", EncodeOptions.for_preset("best", q=q), False),
     ):
-        reduced = reduce(evaluator.source, train_views(evaluator.cameras), changed, Stopwatch(), device)
-        steps.append({"step": name, **_coded(evaluator, reduced.scene, changed, rgb)})
+        left = reduced(evaluator.source, train_views(evaluator.cameras), changed, device)
+        steps.append({"step": name, **_coded(evaluator, left, changed, rgb)})
     return steps
 
 
 def _measure(args: argparse.Namespace) -> None:
     device = Device(args.device)
-    results: dict[str, Any] = {"device": device.info.name, "q": args.quality, "scenes": {}}
+    about = circumstances(device.info)
+    results: dict[str, Any] = {**about, "device": device.info.name, "q": args.quality, "scenes": {}}
     for folder in args.scenes:
         evaluator = EvaluatedScene(folder, device)
         steps = measure_steps(evaluator, device, args.quality)
@@ -134,17 +134,8 @@ def _report(args: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(required=True)
-    measure = commands.add_parser("measure")
-    measure.add_argument("scenes", nargs="+", type=Path)
-    measure.add_argument("--json", type=Path, required=True)
+    parser, measure, _ = study_parser(__doc__, _measure, _report)
     measure.add_argument("--quality", type=float, default=0.5)
-    measure.add_argument("--device")
-    measure.set_defaults(run=_measure)
-    report = commands.add_parser("report")
-    report.add_argument("results", type=Path)
-    report.set_defaults(run=_report)
     args = parser.parse_args()
     args.run(args)
 

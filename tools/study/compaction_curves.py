@@ -1,20 +1,18 @@
-"""What the SH energy compaction does to sparsity and pictures: python -m tools.study.compaction_curves FOLDER …
-[options]
+"""What the SH energy compaction does to sparsity and pictures.
+
+    python -m tools.study.compaction_curves FOLDER … --json curves.json       measure; keep the figures
+    python -m tools.study.compaction_curves --from curves.json [--png FILE]   tables and plot of figures that were kept
 
 Each FOLDER holds point_cloud.ply and cameras.json. Of each scene, as it is and pruned at quality 0.5: share of AC
 coefficients that are quantised to 0, mean magnitude of the others in steps of the quantiser, and PSNR over all test
 views, against λ and α and without single parts of the method; and the same sparsity from training views of half the
 size. PSNR is against the renders of the uncompressed scene, of the same splats uncompacted and unquantised, and against
 the photographs where they are there. Only SH coefficients are quantised. Prints Markdown.
-
-  python -m tools.study.compaction_curves FOLDER … --json curves.json       measure; keep the figures
-  python -m tools.study.compaction_curves --from curves.json [--png FILE]   tables and plot of figures that were kept
 """
 
 from __future__ import annotations
 
 import argparse
-import contextlib
 import json
 from collections.abc import Iterator, Sequence
 from dataclasses import replace
@@ -24,7 +22,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-import potr_cl.opencl.source
 from potr_cl.codec.quantize import quantize_sh, to_ycocg
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.formats.images import read_ground_truth
@@ -32,10 +29,10 @@ from potr_cl.model.camera import Camera, camera_centres, test_views, train_views
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.reduction import reduce_scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
+from tools.workloads import reduced, scaled
 
 ALPHAS = (1.0, 0.9, 0.7)
 POWERS = tuple(range(-5, 6))
@@ -50,8 +47,9 @@ PARTS: tuple[tuple[str, dict[str, Any]], ...] = (
     ("α = 0.9, λ = 100, visibility", {"weighting": "visibility", "lam": 100.0}),
     ("λ = ∞", {"lam": 1e20}),
 )
-#: Square pixels that the rasterizer adds to a splat's variance on screen, and their square, as in cl/raster/project.cl.
-_LOW_PASS = ("0.3f", "0.09f")
+#: Macros of cl/raster/project.cl: a quarter of its low-pass filter, which is to a view of half the size what the whole
+#: is to one of full size.
+QUARTER_LOW_PASS = {"LOW_PASS": 0.3 / 4, "LOW_PASS_SQUARED": 0.09 / 16}
 
 
 def measured_weights(device: Device, scene: Scene, cameras: Sequence[Camera]) -> ViewWeights:
@@ -98,40 +96,14 @@ def _ground_truth(cameras: Sequence[Camera]) -> list[FloatArray] | None:
     return [read_ground_truth(p) for p in paths if p is not None]
 
 
-@contextlib.contextmanager
-def _low_pass(factor: float) -> Iterator[None]:
-    """Rasterizers built inside add ``factor`` of their low-pass filter."""
-    original = potr_cl.opencl.source.kernel_source
-
-    def changed(name: str) -> str:
-        text = original(name)
-        if name == "raster/project.cl":
-            once, squared = _LOW_PASS
-            assert once in text
-            assert squared in text
-            text = text.replace(squared, f"{0.09 * factor**2:.9f}f").replace(once, f"{0.3 * factor:.9f}f")
-        return text
-
-    potr_cl.opencl.source.kernel_source = changed
-    try:
-        yield
-    finally:
-        potr_cl.opencl.source.kernel_source = original
-
-
-def _halved(camera: Camera) -> Camera:
-    intrinsics = {name: getattr(camera, name) / 2 for name in ("fx", "fy", "cx", "cy")}
-    return replace(camera, width=camera.width // 2, height=camera.height // 2, **intrinsics)
-
-
 def _resolution(
     device: Device, scene: Scene, views: list[Camera], weights: ViewWeights, sf_sh: float
 ) -> list[dict[str, Any]]:
     """Sparsity with weights from views of full and half size, and of half size with the low-pass of full size."""
-    small = [_halved(c) for c in views]
+    small = [scaled(c, 0.5) for c in views]
     half = measured_weights(device, scene, small)
-    with _low_pass(0.25):
-        sharp = measured_weights(Device(device.info, family=device.family), scene, small)
+    sharp_device = Device(device.info, family=device.family, macros=QUARTER_LOW_PASS)
+    sharp = measured_weights(sharp_device, scene, small)
     centres, compactor = camera_centres(views), Compactor(device)
     rows = []
     for lam in (0.1, 1.0, 10.0):
@@ -178,7 +150,7 @@ def measure(device: Device, folder: Path, every: int, powers: Sequence[float]) -
     cameras = load_cameras(folder / "cameras.json")
     views, tests = train_views(cameras), test_views(cameras)[::every]
     ground_truth = _ground_truth(tests)
-    options = EncodeOptions(compact=False)
+    options = EncodeOptions.for_preset("paper", compact=False)
     sf_sh = options.parameters.sf_sh
     settings: list[tuple[str, dict[str, Any]]] = [
         (f"α = {alpha:g}, λ = 10^{power:g}", {"alpha": alpha, "lam": 10.0**power})
@@ -189,7 +161,7 @@ def measure(device: Device, folder: Path, every: int, powers: Sequence[float]) -
     targets: dict[str, list[FloatArray]] = {}
     for pruned in (False, True):
         if pruned:
-            scene, _ = reduce_scene(scene, cameras, options, device=device)
+            scene = reduced(scene, views, options, device)
         rasterizer = Rasterizer(device, scene)
         unquantized = _renders(rasterizer, tests)
         targets = {"uncompressed": targets.get("uncompressed", unquantized), "uncompacted": unquantized}

@@ -1,7 +1,7 @@
 """What people would use instead: other formats and codecs on the same scenes, against our rate-distortion curve.
 
-python -m tools.study.compare_formats measure SCENE … --json OUT.json [--transform COMMAND] [--formats spz …] [--timeout
-S] python -m tools.study.compare_formats report OUT.json RATE_DISTORTION.json
+    python -m tools.study.compare_formats measure SCENE … --json OUT.json [--transform COMMAND] [options]
+    python -m tools.study.compare_formats report OUT.json RATE_DISTORTION.json
 
 ``measure`` writes each scene in each format with splat-transform (npm's @playcanvas/splat-transform), lets the same
 tool decode it to a PLY, and judges that by all test views. A format that does not finish in time is left out.
@@ -24,8 +24,10 @@ from typing import Any
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene
 from potr_cl.opencl.device import Device
+from tools.results import circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
-from tools.study.rate_distortion import size_at, value_at, write_json
+from tools.study.rate_distortion import size_at, value_at
+from tools.workloads import study_parser
 
 FORMATS = ("compressed.ply", "spz", "sog")
 
@@ -85,7 +87,8 @@ def _measure(args: argparse.Namespace) -> None:
     transform = shlex.split(args.transform)
     version = subprocess.run([*transform, "--version"], capture_output=True, text=True, check=True)
     device = Device(args.device)
-    results: dict[str, Any] = {"tool": (version.stdout + version.stderr).strip(), "scenes": {}}
+    tool = (version.stdout + version.stderr).strip()
+    results: dict[str, Any] = {**circumstances(device.info), "tool": tool, "scenes": {}}
     for folder in args.scenes:
         evaluator = EvaluatedScene(folder, device)
         rows = [_through(evaluator, folder / "point_cloud.ply", f, transform, args.timeout) for f in args.formats]
@@ -141,20 +144,11 @@ def _report(args: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(required=True)
-    measure = commands.add_parser("measure")
-    measure.add_argument("scenes", nargs="+", type=Path)
-    measure.add_argument("--json", type=Path, required=True)
+    parser, measure, report = study_parser(__doc__, _measure, _report)
     measure.add_argument("--transform", default="npx splat-transform", metavar="COMMAND")
     measure.add_argument("--formats", nargs="+", choices=FORMATS, default=FORMATS)
     measure.add_argument("--timeout", type=float, default=3600, metavar="S", help="a format; default an hour")
-    measure.add_argument("--device")
-    measure.set_defaults(run=_measure)
-    report = commands.add_parser("report")
-    report.add_argument("results", type=Path)
     report.add_argument("curves", type=Path, help="what tools.study.rate_distortion measured")
-    report.set_defaults(run=_report)
     args = parser.parse_args()
     args.run(args)
 

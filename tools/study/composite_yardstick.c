@@ -1,7 +1,7 @@
 /* The compositing of potr_cl/cl/composite_cpu.cl as a plain C loop, for the compiler to vectorise: what OpenCL on a CPU
    is measured against. And a loop of nothing but fused multiply-adds, for the machine's peak.
 
-   Built and called by tools/composite_yardstick.py; arrays as in potr_cl/rasterizer.py's View. */
+   Built and called by composite_yardstick.py; arrays as in the View of potr_cl/raster/rasterizer.py. */
 
 #include <math.h>
 #include <stdint.h>

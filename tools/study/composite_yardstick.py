@@ -1,7 +1,9 @@
-"""The CPU compositing kernel beside a C loop: python -m tools.study.composite_yardstick SCENE [--views N]
+"""The CPU compositing kernel beside a C loop.
+
+    python -m tools.study.composite_yardstick SCENE [--views N]
 
 On every CPU runtime that is installed: (pixel, splat) pairs a second of the compositing kernel alone, against
-tools/composite_yardstick.c built by the system's C compiler with its best vectorisation, on the same lists and threads;
+composite_yardstick.c built by the system's C compiler with its best vectorisation, on the same lists and threads;
 and the share of the machine's measured peak of fused multiply-adds.
 """
 

@@ -1,11 +1,11 @@
 """Size against quality: encode at many qualities, decode, judge by all test views; then tables and plots.
 
-python -m tools.study.rate_distortion measure SCENE … --json OUT.json [--qualities Q …] [--series NAME[:OPTION=VALUE,…]
-…] python -m tools.study.rate_distortion report OUT.json [--formats FORMATS.json] [--images DIR] [--against NAME --at Q]
+    python -m tools.study.rate_distortion measure SCENE … --json OUT.json [--series NAME[:OPTION=VALUE,…] …] [options]
+    python -m tools.study.rate_distortion report OUT.json [--formats FORMATS.json] [--images DIR] [options]
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photographs in images. A series is a curve:
-the name it gets and the fields of EncodeOptions in which it differs from the defaults, as in best:preset=best; those of
-its SweepOptions too, as in exact:preset=best,sweep.tolerance=0. ``measure`` writes its results after every encode and
+the name it gets and the options of EncodeOptions in which it differs from the defaults, those of a stage with its name,
+as in exact:preset=best,prune.tolerance=0. ``measure`` writes its results after every encode and
 goes on where an existing file stops. ``report`` prints Markdown and draws DIR/rate_distortion_SCENE.png; the points of
 other formats come from tools.study.compare_formats. With --against it prints instead how many bytes more or fewer each
 series takes at the PSNR that the series NAME has at quality Q, by interpolation, and how long its encodes take.
@@ -25,13 +25,13 @@ import numpy as np
 
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.errors import UsageError
-from potr_cl.host.atomic_write import replacing
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
-from potr_cl.stages.pruning.removal import SweepOptions
+from tools.results import circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
+from tools.workloads import study_parser
 
 QUALITIES = tuple(round(0.1 * step, 1) for step in range(1, 11))
 
@@ -40,19 +40,20 @@ QUALITIES = tuple(round(0.1 * step, 1) for step in range(1, 11))
 
 
 def parse_series(text: str) -> tuple[str, dict[str, Any]]:
-    """``NAME:OPTION=VALUE,…`` to the name and the options.
+    """``NAME:OPTION=VALUE,…`` to the name and the options; those of a stage are STAGE.OPTION, STAGE alone is a switch.
 
     Raises:
-        UsageError: an option is no field of :class:`EncodeOptions`.
+        UsageError: there is no such option.
     """
     name, _, rest = text.partition(":")
     options: dict[str, Any] = {}
-    fields = {field.name for field in dataclasses.fields(EncodeOptions)} - {"sweep"}
-    fields |= {f"sweep.{field.name}" for field in dataclasses.fields(SweepOptions)}
+    known = {field.name for field in dataclasses.fields(EncodeOptions)} - {"q", "stages"}
+    for stage in EncodeOptions().stages:
+        known |= {stage.name, *(f"{stage.name}.{field.name}" for field in dataclasses.fields(stage))}
     for part in filter(None, rest.split(",")):
         key, _, value = part.partition("=")
-        if key not in fields or key == "q":
-            raise UsageError(f"--series {text}: '{key}' is no option, expected one of {', '.join(sorted(fields))}")
+        if key not in known:
+            raise UsageError(f"--series {text}: '{key}' is no option, expected one of {', '.join(sorted(known))}")
         try:
             options[key] = ast.literal_eval(value)
         except (ValueError, SyntaxError):
@@ -62,9 +63,14 @@ def parse_series(text: str) -> tuple[str, dict[str, Any]]:
 
 def encode_options(changes: dict[str, Any]) -> EncodeOptions:
     """The options of a series, quality included."""
-    sweep = {key.removeprefix("sweep."): value for key, value in changes.items() if key.startswith("sweep.")}
-    plain = {key: value for key, value in changes.items() if not key.startswith("sweep.")}
-    return EncodeOptions.for_preset(**{"preset": EncodeOptions.preset, **plain, "sweep": SweepOptions(**sweep)})
+    nested: dict[str, Any] = {}
+    for key, value in changes.items():
+        stage, _, option = key.partition(".")
+        if option:
+            nested.setdefault(stage, {})[option] = value
+        else:
+            nested[stage] = value
+    return EncodeOptions.for_preset(**nested)
 
 
 def measure_encode(evaluator: EvaluatedScene, options: EncodeOptions, device: Device) -> dict[str, Any]:
@@ -82,18 +88,13 @@ def measure_encode(evaluator: EvaluatedScene, options: EncodeOptions, device: De
     }
 
 
-def write_json(path: Path, content: Any) -> None:
-    with replacing(path) as file:
-        file.write(json.dumps(content, indent=1, allow_nan=False).encode())
-
-
 def _measure(args: argparse.Namespace) -> None:
     series = dict(parse_series(text) for text in args.series)
     device = Device(args.device)
     results: dict[str, Any] = {"scenes": {}}
     if args.json.exists():
         results = json.loads(args.json.read_text())
-    results["device"] = device.info.name
+    results |= {**circumstances(device.info), "device": device.info.name}
     for folder in args.scenes:
         evaluator = EvaluatedScene(folder, device)
         entry = results["scenes"].setdefault(evaluator.name, {**evaluator.facts(), "series": {}})
@@ -241,22 +242,13 @@ def _report(args: argparse.Namespace) -> None:
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    commands = parser.add_subparsers(required=True)
-    measure = commands.add_parser("measure")
-    measure.add_argument("scenes", nargs="+", type=Path)
-    measure.add_argument("--json", type=Path, required=True)
+    parser, measure, report = study_parser(__doc__, _measure, _report)
     measure.add_argument("--qualities", nargs="+", type=float, default=QUALITIES, metavar="Q")
     measure.add_argument("--series", nargs="+", default=["default"], metavar="NAME[:OPTION=VALUE,…]")
-    measure.add_argument("--device")
-    measure.set_defaults(run=_measure)
-    report = commands.add_parser("report")
-    report.add_argument("results", type=Path)
     report.add_argument("--formats", type=Path, help="what tools.study.compare_formats measured")
     report.add_argument("--images", type=Path, metavar="DIR", help="draw the curves too")
     report.add_argument("--against", metavar="NAME")
     report.add_argument("--at", type=float, default=0.5, metavar="Q")
-    report.set_defaults(run=_report)
     args = parser.parse_args()
     args.run(args)
 

@@ -1,4 +1,6 @@
-"""Where the bits go and what they buy: python -m tools.study.rates PART SCENE … [--q Q] [--reduced FOLDER]
+"""Where the bits go and what they buy.
+
+    python -m tools.study.rates PART SCENE … [--q Q] [--reduced FOLDER]
 
 Parts: errors (bits and error of each quantiser, and of others that were tried), margins (what a bit less of each
 property costs), streams (bytes and decode time with each coder), sizes (the steps from the paper's file to the
@@ -32,10 +34,11 @@ from potr_cl.formats.scenes import ply
 from potr_cl.model.camera import Camera, camera_centres, train_views
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Stopwatch, code, reduce
+from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.report.file import file_report
+from tools.workloads import reduced
 
 STEPS = ("sf_dc", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale")
 #: Steps of equal worth at q = 0.5 for colours that compaction has made sparse; a preset with a re-fit has others.
@@ -60,8 +63,8 @@ class Bench:
     def reduced(self) -> Scene:
         if not self._kept.exists():
             self._kept.parent.mkdir(parents=True, exist_ok=True)
-            options = EncodeOptions(q=self._q)
-            ply.save(self._kept, reduce(self.source, self.train, options, Stopwatch(), self.device).scene)
+            options = EncodeOptions.for_preset("paper", q=self._q)
+            ply.save(self._kept, reduced(self.source, self.train, options, self.device))
         return load_scene(self._kept)
 
     def render(self, scene: Scene) -> list[FloatArray]:
@@ -168,11 +171,11 @@ def _quantisers(scene: Scene, train: Sequence[Camera]) -> Iterator[tuple[str, fl
 
 
 def bench_errors(bench: Bench) -> None:
-    reduced = bench.reduced()
-    own = bench.render(reduced)
+    left = bench.reduced()
+    own = bench.render(left)
     print(f"\n#### {bench.name}: bits and error of one quantiser alone\n")
     print("| quantiser | bits a splat (order 0; positions zstd) | error it adds |\n|---|---|---|")
-    for name, bits, scene in _quantisers(reduced, bench.train):
+    for name, bits, scene in _quantisers(left, bench.train):
         print(f"| {name} | {bits:.2f} | {_db(bench.error(scene, own)):.1f} dB |", flush=True)
 
 
@@ -180,11 +183,11 @@ def bench_errors(bench: Bench) -> None:
 
 
 def bench_margins(bench: Bench) -> None:
-    reduced = bench.reduced()
+    left = bench.reduced()
     base = HyperParameters.from_quality(0.5, "best", **COMPACTED)
 
     def at(parameters: HyperParameters) -> tuple[int, float]:
-        file = bench.coded(reduced, parameters)
+        file = bench.coded(left, parameters)
         return len(file.data), _db(bench.error(file.scene()))
 
     nbytes, psnr = at(base)
@@ -201,17 +204,17 @@ def bench_margins(bench: Bench) -> None:
 
 
 def bench_streams(bench: Bench) -> None:
-    reduced = bench.reduced()
+    left = bench.reduced()
     parameters = HyperParameters.from_quality(0.5, "best", **COMPACTED)
     coders = {"zstd 19": EntropyCoder("zstd"), "context": EntropyCoder("context")}
-    files = {name: bench.coded(reduced, parameters, coder) for name, coder in coders.items()}
+    files = {name: bench.coded(left, parameters, coder) for name, coder in coders.items()}
     sections = {name: file_report(file)["sections"] for name, file in files.items()}
-    print(f"\n#### {bench.name}: {len(reduced)} splats, the same integers in two coders\n")
+    print(f"\n#### {bench.name}: {len(left)} splats, the same integers in two coders\n")
     print("| | zstd 19, B a splat | context, B a splat | |\n|---|---|---|---|")
     for section in sections["zstd 19"]:
-        plain, context = (sections[name][section]["bytes"] / len(reduced) for name in coders)
+        plain, context = (sections[name][section]["bytes"] / len(left) for name in coders)
         print(f"| {section} | {plain:.3f} | {context:.3f} | {100 * (context / plain - 1):+.1f} % |")
-    plain, context = (len(file.data) / len(reduced) for file in files.values())
+    plain, context = (len(file.data) / len(left) for file in files.values())
     print(f"| **all** | {plain:.3f} | {context:.3f} | {100 * (context / plain - 1):+.1f} % |")
     print("\n| decode, one thread, ms | zstd 19 | context |\n|---|---|---|")
     calls: dict[str, Callable[[PotrFile], Any]] = {
@@ -238,33 +241,31 @@ def _seconds(call: Callable[[PotrFile], Any], file: PotrFile) -> float:
 
 def bench_sizes(bench: Bench) -> None:
     """Each step's file where its PSNR is that of the paper's file, by interpolation between finer and coarser ones."""
-    reduced = bench.reduced()
+    left = bench.reduced()
     paper = HyperParameters.from_quality(0.5)
-    file = bench.coded(reduced, paper, EntropyCoder("zstd"))
+    file = bench.coded(left, paper, EntropyCoder("zstd"))
     size, psnr = len(file.data), _db(bench.error(file.scene()))
-    print(f"\n#### {bench.name}: at the PSNR of the paper's steps ({psnr:.2f} dB), {len(reduced)} splats\n")
+    print(f"\n#### {bench.name}: at the PSNR of the paper's steps ({psnr:.2f} dB), {len(left)} splats\n")
     print("| | bytes | B a splat | |\n|---|---|---|---|")
-    print(f"| paper's steps, zstd 19 | {size} | {size / len(reduced):.2f} | |")
+    print(f"| paper's steps, zstd 19 | {size} | {size / len(left):.2f} | |")
     best = HyperParameters.from_quality(0.5, "best", **COMPACTED)
     for name, coder in (("steps of equal worth, zstd 19", "zstd"), ("the same, context coder", "context")):
         curve = []
         for factor in (1.0, 1.25, 1.5625, 1.953):
-            file = bench.coded(reduced, finer(best, factor), EntropyCoder(coder))
+            file = bench.coded(left, finer(best, factor), EntropyCoder(coder))
             curve.append((_db(bench.error(file.scene())), math.log(len(file.data))))
         at, logarithm = np.array(sorted(curve)).T
         equal = math.exp(float(np.interp(psnr, at, logarithm)))
         note = f"{100 * (equal / size - 1):+.1f} %"
-        print(f"| {name} | {equal:.0f} | {equal / len(reduced):.2f} | {note} |", flush=True)
+        print(f"| {name} | {equal:.0f} | {equal / len(left):.2f} | {note} |", flush=True)
 
 
 # ------------------------------------------------------------------------------------------------ balance
 
 
-def bench_balance(bench: Bench, q: float, extra: dict[str, Any]) -> None:
+def bench_balance(bench: Bench, q: float, refit_steps: int) -> None:
     """Pruning and compaction of other qualities with steps around the preset's."""
-    paper = EncodeOptions(q=q)
-    reduced = reduce(bench.source, bench.train, paper, Stopwatch(), bench.device)
-    coded = code(bench.source, reduced, bench.train, paper, Stopwatch())
+    coded = encode(bench.source, bench.train, EncodeOptions.for_preset("paper", q=q), device=bench.device)
     psnr = _db(bench.error(PotrFile.from_bytes(b"".join(coded.pieces)).scene()))
     print(f"\n#### {bench.name}: pruning and compaction against steps; paper: {coded.nbytes} bytes, {psnr:.2f} dB\n")
     print("| ΔMSE_MAX of q + | λ of q + | steps finer by | splats | bytes | PSNR |\n|---|---|---|---|---|---|")
@@ -273,15 +274,15 @@ def bench_balance(bench: Bench, q: float, extra: dict[str, Any]) -> None:
             options = EncodeOptions.for_preset(
                 "best",
                 q=q,
-                delta_mse_max=10 ** (-8.8 - 2 * (q + more)),
-                lam=10 ** -(q + softer),
-                **extra,
+                prune={"delta_mse_max": 10 ** (-8.8 - 2 * (q + more))},
+                compact={"lam": 10 ** -(q + softer)},
+                refit={"steps": refit_steps},
             )
-            found = reduce(bench.source, bench.train, options, Stopwatch(), bench.device)
+            left = reduced(bench.source, bench.train, options, bench.device)
             for factor in (0.7, 0.85, 1.0, 1.25):
-                file = bench.coded(found.scene, finer(options.parameters, factor))
+                file = bench.coded(left, finer(options.parameters, factor))
                 psnr = _db(bench.error(file.scene()))
-                row = f"| {more:g} | {softer:g} | {factor:g} | {len(found.scene)} | {len(file.data)} | {psnr:.2f} dB |"
+                row = f"| {more:g} | {softer:g} | {factor:g} | {len(left)} | {len(file.data)} | {psnr:.2f} dB |"
                 print(row, flush=True)
 
 
@@ -299,7 +300,7 @@ def main() -> None:
     for folder in args.scenes:
         bench = Bench(folder, args, device)
         if args.part == "balance":
-            bench_balance(bench, args.q, {"refit": args.refit})
+            bench_balance(bench, args.q, args.refit)
         else:
             {"errors": bench_errors, "margins": bench_margins, "streams": bench_streams, "sizes": bench_sizes}[
                 args.part

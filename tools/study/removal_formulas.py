@@ -1,4 +1,6 @@
-"""The two formulas of removal effects beside each other: python -m tools.study.removal_formulas
+"""The two formulas of removal effects beside each other.
+
+    python -m tools.study.removal_formulas
 
 Back to front is what the package computes, PD = T alpha (B - c) with the colour behind B grown from the last splat on.
 Prefix sums is the paper's, PD_k = P_k - P_{k+1} / (1 - alpha) + alpha / (1 - alpha) P_K, in a second sweep from front
@@ -17,10 +19,8 @@ from __future__ import annotations
 import argparse
 from collections.abc import Sequence
 from pathlib import Path
-from unittest import mock
 
 import numpy as np
-import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.formats import load_cameras, load_scene
@@ -28,19 +28,20 @@ from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import Family
-from potr_cl.opencl.source import kernel_source
 from potr_cl.raster.rasterizer import INRIA, Rasterizer
-from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
-from tests.oracles import raster as reference
-from tools.study.removal_exactness import NOISE_FLOOR, SCENES, BruteForce, choose_splats, spent
+from potr_cl.reference import raster as reference
+from potr_cl.reference.removal import BruteForce
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from tools.study.removal_exactness import NOISE_FLOOR, choose_splats, spent
+from tools.workloads import SCENES
 
 F64 = NDArray[np.float64]
 
-#: Where what the paper's formula replaces begins: a GPU kernel's second half, all of a CPU kernel. It ends before the
-#: next kernel.
-_SECOND_HALVES = {
-    "prune/removal_cpu.cl": "/* Where a list's transmittances are kept",
-    "prune/removal_gpu.cl": "    /* From here on r, g, b are twice the difference",
+#: The removal kernels by the paper's formula, for :class:`potr_cl.opencl.device.Device`.
+PREFIX_SUMS = {
+    f"prune/removal_{family}.cl": Path(__file__).with_name(f"removal_prefix_sums_{family}.cl")
+    for family in ("cpu", "gpu")
 }
 #: Pixels end here, in the sweeps and in float64.
 TRANSMITTANCE_THRESHOLD = 1e-8
@@ -50,30 +51,9 @@ TIMED_VIEWS = 5
 REPEATS = 7
 
 
-def prefix_sums_source(name: str) -> str:
-    """:func:`potr_cl.opencl.device.kernel_source`, but for the removal kernels, whose second half is the paper's."""
-    source = kernel_source(name)
-    if name not in _SECOND_HALVES:
-        return source
-    first_half, begin, rest = source.partition(_SECOND_HALVES[name])
-    _, end, others = rest.partition("/* Adds to each tile's staleness")
-    if not (begin and end):
-        raise RuntimeError(f"{name} has changed: its second half is not where {Path(__file__).name} looks for it")
-    second_half = Path(__file__).with_name(Path(name).name.replace("removal_", "removal_prefix_sums_"))
-    return first_half + second_half.read_text("utf-8") + "\n" + end + others
-
-
-class PrefixSumsDevice(Device):
-    """A device whose removal kernel follows the paper's formula; all else is the same."""
-
-    def program(self, source: str, **defines: str | int | float) -> cl.Program:
-        with mock.patch("potr_cl.opencl.device.kernel_source", prefix_sums_source):
-            return super().program(source, **defines)
-
-
 def devices(spec: str | None = None, family: Family | None = None) -> tuple[Device, Device]:
     """Back to front and prefix sums, in this order."""
-    return Device(spec, family=family), PrefixSumsDevice(spec, family=family)
+    return Device(spec, family=family), Device(spec, family=family, variants=PREFIX_SUMS)
 
 
 def measure(device: Device, scene: Scene, cameras: Sequence[Camera]) -> tuple[F64, F64]:
@@ -159,7 +139,7 @@ def time_sweeps(scene: Scene, cameras: Sequence[Camera], pair: tuple[Device, Dev
 
 
 def main() -> None:
-    parser = argparse.ArgumentParser(description=__doc__)
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--device")
     parser.add_argument("--splats", type=int, default=150)
     parser.add_argument("--family", choices=("cpu", "gpu"), help="of kernels; default: the device's own")

@@ -4,7 +4,16 @@
 
        PD_k = P_k - P_{k+1} / (1 - alpha) + alpha / (1 - alpha) P_K
 
-   Stands in removal_cpu.cl for the walks sub-tile by sub-tile; see removal_formulas.py. */
+   In place of prune/removal_cpu.cl, which walks sub-tile by sub-tile; see removal_formulas.py.
+
+   Macros: LANES, ALPHA_CAP, TRANSMITTANCE_THRESHOLD, TIGHTEN. */
+
+#include "include/lanes.clh"
+#include "include/splat.clh"
+#include "include/subtile_vectors.clh"
+#include "include/subtile_walk.clh"
+#include "prune/removal.clh"
+#include "prune/staleness_cpu.clh"
 
 /* Work-item i handles tile tiles[start + i]. */
 kernel void removal(
@@ -13,7 +22,7 @@ kernel void removal(
     global const float4 *shapes,
     global const float4 *colours,
     global const uchar *alive,
-    global const uint *begins,
+    global const uint *offsets,
     global uint *lengths,
     global uint *intersections,
     global uint *subtiles,
@@ -30,7 +39,7 @@ kernel void removal(
 {
     const int tile = tiles[start + get_global_id(0)];
     const int2 origin = (int2)(tile % view.columns, tile / view.columns) * TILE;
-    const uint begin = begins[tile];
+    const uint begin = offsets[tile];
     const uint end = begin + lengths[tile];
 
     vfloat t[SUBTILES], r[SUBTILES], g[SUBTILES], b[SUBTILES];

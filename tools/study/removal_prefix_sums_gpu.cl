@@ -1,6 +1,77 @@
-    /* The paper's second half of the removal kernel for GPUs: see removal_prefix_sums_cpu.cl, whose names and order of
-       operations these are. From here on r, g, b are the final colour, and behind_r, behind_g, behind_b the colour before
-       a splat. */
+/* The removal kernel for GPUs with the paper's second half: see removal_prefix_sums_cpu.cl, whose names and order of
+   operations these are. The first half is that of prune/removal_gpu.cl, in whose place this file is read.
+
+   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2, INT64_ATOMICS, and TIGHTEN for what is shared. */
+
+#define ROUND 8
+#include "include/subtile_lists.clh"
+#include "prune/removal.clh"
+#include "prune/staleness_gpu.clh"
+
+/* From one sub-tile's parts to the next: a little more than they need, so that sub-tiles lie in different banks. */
+#define NEXT_PARTS (PARTS + SHARE)
+
+kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
+void removal(
+    uint start,
+    global const uint *tiles,
+    global const SetView *views,
+    uint view_count,
+    uint stride,
+    global const float4 *shapes,
+    global const float4 *colours,
+    global const uint *offsets,
+    global const uint *lengths,
+    global const uint *intersections,
+    global const ushort *subtiles,
+    float red,
+    float green,
+    float blue,
+    int first_time,
+    float scale,
+    float most_pixels,
+    float bound,
+    global float *target,
+    global float2 *sums,
+    volatile global uint *totals)
+{
+    local State state;
+    local Batch near;
+    local float behind_r[TILE * TILE], behind_g[TILE * TILE], behind_b[TILE * TILE];
+    local float2 all_parts[SUBTILES * NEXT_PARTS];
+    local int levels[2 * LEVELS * BATCH];
+    local int unfinished[2], end_of_subtile[SUBTILES], rounds[2];
+
+    const int lid = get_local_id(0), share = lid % SHARE;
+    const uint set_tile = tiles[start + get_group_id(0)];
+    const uint number = view_of_tile(views, view_count, set_tile);
+    views += number;
+    const int2 picture = (int2)(views->view.width, views->view.height);
+    const int columns = views->view.columns;
+    const uint tile = set_tile - views->first_tile;
+    shapes += 2 * (size_t)stride * number;
+    colours += (size_t)stride * number;
+    const uint begin = views->first_intersection + offsets[views->first_offset + tile];
+    const uint length = lengths[set_tile];
+    intersections += begin;
+    subtiles += begin;
+    sums += begin;
+    const float weight = most_pixels / ((float)picture.x * picture.y);
+    const float view_scale = scale * weight, view_bound = bound / weight;
+
+    for (int subtile = lid; subtile < SUBTILES; subtile += ITEMS)
+        end_of_subtile[subtile] = 0;
+    const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
+    uint batch;
+    const uint swept = forward(
+        &state, &near, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &batch);
+    /* What lies behind the last pixel's end has no effect any more. */
+    for (uint e = swept + lid; e < length; e += ITEMS) {
+        replace_sums(totals + TOTAL_WORDS * (size_t)intersections[e], sums[e], (float2)(0.0f), view_scale, view_bound);
+        sums[e] = (float2)(0.0f);
+    }
+
+    /* From here on r, g, b are the final colour, and behind_r, behind_g, behind_b the colour before a splat. */
     Mine mine = pixels_of(lid / SHARE, origin, lid);
     int end = 0;
     for (int p = 0; p < PIXELS; ++p) {

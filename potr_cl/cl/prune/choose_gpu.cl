@@ -124,9 +124,9 @@ void rank(
     barrier(CLK_LOCAL_MEM_FENCE);
     uint key = STAYS;
     ulong importance = 0;
-    if (i < splats && alive[i] == 2)
-        alive[i] = 0;
-    if (i < splats && alive[i] == 1) {
+    if (i < splats && alive[i] == SPLAT_JUST_REMOVED)
+        alive[i] = SPLAT_REMOVED;
+    if (i < splats && alive[i] == SPLAT_ALIVE) {
         global const uint *total = totals + TOTAL_WORDS * (size_t)i;
         importance = (ulong)max(total_at(total + 2), 0L);
         const float newest = convert_float_rte(total_at(total)) * effect_unit;
@@ -172,7 +172,7 @@ void refine(
     merge(state, digit, bins, lid);
 }
 
-/* Mark those that go (alive = 2), note when and at what cost, and count them. */
+/* Mark those that go as just removed, note when and at what cost, and count them. */
 kernel __attribute__((reqd_work_group_size(DIGIT, 1, 1)))
 void mark(
     uint splats,
@@ -195,7 +195,7 @@ void mark(
     const uint last = remaining > 1 ? min(cut.digits, LAST_KEY) : LAST_KEY;
     if (i < splats && keys[i] <= last) {
         global const uint *total = totals + TOTAL_WORDS * (size_t)i;
-        alive[i] = 2;
+        alive[i] = SPLAT_JUST_REMOVED;
         removed[i].iteration = iteration;
         removed[i].key = keys[i];
         removed[i].effect = convert_float_rte(total_at(total)) * effect_unit;

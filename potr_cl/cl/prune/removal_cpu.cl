@@ -12,16 +12,18 @@
    A list of more than SEGMENT splats is walked segment by segment: forward through all of them, the transmittances before
    each kept, then from the last segment to the first, each walked forward once more for its alphas and weights.
 
-   Lists are compacted on the way: intersections of splats that are not alive, or that the last sweep marked, are dropped, in
-   place; a tile's list begins at begins[tile] and has lengths[tile] intersections.
+   Lists are compacted on the way: intersections of removed splats, or that the last sweep marked, are dropped, in
+   place; a tile's list begins at offsets[tile] and has lengths[tile] intersections.
 
-   Macros: LANES, ALPHA_CAP, TRANSMITTANCE_THRESHOLD, TIGHTEN (whether to mark intersections that touch no pixel). */
+   Macros: LANES, ALPHA_CAP, TRANSMITTANCE_THRESHOLD, INT64_ATOMICS, TIGHTEN (whether to mark intersections that touch no
+   pixel). */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
 #include "include/subtile_vectors.clh"
 #include "include/subtile_walk.clh"
 #include "prune/removal.clh"
+#include "prune/staleness_cpu.clh"
 
 /* Where a list's transmittances are kept at the most; of the segments between two of them those before are walked again. */
 #define CHECKPOINTS 16
@@ -116,7 +118,7 @@ kernel void removal(
     global const float4 *shapes,
     global const float4 *colours,
     global const uchar *alive,
-    global const uint *begins,
+    global const uint *offsets,
     global uint *lengths,
     global uint *intersections,
     global uint *subtiles,
@@ -133,13 +135,13 @@ kernel void removal(
 {
     const int tile = tiles[start + get_global_id(0)];
     const int2 origin = (int2)(tile % view.columns, tile / view.columns) * TILE;
-    const uint begin = begins[tile];
+    const uint begin = offsets[tile];
     const uint end = begin + lengths[tile];
 
     uint kept = begin;
     for (uint read = begin; read < end; ++read) {
         const uint number = intersections[read];
-        if (!alive[number] || sums[read].y < 0.0f)
+        if (alive[number] == SPLAT_REMOVED || sums[read].y < 0.0f)
             continue;
         if (kept < read) {
             intersections[kept] = number;
@@ -235,24 +237,4 @@ kernel void removal(
         replace_sums(totals + TOTAL_WORDS * intersections[e], sums[e], (float2)(0.0f, 0.0f), scale, bound);
         sums[e] = (float2)(0.0f, 0.0f);
     }
-}
-
-/* Adds to each tile's staleness how much of its area the splats that have just gone (alive == 2) covered when it was last
-   swept. */
-kernel void staleness(
-    global const uchar *alive,
-    global const uint *begins,
-    global const uint *lengths,
-    global const uint *intersections,
-    global const float2 *sums,
-    uint first,
-    global float *stale)
-{
-    const uint tile = get_global_id(0);
-    const uint begin = begins[tile], end = begin + lengths[tile];
-    float gone = 0.0f;
-    for (uint e = begin; e < end; ++e)
-        if (alive[intersections[e]] == 2 && sums[e].y >= 0.0f)
-            gone += fmax(sums[e].y, LEAST_STALENESS);
-    stale[first + tile] += gone * (1.0f / (TILE * TILE));
 }

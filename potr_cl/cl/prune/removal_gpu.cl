@@ -6,12 +6,10 @@
 #define ROUND 8
 #include "include/subtile_lists.clh"
 #include "prune/removal.clh"
+#include "prune/staleness_gpu.clh"
 
 /* From one sub-tile's parts to the next: a little more than they need, so that sub-tiles lie in different banks. */
 #define NEXT_PARTS (PARTS + SHARE)
-
-/* Work-items that go through a tile's list together. */
-#define LISTERS 128
 
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 void removal(
@@ -223,103 +221,5 @@ void removal(
         fetch(&near, shapes, colours, intersections + batch, subtiles + batch, BATCH, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
         make_lists(&near, lid);
-    }
-}
-
-/* Adds to each tile's staleness how much of its area the splats that have just gone (alive == 2) covered when it was last
-   swept. On the way the tile's list loses, in place, those that are not alive (!= 1) and those that the last sweep marked.
-   A tile that is staler than the tolerance is listed to be swept, and is fresh then. */
-kernel __attribute__((reqd_work_group_size(LISTERS, 1, 1)))
-void staleness(
-    global const uchar *alive,
-    global const SetView *views,
-    uint view_count,
-    global const uint *offsets,
-    global uint *lengths,
-    global uint *intersections,
-    global ushort *subtiles,
-    global float2 *sums,
-    uint first,
-    global float *stale,
-    float tolerance,
-    global uint *tiles,
-    uint set,
-    volatile global uint *listed)
-{
-    local float parts[LISTERS];
-    /* A bit an intersection that goes. Three in turn: one in use, one still being read, one that is cleared. */
-    local uint going[3][LISTERS / 32];
-    const uint set_tile = get_group_id(0), lid = get_local_id(0);
-    const uint number = view_of_tile(views, view_count, set_tile);
-    const uint begin = views[number].first_intersection
-        + offsets[views[number].first_offset + set_tile - views[number].first_tile];
-    const uint length = lengths[set_tile];
-    intersections += begin;
-    subtiles += begin;
-    sums += begin;
-    if (lid < LISTERS / 32)
-        going[0][lid] = going[1][lid] = 0;
-    barrier(CLK_LOCAL_MEM_FENCE);
-    float gone = 0.0f;
-    uint kept = 0, turn = 0;
-    for (uint batch = 0; batch < length; batch += LISTERS) {
-        const uint e = batch + lid;
-        uint splat = 0, stays = 0;
-        if (e < length) {
-            splat = intersections[e];
-            const uchar state = alive[splat];
-            stays = state == 1;
-#if TIGHTEN
-            stays = stays && sums[e].y >= 0.0f;
-#endif
-            if (state == 2) {
-                const float area = sums[e].y;
-                gone += area >= 0.0f ? fmax(area, LEAST_STALENESS) : 0.0f;
-            }
-            if (!stays)
-                atomic_or(&going[turn][lid / 32], 1u << lid % 32);
-        }
-        barrier(CLK_LOCAL_MEM_FENCE);
-        uint before = 0, all = 0;
-        for (uint w = 0; w < LISTERS / 32; ++w) {
-            const uint word = going[turn][w];
-            all += popcount(word);
-            before += popcount(w < lid / 32 ? word : w == lid / 32 ? word & ((1u << lid % 32) - 1) : 0);
-        }
-        if (lid < LISTERS / 32)
-            going[(turn + 2) % 3][lid] = 0;
-        const uint moves = stays && (all > 0 || kept < batch);
-        float2 sum = (float2)(0.0f);
-        ushort touched = 0;
-        if (moves) {
-            sum = sums[e];
-            touched = subtiles[e];
-        }
-        barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
-        if (moves) {
-            const uint place = kept + lid - before;
-            intersections[place] = splat;
-            sums[place] = sum;
-            subtiles[place] = touched;
-        }
-        kept += min(length - batch, (uint)LISTERS) - all;
-        turn = (turn + 1) % 3;
-    }
-    parts[lid] = gone;
-    barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
-    for (uint e = kept + lid; e < length; e += LISTERS)
-        sums[e] = (float2)(0.0f);
-    for (uint step = LISTERS / 2; step > 0; step /= 2) {
-        if (lid < step)
-            parts[lid] += parts[lid + step];
-        barrier(CLK_LOCAL_MEM_FENCE);
-    }
-    if (lid == 0) {
-        const float staleness = stale[first + set_tile] + parts[0] * (1.0f / (TILE * TILE));
-        const int wanted = staleness > tolerance;
-        stale[first + set_tile] = wanted ? 0.0f : staleness;
-        if (wanted)
-            tiles[first + atomic_inc(&listed[set])] = set_tile;
-        lengths[set_tile] = kept;
     }
 }

@@ -11,6 +11,12 @@
 #include "include/view_set.clh"
 #include "include/sh.clh"
 
+/* Square pixels added to a splat's variances on screen, and their square. */
+#ifndef LOW_PASS
+#define LOW_PASS 0.3f
+#define LOW_PASS_SQUARED 0.09f
+#endif
+
 /* sqrt(log2(e) / 2): turns exp(-q / 2) into exp2(-q'). */
 #define EXPONENT_SCALE 0.84932180f
 /* Projected axes are clamped to this many pixels: far more than any image has, and its fourth power is finite. */
@@ -101,9 +107,9 @@ kernel void project(
     vfloat n0 = mx[1] * my[2] - mx[2] * my[1];
     vfloat n1 = mx[2] * my[0] - mx[0] * my[2];
     vfloat n2 = mx[0] * my[1] - mx[1] * my[0];
-    vfloat determinant = n0 * n0 + n1 * n1 + n2 * n2 + 0.3f * (sxx + syy) + 0.09f;
-    sxx += 0.3f;
-    syy += 0.3f;
+    vfloat determinant = n0 * n0 + n1 * n1 + n2 * n2 + LOW_PASS * (sxx + syy) + LOW_PASS_SQUARED;
+    sxx += LOW_PASS;
+    syy += LOW_PASS;
 
     vfloat a = EXPONENT_SCALE * sqrt(syy / determinant);
     vfloat b = -a * (sxy / syy);

@@ -5,13 +5,18 @@
    splat's sum over the pixels of w_k v, three channels, and with WEIGHTS of w_k^2. A tile's sums go to exact totals
    (totals.clh). Lists of more than SEGMENT splats are walked twice.
 
-   Macros: LANES, ALPHA_CAP, TRANSMITTANCE_THRESHOLD, WEIGHTS. */
+   Macros: LANES, ALPHA_CAP, TRANSMITTANCE_THRESHOLD, WEIGHTS (1: sum the squares too), LARGEST_VALUE (refit.clh),
+   INT64_ATOMICS (totals.clh), SUMS_AHEAD (splats whose totals are fetched before they are needed; has a default). */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
 #include "include/subtile_vectors.clh"
 #include "include/subtile_walk.clh"
 #include "refit/refit.clh"
+
+#ifndef SUMS_AHEAD
+#define SUMS_AHEAD 16
+#endif
 
 /* A sub-tile's walk over its list: its transmittances and colours move on, weights[j] becomes the j-th splat's. Returns the
    number of splats before the last pixel's end. */
@@ -137,8 +142,8 @@ kernel void refit_sweep(
             }
             if (pass == 1)
                 for (uint k = 0; k < count; ++k) {
-                    if (k + AHEAD < count)
-                        PREFETCH_TO_WRITE(totals + 2 * TOTALS * intersections[from + k + AHEAD]);
+                    if (k + SUMS_AHEAD < count)
+                        PREFETCH_TO_WRITE(totals + 2 * TOTALS * intersections[from + k + SUMS_AHEAD]);
                     add_sums(totals, intersections[from + k], sums[k], scale);
                 }
             if (from + count >= end)

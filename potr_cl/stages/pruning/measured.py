@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.stage import State, Workbench
 
 

@@ -12,8 +12,10 @@ import numpy as np
 import pyopencl as cl
 
 from potr_cl.opencl.structs import struct_dtype
+from potr_cl.raster.rasterizer import totals_limits
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Iteration, Pruned, PruningOptions, ascending, prune
+from potr_cl.stages.pruning.steering import Steering
 
 _SOURCE = "prune/choose_gpu.cl"
 #: Digits of a score in base 256, and the words of the state buffer (cl/prune/choose_gpu.cl): histograms, what is known
@@ -39,9 +41,9 @@ def prune_scene(
         progress: called with the iterations done and the number of splats left.
         after_iteration: called with the iteration.
     """
-    if not removal.steerable or options.count is not None or not np.isfinite(options.delta_mse_max):
+    if removal.steering is None or options.count is not None or not np.isfinite(options.delta_mse_max):
         return prune(removal, removal.splats, options, progress, after_iteration)
-    controller = _Controller(removal, options)
+    controller = _Controller(removal.steering, options)
     try:
         return controller.run(progress, after_iteration)
     finally:
@@ -49,7 +51,7 @@ def prune_scene(
 
 
 class _Controller:
-    def __init__(self, removal: RemovalSweep, options: PruningOptions) -> None:
+    def __init__(self, removal: Steering, options: PruningOptions) -> None:
         self._removal, self._options = removal, options
         self._device = device = removal.device
         self._splats = removal.splats
@@ -59,7 +61,7 @@ class _Controller:
             self._keys = device.allocate(4 * self._splats, "the splats' scores")
             self._removed = device.upload(np.zeros(self._splats, _REMOVED), "the removed splats")
             self._state = device.allocate(4 * _STATE, "the pruning's state")
-        limits = removal.limits
+        limits = totals_limits(device)
         self._rank, self._refine, self._mark = (device.kernel(_SOURCE, n, **limits) for n in ("rank", "refine", "mark"))
         number, real, buffer = np.uint32, np.float32, None
         self._rank.set_scalar_arg_dtypes([number, buffer, buffer, *[real] * 4, *[buffer] * 3])

@@ -10,7 +10,7 @@ from scipy.spatial import cKDTree
 
 from potr_cl.errors import DataError
 from potr_cl.formats import load_scene, scene_writer
-from tests.cases.scenes import random_scene
+from potr_cl.reference.scenes import random_scene
 
 pytest.importorskip("gsply", reason="the extra convert is not installed")
 

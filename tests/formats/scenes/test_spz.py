@@ -11,7 +11,8 @@ import pytest
 from potr_cl.errors import DataError
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import spz
-from tests.cases.scenes import in_order_of, random_scene
+from potr_cl.reference.scenes import random_scene
+from tests.cases.scenes import in_order_of
 
 pytest.importorskip("gsply", reason="the extra convert is not installed")
 

@@ -6,11 +6,10 @@ from collections.abc import Iterator
 from typing import cast
 
 import numpy as np
-import scipy.linalg
 from numpy.typing import NDArray
 
+from potr_cl.reference.raster import sh_basis
 from potr_cl.stages.compaction.ridge import ViewWeights
-from tests.oracles.raster import sh_basis
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -50,7 +49,13 @@ def objective(basis: Array, original: Array, x: Array, lam: float) -> float:
 
 
 def ridge(basis: Array, original: Array, used: Mask, lam: float) -> Array:
-    """(M,) coefficients that minimise :func:`objective`, zero where not ``used``."""
+    """(M,) coefficients that minimise :func:`objective`, zero where not ``used``.
+
+    Raises:
+        ImportError: scipy is not installed.
+    """
+    import scipy.linalg
+
     x = np.zeros(len(original))
     target = original.copy()
     target[0] = 0

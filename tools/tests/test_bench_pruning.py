@@ -4,8 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from tests.cases.scenes import ring_of_cameras
-from tools.bench.pruning import HalfSizeFirst, halved, pareto, skip_settings
+from tools.bench.pruning import HalfSizeFirst, pareto, skip_settings
 
 
 class Recorder:
@@ -34,14 +33,6 @@ def test_half_size_views_first():
     assert calls.count("full") == 2
     assert calls.count("half") == 3
     assert calls.count("full loses 3") == calls.count("half loses 3") == 4
-
-
-def test_halved_views_see_the_same():
-    camera = ring_of_cameras(1, size=47)[0]
-    half = halved(camera)
-    assert (half.width, half.height) == (23, 23)
-    assert np.isclose(half.cx / half.width, camera.cx / camera.width)
-    assert np.isclose(half.fx / half.width, camera.fx / camera.width)
 
 
 def test_pareto_front():

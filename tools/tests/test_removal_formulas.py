@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.removal import RemovalSweep, SweepOptions
-from tests.cases.scenes import ring_of_cameras
-from tests.stages.test_removal import visible_scene
-from tools.study.removal_formulas import devices, prefix_sums_source
+from potr_cl.reference.scenes import ring_of_cameras, visible_scene
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from tools.study.removal_formulas import devices
 
 
 def measure(device, scene, cameras, background):
@@ -41,13 +41,13 @@ def test_prefix_sums_agree_with_back_to_front(family, background):
 
 @pytest.mark.parametrize("family", ["cpu", "gpu"])
 def test_prefix_sums_agree_where_pixels_end_early(family):
-    agree(family, visible_scene(600).subset(np.repeat(np.arange(600), 4)), ring_of_cameras(2, size=40))
+    agree(family, visible_scene(600, 0).subset(np.repeat(np.arange(600), 4)), ring_of_cameras(2, size=40))
 
 
 @pytest.mark.parametrize(("splats", "segments"), [(3000, 2), (25000, 17)])
 def test_prefix_sums_agree_in_lists_of_many_segments(splats, segments):
     """CPU kernels walk a list 1024 splats at a time, and remember 16 places in it at the most."""
-    scene = visible_scene(splats)
+    scene = visible_scene(splats, 0)
     scene.log_scales[:] = -4.5
     scene.opacity_logits[:] = -4.5
     camera = ring_of_cameras(1, size=16)[0]
@@ -56,9 +56,3 @@ def test_prefix_sums_agree_in_lists_of_many_segments(splats, segments):
     rasterizer = Rasterizer(device, scene)
     assert rasterizer.prepare(camera).intersection_count > 1024 * segments
     assert rasterizer.render(camera)[1].max() > 1e-4  # pixels go on to the end
-
-
-def test_only_the_removal_kernel_is_replaced():
-    for family in ("cpu", "gpu"):
-        assert "paper's second half" in prefix_sums_source(f"prune/removal_{family}.cl")
-        assert "paper's second half" not in prefix_sums_source(f"raster/composite_{family}.cl")

@@ -1,7 +1,7 @@
 """The joint re-fit of the colours in float64: the linear map written out, the objective, the least-squares solution.
 
-The map follows tests/reference.py's picture: a pixel is the sum over the splats of T alpha times the splat's colour, a
-colour is 0.5 + the SH basis times the coefficients, R = Y + Co - Cg, G = Y + Cg, B = Y - Co - Cg.
+The map follows the picture of :mod:`potr_cl.reference.raster`: a pixel is the sum over the splats of T alpha times the
+splat's colour, a colour is 0.5 + the SH basis times the coefficients, R = Y + Co - Cg, G = Y + Cg, B = Y - Co - Cg.
 """
 
 from __future__ import annotations
@@ -13,13 +13,12 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from scipy.sparse.linalg import LinearOperator, lsmr
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import INRIA
+from potr_cl.reference import raster as reference
 from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS
-from tests.oracles import raster as reference
 
 Array = NDArray[np.float64]
 
@@ -58,14 +57,15 @@ def linear_view(scene: Scene, camera: Camera) -> LinearView:
     """The map of one view.
 
     Raises:
-        AssertionError: a pixel is so near a threshold that float32 may decide otherwise.
+        ValueError: a pixel is so near a threshold that float32 may decide otherwise.
     """
     shape = (camera.height, camera.width)
     projected = reference.project(scene, camera, INRIA)
     # With unit colours the picture is the weights.
     unit = dataclasses.replace(projected, colour=np.eye(len(projected.index)))
     composite = reference.composite(unit, shape, INRIA, (0.0,))
-    assert composite.margin.min() > 3e-6, "choose another seed"
+    if composite.margin.min() <= 3e-6:
+        raise ValueError("a pixel is too near a threshold to compare float32 with float64: choose another scene")
     blend = np.zeros((camera.width * camera.height, len(scene)))
     blend[:, projected.index] = composite.image.reshape(len(blend), -1) if len(projected.index) else 0
     directions = scene.means.astype(np.float64) - camera.centre
@@ -159,7 +159,13 @@ class Reference:
         return [t - p for t, p in zip(self.targets, self.pictures(self.start), strict=True)]
 
     def solution(self) -> Array:
-        """(N, M, 3) the least-squares solution, colours that are cut at the start staying so (LSMR)."""
+        """(N, M, 3) the least-squares solution, colours that are cut at the start staying so (LSMR).
+
+        Raises:
+            ImportError: scipy is not installed.
+        """
+        from scipy.sparse.linalg import LinearOperator, lsmr
+
         shape, active = self.start.shape, self.active
         columns = int(active.sum())
         roots = [np.sqrt(view.weight) for view in self.views]

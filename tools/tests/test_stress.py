@@ -9,9 +9,9 @@ import pytest
 
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import GSPLAT, INRIA
-from tests.cases.splats import random_splats, tilted_camera
+from potr_cl.reference import raster as reference
+from potr_cl.reference.scenes import random_splats, tilted_camera
 from tests.devices import KERNELS, open_device
-from tests.oracles import raster as reference
 from tools.stress import cases as stress_cases
 from tools.stress import run as stress
 

@@ -11,7 +11,7 @@ import pytest
 
 from potr_cl.errors import UsageError
 from potr_cl.pipeline.options import EncodeOptions
-from tests.cases.scenes import random_scene
+from potr_cl.reference.scenes import random_scene
 from tools.study import ablation, compare_formats, rate_distortion
 
 
@@ -31,9 +31,11 @@ def call(monkeypatch, tool, *arguments):
 
 
 def test_series():
-    name, options = rate_distortion.parse_series("no colours:compact=False,iterations=8,colour_model=rgb")
-    assert (name, options) == ("no colours", {"compact": False, "iterations": 8, "colour_model": "rgb"})
-    assert EncodeOptions(**options).iterations == 8
+    name, options = rate_distortion.parse_series("no colours:refit=False,prune.iterations=8,compact.colour_model=rgb")
+    assert (name, options) == ("no colours", {"refit": False, "prune.iterations": 8, "compact.colour_model": "rgb"})
+    chosen = rate_distortion.encode_options(options)
+    assert (chosen.refit.on, chosen.prune.iterations, chosen.compact.colour_model) == (False, 8, "rgb")
+    assert rate_distortion.encode_options({}) == EncodeOptions()
     with pytest.raises(UsageError, match="'speed' is no option"):
         rate_distortion.parse_series("a:speed=1")
 
@@ -56,11 +58,12 @@ def test_a_curve_is_measured_written_and_continued(monkeypatch, folder, tmp_path
 
 
 def test_series_of_the_sweeps_options_and_their_gaps(monkeypatch, folder, tmp_path, capsys):
-    _, options = rate_distortion.parse_series("lazy:preset=fast,sweep.tolerance=0.1,iterations=8")
+    _, options = rate_distortion.parse_series("lazy:preset=fast,prune.tolerance=0.1,prune.iterations=8")
     lazy = rate_distortion.encode_options({**options, "q": 0.4})
-    assert (lazy.sweep.tolerance, lazy.iterations, lazy.q, lazy.preset) == (0.1, 8, 0.4, "fast")
+    assert (lazy.prune.tolerance, lazy.prune.iterations, lazy.q, lazy.preset) == (0.1, 8, 0.4, "fast")
     out = tmp_path / "out.json"
-    series = ("plain:iterations=4", "same:iterations=4", "lazy:iterations=4,sweep.tolerance=0.5")
+    series = tuple(f"{name}:preset=paper,prune.iterations=4" for name in ("plain", "same"))
+    series += ("lazy:preset=paper,prune.iterations=4,prune.tolerance=0.5",)
     call(monkeypatch, rate_distortion, "measure", folder, "--json", out, "--qualities", 0.4, 0.6, "--series", *series)
     capsys.readouterr()
     call(monkeypatch, rate_distortion, "report", out, "--against", "plain", "--at", 0.4)

@@ -47,17 +47,6 @@ def test_kernels_and_their_variants(folder):
     assert any("sorts 4096" in row["variant"] for row in rows)
 
 
-def test_a_macro_and_flags_of_a_variant_reach_the_compiler():
-    info = choose_device()
-    sorts = benchmark.VariantDevice(info, "gpu", ("-cl-mad-enable",), SORT_CAPACITY=1024)
-    program = sorts.program("raster/sort_gpu.cl", SORT_CAPACITY=2048)
-    options = program.get_build_info(info.handle, benchmark.cl.program_build_info.OPTIONS)
-    assert "-DSORT_CAPACITY=1024" in options
-    assert "-cl-mad-enable" in options
-    plain = Device(info).program("raster/sort_gpu.cl", SORT_CAPACITY=2048)
-    assert "-cl-mad-enable" not in plain.get_build_info(info.handle, benchmark.cl.program_build_info.OPTIONS)
-
-
 def test_ridge_errors_are_those_of_the_solution():
     scene = benchmark.load_scene(benchmark.DATA / "lego_excerpt.ply").subset(np.arange(50))
     centres, weights = on_a_sphere(30), dense_weights(sparse_weights(50, 30))

@@ -1,0 +1,94 @@
+/* From a sweep's sums back to the coefficients: the last half of the transposed map, and the splats' own blocks.
+
+   Macros: LANES (splats a work-item), SH_COUNT, WEIGHTS (1: the totals hold the sums of w^2 too, for the blocks). */
+
+#include "refit/refit.clh"
+#include "refit/view_colours.clh"
+
+/* The totals of LANES splats times a scale, channel by channel; they become 0. Whether any was not. */
+inline int take_totals(global long *totals, float scale, vfloat *sums)
+{
+    global long4 *splats = (global long4 *)totals;
+#if LANES == 1
+    const long4 total = splats[0];
+    if (!(total.x | total.y | total.z | total.w))
+        return 0;
+    splats[0] = (long4)(0);
+    sums[0] = (float)total.x * scale;
+    sums[1] = (float)total.y * scale;
+    sums[2] = (float)total.z * scale;
+    sums[3] = (float)total.w * scale;
+    return 1;
+#else
+    long4 all = splats[0];
+    for (int lane = 1; lane < LANES; ++lane)
+        all |= splats[lane];
+    if (!(all.x | all.y | all.z | all.w))
+        return 0;
+    float values[4 * LANES];
+    for (int lane = 0; lane < LANES; ++lane) {
+        /* In two parts of 32 bits: conversions of 64 are calls on some CPU runtimes. */
+        const long4 total = splats[lane], high = (total + (1l << 30)) >> 31;
+        const float4 value =
+            MAD(convert_float4(convert_int4(high)), (float4)(0x1p31f), convert_float4(convert_int4(total - (high << 31))));
+        vstore4(value * scale, lane, values);
+        splats[lane] = (long4)(0);
+    }
+    vfloat four[4];
+    for (int k = 0; k < 4; ++k)
+        four[k] = VLOAD(k, values);
+    separate(four, &sums[0], &sums[1], &sums[2], &sums[3]);
+    return 1;
+#endif
+}
+
+/* The totals of a set's views, times the view's scale, onto the coefficients: result += basis x (Y, Co, Cg) of the free
+   channels' sums, view by view. With WEIGHTS also blocks += the sum of w^2 x basis x basis. Leaves the totals zero. */
+kernel void gather(
+    global long *totals,
+    global const float *means,
+    ulong stride,
+    global const SetView *views,
+    uint view_count,
+    global const float *scales,
+    uint first_scale,
+    global const float4 *free,
+    global float *result,
+    global float *blocks)
+{
+    const size_t index = get_global_id(0);
+    vfloat results[3 * SH_COUNT];
+    int any_view = 0;
+    for (uint number = 0; number < view_count; ++number) {
+        const size_t place = number * stride / LANES + index;
+        vfloat sums[4];
+        const int any_sum = take_totals(totals + (size_t)TOTALS * LANES * place, scales[first_scale + number], sums);
+        if (!any_sum)
+            continue;
+        if (!any_view)
+            for (int i = 0; i < 3 * SH_COUNT; ++i)
+                results[i] = VLOAD(index, result + i * stride);
+        any_view = 1;
+        VREAL basis[SH_COUNT];
+        basis_towards(means, stride, index, &views[number].view, basis);
+        const vint kept = free_channels(free, place);
+        const vfloat r = (kept & 1) != 0 ? sums[0] : (vfloat)(0.0f);
+        const vfloat g = (kept & 2) != 0 ? sums[1] : (vfloat)(0.0f);
+        const vfloat b = (kept & 4) != 0 ? sums[2] : (vfloat)(0.0f);
+        const vfloat channels[3] = {r + g + b, r - b, g - r - b};
+        for (int m = 0; m < SH_COUNT; ++m)
+            for (int c = 0; c < 3; ++c)
+                results[3 * m + c] = MAD(basis[m], channels[c], results[3 * m + c]);
+#if WEIGHTS
+        const vfloat weight = sums[3];
+        for (int i = 0; i < SH_COUNT; ++i)
+            for (int j = i; j < SH_COUNT; ++j) {
+                global float *column = blocks + AT(i, j) * stride;
+                VSTORE(MAD(weight * basis[i], basis[j], VLOAD(index, column)), index, column);
+            }
+#endif
+    }
+    if (any_view)
+        for (int i = 0; i < 3 * SH_COUNT; ++i)
+            VSTORE(results[i], index, result + i * stride);
+}

@@ -1,0 +1,59 @@
+/* From coefficients to the splats' colours in each view: the first half of the map from coefficients to pictures.
+
+   Macros: LANES (splats a work-item), SH_COUNT. */
+
+#include "refit/view_colours.clh"
+
+/* The splats' colours in each view of a set: of the coefficients themselves (direction == 0), cut at 0, w telling which
+   channels are free (1, 2, 4: above 0); or their change along a direction, 0 where `free` says that the channel is cut.
+   Work-item i of the second dimension does views i, i + get_global_size(1), … */
+kernel void view_colours(
+    global const float *coefficients,
+    global const float *means,
+    ulong stride,
+    global const SetView *views,
+    uint view_count,
+    int direction,
+    float unit,
+    global const float4 *free,
+    global float4 *colours)
+{
+    const size_t index = get_global_id(0);
+    vfloat values[3 * SH_COUNT];
+    for (int i = 0; i < 3 * SH_COUNT; ++i)
+        values[i] = VLOAD(index, coefficients + i * stride);
+    for (uint number = get_global_id(1); number < view_count; number += get_global_size(1)) {
+        VREAL basis[SH_COUNT];
+        basis_towards(means, stride, index, &views[number].view, basis);
+        vfloat sums[3] = {(vfloat)(0.0f), (vfloat)(0.0f), (vfloat)(0.0f)};
+        for (int m = 0; m < SH_COUNT; ++m)
+            for (int c = 0; c < 3; ++c)
+                sums[c] = MAD(basis[m], values[3 * m + c], sums[c]);
+        vfloat red = sums[0] + sums[1] - sums[2], green = sums[0] + sums[2], blue = sums[0] - sums[1] - sums[2];
+        vfloat channels = (vfloat)(0.0f);
+        const size_t place = number * stride / LANES + index;
+        if (direction) {
+            const vint kept = free_channels(free, place);
+            red = (kept & 1) != 0 ? red * unit : (vfloat)(0.0f);
+            green = (kept & 2) != 0 ? green * unit : (vfloat)(0.0f);
+            blue = (kept & 4) != 0 ? blue * unit : (vfloat)(0.0f);
+        } else {
+            red = fmin(red + 0.5f, (vfloat)(1e30f));
+            green = fmin(green + 0.5f, (vfloat)(1e30f));
+            blue = fmin(blue + 0.5f, (vfloat)(1e30f));
+            channels = (red > 0.0f ? (vfloat)(1.0f) : (vfloat)(0.0f)) + (green > 0.0f ? (vfloat)(2.0f) : (vfloat)(0.0f)) +
+                (blue > 0.0f ? (vfloat)(4.0f) : (vfloat)(0.0f));
+            red = fmax(red, (vfloat)(0.0f));
+            green = fmax(green, (vfloat)(0.0f));
+            blue = fmax(blue, (vfloat)(0.0f));
+        }
+#if LANES == 1
+        colours[place] = (float4)(red, green, blue, channels);
+#else
+        vfloat four[4];
+        interleave(red, green, blue, channels, four);
+        for (int k = 0; k < 4; ++k)
+            VSTORE(four[k], 4 * place + k, (global float *)colours);
+#endif
+    }
+}

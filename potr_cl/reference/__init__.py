@@ -1,0 +1,13 @@
+"""What the kernels compute, written out in float64 and plain numpy: slow, exact, and short enough to be read.
+
+Every result of the OpenCL kernels is compared with these, by the tests and by the tools that measure errors:
+
+- :mod:`potr_cl.reference.raster`: projection, spherical harmonics, compositing;
+- :mod:`potr_cl.reference.removal`: the effect of removing a splat;
+- :mod:`potr_cl.reference.ridge`: the compaction's regressions;
+- :mod:`potr_cl.reference.refit`: the linear map of the colours, its least-squares solution;
+- :mod:`potr_cl.reference.refit_cases`: the device's re-fit beside that map;
+- :mod:`potr_cl.reference.scenes`: small scenes and cameras to compare on.
+
+Nothing else in the package imports them. The two solvers need scipy, which ``pip install potr-cl[test]`` brings.
+"""

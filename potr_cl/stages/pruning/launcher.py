@@ -1,0 +1,92 @@
+"""How the removal kernels are launched: one interface for both kernel families, chosen once."""
+
+from __future__ import annotations
+
+from typing import Protocol
+
+import pyopencl as cl
+
+from potr_cl.raster.rasterizer import Rasterizer, totals_limits
+from potr_cl.stages.pruning.fixed_point import FixedPoint
+from potr_cl.stages.pruning.launch_cpu import CpuLauncher
+from potr_cl.stages.pruning.launch_gpu import GpuLauncher
+from potr_cl.stages.pruning.prepared_views import PreparedSet
+from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+
+
+class SetKernels(Protocol):
+    """The kernels of one set of views, with all their arguments bound."""
+
+    def sweep(self, start: int, count: int, queue: cl.CommandQueue | None = None) -> None:
+        """Enqueue the sweep of so many of the set's tiles, those in the list of tiles from ``start`` on.
+
+        Args:
+            queue: another than the device's own.
+        """
+
+    def sweep_all(self) -> None:
+        """Enqueue the sweep of every tile, without what removed splats left in the lists. The list of tiles must begin
+        with all numbers of the set's tiles."""
+
+    def target_is_known(self) -> None:
+        """The sweeps from now on compare with the target instead of storing it."""
+
+    def note_removal(self, queue: cl.CommandQueue | None = None, list_above: float = float("inf")) -> None:
+        """Enqueue what follows a removal: each tile's staleness grows by what it lost.
+
+        Args:
+            queue: another than the device's own.
+            list_above: where the launcher :attr:`~SweepLauncher.lists_tiles`: tiles that are staler than this are put
+                into the list of tiles, from the set's first tile on, and are fresh then.
+        """
+
+
+class SweepLauncher(Protocol):
+    """The removal kernels of one family, built for one rasterizer.
+
+    Attributes:
+        most_views: that one launch can do.
+        most_queues: on which launches that do not depend on each other may run at a time.
+        lists_tiles: whether the device itself can list the tiles that are stale.
+    """
+
+    most_views: int
+    most_queues: int
+    lists_tiles: bool
+
+    def bind(
+        self,
+        prepared: PreparedSet,
+        geometry: tuple[cl.Buffer, cl.Buffer],
+        buffers: SweepBuffers,
+        *,
+        first_time: bool,
+        place: int = 0,
+    ) -> SetKernels:
+        """Kernels of its own for a set: binding their arguments takes longer than launching them.
+
+        Args:
+            prepared: the set.
+            geometry: its shapes and colours.
+            buffers: what it shares with other sets.
+            first_time: whether a sweep stores the target instead of comparing with it.
+            place: of the set's counter in the buffer of listed tiles' numbers.
+        """
+
+
+def launcher_for(rasterizer: Rasterizer, options: SweepOptions, fixed_point: FixedPoint) -> SweepLauncher:
+    """The launcher of the device's kernel family.
+
+    Raises:
+        DeviceError: the kernels cannot be built.
+    """
+    device, rules = rasterizer.device, rasterizer.rules
+    threshold = options.transmittance_threshold
+    macros: dict[str, float | int] = {
+        "ALPHA_CAP": float(rules.alpha_cap),
+        "TRANSMITTANCE_THRESHOLD": rules.transmittance_threshold if threshold is None else threshold,
+        "TIGHTEN": int(options.tighten),
+    } | totals_limits(device)
+    launcher = GpuLauncher if device.family == "gpu" else CpuLauncher
+    return launcher(rasterizer, fixed_point, macros)

@@ -1,0 +1,62 @@
+"""A removal sweep as a controller on the device sees it: it marks splats and reads totals without asking the host."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from potr_cl.opencl.device import Device
+from potr_cl.stages.pruning.cached_sweep import CachedSweep
+from potr_cl.stages.pruning.survivors import Survivors
+
+
+class Steering:
+    """What :mod:`potr_cl.stages.pruning.on_device` needs. The device lists the tiles that the next measurement sweeps;
+    the host learns only how many they are.
+
+    Args:
+        device: where everything is.
+        cached: the sweep of the views, all of which are cached.
+        survivors: the splats that are left.
+        tolerance: staleness above which a tile is swept again.
+        totals: that the sweep keeps up to date.
+        units: ΔMSE and I of 1 in the totals.
+        splats: N.
+
+    Attributes:
+        device, totals, units, splats: as given; totals are (N, 2) int64 in the device's memory.
+        marks: (N,) uint8 in the device's memory, :class:`~potr_cl.stages.pruning.survivors.SplatState`. Who marks
+            splats as JUST_REMOVED has :meth:`remove_marked` take them out, and makes them REMOVED when marking next.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        cached: CachedSweep,
+        survivors: Survivors,
+        tolerance: float,
+        totals: cl.Buffer,
+        units: tuple[float, float],
+        splats: int,
+    ) -> None:
+        self._cached, self._survivors, self._tolerance = cached, survivors, tolerance
+        self.device, self.totals, self.units, self.splats = device, totals, units, splats
+        self.marks = survivors.buffer
+
+    @property
+    def alive(self) -> NDArray[np.bool_]:
+        """(N,) which splats are left."""
+        return self._survivors.alive
+
+    def measure_on_device(self) -> None:
+        """Bring :attr:`totals` up to date."""
+        if not self._cached.device_has_listed:  # nothing is marked: what is stale is listed
+            self._survivors.settle()
+            self.remove_marked()
+        self._cached.measure()
+
+    def remove_marked(self) -> None:
+        """Take the splats out that are marked JUST_REMOVED."""
+        self._cached.have_listed(self._tolerance)
+        self._survivors.marked_by_device()

@@ -1,0 +1,103 @@
+"""Which splats are left, on host and device."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from enum import IntEnum
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory, Owner
+
+Indices = NDArray[np.int64]
+
+
+class SplatState(IntEnum):
+    """What a splat's byte in the device's memory says; the kernels know the names with SPLAT_ before them
+    (cl/prune/removal.clh)."""
+
+    REMOVED = 0
+    ALIVE = 1
+    #: Removed, but the tile lists still have it, and the tiles that lose it have not noted so.
+    JUST_REMOVED = 2
+
+
+class Survivors(Owner):
+    """Each splat's state, of which host and device have a copy each.
+
+    Either may be ahead of the other: the host after :meth:`remove`, until the kernels that look for JUST_REMOVED are
+    done, and the device after it has marked splats itself (:meth:`marked_by_device`). :meth:`settle` makes them agree.
+
+    Args:
+        device: that has the copy.
+        splats: N.
+        stride: N padded; the buffer holds so many, and all are alive at first.
+        wait: returns once the device has finished what was enqueued.
+
+    Attributes:
+        buffer: (stride,) uint8 in the device's memory, :class:`SplatState`.
+
+    Raises:
+        DeviceMemoryError: the device has no room.
+    """
+
+    def __init__(self, device: Device, splats: int, stride: int, wait: Callable[[], None]) -> None:
+        self._device = device
+        self._splats = splats
+        self._wait = wait
+        self._states = np.full(stride, SplatState.ALIVE, np.uint8)
+        self._host_is_ahead = self._device_is_ahead = False
+        self._memory = Memory(device)
+        self.buffer = self._memory.upload(self._states, "the splats that are left")
+
+    @property
+    def alive(self) -> NDArray[np.bool_]:
+        """(N,) which splats are left."""
+        self.settle()
+        alive: NDArray[np.bool_] = self._states[: self._splats] == SplatState.ALIVE
+        return alive
+
+    def remove(self, splats: Indices) -> None:
+        """Splats go: JUST_REMOVED on the device until the next :meth:`settle`."""
+        self.settle()
+        self._states[splats] = SplatState.JUST_REMOVED
+        self._write(self._states)
+        self._states[splats] = SplatState.REMOVED
+        self._host_is_ahead = True
+
+    def marked_by_device(self) -> None:
+        """The device has changed states from ALIVE to JUST_REMOVED on its own; the host has not been told which."""
+        self._device_is_ahead = True
+
+    def settle(self) -> None:
+        """Have host and device know the same splats as left, and none as just removed."""
+        if self._host_is_ahead:
+            self._host_is_ahead = False
+            self._wait()
+        elif self._device_is_ahead:
+            self._device_is_ahead = False
+            self._states = self._device.download(self.buffer, self._states.shape, np.uint8)
+            self._states[self._states == SplatState.JUST_REMOVED] = SplatState.REMOVED
+        else:
+            return
+        self._write(self._states)
+
+    @contextmanager
+    def none_removed(self) -> Iterator[None]:
+        """Have the device take all splats as alive for a while."""
+        self._write(np.full_like(self._states, SplatState.ALIVE))
+        try:
+            yield
+        finally:
+            self._write(self._states)
+
+    def _write(self, states: NDArray[np.uint8]) -> None:
+        cl.enqueue_copy(self._device.queue, self.buffer, states, is_blocking=True)
+
+    def close(self) -> None:
+        """Give the device's copy back."""
+        self._memory.close()

@@ -1,0 +1,76 @@
+"""Speed/accuracy trade-offs of a removal sweep, and the memory that it may take."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from potr_cl.errors import UsageError
+from potr_cl.opencl.device import Device
+
+#: Below it transmittances lose digits in float32, and the sweep divides by them.
+_LEAST_THRESHOLD = 1e-30
+#: Part of the device's memory that the views may take unless the caller sets a budget. A CPU's is that of the host: the
+#: scene, its new colours and all other programs live there too.
+_SHARE, _SHARE_OF_HOST = 0.5, 0.3
+
+
+@dataclass(frozen=True)
+class SweepOptions:
+    """Speed/accuracy trade-offs of a removal sweep.
+
+    Attributes:
+        tolerance: a tile is swept again once the importance removed from it, as a part of its area, exceeds this.
+            0: whenever anything was removed from it; negative: always.
+        turns: a view is swept in every so many-th measurement only (all of them in the first). Views that do not fit
+            the memory budget are swept in each.
+        memory: bytes of device memory that the views may take; None: :func:`default_memory`.
+        tighten: drop a tile's intersections that reach alpha 1/255 in none of its pixels. Changes no result.
+        transmittance_threshold: a pixel ends before its transmittance falls below this; None: where the rasterizer's
+            rules end it. When a removal lets a pixel go on one splat longer, its colour jumps by up to the hundredfold
+            of this.
+        sample: part of the tiles to be swept that are, drawn at random; the others keep their sums until another time.
+        sampled: measurements, after the first, in which only a sample is swept.
+        seed: of the sample.
+
+    Raises:
+        UsageError: a value is out of range.
+    """
+
+    tolerance: float = 0.01
+    turns: int = 1
+    memory: int | None = None
+    tighten: bool = False
+    transmittance_threshold: float | None = 1e-8
+    sample: float = 1.0
+    sampled: int = 24
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        if not np.isfinite(self.tolerance):
+            raise UsageError(f"the tile tolerance is {self.tolerance:g}, it must be a number")
+        if self.turns < 1:
+            raise UsageError(f"views cannot be swept every {self.turns} measurements: at least 1 is needed")
+        if self.memory is not None and self.memory < 0:
+            raise UsageError(f"a memory budget of {self.memory} bytes is less than nothing")
+        if self.transmittance_threshold is not None and not _LEAST_THRESHOLD <= self.transmittance_threshold < 1:
+            raise UsageError(
+                f"a pixel cannot end at a transmittance of {self.transmittance_threshold:g}: at least "
+                f"{_LEAST_THRESHOLD:g}, below 1"
+            )
+        if not 0 < self.sample <= 1:
+            raise UsageError(f"a sample of {self.sample:g} of the tiles: it must be above 0 and at most 1")
+        if self.sampled < 0:
+            raise UsageError(f"{self.sampled} sampled measurements are less than none")
+
+    @property
+    def only_by_tolerance(self) -> bool:
+        """Whether a tile's staleness alone decides when it is swept again: no turns, no sample."""
+        return self.turns == 1 and self.sample == 1
+
+
+def default_memory(device: Device) -> int:
+    """Bytes that the views may take: half of the device's memory, three tenths where that is the host's."""
+    of_host = device.info.kind == "cpu" or device.info.integrated
+    return int(device.info.memory * (_SHARE_OF_HOST if of_host else _SHARE))

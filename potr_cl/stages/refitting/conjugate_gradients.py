@@ -1,0 +1,107 @@
+"""Preconditioned conjugate gradients on vectors that stay on the device."""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Callable
+from typing import Protocol
+
+import pyopencl as cl
+
+#: Steps end where the residual's square, as the preconditioner measures it, has shrunk by this: single precision has no
+#: more digits, and what is left of them leads astray.
+_CONVERGED = 1e-14
+
+
+class Vectors(Protocol):
+    """Arithmetic of vectors; :class:`potr_cl.stages.refitting.coefficients.Coefficients` is one."""
+
+    def vector(self) -> cl.Buffer:
+        """A new vector."""
+        ...
+
+    def combine(self, a: float, y: cl.Buffer, b: float, x: cl.Buffer) -> None:
+        """y = a y + b x."""
+        ...
+
+    def dot(self, x: cl.Buffer, y: cl.Buffer) -> float:
+        """x · y."""
+        ...
+
+
+class System(Protocol):
+    """Linear equations with a symmetric positive matrix H."""
+
+    def precondition(self, residual: cl.Buffer, result: cl.Buffer) -> None:
+        """result = about H⁻¹ residual, by a symmetric positive matrix."""
+        ...
+
+    def product(self, direction: cl.Buffer, result: cl.Buffer) -> None:
+        """result = H direction."""
+        ...
+
+
+class ConjugateGradients:
+    """Minimises x · H x / 2 - b · x, whose residual is b - H x.
+
+    Args:
+        vectors: makes the vectors that the steps need, and computes with them.
+
+    Attributes:
+        direction, product, preconditioned: the vectors; free for other use between solutions.
+    """
+
+    def __init__(self, vectors: Vectors) -> None:
+        self._vectors = vectors
+        self.direction, self.product, self.preconditioned = (vectors.vector() for _ in range(3))
+
+    def descend(
+        self,
+        system: System,
+        x: cl.Buffer,
+        residual: cl.Buffer,
+        objective: float,
+        steps: int,
+        gain: float,
+        after_step: Callable[[int], None],
+    ) -> int:
+        """Steps from x.
+
+        Args:
+            system: the equations.
+            x: where to start; is moved.
+            residual: at x; is moved along.
+            objective: of least squares at x, x · H x - 2 b · x and a constant that makes it 0 or more.
+            steps: at the most.
+            gain: stop after a step that takes less than this part off the objective that is left.
+            after_step: called with the number of steps done.
+
+        Returns:
+            The number of steps done.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        vectors, direction, product, preconditioned = self._vectors, self.direction, self.product, self.preconditioned
+        slope, least = 0.0, 0.0
+        for step in range(steps):
+            system.precondition(residual, preconditioned)
+            new_slope = vectors.dot(preconditioned, residual)
+            least = _CONVERGED * new_slope if step == 0 else least
+            if not (new_slope > least and math.isfinite(new_slope)):
+                return step
+            vectors.combine(new_slope / slope if step else 0.0, direction, 1.0, preconditioned)
+            slope = new_slope
+            system.product(direction, product)
+            curvature = vectors.dot(direction, product)
+            if not (curvature > 0 and math.isfinite(curvature)):
+                return step
+            length = slope / curvature
+            vectors.combine(1.0, x, length, direction)
+            vectors.combine(1.0, residual, -length, product)
+            gained = length * slope
+            objective -= gained
+            after_step(step + 1)
+            if gained < gain * objective:
+                return step + 1
+        return steps

@@ -1,0 +1,20 @@
+"""The fixed point of a sweep's sums over a view's pixels: integers, so that the bits are the same on every run."""
+
+from __future__ import annotations
+
+import numpy as np
+
+from potr_cl.raster.rasterizer import TILE
+
+#: Pixel values beyond this are cut in the kernels (macro LARGEST_VALUE of cl/refit/refit.clh): no sum can overflow.
+LARGEST_VALUE = 64.0
+
+
+def fixed_point_scale(width: int, height: int) -> float:
+    """What sums over a view's pixels are multiplied by: the largest power of two with which 62 bits suffice.
+
+    Args:
+        width, height: of the view in pixels.
+    """
+    area = (width + TILE - 1) * (height + TILE - 1)
+    return float(2.0 ** np.floor(62 - np.log2(LARGEST_VALUE * area)))

@@ -1,0 +1,105 @@
+"""The views of a sweep, prepared for the launches that do them, and kept as far as a budget of device memory allows."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+
+from potr_cl.errors import DeviceMemoryError
+from potr_cl.model.camera import Camera
+from potr_cl.opencl.memory import Owner
+from potr_cl.raster.rasterizer import Rasterizer, ViewSet
+from potr_cl.raster.view_cache import ViewCache
+
+#: Part of the device's memory not yet taken that is the budget unless the caller sets one.
+_SHARE = 0.25
+
+
+class PreparedViews(Owner):
+    """Prepared views, launch by launch.
+
+    Args:
+        rasterizer: that prepares them.
+        cameras: the views.
+        most_views: that a launch can do.
+        nbytes: that a view takes in a sweep's own buffers.
+        memory: bytes that the kept views, and what else is taken from :attr:`budget`, may take; None: a quarter of what
+            is free.
+
+    Attributes:
+        launches: the numbers of the views of each launch.
+        budget: its ``room`` is what is left of the memory.
+
+    Raises:
+        DeviceError: a view does not fit the device.
+    """
+
+    def __init__(
+        self, rasterizer: Rasterizer, cameras: Sequence[Camera], most_views: int, nbytes: int, memory: int | None
+    ) -> None:
+        self._rasterizer = rasterizer
+        self._cameras = list(cameras)
+        device = rasterizer.device
+        free = device.info.memory - device.allocated
+        self.budget = ViewCache(rasterizer, free * _SHARE if memory is None else memory)
+        self.launches: list[range] = []
+        self._kept: dict[range, ViewSet] = {}
+        try:
+            self._prepare_all(self.budget.most_views(most_views, nbytes))
+        except BaseException:
+            self.close()
+            raise
+
+    def _prepare_all(self, most: int) -> None:
+        number = 0
+        while number < len(self._cameras):
+            numbers = range(number, min(number + most, len(self._cameras)))
+            try:
+                views = self._prepare(numbers)
+            except DeviceMemoryError:
+                if most == 1:
+                    raise
+                most //= 2
+                continue
+            self._keep_or_free(numbers, views)
+            self.launches.append(numbers)
+            number += len(numbers)
+
+    def _keep_or_free(self, numbers: range, views: ViewSet) -> None:
+        kept = False
+        try:
+            kept = self.budget.keep(views)
+        finally:
+            if not kept:
+                views.free()
+        if kept:
+            self._kept[numbers] = views
+
+    def _prepare(self, numbers: range) -> ViewSet:
+        return self._rasterizer.prepare_set([self._cameras[number] for number in numbers])
+
+    @contextmanager
+    def ready(self, numbers: range) -> Iterator[tuple[ViewSet, bool]]:
+        """Have a launch's views there with their geometry.
+
+        Yields:
+            The views, and whether their colours were made anew since the last time.
+
+        Raises:
+            DeviceError: they do not fit the device.
+        """
+        kept = self._kept.get(numbers)
+        views = self._prepare(numbers) if kept is None else kept
+        try:
+            with self.budget.geometry(views) as projected:
+                yield views, projected or kept is None
+        finally:
+            if kept is None:
+                views.free()
+
+    def close(self) -> None:
+        """Give all device memory back."""
+        for views in self._kept.values():
+            views.free()
+        self._kept = {}
+        self.budget.free()

@@ -1,0 +1,232 @@
+"""The solver of the joint re-fit, after "Re-fit of the colours" in docs/method.md:
+
+    minimise over x: sum over views s of w_s |A_s x - target_s|^2 + lambda |x_AC|^2 + prior |x - start|^2
+    (lambda threefold on chroma)
+
+Conjugate gradients on the normal equations, preconditioned by each splat's own block. Colours that are cut at 0 stay so
+while a solution is sought; the true error of the result is measured, and the start is kept if it was better.
+
+Which AC coefficients are worth their bytes is seen here too: after a few steps those are given up whose loss would cost
+less than a given squared error, and the rest is solved again.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pyopencl as cl
+
+from potr_cl.opencl.memory import Owner
+from potr_cl.stages.refitting.blocks import SplatBlocks
+from potr_cl.stages.refitting.coefficients import Coefficients, Ridge
+from potr_cl.stages.refitting.colour_map import ColourMap
+from potr_cl.stages.refitting.conjugate_gradients import ConjugateGradients
+from potr_cl.stages.refitting.targets import Targets
+
+#: Half steps tried when a solution is worse than its start because colours were cut at 0 on the way.
+_HALVINGS = 4
+
+
+@dataclass(frozen=True)
+class Descent:
+    """How to come down to a solution.
+
+    Attributes:
+        steps: conjugate-gradient steps at the most.
+        gain: stop when a step takes less than this part off the objective.
+        ridge: what holds the coefficients.
+    """
+
+    steps: int
+    gain: float
+    ridge: Ridge
+
+
+@dataclass(frozen=True)
+class Selection:
+    """How to choose the AC coefficients that are given up.
+
+    Attributes:
+        descent: before the choice.
+        least: coefficients that cost less mean squared error than this are given up.
+    """
+
+    descent: Descent
+    least: float
+
+
+@dataclass(frozen=True)
+class Solved:
+    """What a solution did.
+
+    Attributes:
+        errors: mean squared error over views, pixels and channels before, and after.
+        steps: conjugate-gradient steps that were taken and kept.
+    """
+
+    errors: tuple[float, float]
+    steps: int
+
+
+@dataclass(frozen=True)
+class _Problem:
+    """The map, and the pictures to come near to."""
+
+    colour_map: ColourMap
+    targets: Targets
+
+
+@dataclass(frozen=True)
+class _NormalEquations:
+    """Aᵀ W A + ridge, with the colours cut as they are ``at`` a vector: what conjugate gradients solve with."""
+
+    colour_map: ColourMap
+    coefficients: Coefficients
+    blocks: SplatBlocks
+    ridge: Ridge
+    at: cl.Buffer
+
+    def precondition(self, residual: cl.Buffer, result: cl.Buffer) -> None:
+        self.blocks.precondition(residual, self.ridge, result)
+
+    def product(self, direction: cl.Buffer, result: cl.Buffer) -> None:
+        self.coefficients.zero(result)
+        self.colour_map.normal(direction, self.at, result)
+        self.coefficients.add_ridge(result, direction, self.ridge)
+
+
+@dataclass(frozen=True)
+class _State:
+    """Squared error by W at some coefficients, and with the ridge."""
+
+    error: float
+    objective: float
+
+
+class ColourSolver(Owner):
+    """Solves for one scene's coefficients, on vectors of its own.
+
+    Args:
+        coefficients: makes the vectors, which live as long as it does, and knows which coefficients may change.
+
+    Attributes:
+        x: the coefficients: set them to the start before :meth:`solve`, which leaves the solution in them.
+
+    Raises:
+        DeviceError: the device has no room, or the kernels cannot be built.
+    """
+
+    def __init__(self, coefficients: Coefficients) -> None:
+        self._coefficients = coefficients
+        self.x, self._start, self._residual = (coefficients.vector() for _ in range(3))
+        self._gradients = ConjugateGradients(coefficients)
+        self._blocks = SplatBlocks(coefficients)
+
+    def solve(
+        self,
+        colour_map: ColourMap,
+        targets: Targets,
+        descent: Descent,
+        selection: Selection | None = None,
+        after_step: Callable[[int], None] = lambda steps: None,
+    ) -> Solved:
+        """Solve for the active coefficients, after choosing among them if there is to be a choice.
+
+        Args:
+            colour_map: A of the scene.
+            targets: the pictures to come near to.
+            descent: to the solution.
+            selection: what comes first.
+            after_step: called with the number of steps done.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        problem = _Problem(colour_map, targets)
+        self._blocks.zero()
+        self._coefficients.copy(self._start, self.x)
+        first = self._linearise(problem, (selection.descent if selection else descent).ridge, self._blocks)
+        state, steps = first, 0
+        if selection is not None:
+            state, steps = self._choose(problem, first, selection, descent.ridge, after_step)
+        more = self._descend(problem, state, descent, lambda done: after_step(steps + done))
+        last = self._halve_until_better(problem, state, descent.ridge)
+        if last is None:
+            last, more = state, 0
+        whole = colour_map.total_weight
+        return Solved((first.error / whole, last.error / whole), steps + more)
+
+    def _linearise(self, problem: _Problem, ridge: Ridge, blocks: SplatBlocks | None = None) -> _State:
+        """Settle which colours are cut, and make the residual: minus half the objective's gradient at x."""
+        vectors, residual = self._coefficients, self._residual
+        change, pulled = self._gradients.direction, self._gradients.product
+        shrinking = replace(ridge, prior=0.0)
+        vectors.zero(residual)
+        error = problem.colour_map.gradient(self.x, problem.targets, residual, blocks)
+        vectors.add_ridge(residual, self.x, shrinking)
+        vectors.zero(pulled)
+        vectors.add_ridge(pulled, self.x, shrinking)
+        penalty = vectors.dot(self.x, pulled)
+        vectors.copy(change, self.x)
+        vectors.combine(1.0, change, -1.0, self._start)
+        penalty += ridge.prior * vectors.dot(change, change)
+        vectors.combine(-1.0, residual, -ridge.prior, change)
+        return _State(error, error + penalty)
+
+    def _descend(self, problem: _Problem, state: _State, how: Descent, after_step: Callable[[int], None]) -> int:
+        """Conjugate-gradient steps from where x was linearised; returns how many paid."""
+        equations = _NormalEquations(problem.colour_map, self._coefficients, self._blocks, how.ridge, at=self._start)
+        return self._gradients.descend(
+            equations, self.x, self._residual, state.objective, how.steps, how.gain, after_step
+        )
+
+    def _halve_until_better(self, problem: _Problem, state: _State, ridge: Ridge) -> _State | None:
+        """Half the way back to the start as long as that was better, and all the way if nothing helps: then None."""
+        last = self._linearise(problem, ridge)
+        for _ in range(_HALVINGS):
+            if last.objective <= state.objective:
+                break
+            self._coefficients.combine(0.5, self.x, 0.5, self._start)
+            last = self._linearise(problem, ridge)
+        if not last.objective <= state.objective:
+            self._coefficients.copy(self.x, self._start)
+            return None
+        return last
+
+    def _choose(
+        self, problem: _Problem, first: _State, how: Selection, ridge: Ridge, after_step: Callable[[int], None]
+    ) -> tuple[_State, int]:
+        """Come near to the solution, give up what costs little there, and start anew from what is left.
+
+        Returns:
+            The new start's state, and the steps that led to it.
+        """
+        vectors = self._coefficients
+        chosen_from = vectors.save_flags()
+        steps = self._descend(problem, first, how.descent, after_step)
+        least = how.least * problem.colour_map.total_weight
+        self._give_up(least, ridge)
+        former_start = self._gradients.preconditioned
+        vectors.copy(former_start, self._start)
+        state = self._start_here(problem, ridge)
+        given_up = least * int(np.bitwise_count(chosen_from ^ vectors.save_flags()).sum())
+        if not state.error <= first.error + given_up:
+            # Colours were cut at 0 on the way: choose among the coefficients as they were.
+            vectors.copy(self.x, former_start)
+            vectors.restore_flags(chosen_from)
+            self._give_up(least, ridge)
+            state, steps = self._start_here(problem, ridge), 0
+        return state, steps
+
+    def _give_up(self, least: float, ridge: Ridge) -> None:
+        self._blocks.give_up(self.x, ridge.prior, least)
+
+    def _start_here(self, problem: _Problem, ridge: Ridge) -> _State:
+        self._coefficients.copy(self._start, self.x)
+        return self._linearise(problem, ridge)
+
+    def close(self) -> None:
+        """Give the blocks' memory back."""
+        self._blocks.close()

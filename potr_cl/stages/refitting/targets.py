@@ -1,0 +1,155 @@
+"""What pictures should show, view by view: :class:`Targets`, where they come from, and which of them are kept."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from typing import Protocol
+
+import numpy as np
+import pyopencl as cl
+
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.raster.rasterizer import Rasterizer
+
+
+class Targets(Protocol):
+    """What the pictures of some numbered views should show."""
+
+    def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
+        """Write the pictures of several views to device memory.
+
+        Args:
+            numbers: of the views.
+            buffer: takes (H, W, 3) float32 of each, one behind the other from its beginning on.
+
+        Raises:
+            DeviceError: the device failed, or a view does not fit it.
+        """
+        ...
+
+
+class RenderedTargets:
+    """The pictures that another scene gives: the uncompressed one's.
+
+    Args:
+        rasterizer: of that scene.
+        cameras: the views.
+    """
+
+    def __init__(self, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> None:
+        self._rasterizer = rasterizer
+        self._cameras = list(cameras)
+
+    def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
+        """See :meth:`Targets.into`."""
+        self._rasterizer.render_into([self._cameras[number] for number in numbers], buffer)
+
+
+class Photographs(Protocol):
+    """Gives pictures by camera; :class:`potr_cl.quality.ground_truth.GroundTruth` does."""
+
+    def picture(self, camera: Camera) -> FloatArray:
+        """(H, W, 3) float32, the photograph of a view."""
+        ...
+
+
+class GroundTruthTargets:
+    """Photographs, read anew whenever they are asked for.
+
+    Args:
+        device: that the re-fit computes on.
+        ground_truth: has photographs of all the cameras.
+        cameras: the views.
+    """
+
+    def __init__(self, device: Device, ground_truth: Photographs, cameras: Sequence[Camera]) -> None:
+        self._device = device
+        self._ground_truth = ground_truth
+        self._cameras = list(cameras)
+
+    def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
+        """See :meth:`Targets.into`.
+
+        Raises:
+            UsageError: a photograph cannot be opened.
+            DataError: one is damaged.
+        """
+        start = 0
+        for number in numbers:
+            picture = np.ascontiguousarray(self._ground_truth.picture(self._cameras[number]), np.float32)
+            with self._device.errors("failed to take a photograph"):
+                cl.enqueue_copy(self._device.queue, buffer, picture, dst_offset=start, is_blocking=True)
+            start += picture.nbytes
+
+
+class Budget(Protocol):
+    """Bytes of device memory that several share."""
+
+    #: What is left.
+    room: float
+
+
+class TargetCache(Owner):
+    """Target pictures on the device, kept from the first time on while the memory budget lasts.
+
+    Args:
+        device: whose memory it is.
+        cameras: the views.
+        launches: the numbers of the views that are asked for together.
+        budget: that the pictures which are kept are taken from.
+
+    Raises:
+        DeviceMemoryError: the device has no room for those of one launch.
+    """
+
+    def __init__(self, device: Device, cameras: Sequence[Camera], launches: Sequence[range], budget: Budget) -> None:
+        self._nbytes = {
+            numbers: 12 * sum(cameras[number].width * cameras[number].height for number in numbers)
+            for numbers in launches
+        }
+        self._budget = budget
+        self._memory = Memory(device)
+        self._others = self._memory.allocate(max(self._nbytes.values()), "the target images")
+        self._kept: dict[range, cl.Buffer] = {}
+        self._kept_of: Targets | None = None
+
+    def pictures(self, targets: Targets, numbers: range) -> cl.Buffer:
+        """(pixels, 3) float32, what the views of a launch should show, one behind the other.
+
+        They are valid until the next call. Other targets than at the last call take the place of what was kept.
+        """
+        if targets is not self._kept_of:
+            self._forget()
+            self._kept_of = targets
+        if numbers in self._kept:
+            return self._kept[numbers]
+        nbytes = self._nbytes[numbers]
+        if nbytes > self._budget.room:
+            targets.into(numbers, self._others)
+            return self._others
+        buffer = self._memory.allocate(nbytes, "the target images")
+        self._budget.room -= buffer.size
+        self._kept[numbers] = buffer
+        try:
+            targets.into(numbers, buffer)
+        except BaseException:
+            self._drop(numbers)
+            raise
+        return buffer
+
+    def _drop(self, numbers: range) -> None:
+        buffer = self._kept.pop(numbers)
+        self._budget.room += buffer.size
+        self._memory.free(buffer)
+
+    def _forget(self) -> None:
+        for numbers in list(self._kept):
+            self._drop(numbers)
+
+    def close(self) -> None:
+        """Give all device memory back."""
+        self._forget()
+        self._memory.close()

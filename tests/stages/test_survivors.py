@@ -1,0 +1,87 @@
+"""States of splats: the same names on host and device, and both agree after every change."""
+
+from __future__ import annotations
+
+import re
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.source import kernel_source
+from potr_cl.stages.pruning.survivors import SplatState, Survivors
+
+REMOVED, ALIVE, JUST_REMOVED = SplatState
+
+
+def test_the_kernels_know_the_same_states():
+    defined = re.findall(r"^#define SPLAT_(\w+) (\d+)$", kernel_source("prune/removal.clh"), re.MULTILINE)
+    assert {name: int(value) for name, value in defined} == {state.name: int(state) for state in SplatState}
+
+
+@pytest.fixture(scope="module")
+def device():
+    device = Device()
+    yield device
+    assert device.allocated == 0, "survivors did not give all their memory back"
+
+
+@pytest.fixture
+def waits():
+    return []
+
+
+@pytest.fixture
+def survivors(device, waits):
+    with Survivors(device, 5, 8, lambda: waits.append(on_device(device, made))) as made:
+        yield made
+
+
+def on_device(device, survivors) -> list[int]:
+    return device.download(survivors.buffer, (8,), np.uint8).tolist()
+
+
+def test_all_are_alive_at_first(device, survivors, waits):
+    assert survivors.alive.tolist() == [True] * 5
+    assert on_device(device, survivors) == [ALIVE] * 8
+    assert waits == []
+
+
+def test_a_removal_is_news_to_the_device_until_it_is_settled(device, survivors, waits):
+    survivors.remove(np.array([1, 3]))
+    just = [ALIVE, JUST_REMOVED, ALIVE, JUST_REMOVED, *[ALIVE] * 4]
+    assert on_device(device, survivors) == just
+    assert waits == []
+    assert survivors.alive.tolist() == [True, False, True, False, True]
+    assert waits == [just]  # the kernels that look for them were waited for before the states changed
+    assert on_device(device, survivors) == [ALIVE, REMOVED, ALIVE, REMOVED, *[ALIVE] * 4]
+    survivors.settle()
+    assert len(waits) == 1
+
+
+def test_what_the_device_has_marked_reaches_the_host(device, survivors):
+    marked = np.array([ALIVE, ALIVE, JUST_REMOVED, REMOVED, *[ALIVE] * 4], np.uint8)
+    cl.enqueue_copy(device.queue, survivors.buffer, marked, is_blocking=True)
+    survivors.marked_by_device()
+    assert survivors.alive.tolist() == [True, True, False, False, True]
+    assert on_device(device, survivors) == [ALIVE, ALIVE, REMOVED, REMOVED, *[ALIVE] * 4]
+
+
+def test_removals_of_host_and_device_add_up(device, survivors):
+    survivors.remove(np.array([0]))
+    survivors.settle()
+    marked = np.array([REMOVED, JUST_REMOVED, *[ALIVE] * 6], np.uint8)
+    cl.enqueue_copy(device.queue, survivors.buffer, marked, is_blocking=True)
+    survivors.marked_by_device()
+    survivors.remove(np.array([4]))
+    assert survivors.alive.tolist() == [False, False, True, True, False]
+
+
+def test_none_removed_for_a_while(device, survivors):
+    survivors.remove(np.array([2]))
+    survivors.settle()
+    with survivors.none_removed():
+        assert on_device(device, survivors) == [ALIVE] * 8
+    assert on_device(device, survivors)[2] == REMOVED
+    assert survivors.alive.tolist() == [True, True, False, True, True]

@@ -1,0 +1,225 @@
+"""The documentation against what it speaks of: links, paths, names, commands, the table of folders, the recipes."""
+
+from __future__ import annotations
+
+import ast
+import importlib
+import re
+import shlex
+import shutil
+import subprocess
+import sys
+from collections import Counter
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+from potr_cl.cli import command_parser
+
+ROOT = Path(__file__).parents[1]
+#: Pages for people; data's descriptions too.
+PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "tests").rglob("*.md")])
+#: Pages that speak of the code as it is now; others tell of what was.
+PRESENT = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/method.md")]
+#: Folders of the package, which pages name without it.
+FOLDERS = sorted(path.name for path in (ROOT / "potr_cl").iterdir() if path.is_dir() and path.name != "__pycache__")
+#: Sections of docs/architecture.md, and the tests that must pass besides those that they bring.
+RECIPES = {
+    "Add a stage": ["tests/test_api.py"],
+    "Add a kernel": ["tests/opencl/test_kernel.py"],
+    "Try a variant of a kernel": [],
+    "Add a format": ["tests/formats/test_registry.py"],
+}
+
+
+def ids(paths: list[Path]) -> list[str]:
+    return [str(path.relative_to(ROOT)) for path in paths]
+
+
+def without_code(text: str) -> str:
+    """A page without its blocks of code."""
+    text = re.sub(r"^```.*?^```$", "", text, flags=re.MULTILINE | re.DOTALL)
+    return re.sub(r"^ {4}.*$", "", text, flags=re.MULTILINE)
+
+
+def anchors(page: Path) -> set[str]:
+    """The anchors that GitHub gives a page's headings."""
+    found: Counter[str] = Counter()
+    names = set()
+    for title in re.findall(r"^#{1,6} (.+)$", without_code(page.read_text("utf-8")), re.MULTILINE):
+        shown = re.sub(r"\[([^\]]*)\]\([^)]*\)", r"\1", title.strip()).lower()
+        name = re.sub(r"[^\w\- ]", "", shown).replace(" ", "-")
+        names.add(f"{name}-{found[name]}" if found[name] else name)
+        found[name] += 1
+    return names
+
+
+@pytest.mark.parametrize("page", PAGES, ids=ids(PAGES))
+def test_links_lead_somewhere(page: Path) -> None:
+    text = re.sub(r"`[^`\n]*`", "", without_code(page.read_text("utf-8")))
+    for link in re.findall(r"\]\(([^)\s]+)\)", text):
+        if link.startswith(("http://", "https://")):
+            continue
+        path, _, anchor = link.partition("#")
+        target = (page.parent / path).resolve() if path else page
+        assert target.exists(), f"{link}: there is no such file"
+        assert ROOT in target.parents, f"{link} leads out of the repository"
+        assert not anchor or anchor in anchors(target), f"{link}: the page has no such heading"
+
+
+@pytest.mark.parametrize("page", PRESENT, ids=ids(PRESENT))
+def test_paths_and_names_exist(page: Path) -> None:
+    """What stands in `…` and looks like a path of the repository, or a name of the package."""
+    of_recipes = {path for title in RECIPES for path, _, _ in recipe(title)}
+    for quoted in re.findall(r"`([^`\n]+)`", without_code(page.read_text("utf-8"))):
+        if quoted in of_recipes:
+            continue
+        if re.fullmatch(r"(potr_cl|tests|tools|docs|\.ci)/[\w./*-]*", quoted):
+            assert list(ROOT.glob(quoted.rstrip("/"))), f"there is no {quoted}"
+        elif re.fullmatch(rf"({'|'.join(FOLDERS)})/[\w./*-]*", quoted):
+            assert list((ROOT / "potr_cl").glob(quoted.rstrip("/"))), f"there is no potr_cl/{quoted}"
+        elif re.fullmatch(r"(potr_cl|tools)(\.\w+)+", quoted):
+            assert resolves(quoted), f"there is no {quoted}"
+
+
+def resolves(name: str) -> bool:
+    parts = name.split(".")
+    for count in range(len(parts), 0, -1):
+        try:
+            found = importlib.import_module(".".join(parts[:count]))
+        except ModuleNotFoundError:
+            continue
+        for part in parts[count:]:
+            if not hasattr(found, part):
+                return False
+            found = getattr(found, part)
+        return True
+    return False
+
+
+def commands(page: Path) -> Iterator[list[str]]:
+    """The calls of the command line in a page's indented blocks, without comments."""
+    for line in re.findall(r"^ {4}(.+)$", page.read_text("utf-8"), re.MULTILINE):
+        for call in re.findall(r"python -m potr_cl ([^&|]+)", line):
+            yield shlex.split(call, comments=True)
+
+
+@pytest.mark.parametrize("page", PRESENT, ids=ids(PRESENT))
+def test_commands_are_understood(page: Path) -> None:
+    found = [call for call in commands(page) if "--haze" not in call]
+    assert found or page.name != "README.md"
+    for call in found:
+        command_parser(call).parse_args(call)
+
+
+@pytest.mark.parametrize("page", PRESENT, ids=ids(PRESENT))
+def test_flags_exist(page: Path) -> None:
+    known = set(re.findall(r"`(--[\w-]+)", (ROOT / "docs" / "cli.md").read_text("utf-8")))
+    elsewhere = {"--haze", "--check", "--split"}  # of a recipe, and of tools
+    for quoted in re.findall(r"`([^`\n]+)`", without_code(page.read_text("utf-8"))):
+        if not quoted.startswith(("python -m pytest", "ruff", "pip", "git")):
+            for flag in re.findall(r"(?<![\w-])--[a-z][\w-]+", quoted):
+                assert flag in known | elsewhere, f"no command has {flag}"
+
+
+def test_generated_pages_are_current() -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", "tools.make.docs", "--check"], cwd=ROOT, capture_output=True, text=True, check=False
+    )
+    assert done.returncode == 0, done.stderr
+
+
+# The table of folders
+
+
+def folders_of_the_page() -> dict[str, set[str]]:
+    """What each folder may import, as docs/architecture.md says."""
+    text = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    rows = re.findall(r"^\| `(\w+)/` \|[^|]*\|[^|]*\| ([^|]*) \|$", text, re.MULTILINE)
+    names = {folder for folder, _ in rows}
+    return {
+        folder: names if allowed == "all of them" else set() if allowed == "nothing" else set(allowed.split(", "))
+        for folder, allowed in rows
+    }
+
+
+def imports_of(folder: Path) -> set[str]:
+    """The folders of the package that a folder's modules import, with those for type checkers."""
+    found = set()
+    for path in folder.rglob("*.py"):
+        for node in ast.walk(ast.parse(path.read_text("utf-8"))):
+            names = [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
+            names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
+            found |= {name.split(".")[1] for name in names if name.startswith("potr_cl.")}
+    return found - {folder.name, "errors"}
+
+
+def test_the_table_of_folders_is_true() -> None:
+    table = folders_of_the_page()
+    folders = {path.parent.name for path in (ROOT / "potr_cl").glob("*/__init__.py")}
+    assert set(table) == folders
+    for folder, allowed in table.items():
+        unexpected = imports_of(ROOT / "potr_cl" / folder) - allowed
+        assert not unexpected, (
+            f"{folder}/ imports {', '.join(sorted(unexpected))}: docs/architecture.md does not allow it"
+        )
+
+
+# The recipes
+
+
+def section(title: str) -> str:
+    text = (ROOT / "docs" / "architecture.md").read_text("utf-8")
+    return text.split(f"\n## {title}\n")[1].split("\n## ")[0]
+
+
+def recipe(title: str) -> list[tuple[str, str, str]]:
+    """Path, kind and text of each block of code of a section that stands below its path."""
+    return re.findall(r"^`([\w./]+)`:\n\n```(\w+)\n(.*?)^```$", section(title), re.MULTILINE | re.DOTALL)
+
+
+def changed(text: str, diff: str) -> str:
+    """A file with a diff of the recipes: parts that @@ divides, each of which fits at one place."""
+    for part in diff.split("@@\n"):
+        lines = part.splitlines()
+        old = "\n".join(line[1:] for line in lines if line[0] in " -")
+        new = "\n".join(line[1:] for line in lines if line[0] in " +")
+        assert text.count(old) == 1, f"the recipe does not fit: {old}"
+        text = text.replace(old, new)
+    return text
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("title", "checks"), RECIPES.items(), ids=list(RECIPES))
+def test_a_recipe_can_be_followed(title: str, checks: list[str], tmp_path: Path) -> None:
+    """Its files and changes, put into a copy of the package, pass their own tests and those that it names.
+
+    And the commands that it shows do what they should.
+    """
+    for folder in ("potr_cl", "tests", "tools", "docs"):
+        shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__", "images"))
+    for file in ("pyproject.toml", "README.md", "CONTRIBUTING.md"):
+        shutil.copy(ROOT / file, tmp_path)
+    blocks = recipe(title)
+    tests = [path for path, _, _ in blocks if path.startswith("tests/")]
+    assert blocks
+    for path, kind, text in blocks:
+        file = tmp_path / path
+        if kind == "diff":
+            file.write_text(changed(file.read_text("utf-8"), text), "utf-8")
+        else:
+            assert not file.exists(), f"{path} is there already: the recipe needs another example"
+            file.write_text(text, "utf-8")
+    added = sum(line.startswith("+") for _, kind, text in blocks if kind == "diff" for line in text.splitlines())
+    assert added <= 2, "an addition should take two lines elsewhere at the most"
+    run = [line.split()[2:] for line in re.findall(r"^ {4}(python -m .+)$", section(title), re.MULTILINE)]
+    run.append(["tools.make.docs"])
+    if tests or checks:
+        run.append(["pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests, *checks])
+    assert len(run) > 1, "a recipe that nobody tries"
+    for command in run:
+        done = subprocess.run(
+            [sys.executable, "-m", *command], cwd=tmp_path, capture_output=True, text=True, check=False
+        )
+        assert done.returncode == 0, f"{done.stdout[-3000:]}\n{done.stderr[-3000:]}"

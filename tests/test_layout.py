@@ -1,0 +1,150 @@
+"""Who may know whom: the package's folders in layers, tests and tools beside it. Data flows one way, see FOLDERS."""
+
+from __future__ import annotations
+
+import ast
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+PACKAGE = "potr_cl"
+
+#: What each folder (or module) at the package's top may import, besides itself. It may name only what stands above it:
+#: so there is no way round in a circle. A folder that needs one more adds it here, and says in the commit why.
+FOLDERS: dict[str, set[str]] = {
+    "errors": set(),
+    "host": {"errors"},
+    "model": {"errors", "host"},
+    "opencl": {"errors", "host"},
+    "raster": {"errors", "host", "model", "opencl"},
+    "codec": {"errors", "host", "model"},
+    "formats": {"errors", "host", "model", "codec"},
+    "quality": {"errors", "host", "model", "opencl", "raster", "formats"},
+    "stages": {"errors", "host", "model", "opencl", "raster", "codec", "quality"},
+    "pipeline": {"errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality"},
+    "report": {"errors", "host", "model", "opencl", "codec", "formats", "quality", "pipeline"},
+    "reference": {"errors", "model", "opencl", "raster", "stages"},
+    "cli": {
+        "errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality", "pipeline", "report"
+    },
+}  # fmt: skip
+#: They offer the whole package under short names, and start it.
+ENTRIES = {"__init__", "__main__"}
+
+
+def module_name(path: Path) -> str:
+    parts = path.relative_to(ROOT).with_suffix("").parts
+    return ".".join(parts[:-1] if parts[-1] == "__init__" and len(parts) > 1 else parts)
+
+
+def sources(folder: str) -> list[Path]:
+    found = sorted((ROOT / folder).rglob("*.py"))
+    assert found, f"no Python files in {folder}: the test looks in the wrong place"
+    return found
+
+
+def imports(path: Path, only_at_import: bool = False) -> Iterator[tuple[str, int]]:
+    """Modules that a file imports, and where: anywhere in it, or just what runs when it is imported itself.
+
+    ``from a import b`` counts as ``a.b`` where that is a module, else as ``a``.
+    """
+
+    def walk(node: ast.AST) -> Iterator[ast.AST]:
+        for child in ast.iter_child_nodes(node):
+            late = isinstance(child, (ast.FunctionDef, ast.AsyncFunctionDef, ast.Lambda))
+            typing = isinstance(child, ast.If) and "TYPE_CHECKING" in ast.unparse(child.test)
+            if only_at_import and (late or typing):
+                continue
+            yield child
+            yield from walk(child)
+
+    for node in walk(ast.parse(path.read_text("utf-8"))):
+        if isinstance(node, ast.Import):
+            yield from ((alias.name, node.lineno) for alias in node.names)
+        elif isinstance(node, ast.ImportFrom):
+            assert not node.level, f"{path}:{node.lineno}: a relative import"
+            assert node.module
+            for alias in node.names:
+                name = f"{node.module}.{alias.name}"
+                place = ROOT.joinpath(*name.split("."))
+                is_module = place.with_suffix(".py").exists() or place.is_dir()
+                yield (name if is_module else node.module), node.lineno
+
+
+def folder_of(module: str) -> str | None:
+    """The folder or module at the package's top that a module lies in; None of the package itself and of others."""
+    parts = module.split(".")
+    return parts[1] if parts[0] == PACKAGE and len(parts) > 1 else None
+
+
+def test_the_table_leads_one_way() -> None:
+    above: set[str] = set()
+    for folder, known in FOLDERS.items():
+        assert known <= above, f"{folder} may import {known - above}, which does not stand above it"
+        above.add(folder)
+
+
+def test_every_folder_has_its_place() -> None:
+    top = (ROOT / PACKAGE).iterdir()
+    there = {path.stem for path in top if path.suffix == ".py" or (path / "__init__.py").exists()}
+    assert there - ENTRIES == FOLDERS.keys()
+
+
+def test_folders_import_what_they_may() -> None:
+    wrong = []
+    for path in sources(PACKAGE):
+        own = path.relative_to(ROOT / PACKAGE).with_suffix("").parts[0]
+        if own in ENTRIES:
+            continue
+        for module, line in imports(path):
+            folder = folder_of(module)
+            if folder is not None and folder not in {own, *FOLDERS[own]}:
+                wrong.append(f"{path.relative_to(ROOT)}:{line}: {own} imports {module}")
+    assert not wrong, "\n".join(wrong)
+
+
+def test_no_modules_import_each_other() -> None:
+    """Within a folder either: what runs when a module is imported never comes back to it."""
+    graph = {module_name(p): {m for m, _ in imports(p, only_at_import=True)} for p in sources(PACKAGE)}
+    done: set[str] = set()
+
+    def visit(module: str, way: list[str]) -> None:
+        assert module not in way, " -> ".join([*way[way.index(module) :], module])
+        if module not in done:
+            for other in sorted(graph[module] & graph.keys()):
+                visit(other, [*way, module])
+            done.add(module)
+
+    for module in sorted(graph):
+        visit(module, [])
+
+
+@pytest.mark.parametrize(
+    ("folder", "others"), [(PACKAGE, {"tests", "tools"}), ("tests", {"tools"}), ("tools", {"tests"})]
+)
+def test_package_tests_and_tools_stay_apart(folder: str, others: set[str]) -> None:
+    """The tools' own tests, in tools/tests, may use what tests share."""
+    wrong = [
+        f"{path.relative_to(ROOT)}:{line}: imports {module}"
+        for path in sources(folder)
+        if path.parent != ROOT / "tools" / "tests"
+        for module, line in imports(path)
+        if module.split(".")[0] in others
+    ]
+    assert not wrong, "\n".join(wrong)
+
+
+def test_an_import_is_found_wherever_it_stands(tmp_path: Path) -> None:
+    file = tmp_path / "file.py"
+    file.write_text(
+        "from typing import TYPE_CHECKING\n"
+        "import potr_cl.cli.files as files\n"
+        "if TYPE_CHECKING:\n    from potr_cl.model import camera\n"
+        "def f():\n    from potr_cl.model.scene import Scene\n"
+        "class A:\n    from tools import bench\n"
+    )
+    everywhere = {module for module, _ in imports(file)}
+    assert everywhere == {"typing", "potr_cl.cli.files", "potr_cl.model.camera", "potr_cl.model.scene", "tools.bench"}
+    assert {m for m, _ in imports(file, only_at_import=True)} == {"typing", "potr_cl.cli.files", "tools.bench"}
