@@ -2,14 +2,14 @@
 
 from __future__ import annotations
 
-from potr_cl.host.plain_text import plain
+from potr_cl.plain_text import plain
 
 
 class PotrError(Exception):
     """Base of every error raised on purpose; the command line prints it as one line and exits with ``exit_code``.
 
     Args:
-        message: may quote what a file holds: it is made harmless here (:func:`potr_cl.host.plain_text.plain`), so that
+        message: may quote what a file holds: it is made harmless here (:func:`potr_cl.plain_text.plain`), so that
             no caller has to.
     """
 

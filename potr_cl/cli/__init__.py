@@ -15,8 +15,8 @@ from potr_cl.cli import guard
 from potr_cl.cli.parser import CommandParser
 from potr_cl.cli.terminal import note
 from potr_cl.errors import PotrError
-from potr_cl.host.plain_text import plain
 from potr_cl.host.threads import in_background
+from potr_cl.plain_text import plain
 
 #: The commands, and who adds them, in the order of the help.
 _COMMANDS = {

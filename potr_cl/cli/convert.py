@@ -6,19 +6,18 @@ import argparse
 
 from potr_cl.cli.guard import ReadFile, WrittenFile
 from potr_cl.cli.options import Commands
-from potr_cl.cli.scenes import add_trust_option, read_scene
+from potr_cl.cli.scenes import add_trust_option, read_scene, size_of_file
 from potr_cl.cli.terminal import say
 from potr_cl.formats import scene_writer
 from potr_cl.formats.registry import extras_needed, suffixes_read, suffixes_written
-from potr_cl.formats.scenes.scene_files import file_size
 
 
 def _convert(args: argparse.Namespace) -> None:
     write = scene_writer(args.output)  # a wrong name is told before anything is read
-    before = file_size(args.scene)
+    before = size_of_file(args.scene)
     scene = read_scene(args, args.scene)
     write(scene)
-    after = file_size(args.output)
+    after = size_of_file(args.output)
     say(f"{args.output}: {len(scene)} splats of SH degree {scene.sh_degree}, {after} bytes; {args.scene} has {before}")
 
 

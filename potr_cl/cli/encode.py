@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import os
 import time
 from concurrent.futures import Future
 from typing import Any
@@ -13,7 +12,7 @@ from potr_cl.cli.guard import ReadFile, WrittenFile
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option, as_bytes, size_in_bytes
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_trust_option, read_scene
+from potr_cl.cli.scenes import add_trust_option, read_scene, size_of_file
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say, say_document
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
@@ -46,7 +45,7 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
         background=parse_colour(args.background),
         memory=as_bytes(args.memory),
         threads=args.threads,
-        source_bytes=_size(args.scene),
+        source_bytes=size_of_file(args.scene),
         **stage_choices(args),
     )
     _ = options.parameters  # a wrong option is told before a gigabyte is read
@@ -117,14 +116,6 @@ def _encode(args: argparse.Namespace) -> None:
         say_document(report)
     else:
         say(format_encode_report(report))
-
-
-def _size(path: ReadFile) -> int | None:
-    """Bytes of a file; None where there is none, which whoever reads it will say."""
-    try:
-        return os.stat(path).st_size if os.path.isfile(path) else None
-    except (OSError, ValueError):
-        return None
 
 
 def _proved(encoded: Encoded) -> tuple[PotrFile, Scene]:

@@ -7,7 +7,7 @@ import sys
 from typing import Any, NoReturn
 
 from potr_cl.cli.terminal import note, say
-from potr_cl.host.plain_text import plain
+from potr_cl.plain_text import plain
 
 #: More digits than any number of views, steps or splats has.
 _MOST_DIGITS = 12

@@ -23,9 +23,9 @@ from potr_cl.cli.views import read_cameras
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.images import parse_colour, to_8_bits, write_png
 from potr_cl.host.atomic_write import replacing
-from potr_cl.host.plain_text import plain
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.opencl.device import Device
+from potr_cl.plain_text import plain
 from potr_cl.quality.compare import (
     SceneFile,
     compare,

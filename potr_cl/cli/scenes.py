@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import os
 from pathlib import Path
 from typing import Any
 
@@ -31,3 +32,11 @@ def read_scene(args: argparse.Namespace, path: Path) -> Scene:
         As :func:`potr_cl.formats.load_scene`.
     """
     return load_scene(path, **trust(args))
+
+
+def size_of_file(path: Path) -> int | None:
+    """Bytes of a file; None where there is none, which whoever reads it will say."""
+    try:
+        return os.stat(path).st_size if os.path.isfile(path) else None
+    except (OSError, ValueError):
+        return None

@@ -13,7 +13,7 @@ import sys
 from typing import Any, TextIO
 
 from potr_cl.errors import PotrError
-from potr_cl.host.plain_text import plain_document, plain_lines
+from potr_cl.plain_text import plain_document, plain_lines
 
 
 def say(text: object) -> None:

@@ -7,8 +7,8 @@ from typing import Any
 
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.sections import Property, Section
-from potr_cl.host.plain_text import plain_fact
 from potr_cl.model.scene import SH_COEFFICIENTS
+from potr_cl.plain_text import plain_fact
 
 _GROUPS = {
     Property.METADATA: "metadata",

@@ -20,8 +20,8 @@ from numpy.typing import NDArray
 from PIL import Image, features
 
 from potr_cl.formats.images import to_8_bits
-from potr_cl.host.plain_text import plain
 from potr_cl.model.scene import FloatArray
+from potr_cl.plain_text import plain
 from potr_cl.quality.compare import difference_map
 from potr_cl.report.summary import decibels
 
