@@ -129,8 +129,8 @@ def _proved(args: argparse.Namespace, encoded: Encoded) -> tuple[PotrFile, Scene
         return file, file.scene()
     except DataError as error:
         raise PotrError(
-            f"the encoded file cannot be decoded ({error}): nothing was written. Values of this scene are beyond what "
-            "the format holds; look for splats that are very far away or very large"
+            f"the encoded file cannot be decoded ({error}): nothing was written. If the scene has splats that are very "
+            "far away or very large, leave them out"
         ) from error
 
 
