@@ -8,7 +8,7 @@ from typing import Any
 import numpy as np
 
 from potr_cl.codec import octree
-from potr_cl.errors import UsageError
+from potr_cl.errors import PotrError, UsageError
 from potr_cl.formats.declaration import install_command
 from potr_cl.formats.scenes.scene_files import cleaned, first_line
 from potr_cl.model.scene import Scene
@@ -24,6 +24,7 @@ def library(path: str | os.PathLike[str]) -> Any:
 
     Raises:
         UsageError: it is not installed.
+        PotrError: it does not start.
     """
     try:
         import gsply
@@ -33,6 +34,11 @@ def library(path: str | os.PathLike[str]) -> Any:
         raise UsageError(
             f"'{path}': this kind of file needs the library gsply, which cannot be loaded ({first_line(error)}): "
             f"{install_command(EXTRA)}"
+        ) from None
+    except Exception as error:  # compilers that do not fit the memory: OSError, SystemError, RuntimeError
+        raise PotrError(
+            f"'{path}': this kind of file needs the library gsply, which does not start here, perhaps for want of "
+            f"memory ({first_line(error)})"
         ) from None
     return gsply
 

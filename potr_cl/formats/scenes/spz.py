@@ -11,7 +11,6 @@ import logging
 import os
 import shutil
 import struct
-import tempfile
 import zlib
 from pathlib import Path
 
@@ -23,6 +22,7 @@ from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.gsply_arrays import EXTRA, from_scene, library, to_scene
 from potr_cl.formats.scenes.scene_files import file_size, reading
 from potr_cl.host.atomic_write import replacing
+from potr_cl.host.leftovers import temporary_folder
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 
 _log = logging.getLogger("potr_cl")
@@ -87,7 +87,7 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
         raise DataError(f"'{path}': SPZ cannot hold a splat {largest:.3g} units from the origin")
     if bits < _FRACTIONAL_BITS:
         _log.warning("'%s': the scene is large for SPZ: positions are stored in steps of 1/%d unit", path, 2**bits)
-    with replacing(path) as file, tempfile.TemporaryDirectory() as folder:
+    with replacing(path) as file, temporary_folder() as folder:
         temporary = Path(folder) / "scene.spz"
         gsply.spz.write_spz(temporary, from_scene(gsply, scene), version=3, fractional_bits=bits)
         with temporary.open("rb") as written:
