@@ -14,6 +14,8 @@ from typing import Any
 
 import pyopencl as cl
 
+from potr_cl.host.leftovers import removed_at_end
+
 logger = logging.getLogger("potr_cl")
 
 _ICD_VARIABLE = "OCL_ICD_VENDORS"
@@ -111,15 +113,16 @@ def _register_intel_runtime() -> None:
     contents = {icd.name: icd.read_text(errors="replace") for icd in others}
     contents["potr_cl_intel_cpu.icd"] = f"{library}\n"
     digest = hashlib.sha256(repr(sorted(contents.items())).encode()).hexdigest()[:16]
-    folder = Path(tempfile.gettempdir()) / f"potr_cl_icd_{os.getuid()}_{digest}"
     try:
+        folder = Path(tempfile.gettempdir()) / f"potr_cl_icd_{os.getuid()}_{digest}"
         folder.mkdir(mode=0o700, exist_ok=True)
         if folder.stat().st_uid != os.getuid():
             return  # someone else's folder: do not load libraries that it names
         for name, text in contents.items():
             partial = folder / f".{name}.{os.getpid()}"
-            partial.write_text(text)
-            partial.replace(folder / name)
+            with removed_at_end(partial):
+                partial.write_text(text)
+                partial.replace(folder / name)
     except OSError as error:
         logger.warning("cannot register Intel's CPU runtime: %s", error)
         return

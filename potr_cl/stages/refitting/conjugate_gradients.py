@@ -20,6 +20,10 @@ class Vectors(Protocol):
         """A new vector."""
         ...
 
+    def zero(self, x: cl.Buffer) -> None:
+        """x = 0."""
+        ...
+
     def combine(self, a: float, y: cl.Buffer, b: float, x: cl.Buffer) -> None:
         """y = a y + b x."""
         ...
@@ -83,6 +87,7 @@ class ConjugateGradients:
             DeviceError: the device failed.
         """
         vectors, direction, product, preconditioned = self._vectors, self.direction, self.product, self.preconditioned
+        vectors.zero(direction)
         slope, least = 0.0, 0.0
         for step in range(steps):
             system.precondition(residual, preconditioned)
