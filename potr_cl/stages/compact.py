@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
@@ -79,10 +79,11 @@ class Compact(Stage):
         return self.on and scene.sh_degree > 0
 
     def interludes(self, iterations: int) -> Sequence[Interlude]:
-        return [Interlude(max(math.ceil(self.at * iterations), 1), self, always=True)] if self.on else []
+        after = max(math.ceil(self.at * iterations), 1)
+        return [Interlude(after, self, always=True, afresh=True)] if self.on else []
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Give what is left of the uncompressed scene sparse colours."""
+        """Make the colours of the state's scene sparse, unless that has been done while splats were removed."""
         if self.name in state.learnt or state.scene.sh_degree == 0:
             return state
         options = CompactionOptions(
@@ -96,11 +97,8 @@ class Compact(Stage):
         with _effects(state, bench) as effects:
             bench.progress("compact", 0.0)
             weights = ViewWeights.from_importances(len(state.scene), effects.view_importances())
-            scene = state.scene
-            if not state.original_colours:
-                scene = replace(scene, sh=state.source.sh[state.survivors])
             places = standpoints(state.views, state.source.means)
-            sh = Compactor(bench.opened).compact(scene, places, weights, options).sh
+            sh = Compactor(bench.opened).compact(state.scene, places, weights, options).sh
             bench.progress("compact", 1.0)
         return state.recoloured(sh).having_learnt(self.name, True)
 

@@ -45,7 +45,6 @@ class State:
         survivors: (n,) int64, ascending: the number in ``source`` of each splat of ``scene``.
         views: the training views; empty if there are no cameras.
         geometry: of ``scene`` as a decoder will see it, once a stage has quantised it.
-        original_colours: whether ``scene`` has the colours that its splats have in ``source``.
         effects: importances view by view while splats are being removed, else None.
         learnt: what each stage has to tell, by its name.
     """
@@ -55,7 +54,6 @@ class State:
     survivors: NDArray[np.int64]
     views: tuple[Camera, ...]
     geometry: Geometry | None = None
-    original_colours: bool = True
     effects: Measured | None = None
     learnt: Mapping[str, Any] = field(default_factory=dict)
 
@@ -66,7 +64,7 @@ class State:
 
     def recoloured(self, sh: NDArray[np.float32]) -> State:
         """The same with other SH coefficients, (n, M, 3)."""
-        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, sh=sh), original_colours=False)
+        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, sh=sh))
 
     def having_learnt(self, name: str, result: Any) -> State:
         """The same, with what a stage has to tell."""
@@ -168,11 +166,14 @@ class Interlude:
         after: how many iterations.
         stage: that does it, on what is left then.
         always: whether it is done too if the iterations end before; then at their end.
+        afresh: whether it gets the colours that the splats had before the first iteration, not those that other
+            interludes have given them since.
     """
 
     after: int
     stage: Stage
     always: bool = False
+    afresh: bool = False
 
 
 @dataclass(frozen=True)
