@@ -16,9 +16,6 @@ from potr_cl.stages.stage import Stage, parameters
 
 S = TypeVar("S", bound=Stage)
 
-#: A stage's options by name; True and False switch it on and off.
-StageChanges = Mapping[str, Any] | bool
-
 
 @dataclass(frozen=True)
 class EncodeOptions:
@@ -84,9 +81,11 @@ class EncodeOptions:
         fields = {field.name for field in dataclasses.fields(self)}
         for name, change in changes.items():
             if name in stages:
-                stages[name] = stages[name].changed(**({"on": change} if isinstance(change, bool) else change))
+                stages[name] = stages[name].changed(**_changes_of(name, change))
             elif name in fields:
                 own[name] = change
+            elif having_it := [preset for preset, table in PRESETS.items() if name in {each.name for each in table}]:
+                raise UsageError(f"preset '{self.preset}' has no stage '{name}': it is in {', '.join(having_it)}")
             else:
                 raise UsageError(f"there is no option '{name}': there are {', '.join(sorted(fields | stages.keys()))}")
         return dataclasses.replace(self, **{"stages": tuple(stages.values()), **own})
@@ -144,3 +143,12 @@ class EncodeOptions:
 
         own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "stages"}
         return own | {stage.name: plain(dataclasses.asdict(stage)) for stage in self.stages}
+
+
+def _changes_of(stage: str, change: Any) -> Mapping[str, Any]:
+    """What a caller wants of a stage, as options by name."""
+    if isinstance(change, bool):
+        return {"on": change}
+    if not isinstance(change, Mapping):
+        raise UsageError(f"'{stage}' is {change!r}: give a mapping of its options, True or False")
+    return change
