@@ -14,9 +14,24 @@ DEFAULT: Preset = "best"
 
 #: Stages by preset, in their order. Those that are switched off are there to be asked for.
 PRESETS: dict[Preset, tuple[Stage, ...]] = {
-    "best": (Prune(), Compact(on=False), Refit(steps=8), Code()),
-    "fast": (Prune(iterations=16), Compact(on=False), Refit(steps=4), Code(entropy="zstd", zstd_level=9)),
-    "paper": (Prune(), Compact(), Refit(steps=0), Code()),
+    "best": (
+        Prune(),
+        Compact(on=False),
+        Refit(steps=8),
+        Code(),
+    ),
+    "fast": (
+        Prune(iterations=16),
+        Compact(on=False),
+        Refit(steps=4),
+        Code(entropy="zstd", zstd_level=9),
+    ),
+    "paper": (
+        Prune(),
+        Compact(),
+        Refit(steps=0),
+        Code(),
+    ),
 }
 
 #: What each preset is for, in a line.
