@@ -1,4 +1,4 @@
-"""How to encode: every choice that a caller has."""
+"""How to encode: :class:`EncodeOptions` has every choice that a caller has."""
 
 from __future__ import annotations
 
@@ -28,10 +28,10 @@ class EncodeOptions:
         q: quality, 0 to 1; sets every hyper-parameter that no stage replaces.
         preset: how q sets them, and the file's version
             (:meth:`potr_cl.codec.quantize.HyperParameters.from_quality`).
-        stages: in their order, with their options; those of the preset unless others are given.
+        stages: the stages with their options, in their order; by default those of the preset.
         background: R, G, B behind the scene in the views that are looked at.
-        memory: bytes of device memory to keep views in; None: half of the device's, three tenths of a CPU's.
-        threads: for work on the host; the bytes do not depend on it. 0: one a processor.
+        memory: how many bytes of device memory may be filled with views; None: half of a GPU's memory, 0.3 of a CPU's.
+        threads: number of threads for work on the host; the bytes do not depend on it. 0: one for each processor.
         source_bytes: size of the file that the scene came from, for the metadata; None if it came from none.
     """
 
@@ -146,7 +146,7 @@ class EncodeOptions:
 
 
 def _changes_of(stage: str, change: Any) -> Mapping[str, Any]:
-    """What a caller wants of a stage, as options by name."""
+    """The changes of one stage as options by name."""
     if isinstance(change, bool):
         return {"on": change}
     if not isinstance(change, Mapping):

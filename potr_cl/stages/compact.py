@@ -22,7 +22,7 @@ from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, optio
 
 @dataclass(frozen=True)
 class Compact(Stage):
-    """Make the SH coefficients sparse; looks at views.
+    """Make the SH coefficients sparse, so that the colours change little in the training views.
 
     Attributes:
         at: the part of the pruning iterations after which it is done, so that later ones see its effect.
@@ -105,7 +105,7 @@ class Compact(Stage):
 
 @contextmanager
 def _effects(state: State, bench: Workbench) -> Iterator[Measured]:
-    """The importances: those at hand while splats are being removed, else measured for this."""
+    """Importances view by view: those that pruning has measured, or, without pruning, measured for this."""
     if state.effects is not None:
         yield state.effects
         return

@@ -18,9 +18,9 @@ from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, optio
 
 @dataclass(frozen=True)
 class Prune(Stage):
-    """Remove splats, fewer at a time in many iterations; look at views.
+    """Remove splats in many iterations, judging by the training views.
 
-    What other stages want done between iterations (:meth:`potr_cl.stages.stage.Stage.interludes`) is done here.
+    Between iterations it does what other stages want done then (:meth:`potr_cl.stages.stage.Stage.interludes`).
 
     Attributes:
         keep, count: part or number of the splats to keep, exactly, instead of ``delta_mse_max``.
@@ -107,7 +107,7 @@ class Prune(Stage):
         return PruningOptions(delta_mse_max, self.iterations, a=self.mapping_a, count=count, decay=self.decay)
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Remove splats; ``learnt`` gets a :class:`potr_cl.stages.pruning.schedule.Pruned`."""
+        """Remove splats, and leave a :class:`potr_cl.stages.pruning.schedule.Pruned` in ``learnt``."""
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene))
         bench.progress("prepare views", 0.0)
@@ -137,11 +137,11 @@ class _Course:
     """The scene while splats are being removed.
 
     Args:
-        state: before.
-        removal: measures, and knows what is left.
+        state: the state before the first iteration.
+        removal: measures effects, and knows which splats are left.
 
     Attributes:
-        sh: (N, M, 3) the colours of all splats of the state's scene, as far as they have changed.
+        sh: (N, M, 3) the colours that all splats of the state's scene have by now.
     """
 
     def __init__(self, state: State, removal: RemovalSweep) -> None:
@@ -149,7 +149,7 @@ class _Course:
         self.sh = state.scene.sh
 
     def left(self, splats: NDArray[np.int64], afresh: bool = False) -> State:
-        """The state in which only these splats are left, with their first colours or with those that they have now."""
+        """The state in which only these splats are left, with the colours of the beginning or with those of now."""
         scene = self._state.scene if afresh else replace(self._state.scene, sh=self.sh)
         return replace(self._state, scene=scene.subset(splats), survivors=self._state.survivors[splats])
 
@@ -159,7 +159,7 @@ class _Course:
         then = interlude.stage.run(given, bench)
         if then is given:
             return
-        if self.sh is self._state.scene.sh:  # not ours to change
+        if self.sh is self._state.scene.sh:  # the array of the state before, which must not change
             self.sh = self.sh.copy()
         self.sh[splats] = then.scene.sh
         self._state = replace(self._state, learnt=then.learnt)
