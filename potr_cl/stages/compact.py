@@ -79,7 +79,7 @@ class Compact(Stage):
         return self.on and scene.sh_degree > 0
 
     def interludes(self, iterations: int) -> Sequence[Interlude]:
-        return [Interlude(max(math.ceil(self.at * iterations), 1), self, always=True)] if self.on else []
+        return [Interlude(max(math.ceil(self.at * iterations), 1), self, always=True)]
 
     def run(self, state: State, bench: Workbench) -> State:
         """Give what is left of the uncompressed scene sparse colours."""

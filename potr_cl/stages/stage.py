@@ -134,9 +134,14 @@ class Stage(ABC):
             PotrError: it cannot be done.
         """
 
+    @property
+    def asked_for(self) -> bool:
+        """Whether the options leave the stage anything to do, whatever the scene."""
+        return self.on
+
     def looks_at(self, scene: Scene) -> bool:
         """Whether there is anything in this scene for which the stage has to look at views."""
-        return self.on and self.needs_views
+        return self.asked_for and self.needs_views
 
     def interludes(self, iterations: int) -> Sequence[Interlude]:
         """What the stage wants done while splats are being removed in so many iterations."""

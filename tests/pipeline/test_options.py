@@ -67,6 +67,13 @@ def test_without_a_refit_colours_are_compacted_unless_told_otherwise(refit):
     assert EncodeOptions.for_preset("best", refit=refit, compact={"at": 0.5}).compact.on
 
 
+def test_a_refit_that_the_preset_does_not_have_stands_in_for_the_compaction():
+    assert EncodeOptions.for_preset("paper").compact.on
+    assert not EncodeOptions.for_preset("paper", refit={"steps": 8}).compact.on
+    assert EncodeOptions.for_preset("paper", refit={"steps": 8}, compact=True).compact.on
+    assert EncodeOptions.for_preset("paper", refit={"drop": 1e-6}).compact.on  # of no steps
+
+
 def test_stages_replace_the_parameters_that_q_sets():
     options = EncodeOptions(q=0.7).with_parameters(delta_mse_max=1e-7, sf_dc=9.0)
     assert (options.prune.delta_mse_max, options.code.sf_dc) == (1e-7, 9.0)

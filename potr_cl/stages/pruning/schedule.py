@@ -64,7 +64,7 @@ class PruningOptions:
         if self.count is not None and self.count < 1:
             raise UsageError(f"{self.count} splats to keep: at least 1 is needed")
         if not 0 <= self.decay <= 1:
-            raise UsageError(f"the decay is {self.decay:g}, it must lie between 0 and 1")
+            raise UsageError(f"the moving average's decay (--damping) is {self.decay:g}, it must lie between 0 and 1")
 
 
 @dataclass(frozen=True)
