@@ -125,7 +125,7 @@ class Run:
             As :func:`encode`.
         """
         for stage in self._options.stages:
-            if only is None or isinstance(stage, tuple(only)):
+            if only is None or type(stage) in only:
                 state = self._one(stage, state)
         return state
 

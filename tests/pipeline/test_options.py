@@ -50,6 +50,7 @@ def test_changes_reach_the_stage_that_they_name():
         ({"itertions": 3}, "there is no option 'itertions'"),
         ({"prune": {"itertions": 3}}, "stage 'prune' has no option 'itertions'"),
         ({"prune": {"keep": 2.0}}, "must be above 0 and at most 1"),
+        ({"code": False}, "stage 'code' makes the file"),
         ({"code": {"entropy": "gzip"}}, "'gzip' is unknown"),
     ],
 )
