@@ -29,8 +29,8 @@ inline int take_totals(global long *totals, float scale, vfloat *sums)
     for (int lane = 0; lane < LANES; ++lane) {
         /* In two parts of 32 bits: conversions of 64 are calls on some CPU runtimes. */
         const long4 total = splats[lane], high = (total + (1l << 30)) >> 31;
-        const float4 value =
-            MAD(convert_float4(convert_int4(high)), (float4)(0x1p31f), convert_float4(convert_int4(total - (high << 31))));
+        const float4 low = convert_float4(convert_int4(total - (high << 31)));
+        const float4 value = MAD(convert_float4(convert_int4(high)), (float4)(0x1p31f), low);
         vstore4(value * scale, lane, values);
         splats[lane] = (long4)(0);
     }
