@@ -13,20 +13,17 @@ import pyopencl as cl
 
 from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.opencl.structs import struct_dtype
+from potr_cl.opencl.structs import bytes_before, struct_dtype
 from potr_cl.raster.macros import totals_limits
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Iteration, Pruned, PruningOptions, ascending, prune
 from potr_cl.stages.pruning.steering import Steering
 
 _SOURCE = "prune/choose_gpu.cl"
-#: Digits of a score in base 256, and the words of the state buffer (cl/prune/choose_gpu.cl): histograms, what is known
-#: after each digit, the counter of those that went.
+#: A score has so many digits, each of so many values; a work-group has a work-item for each value.
 _DIGIT, _DIGITS = 256, 4
-_COUNTER = _DIGITS * 2 * _DIGIT + 4 * _DIGITS
-_STATE = _COUNTER + 1
 
-_REMOVED = struct_dtype(_SOURCE, "Removed")
+_REMOVED, _STATE = struct_dtype(_SOURCE, "Removed"), struct_dtype(_SOURCE, "State")
 
 
 def prune_scene(
@@ -65,7 +62,7 @@ class _Controller(Owner):
             self._smoothed = memory.allocate(4 * self._splats, "the smoothed effects")
             self._keys = memory.allocate(4 * self._splats, "the splats' scores")
             self._removed = memory.upload(np.zeros(self._splats, _REMOVED), "the removed splats")
-            self._state = memory.allocate(4 * _STATE, "the pruning's state")
+            self._state = memory.allocate(_STATE.itemsize, "the pruning's state")
             macros = totals_limits(device)
             self._rank, self._refine, self._mark = (
                 device.kernel(_SOURCE, name, **macros) for name in ("rank", "refine", "mark")
@@ -95,7 +92,7 @@ class _Controller(Owner):
         remaining = options.iterations - iteration
         effect_unit, importance_unit = removal.units
         everywhere = {"splats": self._splats, "totals": removal.totals, "keys": self._keys, "state": self._state}
-        cl.enqueue_fill_buffer(self._device.queue, self._state, np.uint32(0), 0, 4 * _STATE)
+        cl.enqueue_fill_buffer(self._device.queue, self._state, np.uint32(0), 0, _STATE.itemsize)
         self._rank.bind(
             **everywhere,
             alive=removal.marks,
@@ -122,7 +119,8 @@ class _Controller(Owner):
         self._launch(self._mark)
         gone = np.empty(1, np.uint32)
         with self._device.errors("failed while computing"):
-            cl.enqueue_copy(self._device.queue, gone, self._state, src_offset=4 * _COUNTER, is_blocking=True)
+            place = bytes_before(_STATE, "gone")
+            cl.enqueue_copy(self._device.queue, gone, self._state, src_offset=place, is_blocking=True)
         return int(gone[0])
 
     def _launch(self, kernel: Kernel) -> None:
