@@ -177,7 +177,7 @@ class ColourSolver(Owner):
         return _State(error, error + penalty)
 
     def _descend(self, problem: _Problem, state: _State, how: Descent, after_step: Callable[[int], None]) -> int:
-        """Take conjugate-gradient steps from where x was linearised; returns how many made the error smaller."""
+        """Take conjugate-gradient steps from where x was linearised; returns their number."""
         equations = _NormalEquations(problem.colour_map, self._coefficients, self._blocks, how.ridge, at=self._start)
         return self._gradients.descend(
             equations, self.x, self._residual, state.objective, how.steps, how.gain, after_step
