@@ -15,7 +15,7 @@ import pyopencl as cl
 from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.opencl import compiler, quirks
 from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, compiler_fault, compiles_nothing
-from potr_cl.opencl.kernel import Kernel
+from potr_cl.opencl.kernel import Kernel, declared_parameters
 from potr_cl.opencl.loader import new_context
 from potr_cl.opencl.source import kernel_source
 
@@ -43,6 +43,7 @@ class Device:
 
     Raises:
         DeviceError: the device cannot be opened or lacks what the kernels need.
+        FileNotFoundError: a variant is not there.
     """
 
     def __init__(
@@ -65,6 +66,9 @@ class Device:
         self._profiling = profiling
         self._build_options = tuple(build_options)
         self._variants = dict(variants or {})
+        for path in self._variants.values():
+            if not path.is_file():
+                raise FileNotFoundError(f"there is no file '{path}' to read a kernel from")
         self._macros = dict(macros or {})
         self._programs: dict[tuple[str, tuple[tuple[str, str], ...]], cl.Program] = {}
         self._kernels: dict[tuple[Any, ...], Kernel] = {}
@@ -117,7 +121,13 @@ class Device:
         return self._programs[key]
 
     def kernel(self, source: str, name: str, **defines: str | int | float) -> Kernel:
-        """A new kernel object of :meth:`program`; keep it, making one is slow."""
+        """A new kernel object of :meth:`program`; keep it, making one is slow.
+
+        Raises:
+            TypeError: the file declares no such kernel, or one with an argument of an unknown kind.
+            DeviceError: the device's compiler refused it.
+        """
+        declared_parameters(source, name, self._variants)  # before a compiler is asked: its message would mislead
         with self.errors(f"failed to build {source}"):
             handle = cl.Kernel(self.program(source, **defines), name)
         return Kernel(self, handle, source, self._variants)

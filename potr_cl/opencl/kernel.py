@@ -67,7 +67,8 @@ class Kernel:
             The kernel itself, for ``kernel.bind(…).launch(…)``.
 
         Raises:
-            TypeError: a name is missing or not declared, or a value is of another kind than declared.
+            TypeError: a name is missing or not declared, or a value is of another kind than declared, or too large for
+                it.
         """
         if arguments.keys() != self._places.keys():
             missing, unknown = self._places.keys() - arguments.keys(), arguments.keys() - self._places.keys()
@@ -114,8 +115,12 @@ class Kernel:
             fits = isinstance(value, (cl.MemoryObjectHolder, cl.LocalMemory))
         elif parameter.dtype.names:
             fits = getattr(value, "dtype", None) == parameter.dtype
-        else:
+        elif parameter.range is None:
             fits = isinstance(value, (int, float, np.number, np.bool_))
+        else:
+            fits = isinstance(value, (int, np.integer, np.bool_))
+            if fits and not parameter.range[0] <= value <= parameter.range[1]:
+                raise TypeError(f"{self}: {parameter.name} is {parameter.declaration}, which does not hold {value}")
         if not fits:
             raise TypeError(f"{self}: {parameter.name} is {parameter.declaration}, not a {type(value).__name__}")
         return value
@@ -132,11 +137,13 @@ class Parameter:
         name: of the argument.
         declaration: its type as the source has it.
         dtype: of a number or a struct; None for a pointer.
+        range: least and greatest value of an integer; None for anything else.
     """
 
     name: str
     declaration: str
     dtype: np.dtype[Any] | None
+    range: tuple[int, int] | None = None
 
 
 _declared: dict[tuple[Any, ...], tuple[Parameter, ...]] = {}
@@ -172,5 +179,10 @@ def _parameter(source: str, kernel: str, text: str, variants: Mapping[str, Path]
     if "*" in declaration:
         return Parameter(name, declaration, None)
     kind = declaration.removeprefix("const ").strip()
-    dtype = np.dtype(_NUMBERS[kind]) if kind in _NUMBERS else struct_dtype(source, kind, variants)
-    return Parameter(name, declaration, dtype)
+    if kind not in _NUMBERS:
+        return Parameter(name, declaration, struct_dtype(source, kind, variants))
+    dtype = np.dtype(_NUMBERS[kind])
+    if dtype.kind == "f":
+        return Parameter(name, declaration, dtype)
+    limits = np.iinfo(dtype)
+    return Parameter(name, declaration, dtype, (int(limits.min), int(limits.max)))

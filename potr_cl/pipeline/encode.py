@@ -1,4 +1,4 @@
-"""A whole encode: the stages of a preset in their order, each timed, told of, and done again where memory is short."""
+"""A whole encode: :func:`encode` runs the stages in their order, times them, and repeats one if memory is short."""
 
 from __future__ import annotations
 
@@ -32,12 +32,12 @@ class Encoded:
 
     Attributes:
         pieces: the file's bytes, to be written one after another.
-        nbytes: their number.
+        nbytes: the size of the file.
         order: (N,) index in the source scene of each splat of the file.
         pruned: what pruning did; None if it was left out.
         refitted: what the re-fit of the colours did; None if it was left out.
-        device: that the views were looked at on, another than asked for where that had too little memory; None if there
-            was nothing to look at.
+        device: the device that did the work; not the one that was asked for if that had too little memory. None if no
+            stage needed a device.
         seconds: wall time by stage.
     """
 
@@ -75,9 +75,9 @@ def encode(
         cameras: the training views among them decide which splats may go, and how coarse centres may be. None: virtual
             ones are placed if the options ask for anything that looks at views; if not, γ alone decides about centres.
         options: defaults to quality 0.5 of preset best.
-        progress: told how far each stage is.
-        device: to prune on; the best one there is by default. Where its memory is too small, less is kept in it, and
-            if that is not enough a CPU does the work; either is said by a warning.
+        progress: called with a stage's name and the part of it that is done.
+        device: computes; by default the best one there is. If its memory is too small, less is kept in it, and if that
+            is not enough, a CPU does the work. A warning says so.
 
     Raises:
         UsageError: options out of range, or cameras without a training view.
@@ -94,7 +94,7 @@ def encode(
 def cameras_or_virtual(
     scene: Scene, cameras: Sequence[Camera] | None, options: EncodeOptions, watch: Stopwatch
 ) -> Sequence[Camera] | None:
-    """The cameras, or virtual ones where there are none and the options ask for something that looks at views."""
+    """The cameras; or virtual ones, if there are none and a stage needs views."""
     if cameras is None and options.look_at_views(scene):
         watch("place cameras", 0.0)
         cameras = place_cameras(scene)
@@ -103,15 +103,15 @@ def cameras_or_virtual(
 
 
 class Run:
-    """Stages run one after the other: from the beginning, or from any state that one of them has left.
+    """Runs stages one after the other, from the beginning or from any state that one of them has left.
 
     Args:
-        options: of all stages.
-        watch: told how far each stage is, and keeps the time.
-        device: to begin with; the best one there is by default, opened when a stage looks at views.
+        options: the stages, and what they all share.
+        watch: keeps the time and passes the progress on.
+        device: the first to be tried; by default the best one there is, opened when a stage needs it.
 
     Attributes:
-        device: that the last stage which looks at views ran on; None if there was none.
+        device: the one on which the last stage ran that needs views; None if none did.
     """
 
     def __init__(self, options: EncodeOptions, watch: Stopwatch, device: Device | None = None) -> None:
@@ -177,7 +177,7 @@ class Run:
 
 
 class Stopwatch:
-    """Passes progress on and notes how long each stage took; a stage within another counts for itself alone.
+    """Passes progress on, and notes how long each stage took. Time of a stage within another is not counted twice.
 
     Attributes:
         seconds: wall time by stage, in the order in which they began.

@@ -1,4 +1,4 @@
-"""What to do when a scene does not fit a device: keep less on it, then let a CPU do the work."""
+"""If a scene does not fit a device (:func:`on_device`): keep less in its memory, then let a CPU do the work."""
 
 from __future__ import annotations
 
@@ -15,17 +15,19 @@ logger = logging.getLogger("potr_cl")
 
 T = TypeVar("T")
 
-#: After a failure views get the memory that they had divided by this; after another nothing is kept of them.
+#: After the first failure, views get this many times less memory. After the second, none is kept at all.
 _LESS = 8
 
 
 def on_device(device: Device, memory: int | None, work: Callable[[Device, int | None], T]) -> tuple[T, Device]:
-    """Do work that may not fit a device, again with less memory and in the end on a CPU; each is said by a warning.
+    """Do work that may not fit a device. If it does not, repeat it with less memory, and in the end on a CPU.
+
+    A warning says so each time.
 
     Args:
-        device: to begin with.
-        memory: bytes of its memory to keep views in; None: :func:`default_memory`.
-        work: called with the device and the memory to keep views in; called again after a DeviceMemoryError.
+        device: the first to be tried.
+        memory: how many bytes of its memory may be filled with views; None: :func:`default_memory`.
+        work: called with the device and that number of bytes, and again after a DeviceMemoryError.
 
     Returns:
         What ``work`` returned, and the device that it was done on.

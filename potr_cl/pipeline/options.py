@@ -1,4 +1,4 @@
-"""How to encode: every choice that a caller has."""
+"""How to encode: :class:`EncodeOptions` has every choice that a caller has."""
 
 from __future__ import annotations
 
@@ -16,9 +16,6 @@ from potr_cl.stages.stage import Stage, parameters
 
 S = TypeVar("S", bound=Stage)
 
-#: A stage's options by name; True and False switch it on and off.
-StageChanges = Mapping[str, Any] | bool
-
 
 @dataclass(frozen=True)
 class EncodeOptions:
@@ -31,10 +28,10 @@ class EncodeOptions:
         q: quality, 0 to 1; sets every hyper-parameter that no stage replaces.
         preset: how q sets them, and the file's version
             (:meth:`potr_cl.codec.quantize.HyperParameters.from_quality`).
-        stages: in their order, with their options; those of the preset unless others are given.
+        stages: the stages with their options, in their order; by default those of the preset.
         background: R, G, B behind the scene in the views that are looked at.
-        memory: bytes of device memory to keep views in; None: half of the device's, three tenths of a CPU's.
-        threads: for work on the host; the bytes do not depend on it. 0: one a processor.
+        memory: how many bytes of device memory may be filled with views; None: half of a GPU's memory, 0.3 of a CPU's.
+        threads: number of threads for work on the host; the bytes do not depend on it. 0: one for each processor.
         source_bytes: size of the file that the scene came from, for the metadata; None if it came from none.
     """
 
@@ -85,9 +82,11 @@ class EncodeOptions:
         fields = {field.name for field in dataclasses.fields(self)}
         for name, change in changes.items():
             if name in stages:
-                stages[name] = stages[name].changed(**({"on": change} if isinstance(change, bool) else change))
+                stages[name] = stages[name].changed(**_changes_of(name, change))
             elif name in fields:
                 own[name] = change
+            elif having_it := [preset for preset, table in PRESETS.items() if name in {each.name for each in table}]:
+                raise UsageError(f"preset '{self.preset}' has no stage '{name}': it is in {', '.join(having_it)}")
             else:
                 raise UsageError(f"there is no option '{name}': there are {', '.join(sorted(fields | stages.keys()))}")
         return dataclasses.replace(self, **{"stages": tuple(stages.values()), **own})
@@ -145,3 +144,12 @@ class EncodeOptions:
 
         own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "stages"}
         return own | {stage.name: plain(dataclasses.asdict(stage)) for stage in self.stages}
+
+
+def _changes_of(stage: str, change: Any) -> Mapping[str, Any]:
+    """The changes of one stage as options by name."""
+    if isinstance(change, bool):
+        return {"on": change}
+    if not isinstance(change, Mapping):
+        raise UsageError(f"'{stage}' is {change!r}: give a mapping of its options, True or False")
+    return change

@@ -1,4 +1,4 @@
-"""The presets: which stages an encode has, in their order, and with which options. One line a stage."""
+"""The presets (:data:`PRESETS`): which stages an encode has, in which order, and with which options."""
 
 from __future__ import annotations
 
@@ -12,11 +12,26 @@ from potr_cl.stages.stage import Stage
 #: The preset that is taken unless another is asked for.
 DEFAULT: Preset = "best"
 
-#: Stages by preset, in their order. Those that are switched off are there to be asked for.
+#: The stages of each preset, in their order. A stage with ``on=False`` is only done if the user asks for it.
 PRESETS: dict[Preset, tuple[Stage, ...]] = {
-    "best": (Prune(), Compact(on=False), Refit(steps=8), Code()),
-    "fast": (Prune(iterations=16), Compact(on=False), Refit(steps=4), Code(entropy="zstd", zstd_level=9)),
-    "paper": (Prune(), Compact(), Refit(steps=0), Code()),
+    "best": (
+        Prune(),
+        Compact(on=False),
+        Refit(steps=8),
+        Code(),
+    ),
+    "fast": (
+        Prune(iterations=16),
+        Compact(on=False),
+        Refit(steps=4),
+        Code(entropy="zstd", zstd_level=9),
+    ),
+    "paper": (
+        Prune(),
+        Compact(),
+        Refit(steps=0),
+        Code(),
+    ),
 }
 
 #: What each preset is for, in a line.

@@ -1,16 +1,18 @@
-"""Encode to a size or to a quality: the q whose file just meets a target, in about three encodes' time.
+"""Encode to a size or to a quality: :func:`encode_to_target` finds the q whose file just meets a target.
 
-Size and PSNR grow with q, in most scenes at about the same rate, if from another height. So:
+It takes about as long as three encodes. Size and PSNR grow with q. In most scenes they grow at about the same rate, but
+from different starting values. So the search goes like this:
 
-1. A rough encode, with fewer looks at the views, of the q that a typical scene would need tells the height.
-2. The q that follows is encoded in full.
-3. Its splats are kept, and all else is done again as a q close by would have it: re-fit and steps, or without a re-fit
-   the steps alone.
-4. What is still missing, a per cent perhaps, is made up by the steps of colours. Their re-fit has not seen these, so
-   that nothing that it made up for changes.
+1. It takes the q that a typical scene would need, and encodes roughly, with fewer pruning iterations. The result tells
+   by how much this scene differs from a typical one.
+2. It encodes in full with the q that follows from this.
+3. It keeps the splats of that encode, and repeats only the later stages with a q close by: the re-fit and the
+   quantiser, or only the quantiser if there is no re-fit.
+4. What is still missing, perhaps one per cent, is made up by finer or coarser quantiser steps of the colours. The
+   re-fit does not depend on these steps, so it need not be repeated.
 
-Where 2 is too far off for 3, another q is encoded in full. What is found after a re-fit is what a plain encode makes of
-the options that come with it.
+If the result of 2 is too far off for 3, another q is encoded in full. A plain encode with the options that the search
+returns makes the same file, as long as there is a re-fit.
 """
 
 from __future__ import annotations
@@ -34,7 +36,6 @@ from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.code import Code
-from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Progress, Stage, State, parameters
@@ -80,7 +81,7 @@ _ENCODES, _CHEAP_ENCODES = 5, 12
 _TRIES = 3
 #: Bounds of a measured rate, as parts of the typical one, beyond the places that are known.
 _SLOWEST, _FASTEST = 0.25, 3.0
-#: What is only judged is coded so, which costs no time.
+#: The coder for tries of which only the pictures are looked at: the quickest.
 _QUICK_CODER = {"entropy": "zstd", "zstd_level": 1}
 #: Stands for the infinite PSNR of identical pictures, decibels.
 _IDENTICAL = 200.0
@@ -96,7 +97,7 @@ KINDS = {
 
 @dataclass(frozen=True)
 class Target:
-    """What to reach; one of the two.
+    """What to reach: a size or a PSNR.
 
     Attributes:
         max_bytes: the file shall have at most so many bytes, and at least 98 % of them.
@@ -104,7 +105,7 @@ class Target:
             this at least, and at most 0.1 more.
 
     Raises:
-        UsageError: not exactly one, or out of range.
+        UsageError: both or neither are given, or the value is out of range.
     """
 
     max_bytes: int | None = None
@@ -231,14 +232,14 @@ def encode_to_target(
 
 @dataclass(frozen=True)
 class _Candidate:
-    """Something that may be what is searched for.
+    """An encode that may become the result of the search.
 
     Attributes:
-        thinned: the scene before the stages that are done again for another q.
-        reduced: and after them, before it is coded.
-        options: that lead there.
-        value: of the file that they give.
-        encoded: that file, if the value needed all of it.
+        thinned: the state before the stages that are repeated for another q.
+        reduced: the state after them, before it is coded.
+        options: the options that lead there.
+        value: size or PSNR of the file that they give, as :class:`Target` compares it.
+        encoded: that file; None if it was not needed to find the value.
     """
 
     thinned: State
@@ -269,6 +270,9 @@ class _Search:
         self._tell = tell
         self._tries: list[Try] = []
         self._encoded: dict[float, float] = {}  # values of full encodes
+        kinds = [type(stage) for stage in options.stages]
+        first = kinds.index(Refit) if Refit in kinds else kinds.index(Code)
+        self._once, self._repeated = kinds[:first], [kind for kind in kinds[first:] if kind is not Code]
         self._typical = _Typical(target, options, len(scene))
         self._axis = _Axis(options)
         self._scouted: tuple[float, float] | None = None  # where, and the value of a full encode, about
@@ -294,7 +298,9 @@ class _Search:
             if end or target.inside(found.value):
                 break
             q = self._next()
-            if best is None and (left == 1 or q in self._encoded):  # the last hope
+            if best is None and (
+                left == 1 or q in self._encoded
+            ):  # the last try: the q that is most likely to meet the target
                 q = 0.0 if target.max_bytes is not None else 1.0
             if q in self._encoded:
                 break
@@ -340,7 +346,7 @@ class _Search:
         return self._typical.quality(_meet(points, self._target.aim, self._rate()))
 
     def _rate(self) -> float:
-        """How fast the value grows with the typical one, as far as a scout that went far enough away can tell."""
+        """How fast the value grows, compared with a typical scene; 1 if the rough encode was too near to tell."""
         if self._scouted is None:
             return 1.0
         place, value = self._scouted
@@ -352,7 +358,12 @@ class _Search:
         return min(max((self._encoded[other] - value) / way, _SLOWEST), _FASTEST)
 
     def _approach(self, found: _Candidate, last: bool) -> _Candidate:
-        """Come nearer to the aim with what a full encode has kept, unless that is too far, and not the last one."""
+        """Come nearer to the aim by repeating only the later stages of a full encode.
+
+        Args:
+            found: the full encode.
+            last: whether no other full encode may follow. If one may, nothing is done where ``found`` is too far off.
+        """
         target, typical = self._target, self._typical
         reach, rate = (_NEAR, _NEAR_RATE) if self._fitted else (_MOST_STEPS, _STEPS_RATE)
         rate *= self._rate()
@@ -378,9 +389,9 @@ class _Search:
 
     def _again(self, start: _Candidate, q: float) -> _Candidate:
         """The splats of a candidate, re-fitted and quantised as another q would have it."""
-        parameters = start.options.parameters
-        names = ["delta_mse_max", *(["lam", "alpha"] if self._options.compact.on else [])]
-        kept = {name: getattr(parameters, name) for name in names}
+        chosen = start.options.parameters
+        once = [kind for kind in self._once if kind is Prune or self._options.stage(kind).on]
+        kept = {name: getattr(chosen, name) for kind in once for name in parameters(kind)}
         options = self._options.changed(q=q).with_parameters(**kept)
         return self._evaluate("refit", q, start.thinned, self._refit(start.thinned, options), options)
 
@@ -389,7 +400,12 @@ class _Search:
         return self._evaluate("steps", q, start.thinned, start.reduced, _with_steps(start.options, q))
 
     def _with_other_colours(self, start: _Candidate, most: float) -> _Candidate:
-        """A candidate with steps of colours up to so much finer or coarser: the nearest to the aim of a few."""
+        """The best of a few tries with finer or coarser quantiser steps of the colours.
+
+        Args:
+            start: the candidate to begin with.
+            most: the largest change of a step's logarithm.
+        """
         points, best = {0.0: start.value}, start
         for _ in range(_TRIES):
             finer = _meet(points, self._target.aim, self._colour_rate)
@@ -406,7 +422,7 @@ class _Search:
         return best
 
     def _colours_suffice(self, value: float) -> bool:
-        """Whether other steps of colours will probably do."""
+        """Whether other quantiser steps of the colours will probably reach the target."""
         given = self._options.code.sf_dc is not None and self._options.code.sf_sh is not None
         low, high = self._target.window
         spare = (high - low) / 4
@@ -421,16 +437,16 @@ class _Search:
 
     @property
     def _fitted(self) -> bool:
-        """Whether there is a re-fit, which is then done again for another q."""
+        """Whether there is a re-fit. If so, it is repeated for another q."""
         return self._options.stage(Refit).looks_at(self._scene)
 
     def _thin(self, options: EncodeOptions) -> State:
-        """The stages before those that are done again for another q."""
-        return self._run(State.of(self._scene, self._views), options, [Prune, Compact])
+        """The state after the stages that are not repeated for another q."""
+        return self._run(State.of(self._scene, self._views), options, self._once)
 
     def _refit(self, thinned: State, options: EncodeOptions) -> State:
-        """The stages that are done again for another q, but for the coding."""
-        return self._run(thinned, options, [Refit])
+        """The state after the stages that are repeated for another q, before the coding."""
+        return self._run(thinned, options, self._repeated)
 
     def _run(self, state: State, options: EncodeOptions, only: list[type[Stage]]) -> State:
         run = Run(options, self._watch, self._device)
@@ -476,7 +492,7 @@ class _Search:
 
 
 class _Typical:
-    """What a target's value is in a typical scene, by quality."""
+    """Size or PSNR of a typical scene for each q, and the q for each of these."""
 
     def __init__(self, target: Target, options: EncodeOptions, splats: int) -> None:
         nbytes, psnr = _TYPICAL[options.preset]
@@ -523,12 +539,11 @@ def _with_colour_steps(options: EncodeOptions, given: EncodeOptions, finer: floa
 
 
 def _meet(points: dict[float, float], aim: float, rate: float) -> float:
-    """Where a growing function of which some points are known probably meets the aim.
+    """Where a growing function, known at some points, probably reaches the aim.
 
     Args:
-        points: at least one, values by places.
-        rate: at which the function typically grows; it counts while the aim does not lie between known values, and
-            those that there are leave it open.
+        points: known values by place; at least one.
+        rate: how fast the function typically grows. It is used if the aim does not lie between known values.
     """
     places = sorted(points)
     rising = [(b - a, a, b) for a, b in itertools.pairwise(places) if points[a] < aim <= points[b]]

@@ -16,8 +16,8 @@ class Code(Stage):
     """Octree, quantised streams and entropy coding; the last stage, which is always done.
 
     Attributes:
-        entropy, zstd_level: of the entropy stage (:class:`potr_cl.codec.container.EntropyCoder`).
-        gamma, beta, sf_dc, sf_sh, sf_opacity, sf_rotation, sf_scale: replace q's
+        entropy, zstd_level: choose the entropy coder (:class:`potr_cl.codec.container.EntropyCoder`).
+        gamma, beta, sf_dc, sf_sh, sf_opacity, sf_rotation, sf_scale: replace the values that q gives
             (:class:`potr_cl.codec.quantize.HyperParameters`).
 
     Raises:
@@ -93,18 +93,18 @@ class Code(Stage):
 
     @property
     def coder(self) -> EntropyCoder:
-        """The entropy stage."""
+        """The entropy coder."""
         return EntropyCoder(self.entropy, self.zstd_level)
 
     @classmethod
     def from_flags(cls, given: dict[str, Any]) -> dict[str, Any]:
-        # A level alone asks for zstd, and a coder alone for its own level rather than the preset's.
+        # --zstd-level alone means that coder; --entropy alone means zstd's usual level, not the preset's.
         if given.keys() & {"entropy", "zstd_level"}:
             return {"entropy": "zstd", "zstd_level": EntropyCoder.level, **given}
         return given
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Code; ``learnt`` gets a :class:`potr_cl.codec.encoder.Coded`."""
+        """Make the file's bytes, and leave a :class:`potr_cl.codec.encoder.Coded` in ``learnt``."""
         geometry = state.geometry
         if geometry is not None and geometry.asked != bench.parameters:
             geometry = None

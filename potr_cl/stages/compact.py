@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from typing import get_args
 
 import numpy as np
@@ -22,7 +22,7 @@ from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, optio
 
 @dataclass(frozen=True)
 class Compact(Stage):
-    """Make the SH coefficients sparse; looks at views.
+    """Make the SH coefficients sparse, so that the colours change little in the training views.
 
     Attributes:
         at: the part of the pruning iterations after which it is done, so that later ones see its effect.
@@ -79,10 +79,11 @@ class Compact(Stage):
         return self.on and scene.sh_degree > 0
 
     def interludes(self, iterations: int) -> Sequence[Interlude]:
-        return [Interlude(max(math.ceil(self.at * iterations), 1), self, always=True)]
+        after = max(math.ceil(self.at * iterations), 1)
+        return [Interlude(after, self, always=True, afresh=True)]
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Give what is left of the uncompressed scene sparse colours."""
+        """Make the colours of the state's scene sparse, unless that has been done while splats were removed."""
         if self.name in state.learnt or state.scene.sh_degree == 0:
             return state
         options = CompactionOptions(
@@ -96,18 +97,15 @@ class Compact(Stage):
         with _effects(state, bench) as effects:
             bench.progress("compact", 0.0)
             weights = ViewWeights.from_importances(len(state.scene), effects.view_importances())
-            scene = state.scene
-            if not state.original_colours:
-                scene = replace(scene, sh=state.source.sh[state.survivors])
             places = standpoints(state.views, state.source.means)
-            sh = Compactor(bench.opened).compact(scene, places, weights, options).sh
+            sh = Compactor(bench.opened).compact(state.scene, places, weights, options).sh
             bench.progress("compact", 1.0)
         return state.recoloured(sh).having_learnt(self.name, True)
 
 
 @contextmanager
 def _effects(state: State, bench: Workbench) -> Iterator[Measured]:
-    """The importances: those at hand while splats are being removed, else measured for this."""
+    """Importances view by view: those that pruning has measured, or, without pruning, measured for this."""
     if state.effects is not None:
         yield state.effects
         return

@@ -13,14 +13,14 @@ from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
+from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 
 @dataclass(frozen=True)
 class Prune(Stage):
-    """Remove splats, fewer at a time in many iterations; look at views.
+    """Remove splats in many iterations, judging by the training views.
 
-    What other stages want done between iterations (:meth:`potr_cl.stages.stage.Stage.interludes`) is done here.
+    Between iterations it does what other stages want done then (:meth:`potr_cl.stages.stage.Stage.interludes`).
 
     Attributes:
         keep, count: part or number of the splats to keep, exactly, instead of ``delta_mse_max``.
@@ -107,7 +107,7 @@ class Prune(Stage):
         return PruningOptions(delta_mse_max, self.iterations, a=self.mapping_a, count=count, decay=self.decay)
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Remove splats; ``learnt`` gets a :class:`potr_cl.stages.pruning.schedule.Pruned`."""
+        """Remove splats, and leave a :class:`potr_cl.stages.pruning.schedule.Pruned` in ``learnt``."""
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene))
         bench.progress("prepare views", 0.0)
@@ -116,7 +116,7 @@ class Prune(Stage):
 
             def after_iteration(iteration: int) -> None:
                 while waiting and iteration + 1 >= waiting[0].after:
-                    course.visit(waiting.pop(0).stage, np.flatnonzero(removal.alive), bench)
+                    course.visit(waiting.pop(0), np.flatnonzero(removal.alive), bench)
                     removal.replace_sh(course.sh)
 
             bench.progress("prune", 0.0)
@@ -129,7 +129,7 @@ class Prune(Stage):
             bench.progress("prune", 1.0)
             for interlude in waiting:
                 if interlude.always:
-                    course.visit(interlude.stage, pruned.survivors, bench)
+                    course.visit(interlude, pruned.survivors, bench)
             return course.left(pruned.survivors).having_learnt(self.name, pruned)
 
 
@@ -137,26 +137,29 @@ class _Course:
     """The scene while splats are being removed.
 
     Args:
-        state: before.
-        removal: measures, and knows what is left.
+        state: the state before the first iteration.
+        removal: measures effects, and knows which splats are left.
 
     Attributes:
-        sh: (N, M, 3) the colours of all splats of the state's scene, as far as they have changed.
+        sh: (N, M, 3) the colours that all splats of the state's scene have by now.
     """
 
     def __init__(self, state: State, removal: RemovalSweep) -> None:
         self._state, self._removal = state, removal
         self.sh = state.scene.sh
 
-    def left(self, splats: NDArray[np.int64]) -> State:
-        """The state in which only these splats are left."""
-        scene = replace(self._state.scene, sh=self.sh).subset(splats)
-        return replace(self._state, scene=scene, survivors=self._state.survivors[splats])
+    def left(self, splats: NDArray[np.int64], afresh: bool = False) -> State:
+        """The state in which only these splats are left, with the colours of the beginning or with those of now."""
+        scene = self._state.scene if afresh else replace(self._state.scene, sh=self.sh)
+        return replace(self._state, scene=scene.subset(splats), survivors=self._state.survivors[splats])
 
-    def visit(self, stage: Stage, splats: NDArray[np.int64], bench: Workbench) -> None:
+    def visit(self, interlude: Interlude, splats: NDArray[np.int64], bench: Workbench) -> None:
         """Have another stage work on these splats, and go on with the colours that it gives them."""
-        then = stage.run(replace(self.left(splats), effects=Measured(self._removal, splats)), bench)
-        if self.sh is self._state.scene.sh:  # not ours to change
+        given = replace(self.left(splats, interlude.afresh), effects=Measured(self._removal, splats))
+        then = interlude.stage.run(given, bench)
+        if then is given:
+            return
+        if self.sh is self._state.scene.sh:  # the array of the state before, which must not change
             self.sh = self.sh.copy()
         self.sh[splats] = then.scene.sh
-        self._state = replace(self._state, learnt=then.learnt, original_colours=then.original_colours)
+        self._state = replace(self._state, learnt=then.learnt)

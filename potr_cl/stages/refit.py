@@ -21,7 +21,7 @@ from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, optio
 def _steps(text: str) -> int | None:
     if text in ("auto", "off"):
         return None if text == "auto" else 0
-    # A number of thousands of digits is no number of steps, and Python refuses to make one of it.
+    # Python refuses to make a number from thousands of digits; so many steps are not meant anyway.
     if not text.isdecimal() or len(text) > 9:
         raise UsageError(f"--refit is '{text[:40]}': give a number of steps, auto, or off")
     return int(text)
@@ -29,15 +29,16 @@ def _steps(text: str) -> int | None:
 
 @dataclass(frozen=True)
 class Refit(Stage):
-    """Re-fit the colours on the geometry and opacities that a decoder will see; looks at views.
+    """Re-fit the colours to the training views, on the geometry and opacities that a decoder will see.
 
     Attributes:
-        steps: conjugate-gradient steps at the most; 0 leaves it out.
-        drop: replaces q's.
-        at, at_steps: parts of the pruning iterations after which colours are re-fitted too, so that later ones see
-            colours that have made up for what went, and the steps of each.
-        ground_truth: folder of the views' photographs, named after them: what the pictures come near to, instead of
-            the uncompressed scene's.
+        steps: the most conjugate-gradient steps; with 0 the re-fit is left out.
+        drop: replaces the value that q gives.
+        at: parts of the pruning iterations after which colours are re-fitted too, so that later iterations see colours
+            that make up for the splats that went.
+        at_steps: steps of each of these.
+        ground_truth: folder of the views' photographs, named after the views. The colours are then fitted to the
+            photographs instead of the uncompressed scene's pictures.
 
     Raises:
         UsageError: a value is out of range.
@@ -104,7 +105,7 @@ class Refit(Stage):
         return [Interlude(after, RefitOnTheWay(steps=self.at_steps)) for after in times]
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Re-fit; ``learnt`` gets a :class:`potr_cl.stages.refitting.refit.Refitted`."""
+        """Re-fit the colours, and leave a :class:`potr_cl.stages.refitting.refit.Refitted` in ``learnt``."""
         bench.progress("refit", 0.0)
         parameters = bench.parameters
         geometry = state.geometry
@@ -138,7 +139,7 @@ class Refit(Stage):
 
 @dataclass(frozen=True)
 class RefitOnTheWay(Stage):
-    """A short re-fit while splats are being removed, of the geometry as it is; gives up no coefficient."""
+    """A short re-fit while splats are being removed: on the exact geometry, and without giving up coefficients."""
 
     name = "refit on the way"
     title = ""

@@ -44,10 +44,10 @@ class State:
         scene: what is left of it.
         survivors: (n,) int64, ascending: the number in ``source`` of each splat of ``scene``.
         views: the training views; empty if there are no cameras.
-        geometry: of ``scene`` as a decoder will see it, once a stage has quantised it.
-        original_colours: whether ``scene`` has the colours that its splats have in ``source``.
-        effects: importances view by view while splats are being removed, else None.
-        learnt: what each stage has to tell, by its name.
+        geometry: of ``scene`` as a decoder will see it, once a stage has quantised it. A stage that then changes
+            anything but colours makes it None again.
+        effects: importances of the splats in each view, for stages that work while splats are being removed; else None.
+        learnt: what each stage has found out, by the stage's name.
     """
 
     source: Scene
@@ -55,37 +55,36 @@ class State:
     survivors: NDArray[np.int64]
     views: tuple[Camera, ...]
     geometry: Geometry | None = None
-    original_colours: bool = True
     effects: Measured | None = None
     learnt: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
     def of(scene: Scene, views: Sequence[Camera] = ()) -> State:
-        """Where every encode begins."""
+        """The state before the first stage."""
         return State(scene, scene, np.arange(len(scene)), tuple(views))
 
     def recoloured(self, sh: NDArray[np.float32]) -> State:
-        """The same with other SH coefficients, (n, M, 3)."""
-        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, sh=sh), original_colours=False)
+        """This state with other SH coefficients, (n, M, 3)."""
+        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, sh=sh))
 
     def having_learnt(self, name: str, result: Any) -> State:
-        """The same, with what a stage has to tell."""
+        """This state with what a stage has found out."""
         return dataclasses.replace(self, learnt={**self.learnt, name: result})
 
 
 @dataclass(frozen=True)
 class Workbench:
-    """What stages work with. Nothing of it says what is done to the scene but the parameters.
+    """What a stage works with. Only the hyper-parameters say what is done to the scene.
 
     Attributes:
         parameters: the hyper-parameters that q and the options give.
-        device: to compute on; None where no stage looks at views.
-        memory: bytes of device memory to keep views in; None: each stage's default.
+        device: the stage computes on it; None if the stage needs no views.
+        memory: how many bytes of device memory may be filled with views; None: the stage's own default.
         background: R, G, B behind the scene.
-        threads: for work on the host; results do not depend on it. 0: one a processor.
+        threads: number of threads for work on the host; results do not depend on it. 0: one for each processor.
         interludes: what other stages want done while splats are being removed.
-        metadata: makes the file's metadata of the last state.
-        progress: told how far things are.
+        metadata: makes the file's metadata from the last state.
+        progress: called to say how far the work is.
     """
 
     parameters: HyperParameters
@@ -109,10 +108,10 @@ class Stage(ABC):
     """One step from a scene to a file; its fields are its options.
 
     Attributes:
-        on: whether it is done at all.
-        name: as options, results and flags call it.
-        title: of its flags in the help.
-        needs_views: whether it computes on a device, from views; without any it is left out.
+        on: whether the stage is done at all.
+        name: what options and results call it.
+        title: heads its options in the help of the command line.
+        needs_views: whether it computes on a device, from views. Such a stage is left out if there are no views.
     """
 
     name: ClassVar[str]
@@ -123,15 +122,19 @@ class Stage(ABC):
 
     @abstractmethod
     def run(self, state: State, bench: Workbench) -> State:
-        """Do it.
+        """Do the stage's work.
 
         Args:
-            state: not changed, so that the stage may be run from it again with other options.
+            state: the result of the stage before. It is not changed, so that the stage can be run from it again with
+                other options.
             bench: what to work with.
+
+        Returns:
+            The state for the next stage.
 
         Raises:
             DeviceMemoryError: the device has too little memory; the stage is run again with less, or on a CPU.
-            PotrError: it cannot be done.
+            PotrError: the work cannot be done.
         """
 
     @property
@@ -161,7 +164,7 @@ class Stage(ABC):
 
     @classmethod
     def from_flags(cls, given: dict[str, Any]) -> dict[str, Any]:
-        """Options from what a user typed, by field; for stages in which one flag means more than one field."""
+        """Options by field, from those that a user typed; overridden by stages in which a flag sets several fields."""
         return given
 
 
@@ -170,14 +173,17 @@ class Interlude:
     """Something to be done while splats are being removed, so that later iterations see its effect.
 
     Attributes:
-        after: how many iterations.
-        stage: that does it, on what is left then.
-        always: whether it is done too if the iterations end before; then at their end.
+        after: after how many iterations.
+        stage: the stage that does it, on the splats that are left then.
+        always: whether it is done in any case: at the end, if the iterations end before its time.
+        afresh: whether it gets the colours that the splats had before the first iteration, instead of those that other
+            interludes have given them since.
     """
 
     after: int
     stage: Stage
     always: bool = False
+    afresh: bool = False
 
 
 @dataclass(frozen=True)
@@ -185,14 +191,15 @@ class Flag:
     """How a field of a stage is given on the command line.
 
     Attributes:
-        flag: as typed; for switches of the field ``on`` as ``--no-x`` or ``--x`` (which is also ``--no-x`` then).
-        help: says what the value means; the default is added.
+        flag: as a user types it. For the field ``on``: ``--no-x`` switches the stage off, ``--x`` switches it on (then
+            ``--no-x`` is understood too).
+        help: says what the value means; the default is added to it.
         metavar: stands for the value in the help.
-        kind: makes a value of the text.
-        choices: that there are.
-        group: flags of one group exclude each other.
-        many: whether it takes several values.
-        default: the help says of the default; None: the field's own value.
+        kind: makes the value from the text that was typed.
+        choices: the values that are allowed; none: any.
+        group: of several flags with the same group, only one may be given.
+        many: whether several values may follow the flag.
+        default: what the help calls the default; None: the field's own value.
     """
 
     flag: str
@@ -209,10 +216,10 @@ def option(default: T, flag: Flag | None = None, parameter: bool = False) -> T:
     """A field of a stage.
 
     Args:
-        default: its value where a preset has no other.
-        flag: how it is given on the command line; None: only from Python.
-        parameter: whether it replaces the hyper-parameter of its name that q sets
-            (:class:`potr_cl.codec.quantize.HyperParameters`) unless it is None.
+        default: its value unless a preset has another one.
+        flag: how it is given on the command line; None: it can only be given from Python.
+        parameter: whether a value other than None replaces the hyper-parameter of the same name, which q sets
+            otherwise (:class:`potr_cl.codec.quantize.HyperParameters`).
     """
     made: T = field(default=default, metadata={"flag": flag, "parameter": parameter})
     return made

@@ -50,6 +50,12 @@ def test_values_of_another_kind_are_refused(device):
         kernel.set(rows=3)
     with Memory(device) as memory, pytest.raises(TypeError, match=r"first is uint, not a Buffer"):
         kernel.set(first=memory.allocate(16, "something"))
+    with pytest.raises(TypeError, match=r"first is uint, not a float"):
+        kernel.set(first=1.0)
+    with pytest.raises(TypeError, match=r"first is uint, which does not hold -1"):
+        kernel.set(first=-1)
+    with pytest.raises(TypeError, match=r"first is uint, which does not hold 4294967296"):
+        kernel.set(first=1 << 32)
     composite = device.kernel("raster/sort_cpu.cl", "sort_tiles")
     with pytest.raises(TypeError, match=r"capacity is uint, not a str"):
         composite.set(capacity="3")
@@ -63,7 +69,9 @@ def test_a_struct_must_be_the_one_declared(device):
         fill.set(view=np.zeros((), np.float32))
 
 
-def test_a_kernel_that_is_not_declared():
+def test_a_kernel_that_is_not_declared(device):
+    with pytest.raises(TypeError, match=r"raster/columns\.cl declares no kernel 'rows'"):
+        device.kernel("raster/columns.cl", "rows")
     with pytest.raises(TypeError, match=r"raster/columns\.cl declares no kernel 'rows'"):
         declared_parameters("raster/columns.cl", "rows")
 

@@ -51,6 +51,7 @@ def test_changes_reach_the_stage_that_they_name():
         ({"prune": {"itertions": 3}}, "stage 'prune' has no option 'itertions'"),
         ({"prune": {"keep": 2.0}}, "must be above 0 and at most 1"),
         ({"code": False}, "stage 'code' makes the file"),
+        ({"prune": 3}, "'prune' is 3: give a mapping of its options, True or False"),
         ({"code": {"entropy": "gzip"}}, "'gzip' is unknown"),
     ],
 )
@@ -59,6 +60,12 @@ def test_what_there_is_not_is_named(changes, says):
         EncodeOptions.for_preset("best", **changes)
     with pytest.raises(UsageError, match="preset 'worst' is unknown: choose one of best, fast, paper"):
         EncodeOptions.for_preset("worst")
+
+
+def test_a_stage_that_only_other_presets_have(monkeypatch):
+    monkeypatch.setitem(PRESETS, "fast", PRESETS["fast"][1:])
+    with pytest.raises(UsageError, match="preset 'fast' has no stage 'prune': it is in best, paper"):
+        EncodeOptions.for_preset("fast", prune={"iterations": 7})
 
 
 @pytest.mark.parametrize("refit", [False, {"on": False}, {"steps": 0}])

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import math
+from dataclasses import dataclass
 
 import numpy as np
 import pytest
@@ -32,6 +33,7 @@ from potr_cl.pipeline.search import (
 from potr_cl.quality.compare import compare, mean_view
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from potr_cl.stages.stage import Stage
 from tests.devices import skip_without_cpu
 
 FEW = EncodeOptions.for_preset("paper", prune={"iterations": 6})
@@ -68,6 +70,30 @@ def test_a_size_is_filled_and_not_passed(device, lego_excerpt, cameras, size, pr
     assert len(decode(file)) == len(found.encoded.order) == found.encoded.pruned.kept
     assert len(lines) == len(found.tries)
     assert sum(step.kind == "encode" for step in found.tries) <= 4
+
+
+@dataclass(frozen=True)
+class HalfOpaque(Stage):
+    """Lowers all logits of opacities."""
+
+    name = "half opaque"
+    title = ""
+    needs_views = False
+
+    def run(self, state, bench):
+        scene = dataclasses.replace(state.scene, opacity_logits=state.scene.opacity_logits - np.float32(1))
+        return dataclasses.replace(state, scene=scene, geometry=None)
+
+
+@pytest.mark.parametrize("place", [0, -2, -1])
+def test_a_stage_of_ones_own_takes_part_in_a_search_as_in_an_encode(device, lego_excerpt, cameras, place):
+    stages = list(EncodeOptions.for_preset("best", prune={"iterations": 4}, refit={"steps": 3}).stages)
+    stages.insert(place, HalfOpaque())
+    options = EncodeOptions(stages=tuple(stages))
+    found = encode_to_target(lego_excerpt, cameras, Target(max_bytes=24_000), options, device=device)
+    logits = decode(b"".join(found.encoded.pieces)).opacity_logits
+    changes = logits - lego_excerpt.opacity_logits[found.encoded.order]
+    assert np.median(changes) == pytest.approx(-1, abs=0.1)  # less than the quantiser's steps
 
 
 @pytest.mark.parametrize("target", [Target(max_bytes=24_000), Target(min_psnr=46)])

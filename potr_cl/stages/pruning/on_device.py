@@ -1,7 +1,7 @@
-"""The pruning controller where the effects are: a GPU decides itself what goes, and what is to be measured again.
+"""The pruning controller on a GPU, which decides itself which splats go and which tiles are measured again.
 
-Fetching the effects of every splat and sending back a decision would take a GPU longer than measuring them. The rules
-are those of :mod:`potr_cl.stages.pruning.schedule`, in float32; one difference: splats of the same score go together.
+To fetch the effects of all splats and to send back a decision would take longer than to measure them. The rules are
+those of :mod:`potr_cl.stages.pruning.schedule`, in float32, with one difference: splats of the same score go together.
 """
 
 from __future__ import annotations
@@ -32,7 +32,7 @@ def prune_scene(
     progress: Callable[[int, int], None] | None = None,
     after_iteration: Callable[[int], None] | None = None,
 ) -> Pruned:
-    """Run the schedule, on the device if that can decide for itself.
+    """Run the schedule: on the device if it can decide for itself, else on the host.
 
     Args:
         removal: measures and removes.
@@ -87,7 +87,7 @@ class _Controller(Owner):
         return self._pruned(done)
 
     def _choose(self, iteration: int, weight: float) -> int:
-        """Mark the splats that go in an iteration; how many."""
+        """Mark the splats that go in an iteration, and return their number."""
         removal, options = self._removal, self._options
         remaining = options.iterations - iteration
         effect_unit, importance_unit = removal.units
@@ -145,7 +145,7 @@ class _Controller(Owner):
         return Pruned(order, len(kept), iteration, done, self._history(removed[gone], iteration[gone]))
 
     def _history(self, removed: np.ndarray, iteration: np.ndarray) -> tuple[Iteration, ...]:
-        """Of the splats that went, in their order."""
+        """What is known of each iteration in which splats went, in order."""
         starts = np.flatnonzero(np.diff(iteration, prepend=-1))
         if not len(starts):
             return ()
