@@ -62,7 +62,7 @@ def _prune(args: argparse.Namespace) -> None:
 def _options(args: argparse.Namespace, kind: type[Stage]) -> EncodeOptions:
     """Those of ``encode`` with one stage alone."""
     options = EncodeOptions(q=args.quality, background=parse_colour(args.background), memory=as_bytes(args.memory))
-    options = options.changed(**{stage.name: isinstance(stage, kind) for stage in options.stages})
+    options = options.changed(**{stage.name: isinstance(stage, kind) for stage in options.stages if stage.needs_views})
     options = options.changed(**stage_choices(args))
     _ = options.parameters  # a wrong option is told before a gigabyte is read
     return options

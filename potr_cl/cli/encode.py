@@ -54,7 +54,7 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
 
 def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
     """Whether anything may be rendered: to encode, or to judge what was encoded."""
-    wanted = any(stage.on and stage.needs_views for stage in options.stages)
+    wanted = any(stage.asked_for and stage.needs_views for stage in options.stages)
     return wanted or not (args.cameras is None or args.no_quality)
 
 
@@ -68,7 +68,7 @@ def _encode(args: argparse.Namespace) -> None:
     began = time.perf_counter()
     options, target = _options(args), _target(args)
     refit = options.stage(Refit)
-    if refit.ground_truth is not None and not (args.cameras and refit.on and refit.steps):
+    if refit.ground_truth is not None and not (args.cameras and refit.asked_for):
         raise UsageError("--photos needs --cameras, the views that the photographs show, and a re-fit")
     if args.report is None and args.report_view is not None:
         raise UsageError("--report-view needs --report, the page that shows it")

@@ -6,16 +6,13 @@ import re
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import Any, Protocol
 
 import numpy as np
 import pyopencl as cl
 
 from potr_cl.opencl.source import kernel_source
 from potr_cl.opencl.structs import struct_dtype
-
-if TYPE_CHECKING:
-    from potr_cl.opencl.device import Device
 
 _NUMBERS: dict[str, Any] = {
     "float": np.float32,
@@ -46,7 +43,7 @@ class Kernel:
     """
 
     def __init__(
-        self, device: Device, handle: cl.Kernel, source: str, variants: Mapping[str, Path] | None = None
+        self, device: Launches, handle: cl.Kernel, source: str, variants: Mapping[str, Path] | None = None
     ) -> None:
         self.handle = handle
         self.name: str = handle.function_name
@@ -127,6 +124,19 @@ class Kernel:
 
     def __str__(self) -> str:
         return f"kernel {self.name}"
+
+
+class Launches(Protocol):
+    """What a kernel needs of the device that it was built for, :class:`potr_cl.opencl.device.Device`."""
+
+    def launch(
+        self, kernel: Kernel, items: tuple[int, ...], group: tuple[int, ...] | None, queue: cl.CommandQueue | None
+    ) -> None:
+        """Enqueue the kernel with the arguments it has.
+
+        Raises:
+            DeviceError: the device refused it.
+        """
 
 
 @dataclass(frozen=True)

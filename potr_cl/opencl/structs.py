@@ -36,6 +36,12 @@ def struct_dtype(source: str, name: str, variants: Mapping[str, Path] | None = N
     return _dtype(_expanded(source, tuple((variants or {}).items())), source, name)
 
 
+def bytes_before(struct: np.dtype[Any], member: str) -> int:
+    """Where a member begins, in bytes from the struct's beginning."""
+    assert struct.fields is not None
+    return int(struct.fields[member][1])
+
+
 @cache
 def _dtype(text: str, source: str, name: str) -> np.dtype[Any]:
     found = re.search(r"typedef struct \{([^}]*)\} " + re.escape(name) + ";", text)

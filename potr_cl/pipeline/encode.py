@@ -125,7 +125,7 @@ class Run:
             As :func:`encode`.
         """
         for stage in self._options.stages:
-            if only is None or isinstance(stage, tuple(only)):
+            if only is None or type(stage) in only:
                 state = self._one(stage, state)
         return state
 
@@ -140,7 +140,7 @@ class Run:
             metadata=lambda last: _metadata(last, options),
             progress=self._watch,
         )
-        if not stage.on:
+        if not stage.asked_for:
             return state
         if not stage.needs_views:
             return stage.run(state, bench)
@@ -159,8 +159,8 @@ class Run:
         iterations: int | None = getattr(stage, "iterations", None)
         if iterations is None:
             return ()
-        others = [other for other in self._options.stages if other.looks_at(state.source)]
-        return tuple(interlude for other in others for interlude in other.interludes(iterations))
+        wanted = [each for other in self._options.stages if other.on for each in other.interludes(iterations)]
+        return tuple(interlude for interlude in wanted if interlude.stage.looks_at(state.source))
 
     def finished(self, state: State) -> Encoded:
         """What the stages have made, as the file that it is."""

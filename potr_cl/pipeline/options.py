@@ -53,17 +53,18 @@ class EncodeOptions:
     def for_preset(preset: Preset = DEFAULT, **changes: Any) -> EncodeOptions:
         """All that a preset means, with changes as :meth:`changed` takes them.
 
-        Where the changes leave the re-fit out and say nothing of the compaction, colours are compacted.
+        Where the changes leave out the preset's re-fit and say nothing of the compaction, colours are compacted; where
+        they ask for a re-fit that the preset does not have, colours are not.
 
         Raises:
             UsageError: there is no such preset or option, or a value is out of range.
         """
-        options = EncodeOptions(preset=preset).changed(**changes)
-        refit = options.refit
+        usual = EncodeOptions(preset=preset)
+        options = usual.changed(**changes)
         told = changes.get("compact")
         silent = told is None or (isinstance(told, Mapping) and "on" not in told)
-        if silent and not (refit.on and refit.steps):
-            options = options.changed(compact=True)
+        if silent and options.refit.asked_for != usual.refit.asked_for:
+            options = options.changed(compact=not options.refit.asked_for)
         return options
 
     def changed(self, **changes: Any) -> EncodeOptions:

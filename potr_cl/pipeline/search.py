@@ -18,21 +18,18 @@ returns makes the same file, as long as there is a re-fit.
 from __future__ import annotations
 
 import dataclasses
-import itertools
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from potr_cl.codec.decoder import decode
-from potr_cl.codec.quantize import Preset
 from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, cameras_or_virtual
 from potr_cl.pipeline.fallback import on_device
+from potr_cl.pipeline.growth import FASTEST, SLOWEST, FinenessAxis, Typical, meet, with_colour_steps, with_steps
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.code import Code
@@ -40,23 +37,6 @@ from potr_cl.stages.prune import Prune
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Progress, Stage, State, parameters
 
-#: Qualities, and what they give in a typical scene: bytes a splat of the source, and PSNR in decibels. Means of two
-#: scenes (docs/benchmarks/rate_distortion.md), less sure below 0.1. Above all the rate of growth matters.
-_TYPICAL_Q = (0, 0.02, 0.05, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7, 0.8, 0.9, 1)
-_TYPICAL: dict[Preset, tuple[tuple[float, ...], tuple[float, ...]]] = {
-    "paper": (
-        (0.77, 2.01, 2.97, 4.1, 6.2, 8.3, 10.1, 11.9, 13.7, 15.3, 17.0, 18.7, 20.4),
-        (9.7, 29.7, 34.2, 35.7, 38.2, 39.7, 41.2, 42.8, 44.3, 45.6, 46.6, 47.9, 48.6),
-    ),
-    "fast": (
-        (2.23, 2.34, 2.52, 2.83, 3.58, 4.52, 5.56, 6.76, 8.21, 9.82, 11.63, 13.81, 16.19),
-        (35.3, 35.7, 36.2, 37.2, 38.8, 40.5, 42.3, 44.0, 45.7, 47.5, 49.4, 51.2, 53.0),
-    ),
-    "best": (
-        (1.91, 2.00, 2.15, 2.42, 3.08, 3.90, 4.83, 5.90, 7.21, 8.66, 10.26, 12.19, 14.28),
-        (35.7, 36.1, 36.7, 37.6, 39.3, 41.0, 42.7, 44.5, 46.3, 48.0, 49.7, 51.5, 53.3),
-    ),
-}
 #: A scout's pruning iterations and steps of the re-fit, and by how much what it finds is smaller than a full encode's:
 #: the logarithm of bytes, and decibels; about, and where there is a re-fit.
 _SCOUT_ITERATIONS, _SCOUT_STEPS = 12, 2
@@ -65,8 +45,9 @@ _SCOUT_MISSES = (-0.02, -0.55)
 _SCOUT_END = 0.9
 #: The value's way from a scout, in windows, from which on it tells how fast the value grows.
 _FAR = 20
-#: By how much the fineness (:class:`_Axis`) may differ from that of the q that the splats are of: with a re-fit, which
-#: does what else there is to do again (a tenth costs 0.06 dB), and without, where steps are all that changes.
+#: By how much the fineness (:class:`~potr_cl.pipeline.growth.FinenessAxis`) may differ from that of the q that the
+#: splats are of: with a re-fit, which does what else there is to do again (a tenth costs 0.06 dB), and without, where
+#: steps are all that changes.
 _NEAR, _MOST_STEPS = 0.1, math.log(4 / 3)
 #: How fast the value then grows, as a part of how it grows with q.
 _NEAR_RATE, _STEPS_RATE = 0.7, 0.5
@@ -79,8 +60,6 @@ _COLOUR_RATES = (0.12, 0.45)
 _ENCODES, _CHEAP_ENCODES = 5, 12
 #: Tries of one kind with what a full encode has kept.
 _TRIES = 3
-#: Bounds of a measured rate, as parts of the typical one, beyond the places that are known.
-_SLOWEST, _FASTEST = 0.25, 3.0
 #: The coder for tries of which only the pictures are looked at: the quickest.
 _QUICK_CODER = {"entropy": "zstd", "zstd_level": 1}
 #: Stands for the infinite PSNR of identical pictures, decibels.
@@ -273,8 +252,9 @@ class _Search:
         kinds = [type(stage) for stage in options.stages]
         first = kinds.index(Refit) if Refit in kinds else kinds.index(Code)
         self._once, self._repeated = kinds[:first], [kind for kind in kinds[first:] if kind is not Code]
-        self._typical = _Typical(target, options, len(scene))
-        self._axis = _Axis(options)
+        by_size = target.max_bytes is not None
+        self._typical = Typical.sizes(options.preset, len(scene)) if by_size else Typical.psnrs(options.preset)
+        self._axis = FinenessAxis(options)
         self._scouted: tuple[float, float] | None = None  # where, and the value of a full encode, about
         self._evaluator: Evaluator | None = None
         self._used: Device | None = None  # by the stages that look at views
@@ -343,7 +323,7 @@ class _Search:
     def _next(self) -> float:
         """The q to encode in full next, by what is known of others."""
         points = {self._typical.value(q): value for q, value in self._encoded.items()}
-        return self._typical.quality(_meet(points, self._target.aim, self._rate()))
+        return self._typical.quality(meet(points, self._target.aim, self._rate()))
 
     def _rate(self) -> float:
         """How fast the value grows, compared with a typical scene; 1 if the rough encode was too near to tell."""
@@ -355,7 +335,7 @@ class _Search:
         low, high = self._target.window
         if abs(way) < _FAR * (high - low):
             return 1.0
-        return min(max((self._encoded[other] - value) / way, _SLOWEST), _FASTEST)
+        return min(max((self._encoded[other] - value) / way, SLOWEST), FASTEST)
 
     def _approach(self, found: _Candidate, last: bool) -> _Candidate:
         """Come nearer to the aim by repeating only the later stages of a full encode.
@@ -375,7 +355,7 @@ class _Search:
                 best = self._with_other_colours(best, _MOST_COLOUR_STEPS)
             if target.inside(best.value):
                 return best
-            wanted = typical.quality(_meet(points, target.aim, rate))
+            wanted = typical.quality(meet(points, target.aim, rate))
             q = min(max(wanted, ends[0]), ends[1])
             known = typical.value(q) in points
             if q != wanted and (len(points) == 1 or known) and not last:
@@ -397,7 +377,7 @@ class _Search:
 
     def _with_other_steps(self, start: _Candidate, q: float) -> _Candidate:
         """A candidate that was not re-fitted, with the quantiser steps of another q."""
-        return self._evaluate("steps", q, start.thinned, start.reduced, _with_steps(start.options, q))
+        return self._evaluate("steps", q, start.thinned, start.reduced, with_steps(start.options, q))
 
     def _with_other_colours(self, start: _Candidate, most: float) -> _Candidate:
         """The best of a few tries with finer or coarser quantiser steps of the colours.
@@ -408,9 +388,9 @@ class _Search:
         """
         points, best = {0.0: start.value}, start
         for _ in range(_TRIES):
-            finer = _meet(points, self._target.aim, self._colour_rate)
+            finer = meet(points, self._target.aim, self._colour_rate)
             finer = round(min(max(finer, -most), most), 4)
-            options = _with_colour_steps(start.options, self._options, finer)
+            options = with_colour_steps(start.options, self._options, finer)
             if finer in points or options == start.options or self._target.inside(best.value):
                 break
             reduced, geometry = start.reduced, start.reduced.geometry
@@ -489,72 +469,3 @@ class _Search:
         """Give all device memory back."""
         if self._evaluator is not None:
             self._evaluator.close()
-
-
-class _Typical:
-    """Size or PSNR of a typical scene for each q, and the q for each of these."""
-
-    def __init__(self, target: Target, options: EncodeOptions, splats: int) -> None:
-        nbytes, psnr = _TYPICAL[options.preset]
-        self._values = np.log(nbytes) + math.log(splats) if target.max_bytes is not None else np.array(psnr)
-
-    def value(self, q: float) -> float:
-        """Of a quality from 0 to 1."""
-        return float(np.interp(q, _TYPICAL_Q, self._values))
-
-    def quality(self, value: float) -> float:
-        """The nearest q from 0 to 1, rounded to what matters."""
-        return round(float(np.interp(value, self._values, _TYPICAL_Q)), 5)
-
-
-class _Axis:
-    """Qualities by the logarithm of the quantiser's fineness."""
-
-    def __init__(self, options: EncodeOptions) -> None:
-        self._options = options.changed(code={"sf_sh": None})
-
-    def fineness(self, q: float) -> float:
-        """Of a quality from 0 to 1."""
-        return math.log(self._options.changed(q=q).parameters.sf_sh)
-
-    def quality(self, fineness: float) -> float:
-        """The nearest q from 0 to 1, rounded to what matters."""
-        low, high = 0.0, 1.0
-        for _ in range(20):
-            middle = (low + high) / 2
-            low, high = (middle, high) if self.fineness(middle) < fineness else (low, middle)
-        return round(high if fineness > self.fineness(0) else 0.0, 5)
-
-
-def _with_steps(options: EncodeOptions, q: float) -> EncodeOptions:
-    """The options with the quantiser's parameters of another q, as far as they are not given on their own."""
-    wanted = options.changed(q=q).parameters
-    return options.with_parameters(**{name: getattr(wanted, name) for name in parameters(Code)})
-
-
-def _with_colour_steps(options: EncodeOptions, given: EncodeOptions, finer: float) -> EncodeOptions:
-    """The options with steps of colours that are finer by a factor, given by its logarithm, unless they are given."""
-    names = [name for name in ("sf_dc", "sf_sh") if getattr(given.code, name) is None]
-    return options.with_parameters(**{name: getattr(options.parameters, name) * math.exp(finer) for name in names})
-
-
-def _meet(points: dict[float, float], aim: float, rate: float) -> float:
-    """Where a growing function, known at some points, probably reaches the aim.
-
-    Args:
-        points: known values by place; at least one.
-        rate: how fast the function typically grows. It is used if the aim does not lie between known values.
-    """
-    places = sorted(points)
-    rising = [(b - a, a, b) for a, b in itertools.pairwise(places) if points[a] < aim <= points[b]]
-    if rising:
-        _, a, b = min(rising)
-        return a + (b - a) * (aim - points[a]) / (points[b] - points[a])
-    # Beyond all that is known; values that do not grow everywhere may lie on both sides.
-    if points[places[0]] < aim:
-        places.reverse()
-    edge, *others = places
-    if others:
-        measured = (points[others[0]] - points[edge]) / (others[0] - edge)
-        rate *= min(max(measured / rate, _SLOWEST), _FASTEST)
-    return edge + (aim - points[edge]) / rate

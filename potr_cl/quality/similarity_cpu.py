@@ -7,7 +7,7 @@ import pyopencl as cl
 from potr_cl.opencl.device import Device
 from potr_cl.quality.pictures import Picture
 
-#: Values (of three a pixel) and rows that a work-item does: BLOCK and ROWS in cl/quality/similarity_cpu.cl.
+#: Values (of three a pixel) and rows that a work-item does.
 _VALUES, _ROWS = 96, 32
 #: Fewest values that the kernel takes at a time.
 _LEAST_LANES = 8
@@ -20,7 +20,8 @@ class CpuSimilarityLauncher:
 
     def __init__(self, device: Device, macros: dict[str, float | int]) -> None:
         lanes = max(device.vector_width, _LEAST_LANES)
-        self._kernel = device.shared_kernel("quality/similarity_cpu.cl", "similarity", LANES=lanes, **macros)
+        sizes = {"LANES": lanes, "BLOCK": _VALUES, "ROWS": _ROWS}
+        self._kernel = device.shared_kernel("quality/similarity_cpu.cl", "similarity", **sizes, **macros)
 
     def parts(self, picture: Picture) -> tuple[int, int]:
         return -(-3 * picture.width // _VALUES), -(-picture.height // _ROWS)

@@ -1,4 +1,7 @@
-"""What enqueues the rasterizer's stages behind the projection: one interface, a launcher for each kernel family."""
+"""Who enqueues the rasterizer's stages after the projection: one interface, with a launcher for each kernel family.
+
+:func:`launcher_for` chooses once; nothing else in the rasterizer asks for the family.
+"""
 
 from __future__ import annotations
 
@@ -19,11 +22,11 @@ class RasterLauncher(Protocol):
     Nothing here waits for the device or takes memory of it.
 
     Attributes:
-        whole_sets: whether a launch does all views of a set; otherwise a set has one view.
-        lanes: splats that a work-item of the projection takes.
-        key_bytes: of the sort keys, for each intersection.
-        counter_bytes: of the counters, for each tile.
-        subtile_bytes: of the mask of sub-tiles, for each intersection.
+        whole_sets: whether one launch does all views of a set; if not, every set has one view.
+        lanes: how many splats a work-item of the projection does.
+        key_bytes: bytes of sort keys for each intersection.
+        counter_bytes: bytes of counters for each tile.
+        subtile_bytes: bytes of the mask of sub-tiles for each intersection.
     """
 
     whole_sets: bool
@@ -48,7 +51,8 @@ class RasterLauncher(Protocol):
         Args:
             bounds, counts: as :meth:`enqueue_offsets` took and left them. The counters are zero afterwards.
             keys: room for the sort keys.
-            for_frame: the view will only be composited: no sub-tiles where :meth:`enqueue_composite` needs none.
+            for_frame: whether the view will only be composited, once. Then sub-tiles are left out if
+                :meth:`enqueue_composite` does not need them.
         """
 
     def enqueue_composite(

@@ -1,8 +1,8 @@
-"""The rasterizer: projection, tile lists, depth order and compositing of one view after the other.
+"""The rasterizer (:class:`Rasterizer`): projection, tile lists, depth order and compositing of views.
 
-The stages run in this order and leave their results in device buffers of a
-:class:`~potr_cl.raster.view_set.ViewSet`, so that whoever needs views more than once keeps them and repeats only the
-last stage:
+The steps run in this order and leave their results in device buffers of a
+:class:`~potr_cl.raster.view_set.ViewSet`. A caller that needs a view more than once keeps these, and repeats only the
+last step:
 
 1. ``project``: each splat's ellipse and colour on screen (cl/raster/project.cl);
 2. ``count_tiles``, ``scan_tiles``, ``fill_tiles``: which splats touch which 16 x 16 tile (cl/raster/tile_lists_*.cl);
@@ -48,7 +48,8 @@ class Rasterizer(Owner):
 
     Attributes:
         device, rules, background: as given.
-        splats: N. stride: N padded; buffers of a value a splat hold so many.
+        splats: N.
+        stride: N rounded up; buffers that hold one value for each splat have this length.
 
     Raises:
         DeviceError: the scene does not fit, or the kernels cannot be built.
@@ -130,8 +131,7 @@ class Rasterizer(Owner):
             raise
 
     def render_into(self, cameras: Sequence[Camera], target: cl.Buffer) -> None:
-        """Render views one behind the other into ``target``, (pixels, 3) float32: on a GPU as many at a time as fit
-        easily."""
+        """Render views one behind the other into ``target``, (pixels, 3) float32; on a GPU, several at a time."""
         if self._launcher.whole_sets:
             self._render_sets_into(cameras, target)
             return
@@ -163,10 +163,10 @@ class Rasterizer(Owner):
             start += nbytes
 
     def prepare(self, camera: Camera) -> View:
-        """Projection, tile lists and depth order of a view, to keep for as many :meth:`composite` as wanted.
+        """Find projection, tile lists and depth order of a view, which :meth:`composite` can use any number of times.
 
         Returns:
-            The view, with buffers of its own, its list no longer than needed; :meth:`View.close` it.
+            The view, with buffers of its own, which are no larger than needed; the caller closes it.
 
         Raises:
             DeviceError: it does not fit the device.
@@ -174,10 +174,10 @@ class Rasterizer(Owner):
         return self.prepare_set([camera]).views[0]
 
     def prepare_set(self, cameras: Sequence[Camera]) -> ViewSet:
-        """:meth:`prepare` several views, waiting for the device but once. CPU kernels take one at a time.
+        """:meth:`prepare` several views, and wait for the device only once. CPU kernels take one view at a time.
 
         Returns:
-            The views; :meth:`ViewSet.close` them.
+            The views; the caller closes them.
 
         Raises:
             DeviceMemoryError: they do not fit the device, or not all in buffers of the size that it allows.
@@ -204,7 +204,7 @@ class Rasterizer(Owner):
         return views
 
     def composite(self, view: View) -> tuple[FloatArray, FloatArray]:
-        """The picture of a prepared view: as :meth:`render`."""
+        """The picture of a prepared view; returns what :meth:`render` returns."""
         self._enqueue_composite(view.owner)
         return self._pictures(view.camera)
 
@@ -215,7 +215,7 @@ class Rasterizer(Owner):
         shapes: cl.Buffer | None = None,
         colours: cl.Buffer | None = None,
     ) -> None:
-        """Enqueue the projection alone of prepared views; with other SH, or into other buffers, if these are given."""
+        """Enqueue only the projection of prepared views; with other SH, or into other buffers, if these are given."""
         self._enqueue_project(views, self._room_for_bounds(views), sh, shapes, colours)
 
     def replace_sh(self, sh: FloatArray) -> cl.Buffer:
@@ -233,7 +233,7 @@ class Rasterizer(Owner):
         return self._bounds.buffer
 
     def _zeroed_counts(self, views: ViewSet) -> cl.Buffer:
-        """Counters for all tiles: zero at first, and left so by what uses them."""
+        """Counters for all tiles. They are zero, and the kernels that use them leave them zero."""
         if self._counts.reserve(self._launcher.counter_bytes * views.tiles):
             cl.enqueue_fill_buffer(self.device.queue, self._counts.buffer, np.uint32(0), 0, self._counts.nbytes)
         return self._counts.buffer
@@ -319,7 +319,7 @@ def render(
 
 
 def _accept(view: View, count: int) -> None:
-    """Take the number of intersections that the device found to a view."""
+    """Note in a view how many intersections the device has found."""
     if count == 0xFFFFFFFF:
         raise DeviceError(
             f"view '{view.camera.name}' needs more than 2^32 tile intersections: "

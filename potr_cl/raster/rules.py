@@ -1,4 +1,4 @@
-"""The rules in which rasterizers of 3D Gaussian splats differ."""
+"""The rules in which rasterizers of 3D Gaussian splats differ: :class:`RasterRules`, and two sets of them."""
 
 from __future__ import annotations
 
@@ -17,9 +17,9 @@ class RasterRules:
         near: splats whose view-space depth is at or below this, in world units, are not drawn.
         alpha_cap: largest alpha of a splat in a pixel.
         square_extent: draw a splat only in the tiles that the square of half side ceil(3 sigma_max) around its centre
-            touches, as the original does; without, wherever its alpha reaches 1/255.
-        threshold_included: a pixel ends before a splat that would bring its transmittance to 1e-4 exactly; without,
-            only below.
+            touches, as the original does; if False, wherever its alpha reaches 1/255.
+        threshold_included: whether a pixel ends before a splat that would bring its transmittance to exactly 1e-4; if
+            False, it ends only before one that would bring it below.
     """
 
     near: float = 0.2

@@ -20,7 +20,7 @@ SPLAT_GROUP = 256
 #: Splats whose parameters are uploaded at a time.
 _UPLOADED = 1 << 18
 
-#: Standard deviations above this many world units are taken as this: nothing can be seen to differ, nothing overflows.
+#: Larger standard deviations, in world units, are replaced by this. Nobody can see a difference, and nothing overflows.
 _LARGEST_SCALE = 1e12
 
 
@@ -34,7 +34,8 @@ class SceneBuffers(Owner):
         scene: of N splats; copied, later changes of its arrays are not seen.
 
     Attributes:
-        splats: N. stride: N padded; buffers of a value a splat hold so many.
+        splats: N.
+        stride: N rounded up; buffers that hold one value for each splat have this length.
         sh: (3 M, stride) float32, the SH coefficients of M = ``sh_count`` basis functions.
         sh_count: M.
         geometry: all other parameters and the stride, by the names that the projection's arguments have.
@@ -59,7 +60,7 @@ class SceneBuffers(Owner):
             raise
 
     def replace_sh(self, sh: FloatArray) -> cl.Buffer:
-        """Other SH coefficients, (N, M, 3) float32 of the same degree.
+        """Replace the SH coefficients by others, (N, M, 3) float32 of the same degree.
 
         Returns:
             The buffer of the former ones, which is the caller's to free.
@@ -90,7 +91,7 @@ class SceneBuffers(Owner):
         return self._upload(sh.reshape(self.splats, -1), 0, "the SH coefficients")
 
     def _upload(self, rows: NDArray[Any], padding: float, what: str) -> cl.Buffer:
-        """Rows, one a splat, as columns; they are turned on the device, some at a time."""
+        """Upload rows, one for each splat, and transpose them to columns on the device, some rows at a time."""
         device, width = self._device, rows.shape[1]
         result = self._memory.allocate(4 * width * self.stride, what)
         cl.enqueue_fill_buffer(device.queue, result, np.float32(padding), 0, 4 * width * self.stride)

@@ -1,7 +1,8 @@
-"""Prepared views that are kept for more than one sweep, within a budget of device memory.
+"""Prepared views that are kept for more than one sweep, within a budget of device memory: :class:`ViewCache`.
 
-Tile lists and depth orders take longer to make again than projections, so lists of as many views as possible are kept,
-and projections of as many of these as there is room for then. The other views share the room of one.
+Tile lists and depth orders take longer to make again than projections. So the lists of as many views as possible are
+kept first, and then the projections of as many of these as there is room for. The other views share room for one
+projection, which is made again whenever it is needed.
 """
 
 from __future__ import annotations
@@ -15,7 +16,8 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_set import ViewSet
 
-#: At least so many launches' views should fill a budget that does not hold all: it is used up launch by launch.
+#: A launch's views should take at most a sixteenth of the budget: it is filled launch by launch, and what is left over
+#: at the end is not used.
 _LEAST_SETS = 16
 #: Bytes of a projected splat of a view: shape and colour.
 _SHAPE, _COLOUR = 32, 16
@@ -30,13 +32,14 @@ class ViewCache(Owner):
 
     Attributes:
         room: bytes of the budget that are left.
-        shared: shapes and colours of whichever views are at work that have none of their own; None: all have.
+        shared: shapes and colours for views that have none of their own, one set of views at a time; None: all views
+            have their own.
     """
 
     def __init__(self, rasterizer: Rasterizer, budget: float) -> None:
         self._rasterizer = rasterizer
         self._memory = Memory(rasterizer.device)
-        self._whole: list[ViewSet] = []  # those with their geometry
+        self._whole: list[ViewSet] = []  # those that keep their geometry
         self.room = budget
         self.shared: tuple[cl.Buffer, cl.Buffer] | None = None
 
@@ -50,10 +53,14 @@ class ViewCache(Owner):
         return int(min(max(self.room // (_LEAST_SETS * least), 1), most))
 
     def keep(self, views: ViewSet, own: int = 0) -> bool:
-        """Keep prepared views as far as the budget allows; whether it does. If not, they are the caller's to close.
+        """Keep prepared views if the budget allows it.
 
         Args:
+            views: may lose their geometry now, or later, when other views need the room.
             own: bytes that the caller keeps along with them.
+
+        Returns:
+            Whether they are kept. If not, the caller closes them.
 
         Raises:
             DeviceMemoryError: the device has no room for what views share.
@@ -85,7 +92,11 @@ class ViewCache(Owner):
 
     @contextmanager
     def geometry(self, views: ViewSet) -> Iterator[bool]:
-        """Have kept views' geometry there for a while; whether it had to be made again."""
+        """Make sure that kept views have their geometry inside the block.
+
+        Yields:
+            Whether it had to be made again.
+        """
         if views.shapes is not None:
             yield False
             return
@@ -98,6 +109,6 @@ class ViewCache(Owner):
             views.shapes = views.colours = None
 
     def close(self) -> None:
-        """Give back what views share; they themselves are their owners' to close."""
+        """Give back the memory that views share; the views themselves are closed by their owners."""
         self._memory.close()
         self.shared, self._whole = None, []

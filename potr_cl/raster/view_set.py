@@ -29,7 +29,7 @@ _SET_VIEW = struct_dtype("include/view_set.clh", "SetView")
 
 
 class ViewSet(Owner):
-    """Views whose buffers lie one after another, so that one launch can do them all.
+    """Views whose parts of the buffers lie one after another, so that one launch can do all views.
 
     Made by :meth:`potr_cl.raster.rasterizer.Rasterizer.prepare_set`.
 
@@ -96,7 +96,11 @@ class ViewSet(Owner):
         cl.enqueue_copy(self._device.queue, self.table, table, is_blocking=True)
 
     def aim(self, camera: Camera) -> bool:
-        """Make the only view another camera's, if that has as many tiles across and down; whether it has."""
+        """Point the only view at another camera, if that has as many tiles across and down.
+
+        Returns:
+            Whether it has.
+        """
         (view,) = self.views
         if (view.columns, view.rows) != _tiles(camera):
             return False
@@ -107,7 +111,7 @@ class ViewSet(Owner):
         return True
 
     def make_room(self, counts: Sequence[int]) -> None:
-        """Room for so many intersections of each view; those there are get lost.
+        """Make room for this many intersections of each view. Earlier intersections are lost.
 
         Raises:
             DeviceMemoryError: the device has not that much, or not all in one buffer.
@@ -149,7 +153,7 @@ class ViewSet(Owner):
         return nbytes
 
     def free_geometry(self) -> None:
-        """Give shapes and colours back, for those who keep the lists and project again (:meth:`Rasterizer.project`)."""
+        """Give the memory of shapes and colours back. :meth:`Rasterizer.project` can make them again elsewhere."""
         self._memory.free(*self._geometry)
         self._geometry = ()
         self.shapes = self.colours = None
@@ -165,8 +169,8 @@ class View(Owner):
         owner: the set.
         camera: whose view it is.
         columns, rows: tiles across and down.
-        intersection_count: intersections there are; set once the device is known to have found them all.
-        capacity: intersections that there is room for.
+        intersection_count: number of intersections; set once it is known that the device has found them all.
+        capacity: number of intersections for which there is room.
     """
 
     def __init__(self, owner: ViewSet, camera: Camera) -> None:

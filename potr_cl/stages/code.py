@@ -7,6 +7,7 @@ from typing import Any
 
 from potr_cl.codec.container import ENTROPY_CODERS, EntropyCoder
 from potr_cl.codec.encoder import code_scene
+from potr_cl.errors import UsageError
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
 
@@ -86,6 +87,8 @@ class Code(Stage):
     )
 
     def __post_init__(self) -> None:
+        if not self.on:
+            raise UsageError("stage 'code' makes the file: it cannot be left out")
         _ = self.coder
 
     @property

@@ -17,7 +17,7 @@ from potr_cl.stages.compaction.ridge import ColourModel, CompactionOptions, Comp
 from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.measured import Measured, measurement
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
+from potr_cl.stages.stage import Flag, Importances, Interlude, Stage, State, Workbench, option
 
 
 @dataclass(frozen=True)
@@ -80,7 +80,7 @@ class Compact(Stage):
 
     def interludes(self, iterations: int) -> Sequence[Interlude]:
         after = max(math.ceil(self.at * iterations), 1)
-        return [Interlude(after, self, always=True, afresh=True)] if self.on else []
+        return [Interlude(after, self, always=True, afresh=True)]
 
     def run(self, state: State, bench: Workbench) -> State:
         """Make the colours of the state's scene sparse, unless that has been done while splats were removed."""
@@ -94,9 +94,9 @@ class Compact(Stage):
             colour_model=self.colour_model,
             weighting=self.weighting,
         )
-        with _effects(state, bench) as effects:
+        with _importances(state, bench) as measured:
             bench.progress("compact", 0.0)
-            weights = ViewWeights.from_importances(len(state.scene), effects.view_importances())
+            weights = ViewWeights.from_importances(len(state.scene), measured.view_importances())
             places = standpoints(state.views, state.source.means)
             sh = Compactor(bench.opened).compact(state.scene, places, weights, options).sh
             bench.progress("compact", 1.0)
@@ -104,10 +104,10 @@ class Compact(Stage):
 
 
 @contextmanager
-def _effects(state: State, bench: Workbench) -> Iterator[Measured]:
+def _importances(state: State, bench: Workbench) -> Iterator[Importances]:
     """Importances view by view: those that pruning has measured, or, without pruning, measured for this."""
-    if state.effects is not None:
-        yield state.effects
+    if state.importances is not None:
+        yield state.importances
         return
     bench.progress("prepare views", 0.0)
     with measurement(state, bench, SweepOptions(memory=bench.memory)) as removal:

@@ -151,11 +151,11 @@ class _Course:
     def left(self, splats: NDArray[np.int64], afresh: bool = False) -> State:
         """The state in which only these splats are left, with the colours of the beginning or with those of now."""
         scene = self._state.scene if afresh else replace(self._state.scene, sh=self.sh)
-        return replace(self._state, scene=scene.subset(splats), survivors=self._state.survivors[splats])
+        return replace(self._state, scene=scene).keeping(splats)
 
     def visit(self, interlude: Interlude, splats: NDArray[np.int64], bench: Workbench) -> None:
         """Have another stage work on these splats, and go on with the colours that it gives them."""
-        given = replace(self.left(splats, interlude.afresh), effects=Measured(self._removal, splats))
+        given = replace(self.left(splats, interlude.afresh), importances=Measured(self._removal, splats))
         then = interlude.stage.run(given, bench)
         if then is given:
             return

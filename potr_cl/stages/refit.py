@@ -11,7 +11,6 @@ from typing import Any
 from potr_cl.codec.geometry import quantise_geometry
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import thread_pool
-from potr_cl.model.scene import Scene
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.refit import RefitOptions, active_coefficients, refit_colours
@@ -95,10 +94,10 @@ class Refit(Stage):
 
     @classmethod
     def from_flags(cls, given: dict[str, Any]) -> dict[str, Any]:
-        given = {**given, **({"at": tuple(given["at"])} if "at" in given else {})}
-        return {name: value for name, value in given.items() if not (name == "steps" and value is None)}
+        return {**given, "at": tuple(given["at"])} if "at" in given else given
 
-    def looks_at(self, scene: Scene) -> bool:
+    @property
+    def asked_for(self) -> bool:
         return self.on and self.steps > 0
 
     def interludes(self, iterations: int) -> Sequence[Interlude]:

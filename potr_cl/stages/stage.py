@@ -10,9 +10,9 @@ from __future__ import annotations
 
 import dataclasses
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import TYPE_CHECKING, Any, ClassVar, TypeVar
+from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
 from numpy.typing import NDArray
@@ -27,9 +27,22 @@ if TYPE_CHECKING:
     from typing_extensions import Self
 
     from potr_cl.codec.geometry import Geometry
-    from potr_cl.stages.pruning.measured import Measured
 
 T = TypeVar("T")
+
+
+class Importances(Protocol):
+    """How much each splat shows in each view, as far as that has been measured."""
+
+    def view_importances(self) -> Iterator[tuple[int, NDArray[np.int64], NDArray[np.float64]]]:
+        """The importances, view by view.
+
+        Yields:
+            The number of the view, the numbers of the splats that it sees, ascending, and the mean of T α of each over
+            the view's pixels.
+        """
+        ...
+
 
 #: Called with the name of what is being done and the part of it that is done, 0 to 1.
 Progress = Callable[[str, float], None]
@@ -40,13 +53,13 @@ class State:
     """A scene on its way to a file.
 
     Attributes:
-        source: the uncompressed scene; its pictures are the target of every stage.
+        source: the uncompressed scene; colours are re-fitted to its pictures.
         scene: what is left of it.
         survivors: (n,) int64, ascending: the number in ``source`` of each splat of ``scene``.
         views: the training views; empty if there are no cameras.
         geometry: of ``scene`` as a decoder will see it, once a stage has quantised it. A stage that then changes
             anything but colours makes it None again.
-        effects: importances of the splats in each view, for stages that work while splats are being removed; else None.
+        importances: of the splats in each view, for stages that work while splats are being removed; else None.
         learnt: what each stage has found out, by the stage's name.
     """
 
@@ -55,7 +68,7 @@ class State:
     survivors: NDArray[np.int64]
     views: tuple[Camera, ...]
     geometry: Geometry | None = None
-    effects: Measured | None = None
+    importances: Importances | None = None
     learnt: Mapping[str, Any] = field(default_factory=dict)
 
     @staticmethod
@@ -66,6 +79,11 @@ class State:
     def recoloured(self, sh: NDArray[np.float32]) -> State:
         """This state with other SH coefficients, (n, M, 3)."""
         return dataclasses.replace(self, scene=dataclasses.replace(self.scene, sh=sh))
+
+    def keeping(self, left: NDArray[np.int64]) -> State:
+        """This state without the splats of ``scene`` whose numbers are not in ``left``: (n,) int64, ascending."""
+        scene, survivors = self.scene.subset(left), self.survivors[left]
+        return dataclasses.replace(self, scene=scene, survivors=survivors, geometry=None)
 
     def having_learnt(self, name: str, result: Any) -> State:
         """This state with what a stage has found out."""
@@ -137,9 +155,14 @@ class Stage(ABC):
             PotrError: the work cannot be done.
         """
 
+    @property
+    def asked_for(self) -> bool:
+        """Whether the options leave the stage anything to do, whatever the scene."""
+        return self.on
+
     def looks_at(self, scene: Scene) -> bool:
         """Whether there is anything in this scene for which the stage has to look at views."""
-        return self.on and self.needs_views
+        return self.asked_for and self.needs_views
 
     def interludes(self, iterations: int) -> Sequence[Interlude]:
         """What the stage wants done while splats are being removed in so many iterations."""

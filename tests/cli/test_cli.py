@@ -77,6 +77,13 @@ def fails(capsys, arguments, code, *words) -> None:
         assert word in lines[0]
 
 
+def test_what_looks_at_no_views_opens_no_device(tmp_path, scene_path, monkeypatch):
+    opened = []
+    monkeypatch.setattr("potr_cl.cli.encode.Device", opened.append)
+    assert cli.main(["encode", str(scene_path), "-o", str(tmp_path / "scene.potr"), *KEEP]) == 0
+    assert not opened
+
+
 def test_encode_decode_info(tmp_path, scene_path, capsys):
     potr, back = tmp_path / "a.potr", tmp_path / "back.ply"
     cameras = cameras_json(tmp_path / "cameras.json")

@@ -92,7 +92,12 @@ def test_every_kernel_can_be_read():
 
 @pytest.mark.parametrize(
     ("source", "name"),
-    [("include/splat.clh", "View"), ("include/view_set.clh", "SetView"), ("prune/choose_gpu.cl", "Removed")],
+    [
+        ("include/splat.clh", "View"),
+        ("include/view_set.clh", "SetView"),
+        ("prune/choose_gpu.cl", "Removed"),
+        ("prune/choose_gpu.cl", "State"),
+    ],
 )
 def test_structs_are_laid_out_as_the_compiler_does(device, source, name):
     members = {"View": struct_dtype("include/splat.clh", "View")}

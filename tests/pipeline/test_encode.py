@@ -90,6 +90,14 @@ def test_degree_0_has_nothing_to_compact(device, monkeypatch):
     assert len(left) == 50
 
 
+def test_refits_on_the_way_need_none_at_the_end(device, lego_excerpt, views):
+    options = FEW.changed(compact=False, refit={"steps": 0, "at": (0.5,)})
+    left, pruned = reduced(lego_excerpt, views, options, device)
+    assert not np.array_equal(left.sh, lego_excerpt.sh[pruned.survivors])
+    left, pruned = reduced(lego_excerpt, views, options.changed(refit=False), device)
+    assert np.array_equal(left.sh, lego_excerpt.sh[pruned.survivors])
+
+
 def test_nothing_to_do_needs_no_device(monkeypatch):
     monkeypatch.setattr("potr_cl.pipeline.encode.Device", None)
     encode(random_scene(20, 0), ring_of_cameras(4), EncodeOptions.for_preset("paper", prune=False))

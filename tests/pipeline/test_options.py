@@ -50,6 +50,7 @@ def test_changes_reach_the_stage_that_they_name():
         ({"itertions": 3}, "there is no option 'itertions'"),
         ({"prune": {"itertions": 3}}, "stage 'prune' has no option 'itertions'"),
         ({"prune": {"keep": 2.0}}, "must be above 0 and at most 1"),
+        ({"code": False}, "stage 'code' makes the file"),
         ({"prune": 3}, "'prune' is 3: give a mapping of its options, True or False"),
         ({"code": {"entropy": "gzip"}}, "'gzip' is unknown"),
     ],
@@ -72,6 +73,13 @@ def test_without_a_refit_colours_are_compacted_unless_told_otherwise(refit):
     assert EncodeOptions.for_preset("best", refit=refit).compact.on
     assert not EncodeOptions.for_preset("best", refit=refit, compact=False).compact.on
     assert EncodeOptions.for_preset("best", refit=refit, compact={"at": 0.5}).compact.on
+
+
+def test_a_refit_that_the_preset_does_not_have_stands_in_for_the_compaction():
+    assert EncodeOptions.for_preset("paper").compact.on
+    assert not EncodeOptions.for_preset("paper", refit={"steps": 8}).compact.on
+    assert EncodeOptions.for_preset("paper", refit={"steps": 8}, compact=True).compact.on
+    assert EncodeOptions.for_preset("paper", refit={"drop": 1e-6}).compact.on  # of no steps
 
 
 def test_stages_replace_the_parameters_that_q_sets():

@@ -9,8 +9,6 @@ from dataclasses import dataclass
 
 import numpy as np
 import pytest
-from hypothesis import given, settings
-from hypothesis import strategies as st
 
 from potr_cl.codec.decoder import PotrFile, decode
 from potr_cl.codec.quantize import PRESETS, HyperParameters
@@ -20,16 +18,7 @@ from potr_cl.formats.images import to_8_bits, write_png
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.search import (
-    KINDS,
-    Target,
-    _Axis,
-    _meet,
-    _Typical,
-    _with_colour_steps,
-    _with_steps,
-    encode_to_target,
-)
+from potr_cl.pipeline.search import KINDS, Target, encode_to_target
 from potr_cl.quality.compare import compare, mean_view
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
@@ -37,7 +26,6 @@ from potr_cl.stages.stage import Stage
 from tests.devices import skip_without_cpu
 
 FEW = EncodeOptions.for_preset("paper", prune={"iterations": 6})
-AXIS = _Axis(FEW)
 
 
 @pytest.fixture(scope="module")
@@ -265,83 +253,6 @@ def test_a_cpu_takes_over(lego_excerpt, cameras, caplog):
 def test_bad_targets(bad):
     with pytest.raises(UsageError):
         Target(**bad)
-
-
-@settings(deadline=None)
-@given(st.floats(0.3, 3), st.floats(-50, 50), st.floats(-5, 5))
-def test_lines_are_met_with_two_points(rate, root, first):
-    points = {first: rate * (first - root)}
-    for _ in range(2):
-        place = _meet(points, 0.0, 1.0)
-        points[place] = rate * (place - root)
-    assert min(abs(place - root) for place in points) < 1e-6
-
-
-@settings(deadline=None)
-@given(st.floats(-3, 3), st.floats(0.4, 2.5), st.floats(-0.2, 0.2), st.floats(-3, 3))
-def test_growing_functions_are_met(root, rate, bend, first):
-    """As size and PSNR grow: at about the typical rate, not along a line."""
-
-    def value(x):
-        return rate * (x - root) + bend * rate * (x - root) * abs(x - root) / 6
-
-    points, place = {first: value(first)}, first
-    while abs(value(place)) >= 0.01:
-        assert len(points) <= 6
-        place = _meet(points, 0.0, 1.0)
-        lower = [x for x in points if points[x] < 0]
-        upper = [x for x in points if points[x] >= 0]
-        if lower and upper:
-            assert max(lower) < place < min(upper)
-        points[place] = value(place)
-
-
-@pytest.mark.parametrize(
-    ("points", "side"),
-    [
-        ({1.0: 5.0, 2.0: 5.0, 3.0: 4.0}, -1),  # nowhere little enough: ever further down
-        ({1.0: -4.0, 2.0: -5.0, 3.0: -5.0}, 1),
-    ],
-)
-def test_where_values_do_not_grow_one_goes_on(points, side):
-    place = _meet(points, 0.0, 1.0)
-    assert place < min(points) if side < 0 else place > max(points)
-
-
-def test_typical_values_grow():
-    for preset in PRESETS:
-        for target in (Target(max_bytes=100), Target(min_psnr=40)):
-            typical = _Typical(target, EncodeOptions(preset=preset), 1000)
-            values = [typical.value(q) for q in np.linspace(0, 1, 50)]
-            assert np.all(np.diff(values) > 0)
-            for q in (0, 0.013, 0.3, 0.77, 1):
-                assert typical.quality(typical.value(q)) == pytest.approx(q, abs=1e-5)
-            assert typical.quality(values[0] - 1) == 0
-            assert typical.quality(values[-1] + 1) == 1
-
-
-def test_qualities_from_fineness():
-    for axis in (AXIS, _Axis(FEW.changed(code={"sf_sh": 7.0}))):
-        for q in (0, 0.00123, 0.1, 0.5, 1):
-            assert axis.quality(axis.fineness(q)) == pytest.approx(q, abs=1e-5)
-        assert axis.quality(axis.fineness(0) - 1) == 0
-        assert axis.quality(axis.fineness(1) + 1) == 1
-
-
-def test_steps_of_another_quality():
-    some = FEW.changed(q=0.5, code={"sf_scale": 9.0})
-    mixed, finer = _with_steps(some, 0.7).parameters, some.changed(q=0.7).parameters
-    for field in dataclasses.fields(mixed):
-        source = finer if field.name.startswith("sf_") or field.name in ("beta", "gamma") else some.parameters
-        assert getattr(mixed, field.name) == getattr(source, field.name), field.name
-
-
-def test_steps_of_colours():
-    plain = FEW.changed(q=0.5, code={"sf_dc": 9.0})
-    finer = _with_colour_steps(plain, plain, 0.1)
-    assert finer == plain.changed(code={"sf_sh": plain.parameters.sf_sh * math.exp(0.1)})
-    both = plain.changed(code={"sf_sh": 7.0})
-    assert _with_colour_steps(both, both, 0.1) == both
 
 
 def test_every_try_is_called_by_its_name(device, lego_excerpt, cameras):

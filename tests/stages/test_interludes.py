@@ -23,7 +23,7 @@ class Brighter(Stage):
     title = ""
 
     def run(self, state, bench):
-        assert state.effects is not None
+        assert state.importances is not None
         sh = state.scene.sh.copy()
         sh[:, 0] *= 2
         return state.recoloured(sh)

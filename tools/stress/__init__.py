@@ -1,1 +1,1 @@
-"""What happens at the limits, and on every device."""
+"""What happens at the limits and on every device: run.py measures, cases.py has the inputs, fuzz.py damages files."""

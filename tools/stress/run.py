@@ -111,7 +111,6 @@ class Worst:
     expected: float = 0.0
     at: str = ""
     ratio: float = -1.0
-    ratio_error: float = 0.0
     ratio_at: str = ""
     checked: int = 0
 
@@ -120,7 +119,7 @@ class Worst:
         if not error <= self.error:
             self.error, self.expected, self.at = error, expected, name
         if not error / expected <= self.ratio:
-            self.ratio, self.ratio_error, self.ratio_at = error / expected, error, name
+            self.ratio, self.ratio_at = error / expected, name
 
 
 # ------------------------------------------------------------------------------------------ float64

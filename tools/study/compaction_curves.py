@@ -119,7 +119,7 @@ def _whole(degrees: NDArray[np.float64]) -> float:
     return float(np.sum(degrees * sizes) / np.sum(sizes))
 
 
-class _Judge:
+class _CurveEvaluator:
     """Renders the test views with other SH coefficients and compares.
 
     Args:
@@ -164,7 +164,7 @@ def measure(device: Device, folder: Path, every: int, powers: Sequence[float]) -
             targets = {"uncompressed": targets.get("uncompressed", unquantized), "uncompacted": unquantized}
             if ground_truth:
                 targets["ground_truth"] = ground_truth
-            evaluator = _Judge(rasterizer, tests, targets, sf_sh)
+            evaluator = _CurveEvaluator(rasterizer, tests, targets, sf_sh)
             evaluator.add("no compaction", scene.sh)
             evaluator.add("AC set to 0", np.where(np.arange(scene.sh.shape[1])[:, None] == 0, scene.sh, np.float32(0)))
             weights = measured_weights(device, scene, views)

@@ -1,6 +1,6 @@
-/* The removal kernel with the paper's second half (section "Effect of a splat's removal"), one tile a work-item, splat by
-   splat: the tile's list front to back twice, the second time with the final colour P_K known, P_k and T as running sums
-   and products,
+/* The removal kernel with the paper's second half (section "Effect of a splat's removal"), one tile a work-item, splat
+   by splat: the tile's list front to back twice, the second time with the final colour P_K known, P_k and T as running
+   sums and products,
 
        PD_k = P_k - P_{k+1} / (1 - alpha) + alpha / (1 - alpha) P_K
 
@@ -92,8 +92,8 @@ kernel void removal(
         sums[e] = (float2)(0.0f, 0.0f);
     }
 
-    /* From here on r, g, b are the final colour, dr, dg, db twice its difference to the target, and pr, pg, pb the colour
-       before a splat. */
+    /* From here on r, g, b are the final colour, dr, dg, db twice its difference to the target, and pr, pg, pb the
+       colour before a splat. */
     vfloat dr[SUBTILES], dg[SUBTILES], db[SUBTILES];
     vfloat pr[SUBTILES], pg[SUBTILES], pb[SUBTILES];
     float differences[3][TILE * TILE];

@@ -1,6 +1,6 @@
 /* Sums of transmittances T over a tile's pixels, one for each intersection of the tile's list: one work-group a tile on
-   GPUs (LANES 1), one work-item on CPUs. A GPU's work-group adds up in fixed point, of which 256 ones just fit 32 bits: the
-   sums are the same on every run.
+   GPUs (LANES 1), one work-item on CPUs. A GPU's work-group adds up in fixed point, of which 256 ones just fit 32 bits:
+   the sums are the same on every run.
 
    Macros: LANES, ALPHA_CAP, TRANSMITTANCE_THRESHOLD. */
 

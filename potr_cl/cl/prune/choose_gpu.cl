@@ -19,10 +19,14 @@
 #define STAYS 0xFFFFFFFFu
 #define LAST_KEY 0xFFFFFFFEu
 
-/* The state buffer holds a histogram for each digit, of which each bin is a total of two words; then CUT words of what
-   is known after each digit; then the number of splats that go. */
+/* What the kernels of an iteration hand on: a histogram for each digit, of which each bin is a total of two words; CUT
+   words of what is known after each digit; the number of splats that go. */
+typedef struct {
+    uint histograms[2048]; /* DIGITS * HISTOGRAM */
+    uint cuts[16]; /* DIGITS * CUT */
+    uint gone;
+} State;
 #define HISTOGRAM (2 * DIGIT)
-#define CUTS (DIGITS * HISTOGRAM)
 #define CUT 4
 
 inline uint ordered(float score)
@@ -66,9 +70,9 @@ typedef struct {
 /* Finds one digit more of the last key that goes: the first bin with which the budget is reached. Every work-group
    finds it for itself; the first one leaves it in the state for the next digit. */
 inline Cut next_cut(
-    global uint *state, int digit, uint remaining, uint lid, local ulong *sums, volatile local uint *found)
+    global State *state, int digit, uint remaining, uint lid, local ulong *sums, volatile local uint *found)
 {
-    global const uint *bin = state + digit * HISTOGRAM + 2 * lid;
+    global const uint *bin = state->histograms + digit * HISTOGRAM + 2 * lid;
     sums[lid] = (ulong)bin[1] << 32 | bin[0];
     if (lid == 0)
         *found = DIGIT - 1;
@@ -79,7 +83,7 @@ inline Cut next_cut(
         sums[lid] += below;
         barrier(CLK_LOCAL_MEM_FENCE);
     }
-    global const uint *former = state + CUTS + (digit - 1) * CUT;
+    global const uint *former = state->cuts + (digit - 1) * CUT;
     ulong budget = (sums[DIGIT - 1] + remaining - 1) / remaining;
     uint digits = 0;
     if (digit > 0) {
@@ -94,7 +98,7 @@ inline Cut next_cut(
     cut.digits = digits << 8 | *found;
     cut.rest = budget - (*found > 0 ? sums[*found - 1] : 0);
     if (get_group_id(0) == 0 && lid == 0) {
-        global uint *now = state + CUTS + digit * CUT;
+        global uint *now = state->cuts + digit * CUT;
         now[0] = cut.digits;
         now[1] = (uint)cut.rest;
         now[2] = (uint)(cut.rest >> 32);
@@ -103,10 +107,10 @@ inline Cut next_cut(
 }
 
 /* Adds a work-group's histogram to that of all work-groups. */
-inline void merge(global uint *state, int digit, local const uint *bins, uint lid)
+inline void merge(global State *state, int digit, local const uint *bins, uint lid)
 {
     const ulong sum = (ulong)bins[2 * lid + 1] << 32 | bins[2 * lid];
-    add_fixed(state + digit * HISTOGRAM + 2 * lid, (long)sum);
+    add_fixed(state->histograms + digit * HISTOGRAM + 2 * lid, (long)sum);
 }
 
 /* Finds every splat's smoothed effect and key, and the histogram of the keys' first digit. */
@@ -121,7 +125,7 @@ void rank(
     float a,
     global float *smoothed,
     global uint *keys,
-    global uint *state)
+    global State *state)
 {
     local uint bins[2 * DIGIT];
     const uint i = get_global_id(0), lid = get_local_id(0);
@@ -158,7 +162,7 @@ void refine(
     global const uint *keys,
     int digit,
     uint remaining,
-    global uint *state)
+    global State *state)
 {
     local uint bins[2 * DIGIT];
     local ulong sums[DIGIT];
@@ -189,7 +193,7 @@ void mark(
     uint remaining,
     global uchar *alive,
     global Removed *removed,
-    global uint *state)
+    global State *state)
 {
     local ulong sums[DIGIT];
     local uint found, gone;
@@ -209,5 +213,5 @@ void mark(
     }
     barrier(CLK_LOCAL_MEM_FENCE);
     if (lid == 0 && gone > 0)
-        atomic_add(state + CUTS + DIGITS * CUT, gone);
+        atomic_add(&state->gone, gone);
 }

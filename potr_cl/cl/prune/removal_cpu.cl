@@ -1,22 +1,27 @@
-/* Removal effects for CPUs: one tile a work-item, sub-tile by sub-tile, one walk forward and one back over a sub-tile's list.
+/* Removal effects for CPUs: one tile a work-item, which walks forward and then back over the list of each sub-tile.
+   removal_gpu.cl is its twin.
 
-   Forward as in composite_cpu.cl, for the pixels' colours; each splat's alphas and weights w = T alpha are remembered.
-   Then from the last splat to the first: B, the colour behind a splat as seen with nothing in front, is a convex sum that
-   grows by one splat at a time. So nothing cancels, however many layers hide a splat. Per splat and tile the sweep leaves
-   the sums over the tile's pixels of
+   The walk forward finds the pixels' colours, as composite_cpu.cl does, and remembers each splat's alphas and weights
+   T alpha. The walk back goes from the last splat to the first. It keeps B, the colour behind a splat as seen with
+   nothing in front of it. B is a convex sum that grows by one splat at a time, so that nothing cancels, however many
+   layers hide a splat. For each intersection the sweep leaves two sums over the tile's pixels:
 
        PD^2 + 2 PD (c - c_t),  PD = T alpha (B - c_k)      and      T alpha
 
-   (paper, section "Effect of a splat's removal"), in the slot of the splat's intersection.
+   (paper, section "Effect of a splat's removal").
 
-   A list of more than SEGMENT splats is walked segment by segment: forward through all of them, the transmittances before
-   each kept, then from the last segment to the first, each walked forward once more for its alphas and weights.
+   A list of more than SEGMENT splats is walked in segments. First all of them are walked forward, and the
+   transmittances before each are kept. Then, from the last segment to the first, each is walked forward once more for
+   its alphas and weights, and back.
 
-   Lists are compacted on the way: intersections of removed splats, or that the last sweep marked, are dropped, in
-   place; a tile's list begins at offsets[tile] and has lengths[tile] intersections.
+   On the way a list loses, in place, the intersections of removed splats and those that the last sweep marked. A
+   tile's list begins at offsets[tile] and has lengths[tile] intersections.
 
-   Macros: LANES, ALPHA_CAP, TRANSMITTANCE_THRESHOLD, INT64_ATOMICS, TIGHTEN (whether to mark intersections that touch no
-   pixel). */
+   Macros:
+       LANES                               8 or 16, see lanes.clh;
+       ALPHA_CAP, TRANSMITTANCE_THRESHOLD  see subtile_vectors.clh;
+       INT64_ATOMICS                       see totals.clh;
+       TIGHTEN                             1: mark the intersections that touch no pixel. */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
@@ -25,11 +30,12 @@
 #include "prune/removal.clh"
 #include "prune/staleness_cpu.clh"
 
-/* Where a list's transmittances are kept at the most; of the segments between two of them those before are walked again. */
+/* At how many places of a list the transmittances are kept at most. If there are more segments, those between the last
+   such place and the segment in question are walked again. */
 #define CHECKPOINTS 16
 
-/* A sub-tile's walk forward: its transmittances and colours move on, memory[2 j] and memory[2 j + 1] become the j-th splat's
-   alphas and weights. Returns the number of splats before the last pixel's end. */
+/* A sub-tile's walk forward. Its transmittances and colours move on; memory[2 j] and memory[2 j + 1] become the alphas
+   and weights of the j-th splat. Returns the number of splats before the last pixel's end. */
 inline uint walk(
     const Splat *splats,
     const ushort *list,
@@ -189,7 +195,8 @@ kernel void removal(
             for (int i = 0; i < SUBTILES; ++i)
                 t[i] = checkpoints[checkpoint][i];
             for (uint before = checkpoint * apart; before < segment; ++before) {
-                gather_splats(shapes, colours, intersections, subtiles, begin + before * SEGMENT, kept, splats, lists, listed);
+                gather_splats(
+                    shapes, colours, intersections, subtiles, begin + before * SEGMENT, kept, splats, lists, listed);
                 for (int i = 0; i < SUBTILES; ++i)
                     walk(splats, lists[i], listed[i], subtile_centre(origin, i), &t[i], rgb[i], memory, touching);
             }

@@ -1,8 +1,10 @@
-/* Removal effects for GPUs, all views of a set in one launch: one work-group a tile. See removal_cpu.cl, its twin, for the
-   method, subtile_lists.clh for how a tile's work is shared out, and subtile_batches.clh for the walk back.
+/* Removal effects for GPUs, all views of a set in one launch: one work-group a tile. See removal_cpu.cl, its twin, for
+   the method, subtile_lists.clh for how a tile's work is shared out, and subtile_batches.clh for the walk back.
 
-   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2 (see subtile_lists.clh), INT64_ATOMICS (see totals.clh), TIGHTEN (1:
-   mark the intersections that touch no pixel). */
+   Macros:
+       ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2  see subtile_lists.clh;
+       INT64_ATOMICS                                    see totals.clh;
+       TIGHTEN                                          1: mark the intersections that touch no pixel. */
 
 /* A splat's effect and importance, of eight splats at a time; with the padding, sub-tiles lie in different banks. */
 #define SUMS 2

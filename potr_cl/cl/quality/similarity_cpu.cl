@@ -4,13 +4,11 @@
    values away. Each row's means under the window along the row go into a ring that has as many rows as the window. The
    means under the whole window are made from that ring. Beyond its borders a picture goes on with zeros.
 
-   Macros: LANES (8 or 16, see lanes.clh), and those of similarity.clh. */
+   Macros: LANES (8 or 16, see lanes.clh), ROWS, BLOCK (a multiple of 48), and those of similarity.clh. */
 
 #include "include/lanes.clh"
 #include "quality/similarity.clh"
 
-#define ROWS 32
-#define BLOCK 96
 #define BESIDE 16 /* values of the window on either side of a block, and one more to make a multiple of LANES */
 #define WIDE (BLOCK + 2 * BESIDE)
 #define RING (2 * RADIUS + 1)

@@ -1,6 +1,7 @@
-/* The splats' own blocks of the normal equations: what they precondition, and which coefficients they tell to give up.
+/* The splats' own blocks of the normal equations. `precondition` applies their inverses, `select_active` finds by them
+   which coefficients are given up.
 
-   Macros: LANES (splats a work-item), SH_COUNT. */
+   Macros: LANES (splats a work-item), SH_COUNT (coefficients of a channel). */
 
 #include "refit/coefficients.clh"
 
@@ -31,7 +32,8 @@ kernel void precondition(
         const float length = c == 1 ? 2.0f : 3.0f;
         const float lambda = c == 0 ? lambda_luma : lambda_chroma;
         const vfloat least = trace * (DAMPING * length / SH_COUNT);
-        /* Row by row, U with U^T U = block; the diagonal holds the pivots' inverse square roots, 0 for what is left out. */
+        /* Row by row, U with U^T U = block. The diagonal holds the pivots' inverse square roots, and 0 for what is left
+           out. */
         vfloat factor[TRIANGLE], y[SH_COUNT];
         for (int j = 0; j < SH_COUNT; ++j) {
             const size_t column = 3 * j + c;
@@ -43,7 +45,8 @@ kernel void precondition(
                 rest = MAD(-factor[AT(i, j)], y[i], rest);
             }
             const vint keep = (pivot > LEAST_PIVOT * diagonal) && (pivot > 1e-30f);
-            const vfloat inverse = (keep ? 1.0f / sqrt(pivot) : (vfloat)(0.0f)) * active_lanes(active, stride, index, column);
+            const vfloat inverse =
+                (keep ? 1.0f / sqrt(pivot) : (vfloat)(0.0f)) * active_lanes(active, stride, index, column);
             factor[AT(j, j)] = inverse;
             y[j] = rest * inverse;
             for (int k = j + 1; k < SH_COUNT; ++k) {
@@ -62,10 +65,10 @@ kernel void precondition(
     }
 }
 
-/* Give up AC coefficients, splat by splat and channel by channel: again and again the one whose loss costs least, the others
-   of its channel making up for it as well as they can, while it costs less than `least` (by the splat's own block of the
-   normal equations, the rest of the scene held). With P the inverse of the block, losing x_m costs x_m^2 / P_mm, moves the
-   others by -x_m P_jm / P_mm, and takes P_im P_jm / P_mm off P. */
+/* Gives up AC coefficients, splat by splat and channel by channel: again and again the one whose loss costs least, as
+   long as that is less than `least`. The other coefficients of the channel make up for it as well as they can; all
+   other splats stay as they are. With P the inverse of the block, the loss of x_m costs x_m^2 / P_mm, moves the others
+   by -x_m P_jm / P_mm, and takes P_im P_jm / P_mm off P. */
 kernel void select_active(
     global float *coefficients,
     global const float *blocks,
@@ -136,7 +139,8 @@ kernel void select_active(
             const size_t column = 3 * j + c;
             const vfloat was = VLOAD(index, coefficients + column * stride), value = x[j] / scale[j];
             const vint changed = active_lanes(active, stride, index, column) > 0.0f;
-            VSTORE(changed ? (fabs(value) < 1e30f ? value : (vfloat)(0.0f)) : was, index, coefficients + column * stride);
+            VSTORE(
+                changed ? (fabs(value) < 1e30f ? value : (vfloat)(0.0f)) : was, index, coefficients + column * stride);
             float kept[LANES];
             VSTORE(keep[j], 0, kept);
             for (int lane = 0; lane < LANES; ++lane)

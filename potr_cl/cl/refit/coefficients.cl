@@ -32,8 +32,8 @@ kernel void combine(float a, global float *y, float b, global const float *x)
     y[i] = a * y[i] + b * x[i];
 }
 
-/* parts[i] = sum of x y over every get_global_size(0)-th element from i on, in a fixed order; parts[size + i] = the largest
-   |x| of them. */
+/* parts[i] = the sum of x y over every get_global_size(0)-th element from i on, in a fixed order;
+   parts[get_global_size(0) + i] = the largest |x| among them. */
 kernel void dot_parts(global const float *x, global const float *y, ulong count, global float *parts)
 {
     const size_t items = get_global_size(0), first = get_global_id(0);

@@ -1,11 +1,13 @@
-/* From a sweep's sums back to the coefficients: the last half of the transposed map, and the splats' own blocks.
+/* From the sums of a sweep back to the coefficients: the second half of the transposed map. It also adds up the splats'
+   own blocks of the normal equations.
 
    Macros: LANES (splats a work-item), SH_COUNT, WEIGHTS (1: the totals hold the sums of w^2 too, for the blocks). */
 
 #include "refit/refit.clh"
 #include "refit/view_colours.clh"
 
-/* The totals of LANES splats times a scale, channel by channel; they become 0. Whether any was not. */
+/* Takes the totals of LANES splats, times a scale, channel by channel, and sets them to 0. Returns whether any of them
+   was not 0. */
 inline int take_totals(global long *totals, float scale, vfloat *sums)
 {
     global long4 *splats = (global long4 *)totals;
@@ -30,7 +32,9 @@ inline int take_totals(global long *totals, float scale, vfloat *sums)
         /* In two parts of 32 bits: conversions of 64 are calls on some CPU runtimes. */
         const long4 total = splats[lane], high = (total + (1l << 30)) >> 31;
         const float4 value =
-            MAD(convert_float4(convert_int4(high)), (float4)(0x1p31f), convert_float4(convert_int4(total - (high << 31))));
+            MAD(convert_float4(convert_int4(high)),
+                (float4)(0x1p31f),
+                convert_float4(convert_int4(total - (high << 31))));
         vstore4(value * scale, lane, values);
         splats[lane] = (long4)(0);
     }

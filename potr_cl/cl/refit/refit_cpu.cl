@@ -1,12 +1,17 @@
-/* The picture's dependence on the splats' colours, for CPUs: one tile a work-item, sub-tile by sub-tile.
+/* The picture as a function of the splats' colours, and the way back from pixels to splats, for CPUs: one tile a
+   work-item, sub-tile by sub-tile. refit_gpu.cl is its twin.
 
-   The picture is linear in the colours: pixel = sum of w_k c_k + rest of the background, w_k = T alpha. A walk over a
-   sub-tile's list makes its pixels' values v, less the target if there is one, and remembers the weights; they then give each
-   splat's sum over the pixels of w_k v, three channels, and with WEIGHTS of w_k^2. A tile's sums go to exact totals
-   (totals.clh). Lists of more than SEGMENT splats are walked twice.
+   The picture is linear in the colours: pixel = sum of w_k c_k + the background's part, w_k = T alpha. A walk over a
+   sub-tile's list finds the values v of its pixels, less the target if there is one, and remembers the weights. From
+   these it then finds for each splat the sum of w_k v over the pixels, in three channels, and with WEIGHTS that of
+   w_k^2. A tile's sums go to exact totals (totals.clh). Lists of more than SEGMENT splats are walked twice.
 
-   Macros: LANES, ALPHA_CAP, TRANSMITTANCE_THRESHOLD, WEIGHTS (1: sum the squares too), LARGEST_VALUE (refit.clh),
-   INT64_ATOMICS (totals.clh), SUMS_AHEAD (splats whose totals are fetched before they are needed; has a default). */
+   Macros:
+       LANES                               8 or 16, see lanes.clh;
+       ALPHA_CAP, TRANSMITTANCE_THRESHOLD  see subtile_vectors.clh;
+       WEIGHTS, LARGEST_VALUE              see refit.clh;
+       INT64_ATOMICS                       see totals.clh;
+       SUMS_AHEAD                          splats whose totals are fetched before they are needed; 16 by default. */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
@@ -18,8 +23,8 @@
 #define SUMS_AHEAD 16
 #endif
 
-/* A sub-tile's walk over its list: its transmittances and colours move on, weights[j] becomes the j-th splat's. Returns the
-   number of splats before the last pixel's end. */
+/* A sub-tile's walk over its list. Its transmittances and colours move on; weights[j] becomes the weight of the j-th
+   splat. Returns the number of splats before the last pixel's end. */
 inline uint blend(
     const Splat *splats, const ushort *list, uint length, float2 first, vfloat t[1], vfloat rgb[3], float *weights)
 {

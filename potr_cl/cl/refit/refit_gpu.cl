@@ -1,9 +1,11 @@
-/* The picture's dependence on the splats' colours, for GPUs, all views of a set in one launch: one work-group a tile;
-   get_group_id(1) is the view's number. See refit_cpu.cl, its twin, for the method, subtile_lists.clh for how a tile's work is
-   shared out, and subtile_batches.clh for the second walk.
+/* The picture as a function of the splats' colours, and the way back, for GPUs, all views of a set in one launch: one
+   work-group a tile; get_group_id(1) is the view's number. See refit_cpu.cl, its twin, for the method,
+   subtile_lists.clh for how a tile's work is shared out, and subtile_batches.clh for the second walk.
 
-   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2 (see subtile_lists.clh), INT64_ATOMICS (see totals.clh), WEIGHTS (1:
-   sum w^2 too). */
+   Macros:
+       ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2  see subtile_lists.clh;
+       INT64_ATOMICS                                    see totals.clh;
+       WEIGHTS, LARGEST_VALUE                           see refit.clh. */
 
 /* A splat's sums of w times the pixel's three channels, and of w^2; of four splats at a time. */
 #define SUMS (3 + WEIGHTS)
@@ -55,7 +57,8 @@ void refit_sweep(
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
     uint last_batch;
     const uint swept = forward(
-        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &last_batch);
+        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid,
+        &last_batch);
 
     /* From here on r, g, b are the pixels' values to multiply by. */
     Mine mine = pixels_of(lid / SHARE, origin, lid);

@@ -41,7 +41,8 @@ kernel void view_colours(
             red = fmin(red + 0.5f, (vfloat)(1e30f));
             green = fmin(green + 0.5f, (vfloat)(1e30f));
             blue = fmin(blue + 0.5f, (vfloat)(1e30f));
-            channels = (red > 0.0f ? (vfloat)(1.0f) : (vfloat)(0.0f)) + (green > 0.0f ? (vfloat)(2.0f) : (vfloat)(0.0f)) +
+            channels = (red > 0.0f ? (vfloat)(1.0f) : (vfloat)(0.0f)) +
+                (green > 0.0f ? (vfloat)(2.0f) : (vfloat)(0.0f)) +
                 (blue > 0.0f ? (vfloat)(4.0f) : (vfloat)(0.0f));
             red = fmax(red, (vfloat)(0.0f));
             green = fmax(green, (vfloat)(0.0f));

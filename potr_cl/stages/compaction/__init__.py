@@ -1,1 +1,1 @@
-"""What the stage "compact" computes with: a ridge regression a splat."""
+"""What the stage "compact" computes with: a ridge regression for each splat. Begin with ridge.py."""

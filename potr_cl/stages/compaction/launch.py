@@ -1,4 +1,4 @@
-"""How the kernel families run the compaction: the kernel is the same, its shape is not."""
+"""How each kernel family runs the compaction: both have the same kernel, in different work-groups and vectors."""
 
 from __future__ import annotations
 

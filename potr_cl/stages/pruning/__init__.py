@@ -1,5 +1,7 @@
-"""What the stage "prune" computes with: removal effects, and who decides by them what goes.
+"""What the stage "prune" computes with. Begin with removal.py and schedule.py.
 
-removal.py measures (its docstring names its parts); schedule.py decides, in numpy; on_device.py decides where a GPU
-holds the effects.
+- removal.py measures what the removal of each splat would do to the pictures. Its docstring names the files that are
+  its parts.
+- schedule.py decides from these effects which splats go, in NumPy. on_device.py decides the same on a GPU, so that the
+  effects need not be fetched.
 """

@@ -72,7 +72,7 @@ class CachedSweep(Owner):
             raise
 
     def measure(self) -> None:
-        """Sweep what the device has listed, or else what the schedule says."""
+        """Sweep the tiles that the device has listed, or, if it has not listed any, those that the schedule names."""
         if self._listed is not None:
             self._sweep_what_is_listed()
         else:
@@ -91,7 +91,7 @@ class CachedSweep(Owner):
         self._sweep_tiles(self._schedule.changed(stale), stale)
 
     def note_removal(self) -> None:
-        """Enqueue what follows :meth:`Survivors.remove`: how much each tile has lost."""
+        """Enqueue the kernels that find how much each tile has lost; to be called after :meth:`Survivors.remove`."""
         self._queues.enqueue([kernels.note_removal for kernels in self._kernels])
 
     def forget_sums(self) -> None:
@@ -102,7 +102,7 @@ class CachedSweep(Owner):
             cl.enqueue_fill_buffer(self._device.queue, self._buffers.stale, np.float32(np.inf), 0, 4 * count)
 
     def settle(self) -> None:
-        """Wait for what follows the last removal, and sweep what the device has listed on its own."""
+        """Wait until the last removal is noted, and sweep the tiles that the device has listed on its own."""
         if self._listed is not None:
             self._sweep_what_is_listed()
         self._survivors.settle()

@@ -31,7 +31,7 @@ class SetKernels(Protocol):
         with all numbers of the set's tiles."""
 
     def target_is_known(self) -> None:
-        """The sweeps from now on compare with the target instead of storing it."""
+        """From now on, sweeps compare with the target picture instead of storing it."""
 
     def note_removal(self, queue: cl.CommandQueue | None = None, list_above: float = float("inf")) -> None:
         """Enqueue what follows a removal: each tile's staleness grows by what it lost.
@@ -47,8 +47,8 @@ class SweepLauncher(Protocol):
     """The removal kernels of one family, built for one rasterizer.
 
     Attributes:
-        most_views: that one launch can do.
-        most_queues: on which launches that do not depend on each other may run at a time.
+        most_views: how many views one launch can do.
+        most_queues: on how many queues independent launches may run at the same time.
         lists_tiles: whether the device itself can list the tiles that are stale.
     """
 
@@ -65,7 +65,7 @@ class SweepLauncher(Protocol):
         first_time: bool,
         place: int = 0,
     ) -> SetKernels:
-        """Kernels of its own for a set: binding their arguments takes longer than launching them.
+        """Make the kernels of one set. Each set has its own, because binding arguments takes longer than a launch.
 
         Args:
             prepared: the set.

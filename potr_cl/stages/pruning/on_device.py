@@ -1,7 +1,7 @@
-"""The pruning controller where the effects are: a GPU decides itself what goes, and what is to be measured again.
+"""The pruning controller on a GPU, which decides itself which splats go and which tiles are measured again.
 
-Fetching the effects of every splat and sending back a decision would take a GPU longer than measuring them. The rules
-are those of :mod:`potr_cl.stages.pruning.schedule`, in float32; one difference: splats of the same score go together.
+To fetch the effects of all splats and to send back a decision would take longer than to measure them. The rules are
+those of :mod:`potr_cl.stages.pruning.schedule`, in float32, with one difference: splats of the same score go together.
 """
 
 from __future__ import annotations
@@ -13,20 +13,17 @@ import pyopencl as cl
 
 from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.opencl.structs import struct_dtype
+from potr_cl.opencl.structs import bytes_before, struct_dtype
 from potr_cl.raster.macros import totals_limits
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Iteration, Pruned, PruningOptions, ascending, prune
 from potr_cl.stages.pruning.steering import Steering
 
 _SOURCE = "prune/choose_gpu.cl"
-#: Digits of a score in base 256, and the words of the state buffer (cl/prune/choose_gpu.cl): histograms, what is known
-#: after each digit, the counter of those that went.
+#: A score has so many digits, each of so many values; a work-group has a work-item for each value.
 _DIGIT, _DIGITS = 256, 4
-_COUNTER = _DIGITS * 2 * _DIGIT + 4 * _DIGITS
-_STATE = _COUNTER + 1
 
-_REMOVED = struct_dtype(_SOURCE, "Removed")
+_REMOVED, _STATE = struct_dtype(_SOURCE, "Removed"), struct_dtype(_SOURCE, "State")
 
 
 def prune_scene(
@@ -35,7 +32,7 @@ def prune_scene(
     progress: Callable[[int, int], None] | None = None,
     after_iteration: Callable[[int], None] | None = None,
 ) -> Pruned:
-    """Run the schedule, on the device if that can decide for itself.
+    """Run the schedule: on the device if it can decide for itself, else on the host.
 
     Args:
         removal: measures and removes.
@@ -65,7 +62,7 @@ class _Controller(Owner):
             self._smoothed = memory.allocate(4 * self._splats, "the smoothed effects")
             self._keys = memory.allocate(4 * self._splats, "the splats' scores")
             self._removed = memory.upload(np.zeros(self._splats, _REMOVED), "the removed splats")
-            self._state = memory.allocate(4 * _STATE, "the pruning's state")
+            self._state = memory.allocate(_STATE.itemsize, "the pruning's state")
             macros = totals_limits(device)
             self._rank, self._refine, self._mark = (
                 device.kernel(_SOURCE, name, **macros) for name in ("rank", "refine", "mark")
@@ -90,12 +87,12 @@ class _Controller(Owner):
         return self._pruned(done)
 
     def _choose(self, iteration: int, weight: float) -> int:
-        """Mark the splats that go in an iteration; how many."""
+        """Mark the splats that go in an iteration, and return their number."""
         removal, options = self._removal, self._options
         remaining = options.iterations - iteration
         effect_unit, importance_unit = removal.units
         everywhere = {"splats": self._splats, "totals": removal.totals, "keys": self._keys, "state": self._state}
-        cl.enqueue_fill_buffer(self._device.queue, self._state, np.uint32(0), 0, 4 * _STATE)
+        cl.enqueue_fill_buffer(self._device.queue, self._state, np.uint32(0), 0, _STATE.itemsize)
         self._rank.bind(
             **everywhere,
             alive=removal.marks,
@@ -122,7 +119,8 @@ class _Controller(Owner):
         self._launch(self._mark)
         gone = np.empty(1, np.uint32)
         with self._device.errors("failed while computing"):
-            cl.enqueue_copy(self._device.queue, gone, self._state, src_offset=4 * _COUNTER, is_blocking=True)
+            place = bytes_before(_STATE, "gone")
+            cl.enqueue_copy(self._device.queue, gone, self._state, src_offset=place, is_blocking=True)
         return int(gone[0])
 
     def _launch(self, kernel: Kernel) -> None:
@@ -147,7 +145,7 @@ class _Controller(Owner):
         return Pruned(order, len(kept), iteration, done, self._history(removed[gone], iteration[gone]))
 
     def _history(self, removed: np.ndarray, iteration: np.ndarray) -> tuple[Iteration, ...]:
-        """Of the splats that went, in their order."""
+        """What is known of each iteration in which splats went, in order."""
         starts = np.flatnonzero(np.diff(iteration, prepend=-1))
         if not len(starts):
             return ()

@@ -33,7 +33,7 @@ class PreparedViews(Owner):
     Attributes:
         rasterizer: as given.
         cached: sets of views whose lists fit the budget.
-        uncached: numbers of the views that are prepared again for each sweep, as many as are prepared at a time.
+        uncached: numbers of the views that are prepared again for each sweep, in groups that are prepared together.
         cached_tiles: tiles of the cached views. tiles: of all views.
 
     Raises:
@@ -88,10 +88,10 @@ class PreparedViews(Owner):
             self.rasterizer.project(prepared.views, None, *self.geometry(prepared))
 
     def prepare(self, numbers: range) -> PreparedSet:
-        """Prepare the views of these numbers, whose sums are 0.
+        """Prepare the views of these numbers; all their sums are 0.
 
         Returns:
-            The views, which are the caller's to close.
+            The views; the caller closes them.
 
         Raises:
             DeviceMemoryError: they do not fit the device, or not all in buffers of the size that it allows.
@@ -176,11 +176,11 @@ class PreparedSet(Owner):
 
     @property
     def nbytes(self) -> int:
-        """Bytes besides those of the views."""
+        """Bytes of what is kept besides projection and lists."""
         return self._memory.nbytes
 
     def zero_sums(self) -> None:
-        """Enqueue that no tile has been swept."""
+        """Enqueue that all sums become 0, as before the first sweep."""
         cl.enqueue_fill_buffer(self._device.queue, self.sums, np.float32(0), 0, self.sums.size)
 
     def read_sums(self) -> Iterator[tuple[int, View, NDArray[np.uint32], NDArray[np.float32]]]:
@@ -209,6 +209,6 @@ class PreparedSet(Owner):
         return int(self._device.download(self.lengths, (self.views.tiles,), np.uint32).sum(dtype=np.int64))
 
     def close(self) -> None:
-        """Give the memory back, that of the views too."""
+        """Give the memory back, including that of the views."""
         self.views.close()
         self._memory.close()

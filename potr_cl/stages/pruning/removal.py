@@ -53,7 +53,7 @@ class RemovalSweep(Owner):
     Attributes:
         splats: N.
         cached_views: views whose lists fit the memory budget; the others are made again for every measurement.
-        steering: the same for a controller that lives on the device; None where the host has to decide, because of the
+        steering: the interface for a controller that runs on the device; None if the host has to decide, because of the
             kernel family, the options, or views that do not fit the budget.
 
     Raises:
@@ -118,7 +118,7 @@ class RemovalSweep(Owner):
         return self._survivors.alive
 
     def measure(self) -> tuple[F64, F64]:
-        """ΔMSE_k and I_k of all N splats, float64; of removed splats they mean nothing.
+        """ΔMSE_k and I_k of all N splats, float64; the values of removed splats mean nothing.
 
         ΔMSE is the change of the mean squared error over all views, pixels and channels against the uncompressed
         scene's renders if that splat alone went; I the mean over views and pixels of T α.
@@ -137,7 +137,7 @@ class RemovalSweep(Owner):
         self._cached.note_removal()
 
     def replace_sh(self, sh: FloatArray) -> None:
-        """Go on with other colours: (N, M, 3) float32 of the same degree. The targets stay as they are."""
+        """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
         self._cached.settle()
         former = self._rasterizer.replace_sh(sh)
         if self._original_sh is None:

@@ -64,7 +64,7 @@ class PruningOptions:
         if self.count is not None and self.count < 1:
             raise UsageError(f"{self.count} splats to keep: at least 1 is needed")
         if not 0 <= self.decay <= 1:
-            raise UsageError(f"the decay is {self.decay:g}, it must lie between 0 and 1")
+            raise UsageError(f"the moving average's decay (--damping) is {self.decay:g}, it must lie between 0 and 1")
 
 
 @dataclass(frozen=True)
@@ -126,7 +126,7 @@ class SmoothedEffects:
         self.newest = self._mean
 
     def measure(self) -> tuple[F64, F64]:
-        """The mean ΔMSE_k, and I_k as it is now."""
+        """The weighted mean ΔMSE_k, and the newest I_k."""
         self.newest, importance = self._effects.measure()
         self._weight = self._decay * self._weight + 1
         if len(self._mean):
@@ -201,9 +201,9 @@ def choose(delta_mse: F64, importance: F64, alive: Indices, remaining: int, opti
 
 
 def _cheapest(score: F64, weight: F64, remaining: int) -> Indices:
-    """Those of least score, by score, up to and including the one with which their share of all weight is reached.
+    """The splats of least score, in its order, up to and including the one with which they reach a share of all weight.
 
-    Few go in one iteration: only those below a score are put in order, one that a sample says will do.
+    Few splats go in one iteration. So only those below some score are sorted; a sample tells which score is enough.
     """
     budget = weight.sum() / remaining
     step = max(len(score) // _SAMPLE, 1)

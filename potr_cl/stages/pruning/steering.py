@@ -1,4 +1,4 @@
-"""A removal sweep as a controller on the device sees it: it marks splats and reads totals without asking the host."""
+"""The removal sweep's interface for a controller on the device: it marks splats and reads totals without the host."""
 
 from __future__ import annotations
 
@@ -26,8 +26,9 @@ class Steering:
 
     Attributes:
         device, totals, units, splats: as given; totals are (N, 2) int64 in the device's memory.
-        marks: (N,) uint8 in the device's memory, :class:`~potr_cl.stages.pruning.survivors.SplatState`. Who marks
-            splats as JUST_REMOVED has :meth:`remove_marked` take them out, and makes them REMOVED when marking next.
+        marks: (N,) uint8 in the device's memory, :class:`~potr_cl.stages.pruning.survivors.SplatState`. The controller
+            marks splats as JUST_REMOVED and calls :meth:`remove_marked`; when it marks the next ones, it changes the
+            earlier marks to REMOVED.
     """
 
     def __init__(
@@ -51,7 +52,7 @@ class Steering:
 
     def measure_on_device(self) -> None:
         """Bring :attr:`totals` up to date."""
-        if not self._cached.device_has_listed:  # nothing is marked: what is stale is listed
+        if not self._cached.device_has_listed:  # nothing is marked, so this only lists the stale tiles
             self._survivors.settle()
             self.remove_marked()
         self._cached.measure()

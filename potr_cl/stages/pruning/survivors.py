@@ -1,4 +1,4 @@
-"""Which splats are left, on host and device."""
+"""Which splats are left, as host and device know it: :class:`Survivors`."""
 
 from __future__ import annotations
 
@@ -27,10 +27,10 @@ class SplatState(IntEnum):
 
 
 class Survivors(Owner):
-    """Each splat's state, of which host and device have a copy each.
+    """The state of each splat. Host and device have one copy each, and :meth:`settle` makes them agree.
 
-    Either may be ahead of the other: the host after :meth:`remove`, until the kernels that look for JUST_REMOVED are
-    done, and the device after it has marked splats itself (:meth:`marked_by_device`). :meth:`settle` makes them agree.
+    The host is ahead after :meth:`remove`, until the kernels that look for JUST_REMOVED are done. The device is ahead
+    after it has marked splats itself (:meth:`marked_by_device`).
 
     Args:
         device: that has the copy.
@@ -62,7 +62,7 @@ class Survivors(Owner):
         return alive
 
     def remove(self, splats: Indices) -> None:
-        """Splats go: JUST_REMOVED on the device until the next :meth:`settle`."""
+        """Remove splats. On the device they are JUST_REMOVED until the next :meth:`settle`."""
         self.settle()
         self._states[splats] = SplatState.JUST_REMOVED
         self._write(self._states)
@@ -70,11 +70,11 @@ class Survivors(Owner):
         self._host_is_ahead = True
 
     def marked_by_device(self) -> None:
-        """The device has changed states from ALIVE to JUST_REMOVED on its own; the host has not been told which."""
+        """Note that the device has changed states from ALIVE to JUST_REMOVED, and that the host does not know which."""
         self._device_is_ahead = True
 
     def settle(self) -> None:
-        """Have host and device know the same splats as left, and none as just removed."""
+        """Make host and device agree on the splats that are left; none is JUST_REMOVED afterwards."""
         if self._host_is_ahead:
             self._host_is_ahead = False
             self._wait()
@@ -88,7 +88,7 @@ class Survivors(Owner):
 
     @contextmanager
     def none_removed(self) -> Iterator[None]:
-        """Have the device take all splats as alive for a while."""
+        """Inside the block, the device sees all splats as alive."""
         self._write(np.full_like(self._states, SplatState.ALIVE))
         try:
             yield

@@ -9,7 +9,7 @@ import numpy as np
 from potr_cl.errors import UsageError
 from potr_cl.opencl.device import Device
 
-#: Below it transmittances lose digits in float32, and the sweep divides by them.
+#: The least threshold: smaller transmittances lose digits in float32, and the sweep divides by them.
 _LEAST_THRESHOLD = 1e-30
 #: Part of the device's memory that the views may take unless the caller sets a budget. A CPU's is that of the host: the
 #: scene, its new colours and all other programs live there too.
@@ -23,16 +23,16 @@ class SweepOptions:
     Attributes:
         tolerance: a tile is swept again once the importance removed from it, as a part of its area, exceeds this.
             0: whenever anything was removed from it; negative: always.
-        turns: a view is swept in every so many-th measurement only (all of them in the first). Views that do not fit
-            the memory budget are swept in each.
+        turns: with n, a view is swept only in every n-th measurement after the first. Views that do not fit the memory
+            budget are swept in each measurement.
         memory: bytes of device memory that the views may take; None: :func:`default_memory`.
         tighten: drop a tile's intersections that reach alpha 1/255 in none of its pixels. Changes no result.
         transmittance_threshold: a pixel ends before its transmittance falls below this; None: where the rasterizer's
             rules end it. When a removal lets a pixel go on one splat longer, its colour jumps by up to the hundredfold
             of this.
-        sample: part of the tiles to be swept that are, drawn at random; the others keep their sums until another time.
-        sampled: measurements, after the first, in which only a sample is swept.
-        seed: of the sample.
+        sample: the part, drawn at random, of the tiles due that is really swept; the others keep their sums for now.
+        sampled: in how many measurements after the first only such a sample is swept.
+        seed: of the random sample.
 
     Raises:
         UsageError: a value is out of range.
@@ -71,6 +71,6 @@ class SweepOptions:
 
 
 def default_memory(device: Device) -> int:
-    """Bytes that the views may take: half of the device's memory, three tenths where that is the host's."""
+    """Bytes that the views may take: half of a GPU's memory, 0.3 of a CPU's, which is the host's memory."""
     of_host = device.info.kind == "cpu" or device.info.integrated
     return int(device.info.memory * (_SHARE_OF_HOST if of_host else _SHARE))

@@ -19,7 +19,7 @@ from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
 
 
 class UncachedSweep:
-    """Measures the views that nothing is kept of.
+    """Measures the views of which nothing is kept.
 
     Args:
         prepared: the views.
@@ -88,7 +88,7 @@ class UncachedSweep:
         self.tiles_swept += count
 
     def _buffers(self, memory: Memory) -> SweepBuffers:
-        """New totals; the staleness is written, but nobody reads it."""
+        """Buffers with new totals. The kernels write the staleness too, but nobody reads it here."""
         return SweepBuffers(
             alive=self._survivors.buffer,
             tiles=self._tiles,

@@ -1,1 +1,8 @@
-"""What the stage "refit" computes with: the linear map from colours to pictures, and its solver."""
+"""What the stage "refit" computes with. Begin with refit.py.
+
+- refit.py solves for the colours of a scene. The other files are its parts:
+- colour_map.py is the linear map from colours to pictures, which launcher.py runs on a device;
+- solver.py minimises the error, by conjugate_gradients.py on the vectors of coefficients.py, with blocks.py as
+  preconditioner;
+- targets.py has the pictures to come near to, prepared_views.py what is kept of the views.
+"""

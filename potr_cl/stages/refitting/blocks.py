@@ -1,4 +1,4 @@
-"""The splats' own blocks of the normal equations: they precondition, and tell which coefficients to give up.
+"""The splats' own blocks of the normal equations: the preconditioner, and what tells which coefficients to give up.
 
 A splat's block is the sum over views s and pixels of w_s (T alpha)^2 B Bᵀ, B the SH basis towards the splat, for a
 channel of unit length in R, G, B; Y, Co and Cg have the squared lengths 3, 2 and 3 and do not mix.
@@ -66,10 +66,10 @@ class SplatBlocks(Owner):
         layout.over_splats(self._precondition)
 
     def give_up(self, x: cl.Buffer, prior: float, least: float) -> None:
-        """Make inactive the AC coefficients that cost less, and 0, the others of their channel making up for them.
+        """Set AC coefficients that cost less than ``least`` to 0 and make them inactive.
 
-        A channel at a time, again and again the coefficient whose loss costs least: x_m² / P_mm, P the inverse of the
-        block.
+        In each channel, the coefficient whose loss costs least goes first, and the others make up for it; then the next
+        one, as long as one is cheap enough. The loss of x_m costs x_m² / P_mm, where P is the inverse of the block.
 
         Args:
             x: the coefficients.

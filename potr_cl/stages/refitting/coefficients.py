@@ -59,7 +59,7 @@ class Layout:
 
 @dataclass(frozen=True)
 class Ridge:
-    """What holds the coefficients besides the pictures: lam |x_AC|^2 + prior |x - start|^2, lam greater on chroma.
+    """The penalty beside the pictures' error: lam |x_AC|^2 + prior |x - start|^2, with a larger lam on chroma.
 
     Attributes:
         lam: on the AC coefficients of Y, in pixels of an image of ``REFERENCE_PIXELS``.

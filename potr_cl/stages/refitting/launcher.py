@@ -1,4 +1,4 @@
-"""How a device runs the re-fit's sweep over the tiles of prepared views: :func:`launcher_for` chooses once."""
+"""How a device runs the re-fit's sweep over the tiles of prepared views. :func:`launcher_for` chooses the way once."""
 
 from __future__ import annotations
 
@@ -20,7 +20,7 @@ class Launcher(Protocol):
 
     @property
     def lanes(self) -> int:
-        """Splats a work-item of the kernels that go over splats."""
+        """How many splats a work-item does, in kernels that go over splats."""
         ...
 
     @property

@@ -22,8 +22,8 @@ class PreparedViews(Owner):
     Args:
         rasterizer: that prepares them.
         cameras: the views.
-        most_views: that a launch can do.
-        nbytes: that a view takes in a sweep's own buffers.
+        most_views: how many views a launch can do.
+        nbytes: bytes that a view takes in a sweep's own buffers.
         memory: bytes that the kept views, and what else is taken from :attr:`budget`, may take; None: a quarter of what
             is free.
 
@@ -81,7 +81,7 @@ class PreparedViews(Owner):
 
     @contextmanager
     def ready(self, numbers: range) -> Iterator[tuple[ViewSet, bool]]:
-        """Have a launch's views there with their geometry.
+        """Make sure that a launch's views are there, with their geometry.
 
         Yields:
             The views, and whether their colours were made anew since the last time.

@@ -1,10 +1,11 @@
-"""Joint re-fit of the colours: what pruning and compaction lost, won back in closed form by :func:`refit_colours`.
+"""Joint re-fit of the colours: :func:`refit_colours` wins back what pruning and compaction have lost.
 
-For fixed geometry and opacity the picture is linear in the SH coefficients where no colour is cut at 0 (colour_map.py).
-So the coefficients of all splats are solved for together, against given pictures in all views (targets.py): linear
-least squares with the compaction's ridge on the AC coefficients (solver.py).
+With fixed geometry and opacities a picture is linear in the SH coefficients, except where a colour is cut at 0
+(colour_map.py). So one linear least-squares problem gives the coefficients of all splats together, such that the
+pictures of all views come near to given ones (targets.py). As in the compaction, a ridge holds the AC coefficients down
+(solver.py).
 
-Not in the paper, which solves for each splat alone.
+This is not in the paper, which solves for each splat alone.
 """
 
 from __future__ import annotations
@@ -36,14 +37,14 @@ class RefitOptions:
     """How to re-fit.
 
     Attributes:
-        steps: conjugate-gradient steps at the most.
-        drop: mean squared error for which an AC coefficient is given up; with it, ``selection_steps`` come first, then
-            the coefficients that cost less than this are set to 0 for good.
+        steps: the most conjugate-gradient steps.
+        drop: AC coefficients that cost less mean squared error than this are set to 0 for good, after
+            ``selection_steps`` steps. 0: none is.
         selection_steps, selection_lam: steps and lambda before that choice.
         gain: stop when a step takes less than this part off the squared error.
         lam: lambda on the AC coefficients of Y, in pixels of an image of :data:`REFERENCE_PIXELS`.
         chroma_factor: lambda of Co and Cg over that of Y.
-        prior: the same on every coefficient's distance to its start: what the views do not tell stays as it was.
+        prior: the same for every coefficient's distance to its start, so that what no view shows stays as it was.
         memory: bytes of device memory that prepared views and targets may take; None: a quarter of what is free.
 
     Raises:
@@ -119,7 +120,7 @@ def refit_colours(
 
 
 class ColourRefit(Owner):
-    """One scene's map and solver, for as many solutions as wanted.
+    """The map and the solver of one scene, for any number of solutions.
 
     Args:
         device: to compute on.
@@ -129,7 +130,7 @@ class ColourRefit(Owner):
         memory: bytes of device memory that prepared views and targets may take; None: a quarter of what is free.
 
     Attributes:
-        coefficients, colour_map: the vectors and the map, for who wants products rather than solutions.
+        coefficients, colour_map: the vectors and the map, for callers that want products rather than solutions.
 
     Raises:
         UsageError: no camera.
@@ -153,7 +154,7 @@ class ColourRefit(Owner):
             launcher = launcher_for(device, rules)
             layout = Layout(len(scene), rasterizer.stride, scene.sh.shape[1], launcher.lanes)
             self.coefficients = owned.enter_context(Coefficients(device, layout))
-            # The vectors first: prepared views make do with less memory, at the price of time.
+            # The vectors come first: prepared views can do with less memory, and only take longer then.
             self._solver = owned.enter_context(ColourSolver(self.coefficients))
             self.colour_map = owned.enter_context(
                 ColourMap(launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory)
@@ -176,7 +177,7 @@ class ColourRefit(Owner):
             targets: the picture that each view should show.
             options: of the solver; their memory is of no account here.
             active: (N, M, 3) in Y, Co, Cg: the coefficients that may change; all by default.
-            hold: the others keep their values; without, they are 0.
+            hold: whether the other coefficients keep their values; if not, they become 0.
             progress: called with the steps done and their greatest number.
 
         Raises:

@@ -3,11 +3,12 @@
     minimise over x: sum over views s of w_s |A_s x - target_s|^2 + lambda |x_AC|^2 + prior |x - start|^2
     (lambda threefold on chroma)
 
-Conjugate gradients on the normal equations, preconditioned by each splat's own block. Colours that are cut at 0 stay so
-while a solution is sought; the true error of the result is measured, and the start is kept if it was better.
+It uses conjugate gradients on the normal equations, preconditioned by each splat's own block. Colours that are cut at 0
+count as constant while it looks for a solution. Then it measures the true error of the result, and keeps the start if
+that was better.
 
-Which AC coefficients are worth their bytes is seen here too: after a few steps those are given up whose loss would cost
-less than a given squared error, and the rest is solved again.
+It also chooses which AC coefficients are worth their bytes: after a few steps it gives up those whose loss would cost
+less than a given squared error, and solves again for the rest.
 """
 
 from __future__ import annotations
@@ -31,12 +32,12 @@ _HALVINGS = 4
 
 @dataclass(frozen=True)
 class Descent:
-    """How to come down to a solution.
+    """How to find a solution.
 
     Attributes:
-        steps: conjugate-gradient steps at the most.
+        steps: the most conjugate-gradient steps.
         gain: stop when a step takes less than this part off the objective.
-        ridge: what holds the coefficients.
+        ridge: what holds the coefficients down or near their start.
     """
 
     steps: int
@@ -49,7 +50,7 @@ class Selection:
     """How to choose the AC coefficients that are given up.
 
     Attributes:
-        descent: before the choice.
+        descent: how to come near to the solution before the choice.
         least: coefficients that cost less mean squared error than this are given up.
     """
 
@@ -80,7 +81,7 @@ class _Problem:
 
 @dataclass(frozen=True)
 class _NormalEquations:
-    """Aᵀ W A + ridge, with the colours cut as they are ``at`` a vector: what conjugate gradients solve with."""
+    """The matrix Aᵀ W A + ridge of the conjugate gradients; colours are cut at 0 as they are ``at`` a vector."""
 
     colour_map: ColourMap
     coefficients: Coefficients
@@ -176,14 +177,18 @@ class ColourSolver(Owner):
         return _State(error, error + penalty)
 
     def _descend(self, problem: _Problem, state: _State, how: Descent, after_step: Callable[[int], None]) -> int:
-        """Conjugate-gradient steps from where x was linearised; returns how many paid."""
+        """Take conjugate-gradient steps from where x was linearised; returns their number."""
         equations = _NormalEquations(problem.colour_map, self._coefficients, self._blocks, how.ridge, at=self._start)
         return self._gradients.descend(
             equations, self.x, self._residual, state.objective, how.steps, how.gain, after_step
         )
 
     def _halve_until_better(self, problem: _Problem, state: _State, ridge: Ridge) -> _State | None:
-        """Half the way back to the start as long as that was better, and all the way if nothing helps: then None."""
+        """Go half the way back to the start, again and again, until x is better than the start.
+
+        Returns:
+            The state at x; None if nothing helps, with x back at the start.
+        """
         last = self._linearise(problem, ridge)
         for _ in range(_HALVINGS):
             if last.objective <= state.objective:

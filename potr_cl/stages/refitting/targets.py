@@ -1,4 +1,4 @@
-"""What pictures should show, view by view: :class:`Targets`, where they come from, and which of them are kept."""
+"""The pictures that the re-fit should come near to: :class:`Targets`, where they come from, and which are kept."""
 
 from __future__ import annotations
 
@@ -93,7 +93,7 @@ class Budget(Protocol):
 
 
 class TargetCache(Owner):
-    """Target pictures on the device, kept from the first time on while the memory budget lasts.
+    """Target pictures on the device. Those that fit the memory budget are kept after their first use.
 
     Args:
         device: whose memory it is.
