@@ -465,7 +465,7 @@ def scaled(camera: Camera, factor: float) -> Camera:
 
 def test_half_the_resolution_gives_the_same_sparsity(lego_excerpt: Scene, lego_excerpt_cameras: list[Camera]) -> None:
     """From 800 x 800 to 400 x 400; below, the rasterizer's dilation by 0.3 pixels makes the smallest splats larger."""
-    device = Device(family="cpu")
+    device = Device()
     views = train_views(lego_excerpt_cameras)
     sparsity = []
     for factor in (2, 1):

@@ -211,7 +211,7 @@ def simulate(what: str) -> None:
         removal.measure()
         removal.remove(np.arange(0, 60, 5))
         removal.measure()
-        prune_scene(RemovalSweep(kept[-1], views, SweepOptions(0)), PruningOptions(1e-4, 3))
+        prune_scene(RemovalSweep(kept[-1], views, SweepOptions(0, tighten=True)), PruningOptions(1e-4, 3))
         refit_options = RefitOptions(steps=2, gain=0, drop=1e-9)
         refit_colours(device, scene, views, RenderedTargets(kept[-1], views), refit_options)
         weights = ViewWeights.from_importances(len(scene), removal.view_importances())
@@ -220,7 +220,21 @@ def simulate(what: str) -> None:
         centres = np.random.default_rng(0).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (5000, 3))
         kept.append(Rasterizer(device, plain_splats(centres, sigma=1e-3, logit=1)))
         kept[-1].render(straight_camera(16, 16))  # a list longer than local memory
+        _simulate_several_batches(device, kept)
         check_similarity(device)
+
+
+def _simulate_several_batches(device: Device, kept: list[Rasterizer]) -> None:
+    """Removal and re-fit of a tile whose list the GPU kernels take in three batches, whose pixels go on to the end."""
+    centres = np.random.default_rng(1).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (300, 3))
+    scene, views = plain_splats(centres, sigma=0.03, logit=-4), [straight_camera(16, 16)]
+    kept.append(Rasterizer(device, scene))
+    for tighten in (False, True):
+        removal = RemovalSweep(kept[-1], views, SweepOptions(0, tighten=tighten))
+        removal.measure()
+        removal.remove(np.arange(0, len(scene), 7))
+        removal.measure()
+    refit_colours(device, scene, views, RenderedTargets(kept[-1], views), RefitOptions(steps=1, gain=0, drop=1e-9))
 
 
 def run_oclgrind() -> str:
