@@ -162,7 +162,7 @@ def compare(
     Args:
         a, b: the reference scene and the candidate, on one device, with the same rules and background.
         cameras: at least one.
-        photographs: by view name, see :func:`find_ground_truth`.
+        ground_truth: photographs by view name, see :func:`find_ground_truth`.
         lpips: the metric, where it is installed.
         progress: called with the stage and the part of it that is done.
 
@@ -180,7 +180,7 @@ def compare(
         distances = [lpips(*(picture.download(device) for picture in pair)) if lpips else None for pair in pairs]
         return [Figures(*found, distance) for found, distance in zip(similarity(pairs), distances, strict=True)]
 
-    def evaluator(some: Sequence[Camera], of_a: list[Picture], of_b: list[Picture]) -> Iterator[ViewFigures]:
+    def compared(some: Sequence[Camera], of_a: list[Picture], of_b: list[Picture]) -> Iterator[ViewFigures]:
         found = [figures(list(zip(of_b, of_a, strict=True)))]
         names = ["b_against_a"]
         if ground_truth is not None:
@@ -202,7 +202,7 @@ def compare(
         )
         for some in in_batches(device, cameras):
             with rendered(a, some) as of_a, rendered(b, some) as of_b:
-                for view in evaluator(some, of_a, of_b):
+                for view in compared(some, of_a, of_b):
                     views.append(view)
                     progress(stage, len(views) / len(cameras))
     if not views:

@@ -15,10 +15,10 @@ from potr_cl.reference.raster import Projected
 F64 = NDArray[np.float64]
 
 
-def _ends(alpha: F64, stops: Sequence[float]) -> list[NDArray[np.bool_]]:
+def _ends(alpha: F64, thresholds: Sequence[float]) -> list[NDArray[np.bool_]]:
     """(K, pixels) where a pixel has not ended, for each transmittance at which it may."""
     after = np.cumprod(1 - alpha, axis=0)
-    return [after >= stop for stop in stops]
+    return [after >= threshold for threshold in thresholds]
 
 
 class BruteForce:
@@ -70,11 +70,11 @@ class BruteForce:
         weight[1:] *= np.cumprod(1 - alpha, axis=0)[:-1]
         return [(weight * goes_on).T @ self.p.colour[ranks] for goes_on in ends]
 
-    def effects(self, splats: NDArray[np.int64], stops: Sequence[float] | None = None) -> F64:
-        """ΔSE of each splat over the view's pixels and channels, (2, stops, splats): with the pixels' ends held, and as
-        rendered, for each transmittance at which pixels may end; by default the rules' alone."""
-        stops = [self.rules.transmittance_threshold] if stops is None else stops
-        found = np.zeros((2, len(stops), len(splats)))
+    def effects(self, splats: NDArray[np.int64], thresholds: Sequence[float] | None = None) -> F64:
+        """ΔSE of each splat over the view's pixels and channels, (2, thresholds, splats): with the pixels' ends held,
+        and as rendered, for each transmittance at which pixels may end; by default the rules' alone."""
+        thresholds = [self.rules.transmittance_threshold] if thresholds is None else thresholds
+        found = np.zeros((2, len(thresholds), len(splats)))
         tiles: dict[tuple[int, int], list[int]] = {}
         columns, rows = -(-self.camera.width // TILE), -(-self.camera.height // TILE)
         for i, k in enumerate(splats):
@@ -89,7 +89,7 @@ class BruteForce:
                     tiles.setdefault((column, row), []).append(i)
         for place, members in tiles.items():
             alpha, ranks = self.tile(*place)
-            ends = _ends(alpha, stops)
+            ends = _ends(alpha, thresholds)
             now = self.colour(alpha, ranks, ends)
             for i in members:
                 at = np.flatnonzero(ranks == self.rank_of[int(splats[i])])
@@ -99,7 +99,7 @@ class BruteForce:
                 without = alpha[:, pixels]
                 without[at] = 0
                 held = [end[:, pixels] for end in ends]
-                for truth, rule in zip(found, (held, _ends(without, stops)), strict=True):
+                for truth, rule in zip(found, (held, _ends(without, thresholds)), strict=True):
                     for n, colour in enumerate(self.colour(without, ranks, rule)):
                         truth[n, i] += ((colour - now[n][pixels]) ** 2).sum()
         return found

@@ -254,16 +254,18 @@ def test_a_removal_lets_pixels_go_on(device):
     cameras = ring_of_cameras(1, size=40)
     some = np.arange(0, 900, 10)
     shares = {}
-    for stop in (None, SweepOptions.transmittance_threshold):
+    for threshold in (None, SweepOptions.transmittance_threshold):
         with (
             Rasterizer(device, scene) as rasterizer,
-            RemovalSweep(rasterizer, cameras, SweepOptions(transmittance_threshold=stop)) as removal,
+            RemovalSweep(rasterizer, cameras, SweepOptions(transmittance_threshold=threshold)) as removal,
         ):
             effect, _ = removal.measure()
         exact = BruteForce(reference.project(scene, cameras[0], INRIA), cameras[0], INRIA)
-        true = exact.effects(some, [INRIA.transmittance_threshold if stop is None else stop])[1, 0] / (3 * 40 * 40)
+        true = exact.effects(some, [INRIA.transmittance_threshold if threshold is None else threshold])[1, 0] / (
+            3 * 40 * 40
+        )
         strong = true > 1e-4 * true.max()
-        shares[stop] = np.mean(np.abs(effect[some[strong]] / true[strong] - 1) < 1e-2)
+        shares[threshold] = np.mean(np.abs(effect[some[strong]] / true[strong] - 1) < 1e-2)
     assert shares[None] < shares[SweepOptions.transmittance_threshold]
     assert shares[SweepOptions.transmittance_threshold] > 0.98
 

@@ -268,7 +268,7 @@ def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]
     flags = ("no flags", "mad", "fast relaxed") if quick else tuple(FLAGS)
     default = SweepOptions()
     # What each sweep is compared with ends its pixels in the same place.
-    stops = sorted(
+    thresholds = sorted(
         {INRIA.transmittance_threshold, default.transmittance_threshold or INRIA.transmittance_threshold}, reverse=True
     )
     variants: list[tuple[str, bool, Device, SweepOptions]] = []
@@ -282,14 +282,14 @@ def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]
         plain = profiled(info, family)
         other = dataclasses.replace(default, tighten=not default.tighten)
         variants.append((f"{family}, {'not ' if default.tighten else ''}tightened", False, plain, other))
-        for stop in stops:
-            if stop != (default.transmittance_threshold or INRIA.transmittance_threshold):
-                ends = dataclasses.replace(default, transmittance_threshold=stop)
-                variants.append((f"{family}, pixels end at {stop:.0e}", False, plain, ends))
+        for threshold in thresholds:
+            if threshold != (default.transmittance_threshold or INRIA.transmittance_threshold):
+                ends = dataclasses.replace(default, transmittance_threshold=threshold)
+                variants.append((f"{family}, pixels end at {threshold:.0e}", False, plain, ends))
     with Rasterizer(variants[0][2], load.scene) as rasterizer, RemovalSweep(rasterizer, [camera]) as removal:
         chosen = choose_splats(removal.measure()[1], SPLATS // 3 if quick else SPLATS)
     brute = BruteForce(reference.project(load.scene, camera, INRIA), camera, INRIA)
-    truths = dict(zip(stops, brute.effects(chosen, stops)[0], strict=True))
+    truths = dict(zip(thresholds, brute.effects(chosen, thresholds)[0], strict=True))
     for label, is_default, device, options in variants:
         with Rasterizer(device, load.scene) as rasterizer, RemovalSweep(rasterizer, [camera], options) as removal:
             effect = removal.measure()[0][chosen]

@@ -58,11 +58,13 @@ def spent(device: Device) -> float:
     return time.process_time() if device.family == "cpu" else time.perf_counter()
 
 
-def predicted(rasterizer: Rasterizer, cameras: Sequence[Camera], stop: float) -> tuple[F64, F64, float]:
+def predicted(rasterizer: Rasterizer, cameras: Sequence[Camera], threshold: float) -> tuple[F64, F64, float]:
     """ΔMSE, importance, and the seconds of a sweep, the best of some."""
     own = rasterizer.rules.transmittance_threshold
     with RemovalSweep(
-        rasterizer, cameras, SweepOptions(transmittance_threshold=None if np.float32(stop) == np.float32(own) else stop)
+        rasterizer,
+        cameras,
+        SweepOptions(transmittance_threshold=None if np.float32(threshold) == np.float32(own) else threshold),
     ) as removal:
         effect, importance = removal.measure()
         seconds = []
@@ -82,21 +84,21 @@ def measure(folder: Path, devices: Sequence[Device], views: int, splats: int) ->
     predictions = []
     for device in devices:
         with Rasterizer(device, scene) as rasterizer:
-            predictions.append([predicted(rasterizer, cameras, stop) for stop in THRESHOLDS])
+            predictions.append([predicted(rasterizer, cameras, threshold) for threshold in THRESHOLDS])
     chosen = choose_splats(predictions[0][0][1], splats)
 
     truth = np.zeros((2, len(THRESHOLDS), len(chosen)))
     for camera in cameras:
         view = BruteForce(project(scene, camera, INRIA), camera, INRIA)
         truth += view.effects(chosen, THRESHOLDS) / (3 * camera.width * camera.height * len(cameras))
-    for device, by_stop in zip(devices, predictions, strict=True):
-        for n, (stop, (effect, _, seconds)) in enumerate(zip(THRESHOLDS, by_stop, strict=True)):
+    for device, by_threshold in zip(devices, predictions, strict=True):
+        for n, (threshold, (effect, _, seconds)) in enumerate(zip(THRESHOLDS, by_threshold, strict=True)):
             truths = {"pixel ends held": truth[0, n], "as rendered": truth[1, n]}
             if n:
                 truths["by the rules"] = truth[1, 0]
             for label, true in truths.items():
                 relative = np.abs(effect[chosen] - true) / np.maximum(true, 1e-300)
-                cells = [folder.name, device.family, f"{stop:.0e}", f"{seconds / by_stop[0][2]:.2f}", label]
+                cells = [folder.name, device.family, f"{threshold:.0e}", f"{seconds / by_threshold[0][2]:.2f}", label]
                 for limit in ABOVE:
                     error = relative[true > limit]
                     cells.append(f"{np.median(error):.1e} / {np.quantile(error, 0.99):.1e} ({len(error)})")
@@ -114,7 +116,7 @@ def main() -> None:
     families = args.families or [Device(args.device).family]
     devices = [Device(args.device, family=family) for family in families]
     print(f"{devices[0].info}; relative error of ΔMSE: median / 99th percentile (splats).\n")
-    print("| scene | kernels | stop | time | truth | all | above the noise floor | above 100 times that |")
+    print("| scene | kernels | threshold | time | truth | all | above the noise floor | above 100 times that |")
     print("|---|---|---|---|---|---|---|---|")
     for name in ("lego", "plush"):
         if (args.scenes / name).exists():
