@@ -1,8 +1,25 @@
-"""python -m potr_cl."""
+"""The program: ``python -m potr_cl`` and the script ``potr-cl``."""
 
+# Few imports: until the first lines of main have run, Ctrl-C ends in a traceback.
 import sys
 
-from potr_cl.cli import main
+
+def main() -> int:
+    """Run the command line as a process of its own.
+
+    Returns:
+        Its exit code, see :func:`potr_cl.cli.main`; a process that a signal ends exits with 128 and its number.
+    """
+    from potr_cl.host.signals import end_cleanly_on_signals
+    from potr_cl.host.standard_files import open_standard_files
+
+    end_cleanly_on_signals()
+    open_standard_files()
+
+    from potr_cl.cli import main as run
+
+    return run()
+
 
 if __name__ == "__main__":
     sys.exit(main())

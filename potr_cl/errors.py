@@ -2,11 +2,21 @@
 
 from __future__ import annotations
 
+from potr_cl.plain_text import plain
+
 
 class PotrError(Exception):
-    """Base of every error raised on purpose; the command line prints it as one line and exits with ``exit_code``."""
+    """Base of every error raised on purpose; the command line prints it as one line and exits with ``exit_code``.
+
+    Args:
+        message: may quote what a file holds: it is made harmless here (:func:`potr_cl.plain_text.plain`), so that
+            no caller has to.
+    """
 
     exit_code = 1
+
+    def __init__(self, message: object = "") -> None:
+        super().__init__(plain(message))
 
 
 class DataError(PotrError):

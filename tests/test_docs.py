@@ -152,7 +152,7 @@ def imports_of(folder: Path) -> set[str]:
             names = [node.module] if isinstance(node, ast.ImportFrom) and node.module else []
             names += [alias.name for alias in node.names] if isinstance(node, ast.Import) else []
             found |= {name.split(".")[1] for name in names if name.startswith("potr_cl.")}
-    return found - {folder.name, "errors"}
+    return found - {folder.name, "errors", "plain_text"}
 
 
 def test_the_table_of_folders_is_true() -> None:

@@ -4,13 +4,19 @@ from __future__ import annotations
 
 import argparse
 import logging
+import os
 import sys
+import traceback
 from collections.abc import Sequence
 from importlib import import_module
 
 from potr_cl import __version__
+from potr_cl.cli import guard
+from potr_cl.cli.parser import CommandParser
+from potr_cl.cli.terminal import note
 from potr_cl.errors import PotrError
 from potr_cl.host.threads import in_background
+from potr_cl.plain_text import plain
 
 #: The commands, and who adds them, in the order of the help.
 _COMMANDS = {
@@ -27,11 +33,48 @@ _COMMANDS = {
 }
 #: Those that need an OpenCL device.
 _ON_A_DEVICE = {"encode", "prune", "compact", "refit", "render", "compare", "devices"}
+#: Set to anything, it has errors that nobody foresaw shown with where they come from.
+TRACEBACK_VARIABLE = "POTR_CL_TRACEBACK"
+
+
+def main(argv: Sequence[str] | None = None) -> int:
+    """Run the command line.
+
+    Returns:
+        0 success, 1 bad data, 2 wrong usage, 130 interrupted. A wrong call raises SystemExit with 2, as argparse does.
+    """
+    logging.basicConfig(format="%(message)s", level=logging.WARNING)
+    argv = sys.argv[1:] if argv is None else argv
+    try:
+        _run(argv)
+    except PotrError as error:
+        note(f"potr-cl: {error}")
+        return error.exit_code
+    except MemoryError:
+        note("potr-cl: not enough memory for this scene")
+        return 1
+    except KeyboardInterrupt:
+        note("potr-cl: interrupted; no file is left half written")
+        return 130
+    except BrokenPipeError:
+        return 0  # the reader (head, less) has gone; what it read was right
+    except Exception as error:
+        return _unforeseen(error)
+    return 0
+
+
+def _run(argv: Sequence[str]) -> None:
+    if argv and argv[0] in _ON_A_DEVICE and not {"-h", "--help"} & set(argv):
+        # Drivers take as long to load as the command's modules to be imported.
+        in_background(import_module("potr_cl.opencl.discovery").list_devices)
+    args = command_parser(argv).parse_args(argv)
+    guard.check(args)
+    args.run(args)
 
 
 def command_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
     """The parser of the command that ``argv`` begins with; of all commands where it begins with none."""
-    parser = argparse.ArgumentParser(
+    parser = CommandParser(
         prog="potr-cl", description="Compress trained 3D Gaussian Splatting scenes without retraining."
     )
     parser.add_argument("--version", action="version", version=f"potr-cl {__version__}")
@@ -42,31 +85,16 @@ def command_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
     return parser
 
 
-def main(argv: Sequence[str] | None = None) -> int:
-    """Run the command line.
-
-    Returns:
-        0 success, 1 bad data, 2 wrong usage, 130 interrupted.
-    """
-    logging.basicConfig(format="%(message)s", level=logging.WARNING)
-    argv = sys.argv[1:] if argv is None else argv
-    if argv and argv[0] in _ON_A_DEVICE and not {"-h", "--help"} & set(argv):
-        # Drivers take as long to load as the command's modules to be imported.
-        in_background(import_module("potr_cl.opencl.discovery").list_devices)
-    args = command_parser(argv).parse_args(argv)
-    try:
-        args.run(args)
-    except PotrError as error:
-        print(f"potr-cl: {error}", file=sys.stderr)
-        return error.exit_code
-    except MemoryError:
-        print("potr-cl: not enough memory for this scene", file=sys.stderr)
-        return 1
-    except KeyboardInterrupt:
-        print("potr-cl: interrupted; no file is left half written", file=sys.stderr)
-        return 130
-    except BrokenPipeError:
-        # The reader (head, less) has gone; what it read was right.
-        sys.stderr.close()
-        return 0
-    return 0
+def _unforeseen(error: Exception) -> int:
+    """One line for an error that no code expected: a traceback would quote, as it is, what files hold."""
+    if os.environ.get(TRACEBACK_VARIABLE):
+        note("".join(traceback.format_exception(error)).rstrip())
+    if isinstance(error, OSError) and error.strerror:
+        where = "" if error.filename is None else f"'{error.filename}': "
+        note(plain(f"potr-cl: {where}{error.strerror}"))
+    else:
+        note(
+            plain(f"potr-cl: unforeseen {type(error).__name__}: {error}")
+            + f"; please report it with what the environment variable {TRACEBACK_VARIABLE}=1 adds to this message"
+        )
+    return 1

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import argparse
-import json
 
 from potr_cl.cli.options import Commands
+from potr_cl.cli.terminal import say, say_document
 from potr_cl.errors import DeviceError
 from potr_cl.report.devices import device_report, format_devices, works
 
 
 def _devices(args: argparse.Namespace) -> None:
     report = device_report(args.check)
-    print(json.dumps(report, indent=1) if args.json else format_devices(report))
+    if args.json:
+        say_document(report)
+    else:
+        say(format_devices(report))
     # A device that does not work is no harm while another is taken.
     if args.check and not any(entry["chosen"] and works(entry) for entry in report):
         able = [str(entry["index"]) for entry in report if works(entry)]

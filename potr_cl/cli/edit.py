@@ -6,18 +6,19 @@ import argparse
 import contextlib
 import dataclasses
 import math
-import sys
-from pathlib import Path
 
 import numpy as np
 
+from potr_cl.cli.guard import ReadFile, ReadPhotographs, WrittenFile
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option, as_bytes
+from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
+from potr_cl.cli.scenes import add_trust_option, read_scene
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
+from potr_cl.cli.terminal import note, say
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
 from potr_cl.codec.quantize import ac_sparsity
 from potr_cl.errors import UsageError
-from potr_cl.formats import load_scene
 from potr_cl.formats.images import parse_colour
 from potr_cl.formats.scenes import ply
 from potr_cl.host.atomic_write import replacing
@@ -42,11 +43,9 @@ _ZERO_SF = 1e5
 
 
 def _prune(args: argparse.Namespace) -> None:
-    if args.order is not None and args.order.resolve() == args.output.resolve():
-        raise UsageError("--order and --output name the same file")
     options = _options(args, Prune)
     cameras = given_cameras(args)
-    scene = load_scene(args.scene)
+    scene = read_scene(args, args.scene)
     with contextlib.ExitStack() as stack:
         order = stack.enter_context(replacing(args.order)) if args.order is not None else None
         state, device = _run(args, scene, cameras, options, Prune)
@@ -54,7 +53,7 @@ def _prune(args: argparse.Namespace) -> None:
         ply.save(args.output, state.scene)
         if order is not None:
             np.save(order, pruned.order)
-    print(
+    say(
         f"{args.output}: kept {pruned.kept} of {len(scene)} splats "
         f"({100 * pruned.kept / len(scene):.1f} %) in {pruned.iterations} iterations on {device.info}"
     )
@@ -84,17 +83,18 @@ def _run(
 
 def add_prune(commands: Commands) -> None:
     p = commands.add_parser("prune", help="remove the splats that no view misses; nothing else changes")
-    p.add_argument("scene", type=Path, metavar="SCENE", help=".ply or .potr")
+    p.add_argument("scene", type=ReadFile, metavar="SCENE", help=".ply or .potr")
     add_cameras_options(p)
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.ply")
+    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (fewest splats) to 1; default 0.5")
     p.add_argument(
         "--order",
-        type=Path,
+        type=WrittenFile,
         metavar="FILE.npy",
         help="also write the order of removal: the scene's splat numbers, first removed first, kept ones last",
     )
     add_stage_flags(p, [Prune], without=["on"])
+    add_trust_option(p)
     add_memory_option(p)
     add_device_options(p)
     p.set_defaults(run=_prune)
@@ -106,23 +106,24 @@ def _compact(args: argparse.Namespace) -> None:
         options = options.with_parameters(sf_sh=args.sf_sh)
         _ = options.parameters
     cameras = given_cameras(args)
-    scene = load_scene(args.scene)
+    scene = read_scene(args, args.scene)
     compacted = _run(args, scene, cameras, options, Compact)[0].scene
     ply.save(args.output, compacted)
     before, after = (100 * ac_sparsity(s.sh, options.parameters.sf_sh) for s in (scene, compacted))
-    print(
+    say(
         f"{args.output}: {len(scene)} splats, {after:.1f} % of the AC coefficients quantise to 0, {before:.1f} % before"
     )
 
 
 def add_compact(commands: Commands) -> None:
     p = commands.add_parser("compact", help="make the colours' coefficients sparse; nothing else changes")
-    p.add_argument("scene", type=Path, metavar="SCENE", help=".ply or .potr")
+    p.add_argument("scene", type=ReadFile, metavar="SCENE", help=".ply or .potr")
     add_cameras_options(p)
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.ply")
+    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (sparsest) to 1; default 0.5")
     add_stage_flags(p, [Compact], without=["on", "at"])
     p.add_argument("--sf-sh", type=float, metavar="SF", help="steps a unit of the quantiser to expect")
+    add_trust_option(p)
     add_memory_option(p)
     add_device_options(p)
     p.set_defaults(run=_compact)
@@ -138,7 +139,7 @@ def _refit(args: argparse.Namespace) -> None:
     if args.photos is not None:
         assert cameras is not None
         ground_truth = GroundTruth(args.photos, cameras, background)
-    scene, reference = load_scene(args.scene), load_scene(args.reference)
+    scene, reference = read_scene(args, args.scene), read_scene(args, args.reference)
     device = Device(args.device)
     with contextlib.closing(Progress()) as progress:
         cameras = cameras or virtual_cameras(args, reference, progress)
@@ -164,9 +165,9 @@ def _refit(args: argparse.Namespace) -> None:
         progress("refit", 1.0)
         result = dataclasses.replace(scene, sh=refitted.sh)
         ply.save(args.output, result)
-        print(f"{args.output}: {len(scene)} splats re-fitted in {refitted.steps} steps on {device.info}")
+        say(f"{args.output}: {len(scene)} splats re-fitted in {refitted.steps} steps on {device.info}")
         before, after = refitted.errors
-        print(
+        say(
             f"{len(views)} training views: mean squared error {before:.3g} before, {after:.3g} after, "
             f"PSNR {_decibels(before)} before, {_decibels(after)} after"
         )
@@ -179,7 +180,7 @@ def _refit(args: argparse.Namespace) -> None:
                 psnrs = [evaluator.psnr(candidate) for candidate in (scene, result)]
             finally:
                 evaluator.free()
-            print(f"{evaluator.views}: PSNR {psnrs[0]:.2f} dB before, {psnrs[1]:.2f} dB after, mean over views")
+            say(f"{evaluator.views}: PSNR {psnrs[0]:.2f} dB before, {psnrs[1]:.2f} dB after, mean over views")
 
 
 def _decibels(error: float) -> str:
@@ -195,10 +196,7 @@ def _tell_of_ground_truth(
 ) -> None:
     """What the reference, the scene before and the scene after come to on photographs that the re-fit did not see."""
     if not held_out:
-        print(
-            "warning: no view is held out, so nobody knows whether the colours fit the photographs too closely",
-            file=sys.stderr,
-        )
+        note("warning: no view is held out, so nobody knows whether the colours fit the photographs too closely")
         return
     psnrs = []
     for scene in scenes:
@@ -208,15 +206,14 @@ def _tell_of_ground_truth(
         finally:
             rasterizer.free()
     reference, before, after = psnrs
-    print(
+    say(
         f"{len(held_out)} held-out photographs: PSNR {before:.2f} dB before, {after:.2f} dB after, "
         f"{reference:.2f} dB of the reference, mean over views"
     )
     if after < reference:
-        print(
+        note(
             f"warning: on held-out photographs the result is {reference - after:.2f} dB worse than the reference: "
             "the training photographs are fitted too closely (more --prior, fewer --steps), or too much is gone",
-            file=sys.stderr,
         )
 
 
@@ -227,13 +224,19 @@ def add_refit(commands: Commands) -> None:
         description="Solve for the colours of all splats together, so that the training views look as those of the "
         "reference (or as the photographs) do; nothing else changes. Coefficients that are 0 stay 0.",
     )
-    p.add_argument("scene", type=Path, metavar="PRUNED", help=".ply or .potr")
-    p.add_argument("--reference", type=Path, required=True, metavar="ORIGINAL", help="the uncompressed scene")
+    p.add_argument("scene", type=ReadFile, metavar="PRUNED", help=".ply or .potr")
+    p.add_argument("--reference", type=ReadFile, required=True, metavar="ORIGINAL", help="the uncompressed scene")
     add_cameras_options(p)
-    p.add_argument("--photos", type=Path, metavar="DIR", help="photographs, named after the views, to fit instead")
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.ply")
     p.add_argument(
-        "--steps", type=int, default=RefitOptions.steps, metavar="N", help=f"at the most; default {RefitOptions.steps}"
+        "--photos", type=ReadPhotographs, metavar="DIR", help="photographs, named after the views, to fit instead"
+    )
+    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
+    p.add_argument(
+        "--steps",
+        type=whole_number,
+        default=RefitOptions.steps,
+        metavar="N",
+        help=f"at the most; default {RefitOptions.steps}",
     )
     p.add_argument(
         "--prior",
@@ -257,6 +260,7 @@ def add_refit(commands: Commands) -> None:
         metavar="X",
         help="give up an AC coefficient where the mean squared error grows by less; default: none",
     )
+    add_trust_option(p)
     add_memory_option(p)
     add_device_options(p)
     p.set_defaults(run=_refit)

@@ -4,27 +4,27 @@ from __future__ import annotations
 
 import argparse
 import contextlib
-import json
-import sys
 import time
 from concurrent.futures import Future
-from pathlib import Path
 from typing import Any
 
+from potr_cl.cli.guard import ReadFile, WrittenFile
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option, as_bytes, size_in_bytes
+from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
+from potr_cl.cli.scenes import add_trust_option, read_scene, size_of_file
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
+from potr_cl.cli.terminal import note, say, say_document
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
-from potr_cl.codec.decoder import PotrFile, decode
-from potr_cl.errors import DeviceError, UsageError
-from potr_cl.formats import load_scene
+from potr_cl.codec.decoder import PotrFile
+from potr_cl.errors import DataError, DeviceError, PotrError, UsageError
 from potr_cl.formats.images import Colour, parse_colour
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, test_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Stopwatch, encode
+from potr_cl.pipeline.encode import Encoded, Stopwatch, encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT, PRESETS, PURPOSE
 from potr_cl.pipeline.search import Target, encode_to_target
@@ -45,7 +45,7 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
         background=parse_colour(args.background),
         memory=as_bytes(args.memory),
         threads=args.threads,
-        source_bytes=args.scene.stat().st_size if args.scene.is_file() else None,
+        source_bytes=size_of_file(args.scene),
         **stage_choices(args),
     )
     _ = options.parameters  # a wrong option is told before a gigabyte is read
@@ -72,8 +72,6 @@ def _encode(args: argparse.Namespace) -> None:
         raise UsageError("--photos needs --cameras, the views that the photographs show, and a re-fit")
     if args.report is None and args.report_view is not None:
         raise UsageError("--report-view needs --report, the page that shows it")
-    if args.report is not None and args.report.resolve() == args.output.resolve():
-        raise UsageError("--report and --output name the same file")
     with contextlib.ExitStack() as stack:
         # Opened while the scene is read.
         opened = stack.enter_context(thread_pool(1)).submit(Device, args.device) if _looks(args, options) else None
@@ -81,7 +79,7 @@ def _encode(args: argparse.Namespace) -> None:
         ground_truth = None
         if refit.ground_truth is not None and cameras is not None:
             ground_truth = GroundTruth(refit.ground_truth, cameras, options.background)
-        scene = load_scene(args.scene)
+        scene = read_scene(args, args.scene)
         device = opened.result() if opened is not None and options.look_at_views(scene) else None
         progress = stack.enter_context(contextlib.closing(Progress()))
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None
@@ -98,30 +96,48 @@ def _encode(args: argparse.Namespace) -> None:
             else:
                 found = encode_to_target(scene, cameras, target, options, progress, device, progress.tell)
                 encoded, options, search = found.encoded, found.options, search_report(target, found)
-            for piece in encoded.pieces:
-                file.write(piece)
-        written = PotrFile.from_bytes(b"".join(encoded.pieces))
+            written, candidate = _proved(encoded)  # what cannot be decoded must not replace what can
+            file.write(written.data)
         watch = Stopwatch(progress)
         pictures: list[PicturePair] = []
         quality: dict[str, Any] | str = "not judged, as asked"
         if views is not None:
-            quality, pictures = _evaluate(args, scene, written, views, encoded.device, opened, watch)
+            quality, pictures = _evaluate(args, scene, candidate, views, encoded.device, opened, watch)
         elif cameras is None:
             quality = "not judged: there are no cameras to look from"
         seconds = placing.seconds | encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
         report = encode_report(args.scene, scene, args.output, written, encoded, options, search, quality, seconds)
         if ground_truth is not None and cameras is not None:
             used = encoded.device or device or Device(args.device)
-            _evaluate_by_ground_truth(ground_truth, cameras, scene, decode(written.data), used, options.background)
+            _evaluate_by_ground_truth(ground_truth, cameras, scene, candidate, used, options.background)
         if page is not None:
             page.write(html_report(report, pictures).encode())
-    print(json.dumps(report, indent=1, allow_nan=False) if args.json else format_encode_report(report))
+    if args.json:
+        say_document(report)
+    else:
+        say(format_encode_report(report))
+
+
+def _proved(encoded: Encoded) -> tuple[PotrFile, Scene]:
+    """The file that was made and the scene that a decoder makes of it.
+
+    Raises:
+        PotrError: no decoder takes it.
+    """
+    try:
+        file = PotrFile.from_bytes(b"".join(encoded.pieces))
+        return file, file.scene()
+    except DataError as error:
+        raise PotrError(
+            f"the encoded file cannot be decoded ({error}): nothing was written. Values of this scene are beyond what "
+            "the format holds; look for splats that are very far away or very large"
+        ) from error
 
 
 def _evaluate(
     args: argparse.Namespace,
     scene: Scene,
-    written: PotrFile,
+    candidate: Scene,
     views: EvaluationViews,
     device: Device | None,
     opened: Future[Device] | None,
@@ -136,7 +152,6 @@ def _evaluate(
         device = device or (Device(args.device) if opened is None else opened.result())
         evaluator = Evaluator(device, scene, views, parse_colour(args.background))
         try:
-            candidate = decode(written.data)
             quality = quality_report(views, evaluator.compare(candidate, lambda _, done: watch("evaluate", done)))
             shown = views_to_show(quality, args.report_view) if args.report is not None else []
             pairs = evaluator.pictures(candidate, [view["name"] for _, view in shown])
@@ -160,25 +175,22 @@ def _evaluate_by_ground_truth(
     """Say what the file gained or lost on photographs that the re-fit has not seen."""
     views = test_views(cameras)
     if not views:
-        print("no view is held out: what the photographs gain elsewhere is not known", file=sys.stderr)
+        note("no view is held out: what the photographs gain elsewhere is not known")
         return
     before, after = 0.0, 0.0
     for each in (scene, candidate):
         rasterizer = Rasterizer(device, each, background=background)
         before, after = after, ground_truth.psnr(rasterizer, views)
         rasterizer.free()
-    print(f"{len(views)} held-out photographs: uncompressed {before:.2f} dB, file {after:.2f} dB", file=sys.stderr)
+    note(f"{len(views)} held-out photographs: uncompressed {before:.2f} dB, file {after:.2f} dB")
     if after < before:
-        print(
-            f"warning: on held-out photographs the file is {before - after:.2f} dB worse than the uncompressed scene",
-            file=sys.stderr,
-        )
+        note(f"warning: on held-out photographs the file is {before - after:.2f} dB worse than the uncompressed scene")
 
 
 def add_encode(commands: Commands) -> None:
     p = commands.add_parser("encode", help="a scene (.ply) to a .potr file")
-    p.add_argument("scene", type=Path, metavar="SCENE.ply")
-    p.add_argument("-o", "--output", type=Path, required=True, metavar="OUT.potr")
+    p.add_argument("scene", type=ReadFile, metavar="SCENE.ply")
+    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.potr")
     goal = p.add_mutually_exclusive_group()
     goal.add_argument(
         "-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (smallest) to 1 (best); default 0.5"
@@ -204,13 +216,14 @@ def add_encode(commands: Commands) -> None:
     p.add_argument("--json", action="store_true", help="the summary for programs")
     p.add_argument(
         "--report",
-        type=Path,
+        type=WrittenFile,
         metavar="OUT.html",
         help="a page of its own with sizes, quality by view, pictures before and after, and the course of pruning",
     )
     p.add_argument("--report-view", metavar="NAME", help="a judging view to show besides the worst and the median one")
     add_stage_flags(p)
-    p.add_argument("--threads", type=int, default=0, metavar="T", help="default: one a processor")
+    p.add_argument("--threads", type=whole_number, default=0, metavar="T", help="default: one a processor")
+    add_trust_option(p)
     add_memory_option(p)
     add_device_options(p)
     p.set_defaults(run=_encode)

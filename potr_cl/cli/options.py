@@ -9,12 +9,15 @@ from typing import TypeAlias
 
 from potr_cl.errors import UsageError
 from potr_cl.opencl.discovery import DEVICE_VARIABLE
+from potr_cl.plain_text import plain
 from potr_cl.raster.rasterizer import GSPLAT, INRIA
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 
 #: More than any device has; beyond it someone has typed bytes.
 _MOST_GIGABYTES = 1e6
+#: More than any file has.
+_MOST_BYTES = 1e18
 
 RULES = {"inria": INRIA, "gsplat": GSPLAT}
 CAMERAS_HELP = "cameras.json, transforms.json, or a COLMAP model's folder"
@@ -43,8 +46,10 @@ def size_in_bytes(text: str) -> int:
     if match is not None:
         with contextlib.suppress(ValueError):
             power = " kmg".index((match[2] or " ").lower())
-            return int(float(match[1]) * (1024 if match[3] else 1000) ** power)
-    raise UsageError(f"'{text}' is no size: give bytes, or a number with k, MB, GB, KiB, MiB or GiB")
+            size = float(match[1]) * (1024 if match[3] else 1000) ** power
+            if size <= _MOST_BYTES:
+                return int(size)
+    raise UsageError(f"'{plain(text, 40)}' is no size: give bytes, or a number with k, MB, GB, KiB, MiB or GiB")
 
 
 def add_memory_option(p: argparse._ActionsContainer) -> None:

@@ -8,6 +8,8 @@ from typing import Any
 
 from tqdm import tqdm
 
+from potr_cl.cli.terminal import note
+
 
 class Progress:
     """A bar with the time left on a terminal; elsewhere a line when a stage begins and ends.
@@ -28,18 +30,19 @@ class Progress:
                 form = "{desc}: {percentage:3.0f}% |{bar}| {elapsed} elapsed, {remaining} left"
                 self._bar = tqdm(total=1.0, initial=done, desc=stage, bar_format=form, leave=False)
             elif stage not in self._began:
-                print(f"{stage} …", file=sys.stderr, flush=True)
+                note(f"{stage} …")
             self._began.setdefault(stage, time.perf_counter())
         if self._bar is not None:
             self._bar.update(done - self._bar.n)
         if done >= 1:
             self.close()
-            print(f"{stage}: {time.perf_counter() - self._began.pop(stage):.1f} s", file=sys.stderr, flush=True)
+            note(f"{stage}: {time.perf_counter() - self._began.pop(stage):.1f} s")
             self._stage = ""
 
     def tell(self, line: str) -> None:
         """Print a line of its own."""
-        tqdm.write(line, file=sys.stderr)
+        with tqdm.external_write_mode(file=sys.stderr):
+            note(line)
 
     def close(self) -> None:
         if self._bar is not None:

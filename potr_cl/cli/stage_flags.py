@@ -5,10 +5,16 @@ from __future__ import annotations
 import argparse
 import dataclasses
 from collections.abc import Collection
+from pathlib import Path
 from typing import Any
 
+from potr_cl.cli.guard import ReadPhotographs
+from potr_cl.cli.parser import whole_number
 from potr_cl.pipeline.presets import DEFAULT, PRESETS, stages_of
 from potr_cl.stages.stage import Flag, Stage, flags
+
+#: What the command line takes more exactly than stages do: the folders that they name hold photographs.
+_TYPES: dict[Any, Any] = {Path: ReadPhotographs, int: whole_number}
 
 
 def add_stage_flags(
@@ -60,7 +66,7 @@ def _add(place: argparse._ActionsContainer, kind: type[Stage], field: str, flag:
             settings |= {"action": "store_const", "const": not default}
         place.add_argument(flag.flag, **settings)
         return
-    settings["type"] = flag.kind
+    settings["type"] = _TYPES.get(flag.kind, flag.kind)
     if flag.choices:
         settings["choices"] = flag.choices
     if flag.metavar:

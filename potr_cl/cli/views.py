@@ -3,10 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import sys
-from pathlib import Path
 
+from potr_cl.cli.guard import ReadCameras, check_photographs
 from potr_cl.cli.options import CAMERAS_HELP
+from potr_cl.cli.parser import whole_number
+from potr_cl.cli.terminal import note
 from potr_cl.formats import load_cameras
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
@@ -16,10 +17,12 @@ from potr_cl.stages.stage import Progress
 
 def add_cameras_options(p: argparse.ArgumentParser) -> None:
     """``--cameras``, and what to do without."""
-    p.add_argument("--cameras", type=Path, metavar="PATH", help=f"{CAMERAS_HELP}; without, virtual cameras are placed")
+    p.add_argument(
+        "--cameras", type=ReadCameras, metavar="PATH", help=f"{CAMERAS_HELP}; without, virtual cameras are placed"
+    )
     p.add_argument(
         "--virtual-views",
-        type=int,
+        type=whole_number,
         metavar="N",
         help=f"to place without --cameras; default {FEWEST} to {MOST}, the fewer the more splats",
     )
@@ -27,7 +30,18 @@ def add_cameras_options(p: argparse.ArgumentParser) -> None:
 
 def given_cameras(args: argparse.Namespace) -> list[Camera] | None:
     """The cameras of the file that ``--cameras`` names, if it names one."""
-    return None if args.cameras is None else load_cameras(args.cameras)
+    return None if args.cameras is None else read_cameras(args)
+
+
+def read_cameras(args: argparse.Namespace) -> list[Camera]:
+    """The cameras of ``--cameras``; no output may be a photograph of theirs.
+
+    Raises:
+        UsageError: an output is one; and as :func:`potr_cl.formats.load_cameras`.
+    """
+    cameras = load_cameras(args.cameras)
+    check_photographs(args, cameras)
+    return cameras
 
 
 def virtual_cameras(args: argparse.Namespace, scene: Scene, progress: Progress) -> list[Camera]:
@@ -35,5 +49,5 @@ def virtual_cameras(args: argparse.Namespace, scene: Scene, progress: Progress) 
     progress("place cameras", 0.0)
     cameras = place_cameras(scene, args.virtual_views)
     progress("place cameras", 1.0)
-    print(f"no --cameras: {describe(cameras)}; the cameras of the photographs do better", file=sys.stderr)
+    note(f"no --cameras: {describe(cameras)}; the cameras of the photographs do better")
     return cameras

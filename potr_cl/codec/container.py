@@ -6,7 +6,6 @@ is the business of a version of the format (:mod:`potr_cl.codec.versions`). docs
 
 from __future__ import annotations
 
-import math
 import struct
 import zlib
 from dataclasses import dataclass, field
@@ -16,9 +15,10 @@ import numpy as np
 import zstandard
 from numpy.typing import NDArray
 
-from potr_cl.codec.sections import Coder, Property, Section, context_groups, is_per_splat, stream_count
+from potr_cl.codec.sections import Coder, Property, Section, context_groups, is_bytes, is_per_splat, stream_count
 from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
+from potr_cl.model.claims import check_claim
 from potr_cl.model.scene import SH_COEFFICIENTS
 
 MAGIC = b"POTR\r\n\x1a\n"
@@ -29,6 +29,11 @@ _FIXED = struct.Struct("<8sHHIQQBBHI8d8s8s")
 _FACTOR = struct.Struct("<d")
 _ENTRY = struct.Struct("<BBBBIQQ")
 _CRC = struct.Struct("<I")
+
+#: A splat, and a crowded cell of the octree, takes a bit of a file at least; what packs more is no scene.
+MOST_A_BYTE = 8
+#: Beyond single precision no centre can be told.
+_LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 
 #: The most that a coder's format can expand one stored byte to: a claim beyond is a lie, found before memory is taken.
 _MOST_EXPANSION = {Coder.RAW: 1, Coder.ZSTD: 1 << 15, Coder.DEFLATE: 1032, Coder.CONTEXT: 1 << 15}
@@ -183,12 +188,16 @@ def assemble(header: Header, coded: list[tuple[Section, bytes]]) -> list[bytes]:
     return [fixed + table + _CRC.pack(zlib.crc32(fixed + table)), *(stored for _, stored in coded)]
 
 
-def read_header(data: bytes | memoryview, file_bytes: int) -> Header:
+def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) -> Header:
     """Parse and verify header and section table.
+
+    What passes is no larger, once it is unpacked, than the number of splats and the octree's depth allow, and these are
+    in proportion to the file.
 
     Args:
         data: the first bytes of the file, all of the header at least.
         file_bytes: real size of the file.
+        trust: whether there may be more splats or cells a byte than a real scene has.
 
     Raises:
         DataError: not a .potr file, a future version, damaged, truncated, or sizes that cannot be true.
@@ -228,11 +237,15 @@ def read_header(data: bytes | memoryview, file_bytes: int) -> Header:
         raise DataError(f"format version {version} with flags {flags} is unknown")
     if degree >= len(SH_COEFFICIENTS) or splats < 1 or depth > 52:
         raise DataError(f"the header makes no sense: {splats} splats, SH degree {degree}, octree of {depth} levels")
-    if not all(math.isfinite(x) and abs(x) < 1e38 for x in numbers) or numbers[3] < 0:
+    if not all(abs(x) <= _LARGEST_FLOAT32 for x in numbers[:3]) or not 0 <= numbers[3] <= 2 * _LARGEST_FLOAT32:
         raise DataError("the header makes no sense: its root cube is not finite")
     if not all(1e-3 <= x <= 1e9 for x in (*numbers[4:], sf_ac)):
         raise DataError("the header makes no sense: a scale factor outside 0.001 to 1e9")
     sections = _read_table(data, count, header_bytes, file_bytes, rules, splats, degree)
+    _check_octree_sizes(sections, splats, depth)
+    check_claim(splats, file_bytes, MOST_A_BYTE, trust)
+    cells = sum(section.integers for section in sections if section.kind == Property.OCCUPANCY)
+    check_claim(cells, file_bytes, MOST_A_BYTE, trust, "octree cells")
     origin, side = (numbers[0], numbers[1], numbers[2]), numbers[3]
     sf_scale, sf_rotation, sf_opacity, sf_dc = numbers[4:8]
     return Header(
@@ -278,7 +291,7 @@ def _read_table(
             raise DataError(f"{what} is of coder {coder}, which format version {rules.number} does not have")
         if contextual and (index, streams) not in context_groups(section.kind, degree):
             raise DataError(f"{what} cannot hold {streams} streams of coder {coder}")
-        if not contextual and not 1 <= planes <= 8:
+        if not contextual and not 1 <= planes <= (1 if is_bytes(section.kind) else 8):
             raise DataError(f"{what} holds integers of {planes} bytes")
         if size != integers * max(planes, 1) or (is_per_splat(section.kind) and integers != splats * streams):
             units = "integers" if contextual else "bytes"
@@ -297,3 +310,25 @@ def _read_table(
     if (Property.OPACITY, 0) not in seen:
         raise DataError("there is no opacity section")
     return tuple(sections)
+
+
+def _check_octree_sizes(sections: tuple[Section, ...], splats: int, depth: int) -> None:
+    """Check that the octree's streams are no longer than some splats can need, before they are unpacked.
+
+    A level has at most as many cells with splats as there are splats. A crowded cell above the deepest level has a byte
+    of occupancy; every cell but the root is such a cell, or a leaf, of which there are no more than splats.
+    """
+    integers = {section.kind: section.integers for section in sections}
+    most = {
+        Property.OCCUPANCY: splats * depth,
+        Property.SEVERAL: (splats + integers.get(Property.OCCUPANCY, 0) + 7) // 8,
+        Property.MULTIPLICITY: splats // 2,
+        Property.TAIL_LENGTH: splats,
+        Property.TAIL: 3 * depth * ((splats + 7) // 8),
+    }
+    for kind, limit in most.items():
+        if integers.get(kind, 0) > limit:
+            raise DataError(
+                f"section '{kind.name.lower()}' holds {integers[kind]} integers, more than {splats} splats in an "
+                f"octree of {depth} levels can need"
+            )

@@ -5,8 +5,8 @@ Splats come in the order of the file. Nothing in a file is trusted.
 
 from __future__ import annotations
 
-import json
 import os
+import stat
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from dataclasses import dataclass
@@ -17,7 +17,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec import container, octree, sections
+from potr_cl.codec import container, metadata, octree, sections
 from potr_cl.codec.byte_planes import unpack_integers
 from potr_cl.codec.container import Header
 from potr_cl.codec.context.decoder import Reader, Stream
@@ -50,33 +50,43 @@ class PotrFile:
     data: bytes
 
     @staticmethod
-    def from_bytes(data: bytes) -> PotrFile:
+    def from_bytes(data: bytes, trust: bool = False) -> PotrFile:
         """Verify the header of a file in memory.
 
+        Args:
+            data: the whole file.
+            trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
+
         Raises:
-            DataError: not a .potr file, or a damaged one.
+            DataError: not a .potr file, or a damaged one, or too many splats for its size.
         """
-        return PotrFile(container.read_header(data, len(data)), data)
+        return PotrFile(container.read_header(data, len(data), trust), data)
 
     @staticmethod
-    def open(path: str | os.PathLike[str]) -> PotrFile:
+    def open(path: str | os.PathLike[str], trust: bool = False) -> PotrFile:
         """Read a file and verify its header.
+
+        Args:
+            path: of the file, or of a pipe that brings one.
+            trust: as of :meth:`from_bytes`.
 
         Raises:
             UsageError: the path cannot be read.
-            DataError: not a .potr file, or a damaged one.
+            DataError: not a .potr file, or a damaged one, or too many splats for its size.
         """
         path = Path(path)
         try:
             with path.open("rb") as file:
-                size = os.fstat(file.fileno()).st_size
+                status = os.fstat(file.fileno())
+                if not (stat.S_ISREG(status.st_mode) or stat.S_ISFIFO(status.st_mode)):
+                    raise UsageError(f"'{path}' is not a regular file")
                 # The header must be sound before the rest is worth its memory.
                 start = file.read(len(container.MAGIC))
-                if start == container.MAGIC or size == 0:
+                if start == container.MAGIC:
                     start += file.read()
-            return PotrFile(container.read_header(start, max(len(start), size)), start)
-        except OSError as error:
-            raise UsageError(f"cannot read '{path}': {error.strerror}") from None
+            return PotrFile(container.read_header(start, max(len(start), status.st_size), trust), start)
+        except (OSError, ValueError) as error:
+            raise UsageError(f"cannot read '{path}': {getattr(error, 'strerror', None) or error}") from None
         except DataError as error:
             raise DataError(f"'{path}': {error}") from None
 
@@ -87,13 +97,7 @@ class PotrFile:
         Raises:
             DataError: damaged.
         """
-        try:
-            facts = json.loads(bytes(self._raw(Property.METADATA)) or b"{}")
-        except (ValueError, RecursionError):
-            facts = None
-        if not isinstance(facts, dict):
-            raise DataError("section 'metadata' is not a JSON object")
-        return facts
+        return metadata.parse(bytes(self._raw(Property.METADATA)))
 
     def means(self) -> NDArray[np.float32]:
         """(N, 3) float32 centres, world units.
@@ -156,6 +160,7 @@ class PotrFile:
             DataError: damaged.
         """
         header = self.header
+        _ = self.metadata  # it takes no part in the scene, but damage anywhere is damage
         try:
             planar = self._empty_sh()
             log_scales = np.empty((header.splats, 3), np.float32)
@@ -312,7 +317,7 @@ class PotrFile:
             if differences:
                 channels = [level.astype(np.int64) for level in levels]
                 for c, channel in enumerate(channels):
-                    channel[0] += last[c]
+                    channel[:1] += last[c]  # an array: unlike a number it wraps round without a warning
                     np.cumsum(channel, out=channel)
                     last[c] = channel[-1]
             else:
@@ -349,17 +354,22 @@ def _to_rgb(channels: list[NDArray[Any]], factor: float, out: NDArray[np.float32
     np.divide(r - co, divisor, out=out[2], dtype=np.float32, casting="unsafe")
 
 
-def decode(source: bytes | str | os.PathLike[str]) -> Scene:
+def decode(source: bytes | str | os.PathLike[str], trust: bool = False) -> Scene:
     """Decode a .potr file, given as bytes or as a path.
+
+    Args:
+        source: the file.
+        trust: whether it may hold more splats a byte than a real scene has. Without, the memory taken is in proportion
+            to the size of the file.
 
     Raises:
         UsageError: the path cannot be read.
-        DataError: damaged.
+        DataError: damaged, or too many splats for its size.
     """
     if isinstance(source, bytes):
-        return PotrFile.from_bytes(source).scene()
+        return PotrFile.from_bytes(source, trust).scene()
     try:
-        return PotrFile.open(source).scene()
+        return PotrFile.open(source, trust).scene()
     except DataError as error:
         where = os.fspath(source)
         raise error if where in str(error) else DataError(f"'{where}': {error}") from None

@@ -24,6 +24,7 @@ from potr_cl.errors import DataError
 
 #: Levels that float64 arithmetic on the root cube can tell apart.
 DEEPEST_LEVEL = 52
+_LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 #: Splats worked on at a time where each stands for itself: the temporaries of a block stay in the cache.
 _BLOCK = 1 << 15
 #: Levels whose octants fit a 64-bit Morton word.
@@ -349,13 +350,16 @@ def parse(streams: OctreeStreams, splats: int) -> NDArray[np.float32]:
         raise DataError(f"positions: a tail leads below the octree's deepest level {depth}")
     _append_tails(coordinates, lengths, streams.tails)
 
-    cell = streams.side * 2.0 ** -np.arange(depth + 1)
+    cell = np.ldexp(streams.side, -np.arange(depth + 1))
     means = np.empty((leaves, 3), np.float32)
-    for start in range(0, leaves, _BLOCK):
-        block = slice(start, start + _BLOCK)
-        size = cell[level_of[block]]
-        for axis, c in enumerate(coordinates):
-            means[block, axis] = (c[block].astype(np.float64) + 0.5) * size + streams.origin[axis]
+    with np.errstate(over="ignore"):
+        for start in range(0, leaves, _BLOCK):
+            block = slice(start, start + _BLOCK)
+            size = cell[level_of[block]]
+            for axis, c in enumerate(coordinates):
+                means[block, axis] = (c[block].astype(np.float64) + 0.5) * size + streams.origin[axis]
+    if max(map(abs, streams.origin)) + streams.side > _LARGEST_FLOAT32 and not np.isfinite(means).all():
+        raise DataError("positions: a centre is beyond what single precision can hold")
     if is_crowded is not None:
         counts = np.ones(leaves, np.int64)
         counts[is_crowded] = streams.multiplicities.astype(np.int64)

@@ -11,11 +11,13 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, fields, replace
+from functools import lru_cache
 from typing import Literal
 
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError, UsageError
 
 Integers = NDArray[np.signedinteger]
@@ -35,6 +37,9 @@ LEAST_LOGIT, _LARGEST_LOGIT = -8.0, 12.0
 ZERO_SCALE = 0.25
 #: Quaternions turned at a time: few enough that a BLAS does not wake its threads, which takes longer than the work.
 _ROWS = 1 << 11
+#: Logarithms of levels are looked up in tables of two to the power of these: small ones are made in no time, large ones
+#: fit a second-level cache.
+_SMALLEST_TABLE, _LARGEST_TABLE = 8, 16
 #: Integers beyond this are not exact in float64; no sane scene comes near.
 _LARGEST = 2.0**53
 
@@ -177,9 +182,28 @@ def quantize_scales(log_scales: F64, sf_scale: float) -> Integers:
 
 def dequantize_scales(levels: NDArray[np.integer], sf_scale: float) -> F32:
     """Levels to natural logarithms of standard deviations."""
-    scales = np.maximum(levels.astype(np.float32), np.float32(ZERO_SCALE)) / np.float32(sf_scale)
-    logarithms: F32 = np.log(scales, dtype=np.float32)
-    return logarithms
+    return _looked_up(_log_scales, levels, sf_scale)
+
+
+def _log_scales(levels: NDArray[np.integer], sf_scale: float) -> F32:
+    return natural_logarithm(np.maximum(levels.astype(np.float32), np.float32(ZERO_SCALE)) / np.float32(sf_scale))
+
+
+def _looked_up(compute: Callable[[NDArray[np.integer], float], F32], levels: NDArray[np.integer], factor: float) -> F32:
+    """What ``compute`` makes of levels >= 0 and a scale factor, from a table where the levels are small."""
+    largest = int(levels.max(initial=0))
+    # Tables of few sizes, so that the blocks of a file share them.
+    table = _table(compute, 1 << max(_SMALLEST_TABLE, min(largest.bit_length(), _LARGEST_TABLE)), factor)
+    values: F32 = table.take(levels, mode="clip")
+    if largest >= len(table):
+        beyond = np.flatnonzero(levels >= len(table))
+        values[beyond] = compute(levels[beyond], factor)
+    return values
+
+
+@lru_cache(maxsize=16)
+def _table(compute: Callable[[NDArray[np.integer], float], F32], size: int, factor: float) -> F32:
+    return compute(np.arange(size), factor)
 
 
 # ------------------------------------------------------------------------------------------------ opacity
@@ -192,10 +216,13 @@ def quantize_opacities(logits: F64, sf_opacity: float) -> Integers:
 
 def dequantize_opacities(levels: NDArray[np.integer], sf_opacity: float) -> F32:
     """Levels to logits of (level + 0.25) / SF, kept a float32 rounding away from an opacity of 1."""
+    return _looked_up(_logits, levels, sf_opacity)
+
+
+def _logits(levels: NDArray[np.integer], sf_opacity: float) -> F32:
     opacity = (levels.astype(np.float32) + np.float32(OPACITY_SHIFT)) / np.float32(sf_opacity)
     opacity = np.minimum(opacity, np.float32(1 - 2.0**-24))
-    logits: F32 = np.log(opacity / (1 - opacity), dtype=np.float32)
-    return logits
+    return natural_logarithm(opacity / (1 - opacity))
 
 
 def quantize_logits(logits: F64, sf_opacity: float) -> Integers:
@@ -300,10 +327,11 @@ def dequantize_rotations(levels: Sequence[NDArray[np.integer]], factor: float | 
     """Levels of x, y, z to unit quaternions w, x, y, z in ``out`` (N, 4); w ≥ 0 is computed from the rest."""
     rest = np.ones(len(out), np.float32)
     factor = np.asarray(factor, np.float32)
-    for axis, level in enumerate(levels, start=1):
-        part = level.astype(np.float32) / factor
-        out[:, axis] = part
-        rest -= part * part
+    with np.errstate(over="ignore"):  # of squares, in a hostile file: the real part is 0 then
+        for axis, level in enumerate(levels, start=1):
+            part = level.astype(np.float32) / factor
+            out[:, axis] = part
+            rest -= part * part
     out[:, 0] = np.sqrt(np.maximum(rest, 0))
 
 

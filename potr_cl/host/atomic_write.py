@@ -11,15 +11,16 @@ from pathlib import Path
 from typing import BinaryIO
 
 from potr_cl.errors import PotrError, UsageError
+from potr_cl.host.leftovers import removed_at_end
 
 
 @contextlib.contextmanager
 def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     """Open a temporary file beside ``path`` for writing; rename it to ``path`` when the block ends well.
 
-    If the block fails in any way (Ctrl-C included), the temporary file is removed and an existing file at
-    ``path`` keeps its content. A symbolic link is followed: what it points to is replaced, not the link. An
-    existing file keeps its permission bits, a new one gets those that the umask leaves.
+    If the block fails in any way (Ctrl-C included), the temporary file is removed and an existing file at ``path``
+    keeps its content. A symbolic link is followed: what it points to is replaced, not the link. An existing file
+    keeps its permission bits, a new one gets those that the umask leaves.
 
     Args:
         path: of the file to write.
@@ -36,24 +37,22 @@ def replacing(path: str | os.PathLike[str]) -> Iterator[BinaryIO]:
     mode = _mode_of_existing(target, path)
     # Not derived from the whole name, which may already be as long as the file system allows.
     temporary = target.with_name(f".{target.name[:40]}.{secrets.token_hex(6)}.tmp")
-    try:
-        descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
-    except OSError as error:
-        if not target.parent.is_dir():
-            raise UsageError(f"cannot write '{path}': the folder '{target.parent}' does not exist") from error
-        raise UsageError(f"cannot write '{path}': {error.strerror}") from error
-    try:
-        # Closing flushes: a full disk may show only then, so it has to happen before the renaming.
-        with os.fdopen(descriptor, "w+b") as file:
-            yield file
-        if mode is not None:
-            temporary.chmod(mode)
-        temporary.replace(target)
-    except OSError as error:
-        raise PotrError(f"cannot write '{path}': {error.strerror or error}") from error
-    finally:
-        with contextlib.suppress(OSError):  # after the renaming there is nothing left to remove
-            temporary.unlink()
+    with removed_at_end(temporary):  # after the renaming there is nothing left to remove
+        try:
+            descriptor = os.open(temporary, os.O_RDWR | os.O_CREAT | os.O_EXCL | getattr(os, "O_BINARY", 0), 0o666)
+        except OSError as error:
+            if not target.parent.is_dir():
+                raise UsageError(f"cannot write '{path}': the folder '{target.parent}' does not exist") from error
+            raise UsageError(f"cannot write '{path}': {error.strerror}") from error
+        try:
+            # Closing flushes: a full disk may show only then, so it has to happen before the renaming.
+            with os.fdopen(descriptor, "w+b") as file:
+                yield file
+            if mode is not None:
+                temporary.chmod(mode)
+            temporary.replace(target)
+        except OSError as error:
+            raise PotrError(f"cannot write '{path}': {error.strerror or error}") from error
 
 
 def _mode_of_existing(target: Path, path: str | os.PathLike[str]) -> int | None:

@@ -34,6 +34,8 @@ _SPLATS_TIMES_VIEWS = 150_000_000
 #: Pixels of all of them together, and along a side of each.
 _PIXELS = 108_000_000
 _SMALLEST, _LARGEST = 500, 1000
+#: What may be asked for: no more views than places are tried, no wider ones than are rendered.
+_MOST_ASKED, _WIDEST_ASKED = 4000, 16384
 #: What the names of virtual cameras begin with.
 _PREFIX = "virtual_"
 
@@ -145,14 +147,17 @@ def place_cameras(scene: Scene, count: int | None = None, size: int | None = Non
         Cameras "virtual_000" and so on, in the order in which they were picked.
 
     Raises:
-        UsageError: ``count`` or ``size`` below 1.
+        UsageError: ``count`` or ``size`` below 1, or above what can be placed and rendered.
     """
     if count is None:
         count = min(max(_SPLATS_TIMES_VIEWS // len(scene), FEWEST), MOST)
     if size is None:
         size = min(max(round(math.sqrt(_PIXELS / max(count, 1))), _SMALLEST), _LARGEST)
-    if count < 1 or size < 1:
-        raise UsageError(f"{count} virtual views of {size} x {size} pixels: both must be at least 1")
+    if not (1 <= count <= _MOST_ASKED and 1 <= size <= _WIDEST_ASKED):
+        raise UsageError(
+            f"{count} virtual views of {size} x {size} pixels: both must be at least 1, the views at most "
+            f"{_MOST_ASKED}, a side at most {_WIDEST_ASKED}"
+        )
     frame = _frame(scene)
     matter = _matter(scene, frame)
     candidates = _candidates(frame, matter)

@@ -14,7 +14,7 @@ _HEADING = re.compile(r"^Build on <.*>:$")
 _ENDING = re.compile(r"^\((options|source saved as): ?.*\)$")
 
 
-def complaint(error: cl.Error) -> str:
+def complaint(error: BaseException) -> str:
     """The line of a failed call's message that tells most: the compiler's first error, else its first words.
 
     Where no compiler spoke it is the message's first line, with what pyopencl says several times said once.

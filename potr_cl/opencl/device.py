@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import logging
+import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
 from contextlib import contextmanager
@@ -21,9 +22,20 @@ from potr_cl.opencl.source import kernel_source
 
 logger = logging.getLogger("potr_cl")
 
+#: How drivers say that there is not enough memory, besides what pyopencl makes a MemoryError of.
+_NO_MEMORY = (
+    "OUT_OF_HOST_MEMORY",
+    "OUT_OF_RESOURCES",
+    "MEM_OBJECT_ALLOCATION_FAILURE",
+    "INVALID_BUFFER_SIZE",
+    "std::bad_alloc",
+)
+
 
 class Device:
     """A context, a queue, the programs built for them and the memory taken on one device.
+
+    Several threads may use one at a time, each with objects (a rasterizer, an encode) that it has made itself.
 
     Args:
         info: the device, or what :func:`choose_device` understands.
@@ -59,15 +71,16 @@ class Device:
         if compiler_fault(self.info) is not None:
             raise DeviceError(compiles_nothing([self.info]))
         self.family: Family = family or self.info.family
-        self.allocated = 0
         self.timings: list[tuple[str, cl.Event]] = []
-        self._unfinished: list[list[cl.Buffer]] = []
+        self._lock = threading.RLock()  # of the two that follow
+        self.allocated = 0
+        self._unfinished: dict[int, list[list[cl.Buffer]]] = {}  # by thread
         self._profiling = profiling
         self._build_options = tuple(build_options)
         self._variants = dict(variants or {})
         self._macros = dict(macros or {})
         self._programs: dict[tuple[str, tuple[tuple[str, str], ...]], cl.Program] = {}
-        self._kernels: dict[tuple[Any, ...], Kernel] = {}
+        self._of_this_thread = threading.local()
         with self.errors("cannot be opened"):
             self.context = new_context(self.info.handle)
             flags = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
@@ -90,12 +103,14 @@ class Device:
         """Turn pyopencl's errors into a DeviceError that says ``what`` about this device, or a DeviceMemoryError."""
         try:
             yield
-        except cl.MemoryError as error:
-            raise DeviceMemoryError(
-                f"device {self.info} ran out of memory ({error}): {self._memory_advice()}"
-            ) from None
-        except cl.Error as error:
+        except (cl.Error, MemoryError) as error:
             said = compiler.complaint(error)
+            if isinstance(error, (cl.MemoryError, MemoryError)) or any(
+                code in str(error).partition("\n")[0] for code in _NO_MEMORY
+            ):
+                raise DeviceMemoryError(
+                    f"device {self.info} ran out of memory ({said}): {self._memory_advice()}"
+                ) from None
             raise DeviceError(f"device {self.info} {what} ({said}): choose another with --device") from None
 
     def _memory_advice(self) -> str:
@@ -123,15 +138,18 @@ class Device:
         return Kernel(self, handle, source, self._variants)
 
     def shared_kernel(self, source: str, name: str, types: Any = None, **defines: str | int | float) -> Kernel:
-        """A kernel object that is made once a device: who takes it binds all its arguments before each launch.
+        """A kernel object that is made once a device and thread.
+
+        Who takes it binds all its arguments before each launch; another thread has another, for its own arguments.
 
         Args:
             source, defines: as :meth:`program` takes them.
         """
+        kernels: dict[tuple[Any, ...], Kernel] = self._of_this_thread.__dict__.setdefault("kernels", {})
         key = (source, name, tuple(sorted(defines.items())))
-        if key not in self._kernels:
-            self._kernels[key] = self.kernel(source, name, **defines)
-        return self._kernels[key]
+        if key not in kernels:
+            kernels[key] = self.kernel(source, name, **defines)
+        return kernels[key]
 
     def allocate(self, nbytes: int, what: str) -> cl.Buffer:
         """A read-write buffer.
@@ -152,32 +170,41 @@ class Device:
             )
         with self.errors(f"cannot hold {what}"):
             buffer = cl.Buffer(self.context, cl.mem_flags.READ_WRITE, nbytes)
-        self.allocated += nbytes
-        if self._unfinished:
-            self._unfinished[-1].append(buffer)
+        with self._lock:
+            self.allocated += nbytes
+            if scopes := self._unfinished.get(threading.get_ident()):
+                scopes[-1].append(buffer)
         return buffer
 
     @contextmanager
     def all_or_nothing(self) -> Iterator[None]:
-        """Free what was allocated inside if an error leaves it: for objects that own several buffers."""
-        self._unfinished.append([])
+        """Free what this thread allocated inside if an error leaves it: for objects that own several buffers."""
+        thread = threading.get_ident()
+        with self._lock:
+            scopes = self._unfinished.setdefault(thread, [])
+            scopes.append([])
         try:
             yield
         except BaseException:
-            for buffer in list(self._unfinished[-1]):
+            for buffer in list(scopes[-1]):
                 self.free(buffer)
             raise
         finally:
-            finished = self._unfinished.pop()
-            if self._unfinished:
-                self._unfinished[-1].extend(finished)
+            with self._lock:
+                finished = scopes.pop()
+                if scopes:
+                    scopes[-1].extend(finished)
+                else:
+                    del self._unfinished[thread]
 
     def free(self, buffer: cl.Buffer) -> None:
         """Give back what :meth:`allocate` gave."""
-        for buffers in self._unfinished:
-            if buffer in buffers:
-                buffers.remove(buffer)
-        self.allocated -= buffer.size
+        with self._lock:
+            # Another thread than the one that allocated it may free it.
+            for buffers in (scope for scopes in self._unfinished.values() for scope in scopes):
+                if buffer in buffers:
+                    buffers.remove(buffer)
+            self.allocated -= buffer.size
         buffer.release()
 
     def upload(self, array: np.ndarray[Any, Any], what: str) -> cl.Buffer:
@@ -207,7 +234,7 @@ class Device:
         """Enqueue ``kernel`` with the arguments it has; in another queue than the device's own if one is given."""
         try:
             event = cl.enqueue_nd_range_kernel(queue or self.queue, kernel.handle, items, group)
-        except cl.Error:
+        except (cl.Error, MemoryError):
             with self.errors(f"failed to run {kernel.name}"):
                 raise
         if self._profiling:

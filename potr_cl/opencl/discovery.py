@@ -221,7 +221,7 @@ def fitting_devices(spec: str | None = None) -> list[DeviceInfo]:
     if not spec:
         return devices
     wanted = spec.strip().lower()
-    if wanted.isdigit():
+    if wanted.isdecimal() and len(wanted) < 9:
         matches = [d for d in devices if d.index == int(wanted)]
     elif wanted in ("cpu", "gpu"):
         matches = [d for d in devices if d.kind == wanted]

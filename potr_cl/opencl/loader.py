@@ -111,8 +111,8 @@ def _register_intel_runtime() -> None:
     contents = {icd.name: icd.read_text(errors="replace") for icd in others}
     contents["potr_cl_intel_cpu.icd"] = f"{library}\n"
     digest = hashlib.sha256(repr(sorted(contents.items())).encode()).hexdigest()[:16]
-    folder = Path(tempfile.gettempdir()) / f"potr_cl_icd_{os.getuid()}_{digest}"
     try:
+        folder = Path(tempfile.gettempdir()) / f"potr_cl_icd_{os.getuid()}_{digest}"
         folder.mkdir(mode=0o700, exist_ok=True)
         if folder.stat().st_uid != os.getuid():
             return  # someone else's folder: do not load libraries that it names

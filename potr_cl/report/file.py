@@ -8,6 +8,7 @@ from typing import Any
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.sections import Property, Section
 from potr_cl.model.scene import SH_COEFFICIENTS
+from potr_cl.plain_text import plain_fact
 
 _GROUPS = {
     Property.METADATA: "metadata",
@@ -55,7 +56,8 @@ def file_report(file: PotrFile) -> dict[str, Any]:
         DataError: the positions or the metadata are damaged.
     """
     header = file.header
-    metadata = file.metadata
+    # A file says of itself what it likes.
+    metadata = {name: plain_fact(value) for name, value in file.metadata.items()}
     means = file.means()
     grouped: dict[str, list[Section]] = {}
     for section in header.sections:

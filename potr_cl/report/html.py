@@ -21,10 +21,14 @@ from PIL import Image, features
 
 from potr_cl.formats.images import to_8_bits
 from potr_cl.model.scene import FloatArray
+from potr_cl.plain_text import plain
 from potr_cl.quality.compare import difference_map
 from potr_cl.report.summary import decibels
 
 _COLOURS = ("#4269d0", "#efb118", "#ff725c", "#6cc5b0", "#3ca951", "#ff8ab7", "#a463f2", "#97bbf5", "#9c6b4e")
+
+#: Pixels along a side of a WebP picture.
+_WIDEST_WEBP = 16383
 
 
 @dataclass(frozen=True)
@@ -78,12 +82,17 @@ def html_report(report: dict[str, Any], pictures: Sequence[PicturePair]) -> str:
         _section("Settings", _settings(report)),
         _section("Time, device, versions", _circumstances(report)),
     ]
-    title = f"{escape(source['file'])} → {escape(report['file'])}"
+    title = f"{_text(source['file'])} → {_text(report['file'])}"
     return _PAGE.substitute(title=title, body="\n".join(filter(None, sections)))
 
 
+def _text(text: object) -> str:
+    """As HTML, and on one line without characters that do not print: names come from files that others wrote."""
+    return escape(plain(text))
+
+
 def _section(title: str, content: str) -> str:
-    return f"<section><h2>{escape(title)}</h2>\n{content}\n</section>"
+    return f"<section><h2>{_text(title)}</h2>\n{content}\n</section>"
 
 
 def _headline(report: dict[str, Any]) -> str:
@@ -99,8 +108,8 @@ def _headline(report: dict[str, Any]) -> str:
             (decibels(quality["psnr"]), "mean PSNR against the uncompressed scene"),
             (f"{quality['ssim']:.4f}", "mean SSIM"),
         ]
-    cards = "".join(f"<div><b>{escape(value)}</b><span>{escape(name)}</span></div>" for value, name in facts)
-    names = f"{escape(source['file'])} → {escape(report['file'])}"
+    cards = "".join(f"<div><b>{_text(value)}</b><span>{_text(name)}</span></div>" for value, name in facts)
+    names = f"{_text(source['file'])} → {_text(report['file'])}"
     return f'<header><h1>{names}</h1><div class="cards">{cards}</div></header>'
 
 
@@ -114,9 +123,9 @@ def _sizes(report: dict[str, Any]) -> str:
     left = 0.0
     for colour, (name, nbytes) in zip(_COLOURS, report["properties"].items(), strict=False):
         width = 100 * nbytes / total
-        tip = f"<title>{escape(name)}: {nbytes:,} bytes</title>"
+        tip = f"<title>{_text(name)}: {nbytes:,} bytes</title>"
         bar.append(f'<rect x="{left:.3f}" width="{width:.3f}" height="6" fill="{colour}">{tip}</rect>')
-        swatch = f'<i style="background:{colour}"></i>{escape(name)}'
+        swatch = f'<i style="background:{colour}"></i>{_text(name)}'
         rows.append([swatch, f"{nbytes:,}", f"{nbytes / splats:.2f}", f"{width:.1f} %"])
         left += width
     rows.append(["all", f"{total:,}", f"{total / splats:.2f}", "100 %"])
@@ -126,7 +135,7 @@ def _sizes(report: dict[str, Any]) -> str:
 
 def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
     """A table of cells that are HTML already."""
-    top = "".join(f"<th>{escape(cell)}</th>" for cell in head)
+    top = "".join(f"<th>{_text(cell)}</th>" for cell in head)
     lines = "\n".join("<tr>" + "".join(f"<td>{cell}</td>" for cell in row) + "</tr>" for row in rows)
     return f'<div class="wide"><table><thead><tr>{top}</tr></thead><tbody>\n{lines}\n</tbody></table></div>'
 
@@ -134,10 +143,10 @@ def _table(head: Sequence[str], rows: Sequence[Sequence[str]]) -> str:
 def _pair(pair: PicturePair) -> str:
     heat, factor = difference_map(pair.before, pair.after)
     height, width = pair.before.shape[:2]
-    name = escape(pair.view)
+    name = _text(pair.view)
     size = f'width="{width}" height="{height}"'
     return (
-        f"<h3>{escape(pair.title)}: {name}, {decibels(pair.psnr)}</h3>\n"
+        f"<h3>{_text(pair.title)}: {name}, {decibels(pair.psnr)}</h3>\n"
         '<div class="pair"><figure><div class="slider">\n'
         f'<img {size} src="{_data_uri(pair.before)}" alt="{name}, uncompressed">\n'
         f'<img {size} class="after" src="{_data_uri(pair.after)}" alt="{name}, compressed">\n'
@@ -152,7 +161,8 @@ def _pair(pair: PicturePair) -> str:
 def _data_uri(picture: FloatArray) -> str:
     """The picture without loss: what is to be compared may differ by little."""
     pixels: NDArray[np.uint8] = to_8_bits(picture)
-    kind, options = ("webp", {"lossless": True, "method": 2}) if features.check("webp") else ("png", {})
+    fits = max(pixels.shape[:2]) <= _WIDEST_WEBP and features.check("webp")
+    kind, options = ("webp", {"lossless": True, "method": 2}) if fits else ("png", {})
     file = io.BytesIO()
     Image.fromarray(pixels).save(file, format=kind, **options)
     return f"data:image/{kind};base64,{base64.b64encode(file.getvalue()).decode('ascii')}"
@@ -160,7 +170,7 @@ def _data_uri(picture: FloatArray) -> str:
 
 def _quality(quality: dict[str, Any] | str) -> str:
     if isinstance(quality, str):
-        return f"<p>{escape(quality)}</p>"
+        return f"<p>{_text(quality)}</p>"
     views = quality["views"]
     most = max((view["psnr"] for view in views if view["psnr"] is not None), default=1.0)
     rows = []
@@ -168,9 +178,9 @@ def _quality(quality: dict[str, Any] | str) -> str:
         length = 100.0 if view["psnr"] is None else 100 * max(view["psnr"], 0) / max(most, 1e-9)
         worst = " (worst)" if view["name"] == quality["worst"]["name"] else ""
         bar = f'<span class="meter" style="width:{length:.1f}%"></span>'
-        rows.append([escape(view["name"]) + worst, decibels(view["psnr"]), bar, f"{view['ssim']:.4f}"])
+        rows.append([_text(view["name"]) + worst, decibels(view["psnr"]), bar, f"{view['ssim']:.4f}"])
     rows.append(["<b>mean</b>", f"<b>{decibels(quality['psnr'])}</b>", "", f"<b>{quality['ssim']:.4f}</b>"])
-    said = f"<p>Against {escape(quality['against'])}, judged by {escape(quality['judged_by'])}.</p>"
+    said = f"<p>Against {_text(quality['against'])}, judged by {_text(quality['judged_by'])}.</p>"
     return said + _table(["view", "PSNR", "", "SSIM"], rows)
 
 
@@ -216,7 +226,7 @@ def _chart(title: str, series: Sequence[tuple[str, Sequence[float]]], logarithmi
     def y(value: float) -> float:
         return height - margin - (height - 2 * margin) * (scale(value) - low) / (high - low)
 
-    parts = [f'<text x="{margin_left}" y="16" class="title">{escape(title)}</text>']
+    parts = [f'<text x="{margin_left}" y="16" class="title">{_text(title)}</text>']
     for k in range(5):
         level = low + (high - low) * k / 4
         value = 10**level if logarithmic else level
@@ -235,7 +245,7 @@ def _chart(title: str, series: Sequence[tuple[str, Sequence[float]]], logarithmi
         if name:
             place = height - margin - 8 - 14 * [label for label, _ in points].index(name)
             style = f'text-anchor="end" style="fill:{colour}"'
-            parts.append(f'<text x="{width - 14}" y="{place}" {style}>{escape(name)}</text>')
+            parts.append(f'<text x="{width - 14}" y="{place}" {style}>{_text(name)}</text>')
     return f'<svg viewBox="0 0 {width} {height}" role="img">{"".join(parts)}</svg>'
 
 
@@ -247,13 +257,13 @@ def _search(search: dict[str, Any]) -> str:
         "steps": "other quantiser steps",
         "colours": "other steps of colours",
     }
-    rows = [[kinds[step["kind"]], f"{step['q']:g}", escape(step["said"])] for step in search["tries"]]
-    said = f"<p>Asked for: {escape(search['target'])}. Reached: {escape(search['reached'])}.</p>"
+    rows = [[kinds[step["kind"]], f"{step['q']:g}", _text(step["said"])] for step in search["tries"]]
+    said = f"<p>Asked for: {_text(search['target'])}. Reached: {_text(search['reached'])}.</p>"
     return said + _table(["step", "q", "result"], rows)
 
 
 def _settings(report: dict[str, Any]) -> str:
-    rows = [[escape(name), f"{value:.6g}"] for name, value in report["parameters"].items()]
+    rows = [[_text(name), f"{value:.6g}"] for name, value in report["parameters"].items()]
     others = {
         name: {field: each for field, each in value.items() if field not in report["parameters"]}
         if isinstance(value, dict)
@@ -263,26 +273,26 @@ def _settings(report: dict[str, Any]) -> str:
     return (
         '<div class="columns">'
         + _table(["parameter", "value"], rows)
-        + _table(["option", "value"], [[escape(name), _value(value)] for name, value in others.items()])
+        + _table(["option", "value"], [[_text(name), _value(value)] for name, value in others.items()])
         + "</div>"
     )
 
 
 def _value(value: Any) -> str:
     if isinstance(value, dict):
-        return "<br>".join(f"{escape(str(name))}: {_value(entry)}" for name, entry in value.items())
+        return "<br>".join(f"{_text(str(name))}: {_value(entry)}" for name, entry in value.items())
     if isinstance(value, list | tuple):
         return ", ".join(_value(entry) for entry in value)
-    return "–" if value is None else escape(f"{value:.6g}" if isinstance(value, float) else str(value))
+    return "–" if value is None else _text(f"{value:.6g}" if isinstance(value, float) else str(value))
 
 
 def _circumstances(report: dict[str, Any]) -> str:
-    times = [[escape(stage), f"{seconds:.1f} s"] for stage, seconds in report["seconds"].items()]
+    times = [[_text(stage), f"{seconds:.1f} s"] for stage, seconds in report["seconds"].items()]
     facts = dict(report["versions"])
     if report["device"] is not None:
         device = report["device"]
         facts = {"device": device["name"], "platform": f"{device['platform']}, {device['version']}"} | facts
-    rows = [[escape(name), escape(value)] for name, value in facts.items()]
+    rows = [[_text(name), _text(value)] for name, value in facts.items()]
     return f'<div class="columns">{_table(["stage", "time"], times)}{_table(["", ""], rows)}</div>'
 
 

@@ -15,6 +15,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.pipeline.encode import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.search import Found, Target
+from potr_cl.plain_text import plain_document
 from potr_cl.quality.compare import Comparison, Figures, mean_view
 from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.report.file import file_report
@@ -43,22 +44,24 @@ def encode_report(
         scene: the uncompressed scene.
         file: what was written to ``target``.
         encoded: how it came about.
-        options: that it was encoded with.
+        options: that it was encoded with; they know the size of ``source``.
         search: of :func:`search_report`, where ``options`` were found by a search.
         quality: of :func:`quality_report`, or why it was not judged.
         seconds: wall time by stage, in order; "total" last.
     """
     contents = file_report(file)
+    # The file itself may be gone by now.
+    source_bytes = source.stat().st_size if options.source_bytes is None else options.source_bytes
     report: dict[str, Any] = {
         "source": {
             "file": str(source),
-            "bytes": source.stat().st_size,
+            "bytes": source_bytes,
             "splats": len(scene),
             "sh_degree": scene.sh_degree,
         },
         "file": str(target),
         "bytes": len(file.data),
-        "ratio": source.stat().st_size / len(file.data),
+        "ratio": source_bytes / len(file.data),
         "splats": file.header.splats,
         "bytes_a_splat": len(file.data) / file.header.splats,
         "properties": _properties(contents["sections"]),
@@ -80,7 +83,8 @@ def encode_report(
     if encoded.device is not None:
         info = encoded.device.info
         report["device"] = {"name": info.name, "platform": info.platform, "version": info.version}
-    return report
+    shown: dict[str, Any] = plain_document(report)
+    return shown
 
 
 def _properties(sections: dict[str, dict[str, float]]) -> dict[str, int]:

@@ -34,4 +34,4 @@ def test_convert_tells_what_it_cannot_do(tmp_path, data, capsys, output, said):
 def test_convert_does_not_replace_its_input(tmp_path, data, capsys):
     shutil.copy(data / "lego_excerpt.ply", tmp_path / "a.ply")
     assert main(["convert", str(tmp_path / "a.ply"), str(tmp_path / "a.ply")]) == 2
-    assert "replaced by itself" in capsys.readouterr().err
+    assert "would be replaced" in capsys.readouterr().err

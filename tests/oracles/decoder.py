@@ -41,6 +41,7 @@ STORED = 0
 ZSTANDARD = 1
 ZLIB = 2
 CONTEXT = 3
+LARGEST_SINGLE = (2 - 2.0**-23) * 2.0**127
 LARGEST_EXPANSION = {STORED: 1, ZSTANDARD: 2**15, ZLIB: 1032, CONTEXT: 2**15}
 
 
@@ -147,8 +148,8 @@ def read_header(data: bytes) -> Header:
     check(splats >= 1, "the file holds no splats")
     check(degree <= 3, f"SH degree {degree} is above 3")
     check(deepest <= 52, f"deepest octree level {deepest} is above 52")
-    check(all(math.isfinite(value) for value in origin), "the origin of the root cube is not finite")
-    check(math.isfinite(edge) and edge >= 0, "the edge of the root cube is negative or not finite")
+    check(all(abs(value) <= LARGEST_SINGLE for value in origin), "the origin of the root cube is out of range")
+    check(0 <= edge <= 2 * LARGEST_SINGLE, "the edge of the root cube is out of range")
     for factor in (*scale_factors, ac_factor):
         check(0.001 <= factor <= 1e9, f"scale factor {factor} is not within 0.001 to 10^9")
 
@@ -218,10 +219,24 @@ def read_sections(data: bytes, header: Header) -> Sections:
             sections[prop, index] = Section(planes, undo_coder(coder, stored, raw_size, name))
 
     check(start == len(data), "the sections do not fill the file")
+    check_octree_sizes(sections, header)
     # It also bounds the number of splats by the size of the file, before anything is made for each splat.
     check((OPACITY, 0) in sections, "the opacity section is absent")
     undo_context_coder(coded, sections, header.splats)
     return sections
+
+
+def check_octree_sizes(sections: Sections, header: Header) -> None:
+    """Check that the streams of the octree are not longer than the number of splats allows."""
+    occupancy, several, tail_length, tail = (
+        len(raw_bytes(sections, prop)) for prop in (OCCUPANCY, SEVERAL, TAIL_LENGTH, TAIL)
+    )
+    check(occupancy <= header.splats * header.deepest, "too much occupancy")
+    check(several <= bytes_for_bits(header.splats + occupancy), "too much of several")
+    check(tail_length <= header.splats, "too many tail lengths")
+    check(tail <= 3 * header.deepest * bytes_for_bits(header.splats), "too much tail")
+    if (MULTIPLICITY, 0) in sections:
+        check(len(unsigned_integers(sections[MULTIPLICITY, 0])) <= header.splats / 2, "too many multiplicities")
 
 
 def undo_context_coder(coded: dict[tuple[int, int], bytes], sections: Sections, splats: int) -> None:
@@ -288,12 +303,31 @@ def decode_metadata(sections: Sections) -> dict[str, Any]:
     if not raw:
         return {}
     try:
-        metadata = json.loads(raw.decode("utf-8"))
+        metadata = json.loads(raw.decode("utf-8"), parse_constant=reject, parse_float=finite, parse_int=of_64_bits)
+        # Python takes half of a surrogate pair for a character, but cannot write it as UTF-8.
+        json.dumps(metadata, ensure_ascii=False).encode("utf-8")
     except (ValueError, RecursionError) as error:
         raise ValueError(f"the metadata is not JSON in UTF-8: {error}") from error
     if not isinstance(metadata, dict):
         raise ValueError("the metadata is not a JSON object")
     return metadata
+
+
+def reject(text: str) -> None:
+    """Refuse the constants that only Python's JSON has."""
+    raise ValueError(f"{text} is no JSON")
+
+
+def finite(text: str) -> float:
+    """Return a number with a point or an exponent."""
+    check(math.isfinite(float(text)), "a number is not finite")
+    return float(text)
+
+
+def of_64_bits(text: str) -> int:
+    """Return a whole number."""
+    check(-(2**63) < int(text) < 2**63, "a whole number has more than 64 bits")
+    return int(text)
 
 
 # Integers
@@ -457,7 +491,7 @@ def decode_context_section(
             for n in range(splats):
                 place = n % steps
                 before = [values[n - k] for k in range(1, 5) if place - k >= 0]
-                values[n] += (sum(before) + 2) // 4
+                values[n] = wrapped(values[n] + wrapped(sum(before) + 2) // 4)
         history.add([token_size(token, signed) for token in tokens])
         streams.append(values)
     check(words_read == len(words), "a context section has too many words")
@@ -531,6 +565,9 @@ def decode_means(sections: Sections, header: Header) -> np.ndarray:
     for leaf in leaves:
         for _ in range(leaf.splats):
             means.append(centre(leaf, header))
+    with np.errstate(over="ignore"):
+        singles = np.array(means).astype(np.float32)
+    check(bool(np.isfinite(singles).all()), "a centre is out of range")
     return np.array(means, dtype=np.float64).reshape(header.splats, 3)
 
 
@@ -679,9 +716,9 @@ def decode_sh(sections: Sections, header: Header) -> np.ndarray:
             streams = [running_sums(stream) for stream in streams]
         for n in range(header.splats):
             luma, orange, green = (stream[n] for stream in streams)
-            sh[n, coefficient, 0] = (luma + orange - green) / factor
-            sh[n, coefficient, 1] = (luma + green) / factor
-            sh[n, coefficient, 2] = (luma - orange - green) / factor
+            sh[n, coefficient, 0] = wrapped(luma + orange - green) / factor
+            sh[n, coefficient, 1] = wrapped(luma + green) / factor
+            sh[n, coefficient, 2] = wrapped(luma - orange - green) / factor
     return sh
 
 
@@ -690,9 +727,14 @@ def running_sums(differences: list[int]) -> list[int]:
     total = 0
     sums = []
     for difference in differences:
-        total += difference
+        total = wrapped(total + difference)
         sums.append(total)
     return sums
+
+
+def wrapped(value: int) -> int:
+    """Return what is left of an integer in signed 64 bits that wrap round."""
+    return (value + 2**63) % 2**64 - 2**63
 
 
 def check(condition: bool, message: str) -> None:

@@ -23,7 +23,8 @@ def cli_page() -> str:
         "Every command is called as `python -m potr_cl COMMAND`, or as `potr-cl COMMAND` once the package is "
         "installed. The [README](../README.md#usage) shows what they are for.",
         "Exit codes: 0 success; 1 bad data, a device that fails, or a target that no quality reaches; 2 wrong usage; "
-        "130 interrupted. An output file appears only when it is whole.",
+        "130 interrupted, 143 terminated, 129 the terminal was closed. An output file appears only when it is "
+        "whole, and never in the place of an input. Errors are one line on standard error.",
         table(("command", "what it does"), [(f"[`{n}`](#{n})", cell(helps[n])) for n in commands.choices]),
     ]
     for name, command in commands.choices.items():

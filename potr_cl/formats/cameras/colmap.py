@@ -10,7 +10,6 @@ from __future__ import annotations
 import math
 import os
 import struct
-import tempfile
 from pathlib import Path
 from types import ModuleType
 from typing import Any
@@ -28,6 +27,7 @@ from potr_cl.formats.cameras.view_files import (
     view_names,
 )
 from potr_cl.formats.declaration import CameraFormat, install_command
+from potr_cl.host.leftovers import temporary_folder
 from potr_cl.model.camera import Camera
 
 #: Of this package, which brings pycolmap.
@@ -126,7 +126,7 @@ def _read_checked(folder: Path, ending: str) -> tuple[Any, list[Any]]:
             images.name: _without_points_text(read_bytes(images), images),
             "points3D.txt": b"",
         }
-    with tempfile.TemporaryDirectory(prefix="potr-cl-") as copy:
+    with temporary_folder() as copy:
         for name, data in content.items():
             Path(copy, name).write_bytes(data)
         try:

@@ -48,7 +48,7 @@ class SweepOptions:
     seed: int = 0
 
     def __post_init__(self) -> None:
-        if not self.tolerance < np.inf:
+        if not np.isfinite(self.tolerance):
             raise UsageError(f"the tile tolerance is {self.tolerance:g}, it must be a number")
         if self.turns < 1:
             raise UsageError(f"views cannot be swept every {self.turns} measurements: at least 1 is needed")
