@@ -50,6 +50,10 @@ def cameras_json() -> bytes:
     return json.dumps(views).encode()
 
 
+def good_cameras_json() -> list[Files]:
+    return [{"cameras.json": cameras_json()}]
+
+
 def changed_cameras_json(rng: Random) -> Files:
     data = cameras_json()
     if rng.random() < 0.6:
@@ -86,6 +90,17 @@ def transforms_json() -> bytes:
 _BESIDE = {"transform": [[1.0, 0.0, 0.0, 0.1], [0.0, 1.0, 0.0, 0.2], [0.0, 0.0, 1.0, 0.3]], "scale": 0.25}
 
 
+def good_transforms_json() -> list[Files]:
+    content = json.loads(transforms_json())
+    del content["w"]
+    pictures = {frame["file_path"]: small_png() for frame in content["frames"]}
+    return [
+        {"transforms.json": transforms_json()},
+        {"transforms.json": transforms_json(), "dataparser_transforms.json": json.dumps(_BESIDE).encode()},
+        {"transforms.json": json_bytes(content), **pictures},
+    ]
+
+
 def changed_transforms_json(rng: Random) -> Files:
     content = json.loads(transforms_json())
     kind = rng.randrange(10)
@@ -109,16 +124,14 @@ def changed_transforms_json(rng: Random) -> Files:
     return files
 
 
-def changed_colmap_binary(rng: Random) -> Files:
+def _model() -> tuple[list[Any], list[Any]]:
+    """Cameras and images of a model: number, lens, sides, parameters; number, pose, camera, name, points."""
     cameras = [(1, _PINHOLE, 64, 48, [60.0, 61.0, 32.0, 24.0]), (2, _SIMPLE_PINHOLE, 64, 48, [60.0, 32.0, 24.0])]
     images = [(k + 1, [1.0, 0.0, 0.0, 0.0], [float(k), 0.0, 2.0], 1 + k % 2, f"view_{k}.png", k % 2) for k in range(3)]
-    said = [len(cameras), len(images)]
-    if rng.random() < 0.6:
-        _change_model(cameras, images, rng)
-    if rng.random() < 0.15:
-        said[rng.randrange(2)] = interesting(rng, 8)
-    else:
-        said = [len(cameras), len(images)]
+    return cameras, images
+
+
+def _binary(cameras: list[Any], images: list[Any], said: list[int], rng: Random) -> Files:
     lenses = struct.pack("<Q", said[0])
     for number, model, width, height, params in cameras:
         lenses += struct.pack(f"<IiQQ{len(params)}d", number, model, width, height, *params)
@@ -127,11 +140,25 @@ def changed_colmap_binary(rng: Random) -> Files:
         poses += struct.pack("<I7dI", number, *rotation, *translation, camera)
         poses += name.encode("utf-8", "surrogatepass") + b"\0" + struct.pack("<Q", points)
         poses += rng.randbytes(24) * min(points, 3)
-    if rng.random() < 0.25:
-        lenses = damaged(lenses, rng)
-    if rng.random() < 0.35:
-        poses = damaged(poses, rng)
     return {"images.bin": poses, "cameras.bin": lenses}
+
+
+def good_colmap_binary() -> list[Files]:
+    return [_binary(*_model(), [2, 3], Random(0))]
+
+
+def changed_colmap_binary(rng: Random) -> Files:
+    cameras, images = _model()
+    if rng.random() < 0.6:
+        _change_model(cameras, images, rng)
+    said = [len(cameras), len(images)]
+    if rng.random() < 0.15:
+        said[rng.randrange(2)] = interesting(rng, 8)
+    files = _binary(cameras, images, said, rng)
+    for name, chance in (("cameras.bin", 0.25), ("images.bin", 0.35)):
+        if rng.random() < chance:
+            files[name] = damaged(files[name], rng)
+    return files
 
 
 def _change_model(cameras: list[Any], images: list[Any], rng: Random) -> None:
@@ -170,6 +197,10 @@ _TEXT_IMAGES = (
     b"# images\n1 1.0 0.0 0.0 0.0 0.0 0.0 2.0 1 view_0.png\n\n2 0.8 0.6 0.0 0.0 1.0 0.0 2.0 2 a b.png\n1.0 2.0 -1\n"
     b"3 1.0 0.0 0.0 0.0 2.0 0.0 2.0 1 view_2.png\n\n"
 )
+
+
+def good_colmap_text() -> list[Files]:
+    return [{"images.txt": _TEXT_IMAGES, "cameras.txt": _TEXT_CAMERAS}]
 
 
 def changed_colmap_text(rng: Random) -> Files:

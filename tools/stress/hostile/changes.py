@@ -159,7 +159,10 @@ def damaged_json(data: bytes, rng: Random) -> bytes:
     """A JSON file with changed values, or changed as a text."""
     if rng.random() < 0.25:
         return damaged_text(data, rng)
-    value = json.loads(data)
+    try:
+        value = json.loads(data)
+    except (ValueError, RecursionError):  # an earlier change has been here
+        return damaged(data, rng)
     for _ in range(1 + rng.randrange(3)):
         value = damaged_value(value, rng)
     return json_bytes(value)

@@ -41,6 +41,7 @@ class Format:
     """A kind of input.
 
     Attributes:
+        good: files as they should be, each with those that belong to it: what the changed ones are made of.
         changed: makes a changed file, or several that belong together.
         read: reads the first of them, as the package's user does. Raises WrongResult if what comes out cannot be right.
         constant, a_byte: memory that reading may take, in bytes: so much for any file, and so much for each byte of it.
@@ -48,6 +49,7 @@ class Format:
             show that a library looked there.
     """
 
+    good: Callable[[], list[Files]]
     changed: Callable[[Random], Files]
     read: Callable[[Path], Any]
     constant: int
@@ -92,7 +94,7 @@ def read_picture(path: Path) -> Any:
     """What is done with a photograph."""
     width, height = image_size(path)
     pixels = read_ground_truth(path)
-    if pixels.shape != (height, width, 3) or not (0 <= pixels.min() and pixels.max() <= 1):
+    if pixels.shape != (height, width, 3) or not (pixels.min() >= 0 and pixels.max() <= 1):
         raise WrongResult("pixels that are none")
     return pixels
 
@@ -114,24 +116,36 @@ def parts_of(result: Any) -> list[bytes]:
     return [repr(result).encode()]
 
 
-def _one(name: str, changed: Callable[[Random], bytes]) -> Callable[[Random], Files]:
-    return lambda rng: {name: changed(rng)}
+def _single(
+    name: str, good: Callable[[], list[bytes]], changed: Callable[[Random], bytes], *others: Any, **more: Any
+) -> Format:
+    """A format whose files stand alone."""
+    return Format(lambda: [{name: data} for data in good()], lambda rng: {name: changed(rng)}, *others, **more)
 
 
 #: By name. docs/security.md states the costs.
 FORMATS: dict[str, Format] = {
-    "potr": Format(_one("a.potr", potr_files.changed), read_potr, 64 * MIB, 8192, twice=True),
-    "ply": Format(_one("a.ply", ply_files.changed_plain), read_scene, 32 * MIB, 64, twice=True),
-    "compressed.ply": Format(
-        _one("a.compressed.ply", ply_files.changed_compressed), read_scene, 32 * MIB, 64, twice=True
+    "potr": _single("a.potr", potr_files.originals, potr_files.changed, read_potr, 64 * MIB, 8192, twice=True),
+    "ply": _single("a.ply", ply_files.plain_originals, ply_files.changed_plain, read_scene, 32 * MIB, 64, twice=True),
+    "compressed.ply": _single(
+        "a.compressed.ply", ply_files.compressed_originals, ply_files.changed_compressed, read_scene, 32 * MIB, 64,
+        twice=True,
     ),
-    "spz": Format(_one("a.spz", spz_files.changed), read_scene, 64 * MIB, 8192, twice=True),
-    "sog": Format(_one("a.sog", sog_files.changed), read_scene, 64 * MIB, 8192, twice=True),
-    "cameras.json": Format(camera_files.changed_cameras_json, read_cameras, 32 * MIB, 256),
-    "transforms.json": Format(camera_files.changed_transforms_json, read_cameras, 32 * MIB, 256),
-    "colmap-binary": Format(camera_files.changed_colmap_binary, read_cameras, 32 * MIB, 256),
-    "colmap-text": Format(camera_files.changed_colmap_text, read_cameras, 32 * MIB, 256),
-    "png": Format(_one("a.png", picture_files.changed_png), read_picture, 32 * MIB, 256),
-    "jpeg": Format(_one("a.jpg", picture_files.changed_jpeg), read_picture, 32 * MIB, 256),
-    "webp": Format(_one("a.webp", picture_files.changed_webp), read_picture, 32 * MIB, 256),
-}
+    "spz": _single("a.spz", spz_files.originals, spz_files.changed, read_scene, 64 * MIB, 8192, twice=True),
+    "sog": _single("a.sog", sog_files.originals, sog_files.changed, read_scene, 64 * MIB, 8192, twice=True),
+    "cameras.json": Format(
+        camera_files.good_cameras_json, camera_files.changed_cameras_json, read_cameras, 32 * MIB, 256
+    ),
+    "transforms.json": Format(
+        camera_files.good_transforms_json, camera_files.changed_transforms_json, read_cameras, 32 * MIB, 256
+    ),
+    "colmap-binary": Format(
+        camera_files.good_colmap_binary, camera_files.changed_colmap_binary, read_cameras, 32 * MIB, 256
+    ),
+    "colmap-text": Format(
+        camera_files.good_colmap_text, camera_files.changed_colmap_text, read_cameras, 32 * MIB, 256
+    ),
+    "png": _single("a.png", picture_files.good_pngs, picture_files.changed_png, read_picture, 32 * MIB, 256),
+    "jpeg": _single("a.jpg", picture_files.jpeg_originals, picture_files.changed_jpeg, read_picture, 32 * MIB, 256),
+    "webp": _single("a.webp", picture_files.webp_originals, picture_files.changed_webp, read_picture, 32 * MIB, 256),
+}  # fmt: skip

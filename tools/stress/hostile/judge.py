@@ -209,7 +209,16 @@ class _Watched:
         self.on = False
         self.found: list[tuple[str, str]] = []
         tmp = os.fspath(folder.parent / "tmp")
-        self._allowed = (os.fspath(folder), tmp, sys.prefix, sys.base_prefix, "/proc/self/", "/usr/", "/sys/", "/etc/ld")
+        self._allowed = (
+            os.fspath(folder),
+            tmp,
+            sys.prefix,
+            sys.base_prefix,
+            "/proc/self/",
+            "/usr/",
+            "/sys/",
+            "/etc/ld",
+        )
         sys.addaudithook(self._see)
 
     def _see(self, event: str, args: tuple[Any, ...]) -> None:

@@ -61,8 +61,13 @@ def png_originals() -> list[bytes]:
         *(_saved(mode, "PNG") for mode in ("RGB", "RGBA", "L", "LA", "P", "1")),
         png(8, 4, 16, 0, rows),
         png(4, 4, 8, 6, rows),
-        png(4, 4, 8, 3, rows, chunk(b"PLTE", bytes(range(48))), chunk(b"tRNS", bytes(16))),
+        png(16, 4, 8, 3, rows, chunk(b"PLTE", bytes(range(60))), chunk(b"tRNS", bytes(20))),
     ]
+
+
+def good_pngs() -> list[bytes]:
+    """Those with 8 bits a channel."""
+    return [data for data in png_originals() if data[24] <= 8]
 
 
 @cache
@@ -111,7 +116,9 @@ def changed_png(rng: Random) -> bytes:
             other = rng.choice(
                 (b"tEXt", b"zTXt", b"iTXt", b"PLTE", b"tRNS", b"iCCP", b"eXIf", b"acTL", b"fcTL", b"fdAT", b"gAMA")
             )
-            text = rng.choice((b"", b"a\0\0" + zlib.compress(bytes(1 << 16)), b"Description\0\x1b[2J", rng.randbytes(30)))
+            text = rng.choice(
+                (b"", b"a\0\0" + zlib.compress(bytes(1 << 16)), b"Description\0\x1b[2J", rng.randbytes(30))
+            )
             chunks.insert(rng.randrange(len(chunks) + 1), (other, text))
             continue
         elif way == 4:

@@ -15,8 +15,13 @@ _TYPES = ("float", "double", "char", "uchar", "short", "ushort", "int", "uint", 
 _FORMATS = ("ascii", "binary_little_endian", "binary_big_endian")
 _END = b"end_header\n"
 _PACKED = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
-_BOUNDS = tuple(f"{end}_{name}" for name in ("x", "y", "z", "scale_x", "scale_y", "scale_z") for end in ("min", "max"))
-_COLOUR_BOUNDS = tuple(f"{end}_{name}" for name in ("r", "g", "b") for end in ("min", "max"))
+#: In the order in which they stand.
+_BOUNDS = tuple(
+    f"{end}_{prefix}{axis}"
+    for prefix, axes in (("", "xyz"), ("scale_", "xyz"), ("", "rgb"))
+    for end in ("min", "max")
+    for axis in axes
+)
 
 
 def _names(degree: int, normals: bool) -> list[str]:
@@ -69,11 +74,11 @@ def compressed(splats: int, degree: int) -> bytes:
     rng = Random(splats)
     chunks, rest = -(-splats // 256), 3 * (SH_COEFFICIENTS[degree] - 1)
     header = ["ply", "format binary_little_endian 1.0", f"element chunk {chunks}"]
-    header += [f"property float {name}" for name in (*_BOUNDS, *_COLOUR_BOUNDS)]
+    header += [f"property float {name}" for name in _BOUNDS]
     header += [f"element vertex {splats}", *(f"property uint {name}" for name in _PACKED)]
     if rest:
         header += [f"element sh {splats}", *(f"property uchar f_rest_{i}" for i in range(rest))]
-    bounds = np.array([[rng.uniform(-2, 0), rng.uniform(0.1, 2)] * 9 for _ in range(chunks)], "<f4")
+    bounds = np.array(([-2.0] * 3 + [2.0] * 3) * 3 * chunks, "<f4")
     return "\n".join([*header, ""]).encode() + _END + bounds.tobytes() + rng.randbytes((16 + rest) * splats)
 
 
@@ -97,6 +102,8 @@ def _changed(data: bytes, rng: Random) -> bytes:
             body = damaged_text(body, rng)
         else:
             body = _values(body, rng)
+    if rng.random() < 0.15:  # room for what a header may claim besides
+        body += rng.randbytes(rng.choice((16, 1000, 20_000)))
     head = "\n".join([*lines, ""]).encode("utf-8", "surrogatepass") + end
     if rng.random() < 0.08:
         head = damaged_text(head, rng)
@@ -106,11 +113,11 @@ def _changed(data: bytes, rng: Random) -> bytes:
 def _header_line(lines: list[str], rng: Random) -> None:
     """Change, add, move or drop a line of a header."""
     at = rng.randrange(len(lines)) if lines else 0
-    kind = rng.randrange(12)
+    kind = rng.randrange(14)
     elements = [i for i, line in enumerate(lines) if line.startswith("element")]
     if kind <= 3 and elements:
         at = rng.choice(elements)
-        words = (lines[at].split() + ["", "", ""])[:3]
+        words = [*lines[at].split(), "", "", ""][:3]
         if rng.random() < 0.75:
             words[2] = rng.choice(NUMBERS) if rng.random() < 0.5 else str(rng.choice((0, 1, 2, 4, interesting(rng, 4))))
         else:
@@ -133,6 +140,14 @@ def _header_line(lines: list[str], rng: Random) -> None:
     elif kind == 9:
         count = rng.choice((1, 10, 300))
         lines[at:at] = [f"property {rng.choice(_TYPES)} p{i}_{rng.randrange(3)}" for i in range(count)]
+    elif kind >= 12 and elements:  # an element said twice, the second time in spacing that only some parsers take
+        start = rng.choice(elements)
+        end = min((i for i in elements if i > start), default=len(lines))
+        gap = rng.choice(("  ", "\t", " ", "\xa0", " \x0b"))
+        again = [gap.join(line.split(" ")) for line in lines[start:end]]
+        again[0] = gap.join([*lines[start].split(" ")[:2], str(rng.choice((1, 4, 300, 600, 1000)))])
+        place = rng.choice((start, end))
+        lines[place:place] = again
     elif kind == 10:
         lines[at:at] = [f"element {rng.choice(('vertex', 'chunk', 'a'))} {rng.choice(NUMBERS)}"]
     elif lines:

@@ -72,6 +72,11 @@ def archive(files: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
     return out.getvalue()
 
 
+def originals() -> list[bytes]:
+    """Good files of every SH degree."""
+    return [archive(parts(5, bands)) for bands in range(4)]
+
+
 def changed(rng: Random) -> bytes:
     """A small file, changed."""
     files = dict(parts(rng.choice((1, 4, 30)), rng.choice((0, 0, 1, 2, 3))))

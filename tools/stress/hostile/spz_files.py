@@ -35,6 +35,20 @@ def streamed(splats: int, degree: int, streams: list[bytes], raw_sizes: list[int
     return start + directory + b"".join(streams)
 
 
+def originals() -> list[bytes]:
+    """Good files of every version and SH degree."""
+    files, rng = [], Random(0)
+    for version in (1, 2, 3, 4):
+        for degree in range(4):
+            parts = [part for part in sections(version, 3, degree, rng) if part]
+            if version < 4:
+                files.append(gzip.compress(legacy(version, 3, degree, b"".join(parts)), mtime=0))
+            else:
+                streams = [zstandard.ZstdCompressor().compress(part) for part in parts]
+                files.append(streamed(3, degree, streams, [len(part) for part in parts]))
+    return files
+
+
 def changed(rng: Random) -> bytes:
     """A small file of a random version, changed."""
     version = rng.choice((1, 2, 3, 4))
@@ -66,7 +80,7 @@ def _changed_gzip(version: int, splats: int, degree: int, content: bytes, rng: R
         return raw  # not packed at all
     packed = gzip.compress(raw, rng.choice((0, 1, 9)), mtime=0)
     if kind == 1:  # several members, one after another
-        half = rng.randrange(len(raw))
+        half = rng.randrange(len(raw) + 1)
         packed = gzip.compress(raw[:half], 1, mtime=0) + gzip.compress(raw[half:], 1, mtime=0)
     elif kind == 2:  # a name, a comment and more in gzip's own header
         packed = b"\x1f\x8b\x08\x1c" + bytes(6) + b"\3\0abc" + b"\x1b[2Jname\0comment\0" + packed[10:]

@@ -108,7 +108,10 @@ def run(job: Job) -> tuple[int, str]:
     )  # fmt: skip
     errors = Path(job.folder, "stderr")
     told = errors.read_text(errors="replace") if errors.exists() else ""
-    return done.returncode, (done.stderr + told)[-4000:]
+    said = (done.stderr + told)[-4000:]
+    if done.returncode > 0:  # whatever a reader raises is a verdict
+        raise RuntimeError(f"the worker itself failed:\n{said}")
+    return done.returncode, said
 
 
 class _place:
