@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import octree, quantize
+from potr_cl.codec.outliers import check_positions
 from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
@@ -77,13 +78,14 @@ def quantise_geometry(
         run: in place of :func:`map`, to work with several threads.
 
     Raises:
-        DataError: a value too large to quantise.
+        DataError: a value too large to quantise, or a splat too far from the others to keep them exact.
     """
     version = VERSIONS[parameters.version]
     nearest = _nearest(scene.means, views, run)
     world = version.in_world_units(parameters, scene, nearest)
     tolerance = np.maximum(world.gamma, world.beta * nearest)
     tree, order = octree.build(scene.means, tolerance, absolute=version.absolute_leaf_levels)
+    check_positions(scene, tolerance, tree, order)
     imaginary, log_scales = _canonical(scene, order, run)
     scales = list(run(lambda part: version.quantize_scales(part.astype(np.float64), world.sf_scale), log_scales.T))
     logits = scene.opacity_logits[order].astype(np.float64)

@@ -186,7 +186,8 @@ def dequantize_scales(levels: NDArray[np.integer], sf_scale: float) -> F32:
 
 
 def _log_scales(levels: NDArray[np.integer], sf_scale: float) -> F32:
-    return natural_logarithm(np.maximum(levels.astype(np.float32), np.float32(ZERO_SCALE)) / np.float32(sf_scale))
+    scales = np.maximum(levels.astype(np.float32), np.float32(ZERO_SCALE)) / np.float32(sf_scale)
+    return natural_logarithm(scales.astype(np.float32, copy=False))
 
 
 def _looked_up(compute: Callable[[NDArray[np.integer], float], F32], levels: NDArray[np.integer], factor: float) -> F32:

@@ -16,18 +16,20 @@ from potr_cl.model.scene import Scene
 __all__ = ["load_cameras", "load_scene", "save_scene", "scene_writer"]
 
 
-def load_scene(path: str | os.PathLike[str]) -> Scene:
+def load_scene(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     """Read a trained scene; the extension tells the format, the content where formats share an extension.
 
     Args:
         path: of a file in one of ``registry.SCENE_FORMATS``. A .potr file is decoded.
+        trust: whether the file may hold more splats a byte than a real scene has. Without, memory and time are in
+            proportion to its size.
 
     Raises:
         UsageError: the file cannot be opened, its extension is unknown, or it needs an extra.
-        DataError: its content is damaged.
+        DataError: its content is damaged, or it holds too many splats for its size.
     """
     path = Path(path)
-    return registry.reader_of(path)(path)
+    return registry.reader_of(path)(path, trust)
 
 
 def scene_writer(path: str | os.PathLike[str]) -> Callable[[Scene], None]:

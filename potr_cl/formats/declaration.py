@@ -5,10 +5,26 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Protocol
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
+
+
+class SceneLoader(Protocol):
+    """Reads a scene file.
+
+    Args:
+        path: of the file.
+        trust: whether it may hold more splats a byte than a real scene has. Without, memory and time are in proportion
+            to the size of the file.
+
+    Raises:
+        UsageError: the file cannot be opened, or the format's extra is missing.
+        DataError: it is damaged, or holds too many splats for its size.
+    """
+
+    def __call__(self, path: Path, /, trust: bool = False) -> Scene: ...
 
 
 @dataclass(frozen=True)
@@ -21,8 +37,7 @@ class SceneFormat:
             ".compressed.ply") picks the format of a file that is read, the longest that fits the one of a file that is
             written.
         note: one line for people, in Markdown: who uses it, which versions are read and written.
-        load: reads a file. Raises UsageError if it cannot be opened or the extra is missing, DataError if it is
-            damaged.
+        load: reads a file.
         save: writes a scene to a path, or None where the format is only read. Raises UsageError if the path cannot be
             written to or the extra is missing.
         not_written: what a user should do instead, as a clause, where ``save`` is None.
@@ -35,7 +50,7 @@ class SceneFormat:
     name: str
     suffixes: tuple[str, ...]
     note: str
-    load: Callable[[Path], Scene]
+    load: SceneLoader
     save: Callable[[Path, Scene], None] | None = None
     not_written: str = ""
     extra: str | None = None

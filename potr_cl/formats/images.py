@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import contextlib
+import os
+import stat
+import warnings
 from collections.abc import Iterator
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -11,11 +14,15 @@ import numpy as np
 from numpy.typing import NDArray
 from PIL import Image, ImageColor, PngImagePlugin, UnidentifiedImageError
 
-from potr_cl.errors import DataError, UsageError
+from potr_cl.errors import DataError, PotrError, UsageError
 from potr_cl.model.scene import FloatArray
 
 Colour = tuple[float, float, float]
 
+#: What photographs are read from. Pillow knows dozens of formats more, some of which start other programs.
+_FORMATS = ("PNG", "JPEG", "WEBP")
+#: Photographs with more pixels would take gigabytes each, however small their files are.
+_MOST_PIXELS = 1 << 27
 #: More than 8 bits in one channel: Pillow would clip them on the way to R, G, B.
 _DEEP_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
 
@@ -36,15 +43,51 @@ def parse_colour(text: str) -> Colour:
     raise UsageError(f"'{text}' is no colour: give R,G,B from 0 to 1, a name such as white, or #rrggbb")
 
 
+def opened_image(source: Any, formats: tuple[str, ...]) -> Image.Image:
+    """An image of one of some formats (Pillow's names), of which no more than the header is read yet.
+
+    Args:
+        source: a path or an open file.
+        formats: no other one is even looked at.
+
+    Raises:
+        UnidentifiedImageError: it is of no such format.
+        ValueError: it has several frames.
+    """
+    with warnings.catch_warnings():
+        # A size that Pillow would warn of is checked by whoever calls this.
+        warnings.simplefilter("ignore", Image.DecompressionBombWarning)
+        image = Image.open(source, formats=formats)
+    if image.format == "WEBP" and getattr(image, "n_frames", 1) != 1:
+        image.close()
+        raise ValueError("it is animated")
+    return image
+
+
 @contextlib.contextmanager
-def _reading(path: Path) -> Iterator[None]:
-    """Turn Pillow's many errors for a bad file into ours."""
+def _opened_photograph(path: Path) -> Iterator[Image.Image]:
+    """A photograph whose pixels fit the memory; Pillow's many errors for a bad file become ours."""
     try:
-        yield
-    except (FileNotFoundError, IsADirectoryError, PermissionError) as error:
+        # Before it is opened: a pipe would be waited for.
+        if not stat.S_ISREG(os.stat(path).st_mode):
+            raise UsageError(f"cannot read '{path}': it is not a regular file")
+        with opened_image(path, _FORMATS) as image:
+            width, height = image.size
+            if width * height > _MOST_PIXELS:
+                raise DataError(f"'{path}' has {width} x {height} pixels, at most {_MOST_PIXELS} are read")
+            yield image
+    except PotrError:
+        raise
+    except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
         raise UsageError(f"cannot read '{path}': {error.strerror}") from None
-    except (OSError, SyntaxError, ValueError, EOFError, Image.DecompressionBombError) as error:
-        reason = "not an image that can be read" if isinstance(error, UnidentifiedImageError) else error
+    except UnidentifiedImageError:
+        raise DataError(
+            f"'{path}' is damaged or of another kind: it is no PNG, JPEG or WebP image that can be read"
+        ) from None
+    except MemoryError:
+        raise
+    except Exception as error:  # each of Pillow's decoders has errors of its own
+        reason = " ".join(str(error).split())[:200] or type(error).__name__
         raise DataError(f"'{path}' is damaged or of another kind: {reason}") from None
 
 
@@ -53,9 +96,9 @@ def image_size(path: Path) -> tuple[int, int]:
 
     Raises:
         UsageError: it cannot be opened.
-        DataError: it is no image.
+        DataError: it is no PNG, JPEG or WebP image, or has too many pixels.
     """
-    with _reading(path), Image.open(path) as image:
+    with _opened_photograph(path) as image:
         return image.size
 
 
@@ -71,9 +114,9 @@ def read_ground_truth(path: Path, background: Colour = (0.0, 0.0, 0.0)) -> Float
 
     Raises:
         UsageError: it cannot be opened.
-        DataError: it is no image, is damaged, or has other than 8 bits a channel.
+        DataError: it is no PNG, JPEG or WebP image, is damaged, or has other than 8 bits a channel or too many pixels.
     """
-    with _reading(path), Image.open(path) as image:
+    with _opened_photograph(path) as image:
         if image.mode in _DEEP_MODES:
             raise DataError(f"'{path}' has more than 8 bits a channel: convert it to an 8-bit image")
         transparent = image.mode in ("RGBA", "LA", "PA") or "transparency" in image.info

@@ -11,7 +11,7 @@ from pathlib import Path
 
 from potr_cl.errors import UsageError
 from potr_cl.formats.cameras import cameras_json, colmap, transforms
-from potr_cl.formats.declaration import CameraFormat, SceneFormat, install_command
+from potr_cl.formats.declaration import CameraFormat, SceneFormat, SceneLoader, install_command
 from potr_cl.formats.scenes import compressed_ply, ply, potr, sog, spz
 from potr_cl.model.scene import Scene
 
@@ -33,7 +33,7 @@ CAMERA_FORMATS: tuple[CameraFormat, ...] = (
 )
 
 
-def reader_of(path: Path) -> Callable[[Path], Scene]:
+def reader_of(path: Path) -> SceneLoader:
     """What reads a scene file. Its format is told by its extension, and by its content where formats share that.
 
     Raises:

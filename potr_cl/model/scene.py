@@ -98,8 +98,9 @@ class Scene:
 
     @property
     def scales(self) -> FloatArray:
-        """(N, 3) standard deviations in world units."""
-        return np.exp(self.log_scales)
+        """(N, 3) standard deviations in world units; infinite where single precision cannot hold them."""
+        with np.errstate(over="ignore"):
+            return np.exp(self.log_scales)
 
     @property
     def opacities(self) -> FloatArray:

@@ -189,8 +189,10 @@ def test_any_scene(data, degree, splats, q, balanced):
     if balanced:
         # Both coders; the steps themselves are checked on scenes that have a typical size.
         for entropy in (FAST, EntropyCoder("context")):
-            encoded = encode(scene, options=as_it_is("best", entropy, q=q))
-            assert len(decode(joined(encoded))) == splats
+            options = as_it_is("best", entropy, q=q)
+            if options.parameters.beta * typical_size(scene) < np.ptp(scene.means, axis=0).max() * 2.0**-43:
+                return  # splats of next to no size may ask for more levels than there are, and be refused
+            assert len(decode(joined(encode(scene, options=options)))) == splats
         return
     options = as_it_is(entropy=FAST, q=q)
     encoded = encode(scene, options=options)

@@ -11,6 +11,8 @@ from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import decode
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.geometry import quantise_geometry
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.errors import DataError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import train_views
 from potr_cl.pipeline.options import EncodeOptions
@@ -54,3 +56,67 @@ def test_a_file_of_geometry_that_was_there_is_the_same_file(entropy):
         b"".join(code_scene(scene, parameters, entropy=coder, geometry=known).pieces) for known in (None, geometry)
     }
     assert len(files) == 1
+
+
+# Splats far away ------------------------------------------------------------------------------------------------------
+
+
+def with_splats_at(*places, seed=3):
+    scene = random_scene(300, 0, seed=seed)
+    scene.means[: len(places)] = places
+    return scene
+
+
+def errors_of_the_others(scene, parameters, far):
+    geometry = quantise_geometry(scene, parameters, ())
+    decoded = geometry.decoded(scene.sh).means.astype(np.float64)
+    return np.linalg.norm(decoded - scene.means, axis=1)[far:].max(), geometry.parameters.gamma
+
+
+@pytest.mark.parametrize("preset", ["paper", "best"])
+@pytest.mark.parametrize(
+    "places",
+    [
+        [(1e14, 0, 0)],
+        [(0, -1e15, 3)],
+        [(3e38, 3e38, -3e38)],
+        [(1e14, 0, 0), (-1e20, 0, 0)],
+        [(1e14 + k * 1e9, 0, 0) for k in range(100)],
+    ],
+    ids=["one", "one below", "the largest", "two", "a third of all"],
+)
+def test_splats_too_far_away_are_named(places, preset):
+    """They would collapse all others into coarse cells."""
+    parameters = HyperParameters.from_quality(0.9, preset)
+    with pytest.raises(DataError, match="so far from the others") as caught:
+        quantise_geometry(with_splats_at(*places), parameters, ())
+    message = str(caught.value)
+    assert "\n" not in message
+    assert message.startswith("the splat at (" if len(places) == 1 else f"{len(places)} splats, such as those at (")
+    assert message.count("e+") >= min(len(places), 3)  # the far ones are named, and no other
+
+
+@pytest.mark.parametrize("preset", ["paper", "best"])
+@pytest.mark.parametrize("distance", [1e3, 1e6, 1e8, 1e9, 1e10, 1e11, 1e12, 1e13, 1e14, 1e16, 1e30])
+def test_the_others_are_as_exact_as_without_a_far_splat_or_it_is_refused(preset, distance):
+    parameters = HyperParameters.from_quality(0.9, preset)
+    scene = with_splats_at((distance, -distance, 1))
+    rounding = np.abs(scene.means[1:]).max() * 2.0**-23  # of single precision, of what lies within the tolerance
+    alone, gamma = errors_of_the_others(scene.subset(np.arange(1, 300)), parameters, 0)
+    assert alone <= gamma + rounding
+    try:
+        error, gamma = errors_of_the_others(scene, parameters, 1)
+    except DataError:
+        assert distance > 1e9  # levels enough
+        return
+    assert distance < 1e13
+    assert error <= gamma + rounding
+
+
+@pytest.mark.parametrize("preset", ["paper", "best"])
+def test_a_splat_in_the_eye_of_a_camera_is_no_reason_to_refuse(preset):
+    """Its tolerance is nothing, and no level is fine enough; yet no splat is out of place."""
+    scene = with_splats_at((0, 0, 0), (40, 0, 0))
+    camera = dataclasses.replace(ring_of_cameras(1)[0], translation=np.zeros(3), split="train")
+    geometry = quantise_geometry(scene, HyperParameters.from_quality(0.9, preset), [camera])
+    assert np.abs(geometry.decoded(scene.sh).means[0]).max() < 1e-6

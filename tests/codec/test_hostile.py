@@ -24,7 +24,7 @@ from potr_cl.codec.sections import Coder, Property
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.claims import FREE_SPLATS
 from potr_cl.model.scene import Scene
-from tests.cases.scenes import random_scene
+from potr_cl.reference.scenes import random_scene
 from tests.oracles.decoder import decode as decode_independently
 
 LONE = (Property.TAIL_LENGTH, 0, b"\0", 1)  # what the octree of a single splat consists of
@@ -96,7 +96,7 @@ def test_a_leaf_of_countless_splats(splats):
     if data is None:  # the bytes of a thousand million opacities need not be made to be claimed
         data = claiming(made_of(one_leaf(10_000_000), 10_000_000), splats)
     assert len(data) < 2000
-    refused_without_memory(data, fr"{splats}.*--trust|opacity.*claims a size")
+    refused_without_memory(data, rf"{splats}.*--trust|opacity.*claims a size")
 
 
 def claiming(data, splats):

@@ -3,6 +3,9 @@
 from __future__ import annotations
 
 import io
+import os
+import tracemalloc
+import warnings
 
 import numpy as np
 import pytest
@@ -10,6 +13,7 @@ from PIL import Image
 
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.images import image_size, parse_colour, read_ground_truth, to_8_bits, write_png
+from tests.cases.images import png_of
 
 
 def random_pixels(channels, seed=0):
@@ -50,10 +54,60 @@ def test_grey_is_every_channel(tmp_path):
 
 def test_deep_images_are_refused(tmp_path):
     Image.fromarray(np.arange(63, dtype=np.uint16).reshape(7, 9)).save(tmp_path / "a.png")
-    Image.fromarray(np.ones((7, 9), np.float32)).save(tmp_path / "a.tif")
-    for name in ("a.png", "a.tif"):
-        with pytest.raises(DataError, match="more than 8 bits"):
-            read_ground_truth(tmp_path / name)
+    with pytest.raises(DataError, match="more than 8 bits"):
+        read_ground_truth(tmp_path / "a.png")
+
+
+@pytest.mark.parametrize("form", ["TIFF", "BMP", "GIF", "AVIF", "DDS", "EPS", "PPM", "TGA", "JPEG2000", "PCX", "BLP"])
+@pytest.mark.parametrize("suffix", [".png", ".jpg", ".tif"])
+def test_no_other_kind_of_image_is_read(tmp_path, form, suffix, monkeypatch):
+    """Whatever it is called; some of Pillow's readers start other programs, others end in tracebacks."""
+    started = []
+    monkeypatch.setattr("subprocess.Popen", lambda *args, **kwargs: started.append(args))
+    monkeypatch.setattr("os.system", started.append)
+    path = tmp_path / f"a{suffix}"
+    try:
+        Image.fromarray(random_pixels(3)).convert("P" if form == "BLP" else "RGB").save(path, form)
+    except (KeyError, OSError, ValueError):
+        pytest.skip(f"this Pillow does not write {form}")
+    for read in (image_size, read_ground_truth):
+        with pytest.raises(DataError, match="no PNG, JPEG or WebP image that can be read"):
+            read(path)
+    assert not started
+
+
+def test_webp_is_read(tmp_path):
+    pixels = random_pixels(3)
+    Image.fromarray(pixels).save(tmp_path / "a.webp", lossless=True)
+    assert np.array_equal(to_8_bits(read_ground_truth(tmp_path / "a.webp")), pixels)
+
+
+@pytest.mark.parametrize(("width", "height"), [(100_000, 1400), (13_000, 13_000), (60_000, 60_000)])
+def test_too_many_pixels_are_refused_before_they_are_unpacked(tmp_path, width, height):
+    path = tmp_path / "a.png"
+    path.write_bytes(png_of(width, height))
+    tracemalloc.start()
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        for read in (image_size, read_ground_truth):
+            with pytest.raises(DataError, match="pixels"):
+                read(path)
+    assert tracemalloc.get_traced_memory()[1] < 4 << 20
+    tracemalloc.stop()
+
+
+def test_large_photographs_give_no_warning(tmp_path):
+    (tmp_path / "a.png").write_bytes(png_of(10_000, 10_000))
+    with warnings.catch_warnings():
+        warnings.simplefilter("error")
+        assert image_size(tmp_path / "a.png") == (10_000, 10_000)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+def test_a_pipe_is_not_waited_for(tmp_path):
+    os.mkfifo(tmp_path / "a.png")
+    with pytest.raises(UsageError, match="not a regular file"):
+        image_size(tmp_path / "a.png")
 
 
 @pytest.mark.parametrize("form", ["PNG", "JPEG"])
@@ -69,12 +123,13 @@ def test_damaged_files(tmp_path, form):
 
 
 def test_a_size_that_would_not_fit_memory(tmp_path):
-    path = tmp_path / "a.bmp"
+    path = tmp_path / "a.jpg"
     Image.fromarray(random_pixels(3)).save(path)
     data = bytearray(path.read_bytes())
-    data[18:26] = (50_000).to_bytes(4, "little") * 2
+    at = data.index(b"\xff\xc0") + 5
+    data[at : at + 4] = (50_000).to_bytes(2, "big") * 2
     path.write_bytes(data)
-    with pytest.raises(DataError, match="damaged or of another kind"):
+    with pytest.raises(DataError, match=r"damaged or of another kind|pixels"):
         read_ground_truth(path)
 
 

@@ -1,22 +1,23 @@
 """Views from a COLMAP sparse model: ``cameras`` and ``images``, as .bin or .txt files.
 
-The model is read by pycolmap, which is an extra. It trusts its input: at the end of a truncated file it goes on with
-what happens to be in memory, without an error, or takes memory until none is left. So it is handed copies whose
-structure has been checked here, and without the points: those make up nearly all of a model, and no view needs them.
+They are read here, without COLMAP's own library: it trusts its input, and it reads whole models from a folder only,
+with the points, which make up nearly all of a model and which no view needs.
 """
 
 from __future__ import annotations
 
 import math
 import os
+import re
 import struct
+from collections.abc import Iterator
+from dataclasses import dataclass
 from pathlib import Path
-from types import ModuleType
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from potr_cl.errors import DataError, UsageError
+from potr_cl.errors import DataError
 from potr_cl.formats.cameras.view_files import (
     camera_of,
     every_eighth,
@@ -26,20 +27,42 @@ from potr_cl.formats.cameras.view_files import (
     read_bytes,
     view_names,
 )
-from potr_cl.formats.declaration import CameraFormat, install_command
-from potr_cl.host.leftovers import temporary_folder
+from potr_cl.formats.declaration import CameraFormat
 from potr_cl.model.camera import Camera
 
-#: Of this package, which brings pycolmap.
-EXTRA = "colmap"
-
-#: COLMAP's pinhole models: their number in binary files and how many parameters they have.
-_PINHOLES = {"SIMPLE_PINHOLE": (0, 3), "PINHOLE": (1, 4)}
+#: COLMAP's camera models, by their number in binary files.
+_MODELS = (
+    *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
+    *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
+)
+#: Those without distortion, and how many parameters they have.
+_PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}
 
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters as float64
 _IMAGE = struct.Struct("<I7dI")  # id, rotation, translation, camera; then the name, a zero, the 2-D points
 _COUNT = struct.Struct("<Q")
 _POINT_BYTES = 24
+_LARGEST_ID = 2**32 - 1
+
+
+@dataclass(frozen=True)
+class _Lens:
+    """A camera as COLMAP means it: what images have in common. ``params``: focal lengths and principal point."""
+
+    width: int
+    height: int
+    params: tuple[float, ...]
+
+
+@dataclass(frozen=True)
+class _Image:
+    """A view: its pose from the world as a quaternion w, x, y, z and a translation, its lens by number, its file."""
+
+    number: int
+    rotation: tuple[float, ...]
+    translation: tuple[float, ...]
+    lens: int
+    name: str
 
 
 def is_model(folder: Path) -> bool:
@@ -60,18 +83,21 @@ def load(folder: Path) -> list[Camera]:
         The views, ordered by the names of their images.
 
     Raises:
-        UsageError: pycolmap is not installed, or a file cannot be opened.
+        UsageError: a file cannot be opened.
         DataError: the model is damaged, or a camera is not a pinhole.
     """
     ending = ".bin" if (folder / "cameras.bin").exists() else ".txt"
-    cameras, images = _read_checked(folder, ending)
+    lenses, images = _lenses(folder / f"cameras{ending}"), _images(folder / f"images{ending}")
     path = folder / f"images{ending}"
     if not images:
         raise DataError(f"'{path}' holds no view")
-    files = [image_name(image.name, f"'{path}': the name of image {image.image_id}") for image in images]
+    for image in images:
+        if image.lens not in lenses:
+            raise DataError(f"'{folder}' is a damaged COLMAP model: image {image.number} has an unknown camera")
+    files = [image_name(image.name, f"'{path}': the name of image {image.number}") for image in images]
     ground_truth = _ground_truth(folder)
     return [
-        _camera(path, image, cameras[image.camera_id], name, split, ground_truth / file if ground_truth else None)
+        _camera(path, image, lenses[image.lens], name, split, ground_truth / file if ground_truth else None)
         for image, name, file, split in zip(images, view_names(files, path), files, every_eighth(files), strict=True)
     ]
 
@@ -85,66 +111,37 @@ FORMAT = CameraFormat(
     is_in=is_model,
     load_folder=load,
     subfolders=("sparse/0", "sparse"),
-    extra=EXTRA,
 )
 
 
-def _camera(path: Path, image: Any, lens: Any, name: str, split: str, ground_truth: Path | None) -> Camera:
-    pose = image.cam_from_world()
-    if not abs(math.hypot(*pose.rotation.quat) - 1) < 1e-3:  # zero would silently mean no rotation
+def _camera(path: Path, image: _Image, lens: _Lens, name: str, split: str, ground_truth: Path | None) -> Camera:
+    if not abs(math.hypot(*image.rotation) - 1) < 1e-3:
         raise DataError(f"'{path}', view '{name}': its rotation is not a unit quaternion")
-    world_to_camera = np.asarray(pose.matrix(), dtype=np.float64)
     return camera_of(
         path,
         name=name,
         width=image_side(lens.width, f"'{path}', view '{name}': the width of its camera"),
         height=image_side(lens.height, f"'{path}', view '{name}': the height of its camera"),
-        fx=float(lens.params[0]),
-        fy=float(lens.params[-3]),  # the only focal length of a SIMPLE_PINHOLE
-        cx=float(lens.params[-2]),
-        cy=float(lens.params[-1]),
-        rotation=world_to_camera[:, :3],
-        translation=world_to_camera[:, 3],
+        fx=lens.params[0],
+        fy=lens.params[-3],  # the only focal length of a SIMPLE_PINHOLE
+        cx=lens.params[-2],
+        cy=lens.params[-1],
+        rotation=_matrix(*image.rotation),
+        translation=np.array(image.translation),
         split=split,
         image_path=ground_truth if ground_truth and os.path.isfile(ground_truth) else None,
     )
 
 
-def _read_checked(folder: Path, ending: str) -> tuple[Any, list[Any]]:
-    """The cameras of a model by number, and its images by name, as pycolmap's objects."""
-    pycolmap = _pycolmap()
-    cameras, images = folder / f"cameras{ending}", folder / f"images{ending}"
-    if ending == ".bin":
-        content = {
-            cameras.name: _check_binary_cameras(read_bytes(cameras), cameras),
-            images.name: _without_points_binary(read_bytes(images), images),
-            "points3D.bin": _COUNT.pack(0),
-        }
-    else:
-        content = {
-            cameras.name: _check_text_cameras(read_bytes(cameras), cameras),
-            images.name: _without_points_text(read_bytes(images), images),
-            "points3D.txt": b"",
-        }
-    with temporary_folder() as copy:
-        for name, data in content.items():
-            Path(copy, name).write_bytes(data)
-        try:
-            model = pycolmap.Reconstruction(copy)
-            return model.cameras, sorted(model.images.values(), key=lambda image: image.name)
-        except UnicodeDecodeError as error:
-            raise DataError(f"'{images}': the name of an image is not UTF-8: rename it") from error
-        except Exception as error:  # the library raises what its parts happen to raise
-            reason = " ".join(str(error).split())[:200]
-            raise DataError(f"'{folder}' is a damaged COLMAP model: {reason}") from error
-
-
-def _pycolmap() -> ModuleType:
-    try:
-        import pycolmap
-    except ImportError as error:
-        raise UsageError(f"reading COLMAP models needs pycolmap: {install_command(EXTRA)}") from error
-    return pycolmap  # type: ignore[no-any-return]
+def _matrix(w: float, x: float, y: float, z: float) -> NDArray[np.float64]:
+    """(3, 3) rotation of a quaternion, by the formula that COLMAP uses, for the same digits."""
+    return np.array(
+        [
+            [1 - (2 * y * y + 2 * z * z), 2 * y * x - 2 * z * w, 2 * z * x + 2 * y * w],
+            [2 * y * x + 2 * z * w, 1 - (2 * x * x + 2 * z * z), 2 * z * y - 2 * x * w],
+            [2 * z * x - 2 * y * w, 2 * z * y + 2 * x * w, 1 - (2 * x * x + 2 * y * y)],
+        ]
+    )
 
 
 def _ground_truth(folder: Path) -> Path | None:
@@ -154,6 +151,26 @@ def _ground_truth(folder: Path) -> Path | None:
     return next((candidate for candidate in candidates if candidate.is_dir()), None)
 
 
+def _lenses(path: Path) -> dict[int, _Lens]:
+    """The cameras of a model by number."""
+    lenses: dict[int, _Lens] = {}
+    read = _binary_lenses if path.suffix == ".bin" else _text_lenses
+    for number, lens in read(read_bytes(path), path):
+        if number in lenses:
+            raise _damaged(path, f"camera {number} stands twice")
+        lenses[number] = lens
+    return lenses
+
+
+def _images(path: Path) -> list[_Image]:
+    """The images of a model by name."""
+    read = _binary_images if path.suffix == ".bin" else _text_images
+    images = list(read(read_bytes(path), path))
+    if len({image.number for image in images}) < len(images):
+        raise _damaged(path, "two images have the same number")
+    return sorted(images, key=lambda image: image.name)
+
+
 def _distorted(path: Path, camera: str, model: str) -> DataError:
     return DataError(
         f"'{path}': camera {camera} has the model {excerpt(model)}, only {' and '.join(_PINHOLES)} are supported: "
@@ -161,50 +178,59 @@ def _distorted(path: Path, camera: str, model: str) -> DataError:
     )
 
 
-def _model_name(number: int) -> str:
-    name = str(_pycolmap().CameraModelId(number).name)
-    return f"number {number}" if name == "???" else name
-
-
 def _truncated(path: Path) -> DataError:
     return DataError(f"'{path}' is truncated, or is no file of a COLMAP model")
 
 
-def _check_binary_cameras(data: bytes, path: Path) -> bytes:
-    parameters = dict(_PINHOLES.values())
+def _damaged(path: Path, how: str) -> DataError:
+    return DataError(f"'{path.parent}' is a damaged COLMAP model: {how} in '{path.name}'")
+
+
+def _name(raw: bytes, path: Path) -> str:
+    try:
+        return raw.decode("utf-8")
+    except UnicodeDecodeError as error:
+        raise DataError(f"'{path}': the name of an image is not UTF-8: rename it") from error
+
+
+def _binary_lenses(data: bytes, path: Path) -> Iterator[tuple[int, _Lens]]:
     try:
         (count,) = _COUNT.unpack_from(data)
         offset = _COUNT.size
         for _ in range(count):
-            identifier, model, _, _ = _CAMERA.unpack_from(data, offset)
-            if model not in parameters:
-                raise _distorted(path, str(identifier), _model_name(model))
-            offset += _CAMERA.size + 8 * parameters[model]
+            number, model, width, height = _CAMERA.unpack_from(data, offset)
+            name = _MODELS[model] if 0 <= model < len(_MODELS) else f"number {model}"
+            if name not in _PINHOLES:
+                raise _distorted(path, str(number), name)
+            params = struct.unpack_from(f"<{_PINHOLES[name]}d", data, offset + _CAMERA.size)
+            offset += _CAMERA.size + 8 * len(params)
+            yield number, _Lens(width, height, params)
     except struct.error as error:
         raise _truncated(path) from error
     if offset != len(data):
         raise _truncated(path)
-    return data
 
 
-def _without_points_binary(data: bytes, path: Path) -> bytes:
-    kept = [data[: _COUNT.size]]
+def _binary_images(data: bytes, path: Path) -> Iterator[_Image]:
     try:
         (count,) = _COUNT.unpack_from(data)
         offset = _COUNT.size
         for _ in range(count):
+            number, *pose, lens = _IMAGE.unpack_from(data, offset)
             name_end = data.index(b"\0", offset + _IMAGE.size)
             (points,) = _COUNT.unpack_from(data, name_end + 1)
-            kept += [data[offset : name_end + 1], _COUNT.pack(0)]
+            name = data[offset + _IMAGE.size : name_end]
             offset = name_end + 1 + _COUNT.size + points * _POINT_BYTES
+            if offset > len(data):
+                raise _truncated(path)
+            yield _Image(number, tuple(pose[:4]), tuple(pose[4:]), lens, _name(name, path))
     except (struct.error, ValueError) as error:
         raise _truncated(path) from error
     if offset != len(data):
         raise _truncated(path)
-    return b"".join(kept)
 
 
-def _check_text_cameras(data: bytes, path: Path) -> bytes:
+def _text_lenses(data: bytes, path: Path) -> Iterator[tuple[int, _Lens]]:
     for line in data.splitlines():
         fields = line.decode("utf-8", "replace").split()
         if not fields or fields[0].startswith("#"):
@@ -213,14 +239,14 @@ def _check_text_cameras(data: bytes, path: Path) -> bytes:
             raise _truncated(path)
         if fields[1] not in _PINHOLES:
             raise _distorted(path, excerpt(fields[0]), fields[1])
-        if len(fields) != 4 + _PINHOLES[fields[1]][1]:
+        if len(fields) != 4 + _PINHOLES[fields[1]]:
             raise _truncated(path)
-    return data
+        params = tuple(_real(field, path) for field in fields[4:])
+        yield _whole(fields[0], path), _Lens(_whole(fields[2], path), _whole(fields[3], path), params)
 
 
-def _without_points_text(data: bytes, path: Path) -> bytes:
+def _text_images(data: bytes, path: Path) -> Iterator[_Image]:
     """Each image has two lines, the second one, its 2-D points, may be empty."""
-    kept = []
     lines = iter(data.splitlines())
     for line in lines:
         fields = line.split(maxsplit=9)
@@ -228,6 +254,21 @@ def _without_points_text(data: bytes, path: Path) -> bytes:
             continue
         if len(fields) < 10:
             raise _truncated(path)
-        kept.append(line + b"\n\n")
+        number, *pose, lens = (field.decode("utf-8", "replace") for field in fields[:9])
+        values = [_real(field, path) for field in pose]
+        name = _name(fields[9].rstrip(), path)
+        yield _Image(_whole(number, path), tuple(values[:4]), tuple(values[4:]), _whole(lens, path), name)
         next(lines, None)
-    return b"".join(kept)
+
+
+def _real(field: str, path: Path) -> float:
+    # Python alone would also take "1_0" for a number.
+    if not re.fullmatch(r"[-+]?([0-9]+\.?[0-9]*|\.[0-9]+)([eE][-+]?[0-9]+)?|[-+]?(nan|inf)", field, re.ASCII | re.I):
+        raise _damaged(path, f"{excerpt(field)} is not a number")
+    return float(field)
+
+
+def _whole(field: str, path: Path) -> int:
+    if not re.fullmatch(r"[0-9]{1,10}", field, re.ASCII) or int(field) > _LARGEST_ID:
+        raise _damaged(path, f"{excerpt(field)} is not a whole number of 32 bits")
+    return int(field)

@@ -24,7 +24,7 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.errors import DataError
+from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.cameras.view_files import (
     IMAGE_SUFFIXES,
     camera_of,
@@ -223,16 +223,21 @@ def _image_size(frame: _Frame, image: Path) -> tuple[int, int]:
     width, height = frame.get("w"), frame.get("h")
     if width is not None and height is not None:
         return image_side(width, frame.where("w")), image_side(height, frame.where("h"))
-    from PIL import Image  # imported on use: most files name the size
+    from potr_cl.formats.images import image_size  # imported on use: most files name the size
 
     try:
-        with Image.open(image) as header:  # reads no pixels
-            return header.size
-    except Exception as error:  # the library raises what its decoders happen to raise
+        width, height = image_size(image)  # reads no pixels
+    except UsageError as error:
         raise DataError(
             f"'{frame.path}', frame {frame.index}: the size of the view is unknown: "
             f"the file has no 'w' and 'h', and the image '{image}' cannot be opened: give one of them"
         ) from error
+    except DataError as error:
+        raise DataError(
+            f"'{frame.path}', frame {frame.index}: the size of the view is unknown: the file has no 'w' and 'h', and "
+            f"{error}"
+        ) from error
+    return image_side(width, f"'{image}': the width"), image_side(height, f"'{image}': the height")
 
 
 def _focal_length(frame: _Frame, axis: str, side: int) -> float | None:

@@ -1,45 +1,59 @@
-"""Scenes as compressed PLY files (SuperSplat's and splat-transform's .compressed.ply), through the library gsply."""
+"""Scenes as compressed PLY files (SuperSplat's and splat-transform's .compressed.ply), through the library gsply.
+
+The library unpacks without looking at the bounds of its arrays. So it never sees a header of somebody else: this module
+reads one, strictly, and hands on a header of its own with exactly the bytes that belong to it.
+"""
 
 from __future__ import annotations
 
 import os
 import re
+from typing import BinaryIO
 
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.gsply_arrays import EXTRA, from_scene, library, to_scene
-from potr_cl.formats.scenes.scene_files import file_size, reading
+from potr_cl.formats.scenes.scene_files import opened
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 
 _MAX_HEADER_BYTES = 1 << 16
-#: Splats that share one set of bounds, and the floats that a set takes.
-_CHUNK, _CHUNK_VALUES = 256, 18
-_VERTEX = ("packed_position", "packed_rotation", "packed_scale", "packed_color")
+#: Splats that share one set of bounds, and these bounds.
+_CHUNK = 256
+_BOUNDS = [
+    ("float", f"{end}_{name}")
+    for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
+    for end in ("min", "max")
+    for name in names
+]
+_VERTEX = [("uint", f"packed_{name}") for name in ("position", "rotation", "scale", "color")]
+_FORMAT = "format binary_little_endian 1.0"
 
 
 def is_compressed_ply(path: str | os.PathLike[str]) -> bool:
     """Whether a PLY file is a compressed one; False if it cannot be read."""
     try:
         with open(path, "rb") as file:
-            head = file.read(_MAX_HEADER_BYTES).partition(b"end_header")[0]
+            head = file.read(_MAX_HEADER_BYTES).partition(b"\nend_header\n")[0]
     except (OSError, ValueError):
         return False
-    return head.startswith(b"ply") and b"packed_position" in head
+    return head.startswith(b"ply") and re.search(rb"^\s*property\s+\S+\s+packed_position\s*$", head, re.M) is not None
 
 
-def load(path: str | os.PathLike[str]) -> Scene:
+def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     """Read a scene from a compressed PLY of SH degree 0 to 3.
+
+    Args:
+        path: of the file.
+        trust: of no meaning here: nothing in a compressed PLY expands.
 
     Raises:
         UsageError: there is no such file, or the extra ``convert`` is not installed.
         DataError: it is damaged, or of an older layout.
     """
-    size = file_size(path)
-    gsply = library(path)
-    with reading(path):
-        _check(path, size)
-        data = gsply.plyread(path)
+    with opened(path) as (file, size):
+        gsply = library(path)
+        data = gsply.decompress_from_bytes(_canonical(path, file, size))
     return to_scene(path, data)
 
 
@@ -66,34 +80,68 @@ FORMAT = SceneFormat(
 )
 
 
-def _check(path: str | os.PathLike[str], size: int) -> None:
-    """Check the header's counts against the file's size: the library believes them."""
-    with open(path, "rb") as file:
-        head = file.read(_MAX_HEADER_BYTES)
-    header, end, _ = head.partition(b"end_header\n")
-    if not end:
-        raise DataError(f"'{path}' has a damaged PLY header")
-    elements: dict[str, tuple[int, list[str]]] = {}
-    properties: list[str] = []
-    for line in header.decode("latin-1").split("\n"):
-        if match := re.fullmatch(r"element (\w+) (\d{1,10})", line.strip()):
-            properties = []
-            elements[match[1]] = (int(match[2]), properties)
-        elif match := re.fullmatch(r"property (float|uint|uchar) (\w+)", line.strip()):
-            properties.append(match[2])
-    chunks, bounds = elements.get("chunk", (0, []))
-    splats, vertex = elements.get("vertex", (0, []))
-    lines, rest = elements.get("sh", (splats, []))
+def _canonical(path: str | os.PathLike[str], file: BinaryIO, size: int) -> bytearray:
+    """A file with a header of our own. Not as bytes: the library's kernels are compiled for arrays that can change."""
+    lines, start = _header_lines(path, file.read(_MAX_HEADER_BYTES))
+    chunks, splats, rest = _counts(path, lines)
+    elements = [("chunk", chunks, _BOUNDS), ("vertex", splats, _VERTEX), ("sh", splats, _coefficients(rest))]
+    header = ["ply", _FORMAT]
+    for name, rows, properties in elements:
+        if properties:
+            header += [f"element {name} {rows}", *(f"property {kind} {value}" for kind, value in properties)]
+    whole = bytearray("\n".join([*header, "end_header", ""]).encode("ascii"))
+    values = 4 * len(_BOUNDS) * chunks + (4 * len(_VERTEX) + rest) * splats
+    if size < start + values:
+        raise DataError(f"'{path}' is truncated: its header tells of {start + values} bytes, it has {size}")
+    file.seek(start)
+    content = file.read(values)
+    if len(content) < values:
+        raise DataError(f"'{path}' became shorter while it was read")
+    whole += content
+    return whole
+
+
+def _header_lines(path: str | os.PathLike[str], head: bytes) -> tuple[list[str], int]:
+    """The lines between the first and the last of a header, without comments, and where the values start."""
+    lines: list[str] = []
+    start = 0
+    while (end := head.find(b"\n", start)) >= 0:
+        line = head[start:end].decode("latin-1")
+        start = end + 1
+        if line == "end_header" and lines[:1] == ["ply"]:
+            return lines[1:], start
+        if not line.startswith(("comment ", "obj_info ")) and line != "comment":
+            lines.append(line)
+    raise DataError(f"'{path}' has a damaged PLY header")
+
+
+def _counts(path: str | os.PathLike[str], lines: list[str]) -> tuple[int, int, int]:
+    """Rows of the elements chunk and vertex, and SH coefficients a splat, of a header that has nothing else in it."""
+    elements: list[tuple[str, int, list[tuple[str, str]]]] = []
+    for line in lines[1:]:
+        if match := re.fullmatch(r"element (chunk|vertex|sh) ([0-9]{1,10})", line):
+            elements.append((match[1], int(match[2]), []))
+        elif elements and (match := re.fullmatch(r"property (float|uint|uchar) ([a-z0-9_]+)", line)):
+            elements[-1][2].append((match[1], match[2]))
+        else:
+            raise DataError(f"'{path}' is no compressed PLY that can be read: its header has the line {line[:60]!r}")
+    names = [name for name, _, _ in elements]
+    if lines[:1] != [_FORMAT] or names not in (["chunk", "vertex"], ["chunk", "vertex", "sh"]):
+        raise DataError(f"'{path}' is no compressed PLY that can be read")
+    (_, chunks, bounds), (_, splats, vertex) = elements[:2]
+    _, rows, rest = elements[2] if elements[2:] else ("sh", splats, [])
     if splats == 0:
         raise DataError(f"'{path}' holds no splat")
-    if "format binary_little_endian 1.0" not in header.decode("latin-1") or tuple(vertex) != _VERTEX:
+    if vertex != _VERTEX:
         raise DataError(f"'{path}' is no compressed PLY that can be read")
-    if len(bounds) != _CHUNK_VALUES:
+    if bounds != _BOUNDS:
         raise DataError(f"'{path}' is a compressed PLY of an older layout: run 'splat-transform IN.ply OUT.ply'")
-    if len(rest) not in [3 * (m - 1) for m in SH_COEFFICIENTS] or lines != splats:
-        raise DataError(f"'{path}' is damaged: {lines} rows of {len(rest)} SH coefficients for {splats} splats")
+    if len(rest) not in [3 * (m - 1) for m in SH_COEFFICIENTS] or rest != _coefficients(len(rest)) or rows != splats:
+        raise DataError(f"'{path}' is damaged: {rows} rows of {len(rest)} SH coefficients for {splats} splats")
     if chunks != -(-splats // _CHUNK):
         raise DataError(f"'{path}' is damaged: {chunks} chunks for {splats} splats")
-    wanted = len(header) + len(end) + 4 * _CHUNK_VALUES * chunks + (16 + len(rest)) * splats
-    if size < wanted:
-        raise DataError(f"'{path}' is truncated: its header tells of {wanted} bytes, it has {size}")
+    return chunks, splats, len(rest)
+
+
+def _coefficients(rest: int) -> list[tuple[str, str]]:
+    return [("uchar", f"f_rest_{i}") for i in range(rest)]

@@ -1,4 +1,4 @@
-"""What the formats that the library gsply reads and writes share: the library itself, and its arrays."""
+"""The library gsply, which packs and unpacks compressed PLY: the module itself, and its arrays."""
 
 from __future__ import annotations
 
@@ -7,32 +7,31 @@ from typing import Any
 
 import numpy as np
 
-from potr_cl.codec import octree
 from potr_cl.errors import UsageError
 from potr_cl.formats.declaration import install_command
-from potr_cl.formats.scenes.scene_files import cleaned, first_line
+from potr_cl.formats.scenes.scene_files import arranged, cleaned, first_line
 from potr_cl.model.scene import Scene
 
 #: Of this package, which brings the library.
 EXTRA = "convert"
-
-_LARGEST_LOGIT = np.float32(20)
 
 
 def library(path: str | os.PathLike[str]) -> Any:
     """The module gsply, which ``path`` needs.
 
     Raises:
-        UsageError: it is not installed.
+        UsageError: it is not installed, or there is too little memory to load it.
     """
     try:
         import gsply
-        import gsply.sog_reader
-        import gsply.spz
     except ImportError as error:
         raise UsageError(
             f"'{path}': this kind of file needs the library gsply, which cannot be loaded ({first_line(error)}): "
             f"{install_command(EXTRA)}"
+        ) from None
+    except Exception as error:  # its compiler fails in many ways where memory is short
+        raise UsageError(
+            f"'{path}': the library gsply cannot be loaded ({first_line(error)}): there may be too little memory"
         ) from None
     return gsply
 
@@ -63,19 +62,13 @@ def to_scene(path: str | os.PathLike[str], data: Any) -> Scene:
 
 
 def from_scene(gsply: Any, scene: Scene) -> Any:
-    """A scene as gsply's arrays, with unit quaternions, its splats in an order that keeps neighbours together.
-
-    A compressed PLY has one set of bounds for 256 splats in sequence: in a trainer's order they span the scene.
-    """
-    side = float(np.ptp(scene.means, axis=0).max())
-    scene = scene.subset(octree.build(scene.means, max(side * 2.0**-20, 1e-30))[1])
-    quaternions = scene.quaternions / np.linalg.norm(scene.quaternions, axis=1, keepdims=True)
+    """A scene as gsply's arrays."""
+    scene = arranged(scene)
     return gsply.GSData.from_arrays(
         means=np.ascontiguousarray(scene.means),
         scales=np.ascontiguousarray(scene.log_scales),
-        quats=quaternions,
-        # Eight bits cannot tell anything beyond from 0 or 1, and gsply would overflow.
-        opacities=np.clip(scene.opacity_logits, -_LARGEST_LOGIT, _LARGEST_LOGIT),
+        quats=scene.quaternions,
+        opacities=scene.opacity_logits,
         sh0=np.ascontiguousarray(scene.sh[:, 0]),
         shN=np.ascontiguousarray(scene.sh[:, 1:]) if scene.sh_degree else None,
         format="ply",

@@ -46,7 +46,7 @@ class _Header:
     size: int
 
 
-def load(path: str | os.PathLike[str]) -> Scene:
+def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     """Read a trained scene from a PLY file.
 
     Accepted are binary files of either byte order and ASCII ones, properties in any order and of any numeric type,
@@ -55,6 +55,7 @@ def load(path: str | os.PathLike[str]) -> Scene:
 
     Args:
         path: of the PLY file.
+        trust: of no meaning here: nothing in a PLY file expands.
 
     Returns:
         The scene, finite throughout, every array contiguous.

@@ -1,4 +1,4 @@
-"""What the scene formats have in common: sizes of files, a library's errors as ours, clean scenes."""
+"""What the scene formats have in common: opening files, a library's errors as ours, clean scenes, order for writing."""
 
 from __future__ import annotations
 
@@ -7,39 +7,48 @@ import logging
 import os
 import stat
 from collections.abc import Iterator
+from dataclasses import replace
+from typing import BinaryIO
 
+import numpy as np
+
+from potr_cl.codec import octree
 from potr_cl.errors import DataError, PotrError, UsageError
 from potr_cl.model.scene import Scene
 
 _log = logging.getLogger("potr_cl")
 
-
-def file_size(path: str | os.PathLike[str]) -> int:
-    """Bytes of a regular file.
-
-    Raises:
-        UsageError: there is none at ``path``.
-    """
-    try:
-        status = os.stat(path)
-    except (OSError, ValueError) as error:
-        raise UsageError(f"cannot open '{path}': {getattr(error, 'strerror', None) or error}") from error
-    if not stat.S_ISREG(status.st_mode):
-        raise UsageError(f"'{path}' is not a regular file")
-    return status.st_size
+#: Eight bits cannot tell anything beyond from an opacity of 0 or 1.
+_LARGEST_LOGIT = np.float32(20)
+_LONG = np.float32(1e15)
+#: In formats of other tools a splat takes several bytes; of more than this a byte no scene is made.
+MOST_A_BYTE = 1
 
 
 @contextlib.contextmanager
-def reading(path: str | os.PathLike[str]) -> Iterator[None]:
-    """Turn whatever a library raises over a bad file into a DataError."""
+def opened(path: str | os.PathLike[str]) -> Iterator[tuple[BinaryIO, int]]:
+    """A regular file that is open for reading, and its size in bytes; whatever is raised over it is an error of ours.
+
+    Raises:
+        UsageError: there is none at ``path``, or it cannot be opened.
+        DataError: anything but memory failed while it was read.
+    """
     try:
-        yield
-    except (PotrError, MemoryError):
-        raise
-    except PermissionError as error:
-        raise UsageError(f"cannot open '{path}': {error.strerror}") from error
-    except Exception as error:
-        raise DataError(f"'{path}' is damaged or of another kind: {first_line(error)}") from error
+        file = open(path, "rb")  # noqa: SIM115
+    except IsADirectoryError as error:
+        raise UsageError(f"'{path}' is not a regular file") from error
+    except (OSError, ValueError) as error:
+        raise UsageError(f"cannot open '{path}': {getattr(error, 'strerror', None) or error}") from error
+    with file:
+        status = os.fstat(file.fileno())
+        if not stat.S_ISREG(status.st_mode):
+            raise UsageError(f"'{path}' is not a regular file")
+        try:
+            yield file, status.st_size
+        except (PotrError, MemoryError):
+            raise
+        except Exception as error:  # a library raises what its parts happen to raise
+            raise DataError(f"'{path}' is damaged or of another kind: {first_line(error)}") from error
 
 
 def cleaned(path: str | os.PathLike[str], scene: Scene) -> Scene:
@@ -61,7 +70,25 @@ def cleaned(path: str | os.PathLike[str], scene: Scene) -> Scene:
     return scene
 
 
+def arranged(scene: Scene) -> Scene:
+    """A scene as coarse formats want it: unit quaternions, opacities that bytes can tell, neighbours together.
+
+    A compressed PLY has one set of bounds for 256 splats in sequence: in a trainer's order they span the scene.
+    """
+    side = max(float(axis.max()) - float(axis.min()) for axis in scene.means.T)
+    scene = scene.subset(octree.build(scene.means, max(side * 2.0**-20, 1e-30))[1])
+    quaternions = scene.quaternions
+    largest = np.abs(quaternions).max(axis=1, keepdims=True)
+    if (long := largest > _LONG).any():  # the square of its length would be infinite
+        quaternions = np.where(long, quaternions / largest, quaternions)
+    return replace(
+        scene,
+        quaternions=quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True),
+        opacity_logits=np.clip(scene.opacity_logits, -_LARGEST_LOGIT, _LARGEST_LOGIT),
+    )
+
+
 def first_line(error: BaseException) -> str:
     """What a library says of an error, for a message of one line."""
     lines = str(error).strip().splitlines()
-    return lines[0] if lines else type(error).__name__
+    return lines[0][:200] if lines else type(error).__name__

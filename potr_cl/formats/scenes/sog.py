@@ -1,4 +1,7 @@
-"""Scenes as SOG files (PlayCanvas' .sog), version 2, read through the library gsply."""
+"""Scenes as SOG files (PlayCanvas' .sog), version 2: a zip archive of a description and lossless WebP images.
+
+A pixel is a splat. Everything is read once: what is checked is what is used.
+"""
 
 from __future__ import annotations
 
@@ -7,36 +10,49 @@ import json
 import math
 import os
 import zipfile
-from typing import Any
+from typing import Any, BinaryIO
 
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.gsply_arrays import EXTRA, library, to_scene
-from potr_cl.formats.scenes.scene_files import file_size, reading
-from potr_cl.model.scene import SH_COEFFICIENTS, Scene
+from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, cleaned, opened
+from potr_cl.model.claims import check_claim
+from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
 #: What is packed in a SOG file is compressed already; only its description shrinks.
 _DESCRIPTION_BYTES = 1 << 22
+#: Others take memory that an archive's size does not bound.
+_METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _CODEBOOK = 256
 #: Most entries of a palette of SH coefficients; they stand 64 in a row.
 _PALETTE, _PALETTE_COLUMNS = 1 << 16, 64
+#: The alpha of a quaternion's pixel: this and the number of its largest part, of w, x, y, z.
+_FIRST_TAG = 252
+_OTHER_PARTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
+_LEAST_OPACITY = np.float32(1e-6)
+#: Splats worked on at a time: the temporaries stay small.
+_BLOCK = 1 << 16
+
+U8 = NDArray[np.uint8]
 
 
-def load(path: str | os.PathLike[str]) -> Scene:
+def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     """Read a scene from a SOG file.
 
+    Args:
+        path: of the file.
+        trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
+
     Raises:
-        UsageError: there is no such file, or the extra ``convert`` is not installed.
-        DataError: it is damaged, or of another version.
+        UsageError: there is no such file.
+        DataError: it is damaged, of another version, or holds too many splats for its size.
     """
-    size = file_size(path)
-    gsply = library(path)
-    with reading(path):
-        _check(path, size)
-        data = gsply.sog_reader.sogread(path)
-        if data.shN is not None and data.shN.shape[1] == 0:
-            data.shN = None
-    return to_scene(path, data)
+    with opened(path) as (file, size):
+        scene = _Archive(path, file, size, trust).scene()
+    return cleaned(path, scene)
 
 
 FORMAT = SceneFormat(
@@ -45,50 +61,159 @@ FORMAT = SceneFormat(
     note="of PlayCanvas; version 2 is read",
     load=load,
     not_written="nothing here writes .sog: convert to .ply, and that with splat-transform",
-    extra=EXTRA,
 )
 
 
-def _check(path: str | os.PathLike[str], size: int) -> None:
-    """Check everything that the library believes: sizes of files and images, and what indexes what."""
+class _Archive:
+    """The files of a SOG archive, of which nothing is trusted."""
 
-    from PIL import Image  # imported on use: few read this format
-
-    def damaged(what: str) -> DataError:
-        return DataError(f"'{path}' is damaged: {what}")
-
-    with zipfile.ZipFile(path) as archive:
-        if sum(entry.file_size for entry in archive.infolist()) > 2 * size + _DESCRIPTION_BYTES:
-            raise damaged("it would unpack to far more than its size")
-        meta = json.loads(archive.read("meta.json"))
+    def __init__(self, path: str | os.PathLike[str], file: BinaryIO, size: int, trust: bool) -> None:
+        self._path = path
+        self._zip = zipfile.ZipFile(file)
+        entries = self._zip.infolist()
+        if sum(entry.file_size for entry in entries) > 2 * size + _DESCRIPTION_BYTES:
+            raise self._damaged("it would unpack to far more than its size")
+        if any(entry.compress_type not in _METHODS for entry in entries):
+            raise self._damaged("it is packed in a way that no SOG file is")
+        meta = json.loads(self._zip.read("meta.json"))
         if meta.get("version") != 2:
-            raise DataError(f"'{path}' is a SOG file of version {meta.get('version', 1)}, only 2 can be read")
-        count = meta["count"]
-        if type(count) is not int or not 0 < count < 2**31:
-            raise damaged(f"a count of {count} splats")
+            version = meta.get("version", 1)
+            said = version if type(version) is int and abs(version) < 1000 else "unknown"
+            raise DataError(f"'{path}' is a SOG file of version {said}, only 2 can be read")
+        self._meta = meta
+        self._count = _whole(meta["count"])
+        if not 0 < self._count < 2**31:
+            raise self._damaged(f"a count of {_said(meta['count'])} splats")
+        try:
+            check_claim(self._count, size, MOST_A_BYTE, trust)
+        except DataError as error:
+            raise DataError(f"'{path}': {error}") from None
 
-        def pixels(part: dict[str, Any], index: int) -> tuple[int, int]:
-            with Image.open(io.BytesIO(archive.read(part["files"][index])), formats=["WEBP"]) as image:
-                return image.size
-
+    def scene(self) -> Scene:
+        """The values of all pixels, block by block, an image after another."""
+        count = self._count
+        coefficients = 1
+        if "shN" in self._meta:
+            bands = _whole(self._meta["shN"]["bands"])
+            if not 1 <= bands < len(SH_COEFFICIENTS):
+                raise self._damaged(f"'shN' has {_said(self._meta['shN']['bands'])} bands")
+            coefficients = SH_COEFFICIENTS[bands]
         for name, images in (("means", 2), ("quats", 1), ("scales", 1), ("sh0", 1)):
             for index in range(images):
-                width, height = pixels(meta[name], index)
-                if not count <= width * height <= 2 * count + 2**16:
-                    raise damaged(f"'{name}' has {width} x {height} pixels for {count} splats")
-        for name in ("scales", "sh0", *(["shN"] if "shN" in meta else [])):
-            book = meta[name]["codebook"]
-            if len(book) != _CODEBOOK or not all(type(v) in (int, float) and math.isfinite(v) for v in book):
-                raise damaged(f"the codebook of '{name}' is not {_CODEBOOK} numbers")
-        if "shN" in meta:
-            part = meta["shN"]
-            if part["bands"] not in range(1, len(SH_COEFFICIENTS)) or not 0 < part["count"] <= _PALETTE:
-                raise damaged(f"'shN' has {part['bands']} bands and {part['count']} entries")
-            width, height = pixels(part, 0)
-            if width != _PALETTE_COLUMNS * (SH_COEFFICIENTS[part["bands"]] - 1) or not (
-                part["count"] <= _PALETTE_COLUMNS * height <= 2 * _PALETTE
-            ):
-                raise damaged(f"a palette of {width} x {height} pixels for {part['count']} entries")
-            width, height = pixels(part, 1)
-            if not count <= width * height <= 2 * count + 2**16:
-                raise damaged(f"'shN' has {width} x {height} labels for {count} splats")
+                self._check_pixels(name, index)
+        scene = Scene(
+            np.empty((count, 3), np.float32),
+            np.empty((count, 3), np.float32),
+            np.empty((count, 4), np.float32),
+            np.empty(count, np.float32),
+            np.empty((count, coefficients, 3), np.float32),
+        )
+        self._fill_means(scene.means)
+        quaternions, scales = self._pixels("quats", 0), self._pixels("scales", 0)
+        book = self._codebook("scales")
+        for block in self._blocks():
+            scene.quaternions[block] = _smallest_three(quaternions[block])
+            scene.log_scales[block] = book.take(scales[block, :3])
+        del quaternions, scales
+        colours, book = self._pixels("sh0", 0), self._codebook("sh0")
+        opacity = np.clip(np.arange(256).astype(np.float32) / np.float32(255), _LEAST_OPACITY, 1 - _LEAST_OPACITY)
+        logits = natural_logarithm(opacity / (1 - opacity))
+        for block in self._blocks():
+            scene.sh[block, 0] = book.take(colours[block, :3])
+            scene.opacity_logits[block] = logits.take(colours[block, 3])
+        if coefficients > 1:
+            self._fill_rest(scene.sh[:, 1:])
+        return scene
+
+    def _fill_means(self, means: FloatArray) -> None:
+        low, high = self._pixels("means", 0), self._pixels("means", 1)
+        least, most = (np.array(self._numbers("means", key, 3), np.float32) for key in ("mins", "maxs"))
+        extent = np.where(most == least, np.float32(1), most - least)
+        for block in self._blocks():
+            steps = low[block, :3] | high[block, :3].astype(np.uint16) << np.uint16(8)
+            logarithms = least + extent * (steps.astype(np.float32) * np.float32(1 / 65535))
+            with np.errstate(over="ignore"):  # such a splat is dropped
+                means[block] = np.copysign(np.expm1(np.abs(logarithms), dtype=np.float64), logarithms)
+
+    def _fill_rest(self, rest: FloatArray) -> None:
+        part, coefficients = self._meta["shN"], rest.shape[1]
+        entries = _whole(part["count"])
+        if not 0 < entries <= _PALETTE:
+            raise self._damaged(f"'shN' has {_said(part['count'])} entries")
+        width, height = self._size("shN", 0)
+        if width != _PALETTE_COLUMNS * coefficients or not entries <= _PALETTE_COLUMNS * height <= 2 * _PALETTE:
+            raise self._damaged(f"a palette of {width} x {height} pixels for {entries} entries")
+        self._check_pixels("shN", 1)
+        palette = self._pixels("shN", 0)[:, :3].reshape(-1, coefficients, 3)
+        values = self._codebook("shN").take(palette)
+        values[entries:] = 0
+        labels = self._pixels("shN", 1)
+        for block in self._blocks():
+            index = labels[block, 0] | labels[block, 1].astype(np.intp) << 8
+            index[index >= entries] = -1  # beyond the palette stands nothing: colours that do not change
+            rest[block] = np.where((index >= 0)[:, None, None], values[index], np.float32(0))
+
+    def _blocks(self) -> list[slice]:
+        return [slice(start, min(start + _BLOCK, self._count)) for start in range(0, self._count, _BLOCK)]
+
+    def _codebook(self, name: str) -> FloatArray:
+        return np.array(self._numbers(name, "codebook", _CODEBOOK), np.float32)
+
+    def _numbers(self, name: str, key: str, length: int) -> list[float]:
+        numbers = self._meta[name][key]
+        if (
+            not isinstance(numbers, list)
+            or len(numbers) != length
+            or not all(type(v) in (int, float) and math.isfinite(v) and abs(v) < 1e38 for v in numbers)
+        ):
+            raise self._damaged(f"the {key} of '{name}' are not {length} numbers")
+        return numbers
+
+    def _check_pixels(self, name: str, index: int) -> None:
+        """That an image has a pixel for each splat and few more, before any is unpacked."""
+        width, height = self._size(name, index)
+        if not self._count <= width * height <= 2 * self._count + 2**16:
+            what = "labels" if name == "shN" else "pixels"
+            raise self._damaged(f"'{name}' has {width} x {height} {what} for {self._count} splats")
+
+    def _size(self, name: str, index: int) -> tuple[int, int]:
+        with self._image(name, index) as image:
+            size: tuple[int, int] = image.size
+            return size
+
+    def _pixels(self, name: str, index: int) -> U8:
+        """(pixels, 4) R, G, B, A of an image whose size was checked."""
+        with self._image(name, index) as image:
+            pixels: U8 = np.asarray(image.convert("RGBA")).reshape(-1, 4)
+            return pixels
+
+    def _image(self, name: str, index: int) -> Any:
+        from potr_cl.formats.images import opened_image  # imported on use: few read this format
+
+        return opened_image(io.BytesIO(self._zip.read(self._meta[name]["files"][index])), ("WEBP",))
+
+    def _damaged(self, what: str) -> DataError:
+        return DataError(f"'{self._path}' is damaged: {what}")
+
+
+def _smallest_three(pixels: U8) -> FloatArray:
+    """Quaternions w, x, y, z; no rotation where a pixel holds none."""
+    stored = ((pixels[:, :3].astype(np.float32) / np.float32(255)) * 2 - 1) * np.float32(np.sqrt(0.5))
+    squares = stored * stored
+    left = 1 - (squares[:, 0] + squares[:, 1] + squares[:, 2])
+    largest = np.maximum(pixels[:, 3].astype(np.intp) - _FIRST_TAG, 0)
+    quaternions = np.empty((len(pixels), 4), np.float32)
+    np.put_along_axis(quaternions, _OTHER_PARTS[largest], stored, axis=1)
+    np.put_along_axis(quaternions, largest[:, None], np.sqrt(np.maximum(left, 0))[:, None], axis=1)
+    quaternions[pixels[:, 3] < _FIRST_TAG] = (1, 0, 0, 0)
+    return quaternions
+
+
+def _whole(value: Any) -> int:
+    """A whole number of the description, −1 if it is something else."""
+    return value if type(value) is int else -1
+
+
+def _said(value: Any) -> str:
+    """A value of the description, which may be of any kind and length, for a message."""
+    return str(value) if type(value) is int and value.bit_length() <= 64 else "an impossible number of"

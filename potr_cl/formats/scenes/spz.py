@@ -1,4 +1,4 @@
-"""Scenes as SPZ files (Niantic's .spz), through the library gsply: versions 1 to 4 are read, version 3 is written.
+"""Scenes as SPZ files (Niantic's .spz): versions 1 to 4 are read, version 3 is written.
 
 SPZ names axes of its own (right, up, back), but converters, Niantic's included, keep those of the PLY by default, and
 a file rarely says which it holds. So axes are kept as they are, in both directions.
@@ -9,21 +9,23 @@ from __future__ import annotations
 import gzip
 import logging
 import os
-import shutil
 import struct
-import tempfile
 import zlib
-from pathlib import Path
+from dataclasses import dataclass
+from typing import Any, BinaryIO
 
 import numpy as np
 import zstandard
+from numpy.typing import NDArray
 
+from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.gsply_arrays import EXTRA, from_scene, library, to_scene
-from potr_cl.formats.scenes.scene_files import file_size, reading
+from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, arranged, cleaned, opened
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.scene import SH_COEFFICIENTS, Scene
+from potr_cl.host.threads import thread_pool
+from potr_cl.model.claims import check_claim
+from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
 _log = logging.getLogger("potr_cl")
 
@@ -32,40 +34,74 @@ _MAGIC = b"NGSP"
 _HEADER = struct.Struct("<4sIIBBBB")
 _HEADER_4_BYTES = 32
 _STREAM = struct.Struct("<QQ")
-#: Bytes a splat of positions, opacities, colours and scales.
-_FIXED_BYTES = 16
 _ANTIALIASED, _EXTENSIONS = 1, 2
 #: A file may have extensions behind its splats; no known one comes near.
 _EXTENSION_BYTES = 1 << 20
-#: Nothing that tells splats apart packs better than this (deflate's own limit).
-_MOST_RATIO = 1032
-_BLOCK = 1 << 20
 
 #: Positions are integers of 24 bits with a sign; 12 of them are the fraction in all files that other tools write.
 _POSITION_LIMIT = 2**23 - 1
-_FRACTIONAL_BITS = 12
+_FRACTIONAL_BITS, _MOST_FRACTIONAL_BITS = 12, 24
+_COLOUR_SCALE = 0.15
+#: Of a quaternion's three smallest parts: 9 bits of magnitude below a sign, for 0 to √½.
+_LARGEST_PART = 511
+#: Which parts of x, y, z, w are stored, first the lowest bits, by the number of the largest, which is not.
+_STORED_PARTS = np.array([[3, 2, 1], [3, 2, 0], [3, 1, 0], [2, 1, 0]])
+
+#: Splats worked on at a time: the temporaries stay small.
+_BLOCK = 1 << 16
+#: gzip's header without a time, so that a scene has the same bytes whenever it is written.
+_GZIP_HEADER = b"\x1f\x8b\x08\x00\x00\x00\x00\x00\x00\xff"
+#: Long content is deflated in parts of this many bytes, side by side.
+_GZIP_PART, _GZIP_LONG, _GZIP_LEVEL = 1 << 18, 1 << 20, 6
+
+U8 = NDArray[np.uint8]
 
 
-def load(path: str | os.PathLike[str]) -> Scene:
+@dataclass(frozen=True)
+class _Header:
+    """What stands before the splats, checked: version, number of splats, fractional bits and flags as in the file."""
+
+    version: int
+    splats: int
+    degree: int
+    fractional_bits: int
+    flags: int
+    streams: int
+
+    @property
+    def sizes(self) -> list[int]:
+        """Bytes of positions, opacities, colours, scales, rotations and SH, in this order."""
+        rotation = 3 if self.version < 3 else 4
+        return [self.splats * size for size in (9, 1, 3, 3, rotation, 3 * (SH_COEFFICIENTS[self.degree] - 1))]
+
+
+def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     """Read a scene from an SPZ file of version 1 to 4 and SH degree 0 to 3.
+
+    Args:
+        path: of the file.
+        trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
 
     Returns:
         The scene, finite throughout, in the axes of the file.
 
     Raises:
-        UsageError: there is no such file, or the extra ``convert`` is not installed.
-        DataError: it is damaged or no SPZ file.
+        UsageError: there is no such file.
+        DataError: it is damaged, no SPZ file, or holds too many splats for its size.
     """
-    size = file_size(path)
-    gsply = library(path)
-    with reading(path):
-        flags = _check(path, size)
-        data = gsply.spz.read_spz(path)
-    if flags & _ANTIALIASED:
+    with opened(path) as (file, size):
+        start = file.read(_HEADER_4_BYTES)
+        file.seek(0)
+        if start[:2] == b"\x1f\x8b":
+            header, properties = _read_gzip(path, file, size, trust)
+        else:
+            header, properties = _read_streams(path, file.read(), trust)
+        scene = _unpacked(header, properties)
+    if header.flags & _ANTIALIASED:
         _log.warning("'%s' was trained for a rasterizer with antialiasing: it is rendered without", path)
-    if flags & _EXTENSIONS:
+    if header.flags & _EXTENSIONS:
         _log.warning("'%s' has extensions: they are left out, and axes are kept as they are", path)
-    return to_scene(path, data)
+    return cleaned(path, scene)
 
 
 def save(path: str | os.PathLike[str], scene: Scene) -> None:
@@ -74,11 +110,10 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
     Positions are stored in steps of 1/4096 unit, as every tool writes them; in a scene too large for that, coarser.
 
     Raises:
-        UsageError: ``path`` cannot be written to, or the extra ``convert`` is not installed.
+        UsageError: ``path`` cannot be written to.
         DataError: a position is too large for SPZ.
         PotrError: the system failed to write.
     """
-    gsply = library(path)
     largest = float(np.abs(scene.means).max())
     bits = _FRACTIONAL_BITS
     while bits > 1 and largest * 2**bits > _POSITION_LIMIT:
@@ -87,11 +122,10 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
         raise DataError(f"'{path}': SPZ cannot hold a splat {largest:.3g} units from the origin")
     if bits < _FRACTIONAL_BITS:
         _log.warning("'%s': the scene is large for SPZ: positions are stored in steps of 1/%d unit", path, 2**bits)
-    with replacing(path) as file, tempfile.TemporaryDirectory() as folder:
-        temporary = Path(folder) / "scene.spz"
-        gsply.spz.write_spz(temporary, from_scene(gsply, scene), version=3, fractional_bits=bits)
-        with temporary.open("rb") as written:
-            shutil.copyfileobj(written, file)
+    header = _HEADER.pack(_MAGIC, 3, len(scene), scene.sh_degree, bits, 0, 0)
+    content = b"".join([header, *_packed(arranged(scene), bits)])
+    with replacing(path) as file:
+        _write_gzip(file, content)
 
 
 FORMAT = SceneFormat(
@@ -100,60 +134,185 @@ FORMAT = SceneFormat(
     note="of Niantic; versions 1 to 4 are read, version 3, which every reader knows, is written",
     load=load,
     save=save,
-    extra=EXTRA,
 )
 
 
-def _check(path: str | os.PathLike[str], size: int) -> int:
-    """Check a file's sizes before memory is taken on their word; return its flags."""
-    with open(path, "rb") as file:
-        start = file.read(_HEADER_4_BYTES)
-        if start[:2] == b"\x1f\x8b":
-            file.seek(0)
-            return _check_gzip(path, gzip.GzipFile(fileobj=file), size)
-        if start[:4] != _MAGIC or len(start) < _HEADER_4_BYTES:
-            raise DataError(f"'{path}' is not an SPZ file")
-        content = start + file.read()
-    sizes, flags, streams = _streams(path, start, size)
-    (directory,) = struct.unpack_from("<I", start, _HEADER.size)
-    position = directory + _STREAM.size * streams
-    for k in range(streams):
-        stored, _ = _STREAM.unpack_from(content, directory + _STREAM.size * k)
-        said = zstandard.frame_content_size(content[position : position + 18])
-        if said > max(sizes):
-            raise DataError(f"'{path}' is damaged: a stream of it would be larger than its splats need")
-        position += stored
-    return flags
+# ---------------------------------------------------------------------------------------------------- containers
 
 
-def _check_gzip(path: str | os.PathLike[str], stream: gzip.GzipFile, size: int) -> int:
-    start = stream.read(_HEADER.size)
-    sizes, flags, _ = _streams(path, start, size)
-    most = sum(sizes) + (_EXTENSION_BYTES if flags & _EXTENSIONS else 0)
-    found = 0
+def _read_gzip(
+    path: str | os.PathLike[str], file: BinaryIO, size: int, trust: bool
+) -> tuple[_Header, list[bytes | memoryview]]:
+    """Versions 1 to 3: one stream, of which no more is unpacked than its header tells of."""
     try:
-        while block := stream.read(_BLOCK):
-            found += len(block)
-            if found > most:
-                raise DataError(f"'{path}' is damaged: it holds more than the splats that its header tells of")
+        stream = gzip.GzipFile(fileobj=file)
+        header = _header(path, stream.read(_HEADER.size), range(1, 4), size, trust)
+        properties: list[bytes | memoryview] = [stream.read(wanted) for wanted in header.sizes]
+        beyond = _EXTENSION_BYTES if header.flags & _EXTENSIONS else 0
+        if len(stream.read(beyond + 1)) > beyond:  # to the end, where gzip has its checksum
+            raise DataError(f"'{path}' is damaged: it holds more than the splats that its header tells of")
     except (EOFError, zlib.error, gzip.BadGzipFile) as error:
         raise DataError(f"'{path}' is damaged or truncated: {error}") from error
-    if found < sum(sizes):
+    if any(len(part) < wanted for part, wanted in zip(properties, header.sizes, strict=True)):
         raise DataError(f"'{path}' is truncated: its header tells of more splats than it holds")
-    return flags
+    return header, properties
 
 
-def _streams(path: str | os.PathLike[str], start: bytes, size: int) -> tuple[list[int], int, int]:
-    """From a header: the bytes of SH and of all else before coding, the flags, the number of streams in version 4."""
+def _read_streams(
+    path: str | os.PathLike[str], content: bytes, trust: bool
+) -> tuple[_Header, list[bytes | memoryview]]:
+    """Version 4: a table, and a zstd frame for each property that is not empty."""
+    if content[:4] != _MAGIC or len(content) < _HEADER_4_BYTES:
+        raise DataError(f"'{path}' is not an SPZ file")
+    header = _header(path, content[: _HEADER.size], range(4, 5), len(content), trust)
+    wanted = [size for size in header.sizes if size]
+    (table,) = struct.unpack_from("<I", content, _HEADER.size)
+    position = table + _STREAM.size * len(wanted)
+    if header.streams != len(wanted) or not _HEADER_4_BYTES <= table <= position <= len(content):
+        raise DataError(f"'{path}' is damaged: its table of streams does not fit its splats")
+    properties: list[bytes | memoryview] = []
+    for k, size in enumerate(wanted):
+        stored, said = _STREAM.unpack_from(content, table + _STREAM.size * k)
+        frame = content[position : position + stored]
+        # The frame has a claim of its own, which the library believes.
+        if said != size or len(frame) != stored or zstandard.frame_content_size(frame) not in (size, -1):
+            raise DataError(f"'{path}' is damaged: a stream of it is not as large as its splats need")
+        unpacked = zstandard.ZstdDecompressor().decompress(frame, max_output_size=size)
+        if len(unpacked) != size:
+            raise DataError(f"'{path}' is damaged: a stream of it is not as large as its splats need")
+        properties.append(unpacked)
+        position += stored
+    return header, [*properties, b""][:6]
+
+
+def _header(path: str | os.PathLike[str], start: bytes, versions: range, size: int, trust: bool) -> _Header:
+    """Check a header before memory is taken on its word."""
     if len(start) < _HEADER.size or start[:4] != _MAGIC:
         raise DataError(f"'{path}' is not an SPZ file")
-    _, version, splats, degree, _, flags, streams = _HEADER.unpack_from(start)
+    _, version, splats, degree, bits, flags, streams = _HEADER.unpack_from(start)
+    if version not in versions:
+        raise DataError(f"'{path}' is an SPZ file of version {version}, which is not known or not packed like this")
     if degree >= len(SH_COEFFICIENTS):
         raise DataError(f"'{path}' has SH degree {degree}: export at most 3 bands")
     if splats == 0:
         raise DataError(f"'{path}' holds no splat")
-    rotation = 3 if version < 3 else 4
-    sizes = [3 * (SH_COEFFICIENTS[degree] - 1) * splats, (_FIXED_BYTES + rotation) * splats]
-    if sum(sizes) > _MOST_RATIO * size:
-        raise DataError(f"'{path}' is damaged or truncated: its {size} bytes cannot hold {splats} splats")
-    return sizes, flags, streams
+    if not 1 <= bits <= _MOST_FRACTIONAL_BITS:
+        raise DataError(f"'{path}' is damaged: positions with {bits} fractional bits")
+    try:
+        check_claim(splats, size, MOST_A_BYTE, trust)
+    except DataError as error:
+        raise DataError(f"'{path}': {error}") from None
+    return _Header(version, splats, degree, bits, flags, streams)
+
+
+def _write_gzip(file: BinaryIO, content: bytes) -> None:
+    """One gzip member; its parts are deflated by themselves, which leaves it a single stream."""
+    part = _GZIP_PART if len(content) >= _GZIP_LONG else len(content)
+    starts = range(0, len(content), part)
+    view = memoryview(content)
+
+    def deflate(start: int) -> bytes:
+        compressor = zlib.compressobj(_GZIP_LEVEL, zlib.DEFLATED, -zlib.MAX_WBITS)
+        end = zlib.Z_FINISH if start == starts[-1] else zlib.Z_SYNC_FLUSH
+        return compressor.compress(view[start : start + part]) + compressor.flush(end)
+
+    file.write(_GZIP_HEADER)
+    with thread_pool() as pool:
+        for deflated in pool.map(deflate, starts):
+            file.write(deflated)
+    file.write(struct.pack("<II", zlib.crc32(content), len(content) & 0xFFFFFFFF))
+
+
+# ---------------------------------------------------------------------------------------------------- values
+
+
+def _unpacked(header: _Header, properties: list[bytes | memoryview]) -> Scene:
+    """The values of a file's bytes, block by block."""
+    count, coefficients = header.splats, SH_COEFFICIENTS[header.degree]
+    positions, opacities, colours, scales, rotations, rest = (
+        np.frombuffer(part, np.uint8).reshape(count, -1) for part in properties
+    )
+    scene = Scene(
+        np.empty((count, 3), np.float32),
+        np.empty((count, 3), np.float32),
+        np.empty((count, 4), np.float32),
+        np.empty(count, np.float32),
+        np.empty((count, coefficients, 3), np.float32),
+    )
+    byte = np.arange(256).astype(np.float32)
+    least = np.float32(1e-6)
+    opacity = np.clip(byte / np.float32(255), least, np.float32(1) - least)
+    logits = natural_logarithm(opacity / (np.float32(1) - opacity))
+    dc = (byte / np.float32(255) - np.float32(0.5)) / np.float32(_COLOUR_SCALE)
+    for start in range(0, count, _BLOCK):
+        block = slice(start, start + _BLOCK)
+        scene.means[block] = _positions(positions[block], header.fractional_bits)
+        scene.log_scales[block] = (byte / 16 - 10).take(scales[block])
+        scene.quaternions[block] = _smallest_three(rotations[block]) if header.version > 2 else _xyz(rotations[block])
+        scene.opacity_logits[block] = logits.take(opacities[block, 0])
+        scene.sh[block, 0] = dc.take(colours[block])
+        if coefficients > 1:
+            scene.sh[block, 1:] = ((byte - 128) / 128).take(rest[block]).reshape(-1, coefficients - 1, 3)
+    return scene
+
+
+def _positions(stored: U8, fractional_bits: int) -> FloatArray:
+    parts = stored.reshape(-1, 3, 3).astype(np.int32)
+    values = parts[..., 0] | parts[..., 1] << 8 | parts[..., 2] << 16
+    values = (values ^ 0x800000) - 0x800000
+    positions: FloatArray = values.astype(np.float32) * np.float32(2.0**-fractional_bits)
+    return positions
+
+
+def _smallest_three(stored: U8) -> FloatArray:
+    """Quaternions w, x, y, z from the number of the largest part and the three others."""
+    packed = np.ascontiguousarray(stored).view("<u4")[:, 0]
+    largest = (packed >> 30).astype(np.intp)
+    part = np.arange(1024)
+    magnitudes = np.float32(np.sqrt(0.5)) * ((part & _LARGEST_PART) / np.float32(_LARGEST_PART)).astype(np.float32)
+    values = np.where(part > _LARGEST_PART, -magnitudes, magnitudes)
+    others = np.stack([values.take((packed >> shift) & 1023) for shift in (0, 10, 20)], axis=1)
+    xyzw = np.empty((len(packed), 4), np.float32)
+    np.put_along_axis(xyzw, _STORED_PARTS[largest], others, axis=1)
+    squares = others * others
+    left = 1 - (squares[:, 0] + squares[:, 1] + squares[:, 2])
+    np.put_along_axis(xyzw, largest[:, None], np.sqrt(np.maximum(left, 0))[:, None], axis=1)
+    return xyzw[:, [3, 0, 1, 2]]
+
+
+def _xyz(stored: U8) -> FloatArray:
+    """Quaternions w, x, y, z from bytes of x, y, z, as versions 1 and 2 have them."""
+    xyz = stored.astype(np.float32) / np.float32(127.5) - np.float32(1)
+    left = 1 - (xyz * xyz).sum(axis=1)
+    return np.column_stack([np.sqrt(np.maximum(left, 0)), xyz])
+
+
+def _packed(scene: Scene, fractional_bits: int) -> list[bytes]:
+    """The bytes of a scene with unit quaternions, property by property."""
+
+    def as_bytes(values: NDArray[Any]) -> bytes:
+        return np.clip(np.round(values), 0, 255).astype(np.uint8).tobytes()
+
+    with np.errstate(over="ignore"):  # of values far beyond what bytes hold
+        steps = np.round(scene.means * np.float32(2**fractional_bits)).astype(np.int64)
+        fixed = np.clip(steps, -_POSITION_LIMIT - 1, _POSITION_LIMIT).astype("<i4")
+        return [
+            np.ascontiguousarray(fixed.view(np.uint8).reshape(len(scene), 3, 4)[..., :3]).tobytes(),
+            as_bytes(255 / (1 + np.exp(-scene.opacity_logits))),
+            as_bytes(scene.sh[:, 0] * np.float32(_COLOUR_SCALE * 255) + np.float32(127.5)),
+            as_bytes((scene.log_scales + np.float32(10)) * np.float32(16)),
+            _packed_rotations(scene.quaternions),
+            as_bytes(scene.sh[:, 1:] * np.float32(128) + np.float32(128)),
+        ]
+
+
+def _packed_rotations(quaternions: FloatArray) -> bytes:
+    xyzw = quaternions[:, [1, 2, 3, 0]].astype(np.float64)
+    largest = np.abs(xyzw).argmax(axis=1)
+    xyzw[np.take_along_axis(xyzw, largest[:, None], axis=1)[:, 0] < 0] *= -1
+    others = np.take_along_axis(xyzw, _STORED_PARTS[largest], axis=1)
+    parts = np.minimum(np.round(np.abs(others) * (_LARGEST_PART / np.sqrt(0.5))), _LARGEST_PART).astype(np.uint32)
+    parts |= (others < 0).astype(np.uint32) << 9
+    packed = parts[:, 0] | parts[:, 1] << 10 | parts[:, 2] << 20 | largest.astype(np.uint32) << 30
+    stored: bytes = packed.astype("<u4").tobytes()
+    return stored

@@ -136,9 +136,43 @@ def test_unusable_values_in_a_binary_model(model: Path) -> None:
     refused(model, r"cannot read '.*images\.bin': No such file", UsageError)
 
 
-def test_without_pycolmap(model: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("name", ["plush_sparse_binary", "plush_sparse_text"])
+def test_poses_have_the_digits_of_the_library(name: str, data: Path, tmp_path: Path) -> None:
+    pycolmap = pytest.importorskip("pycolmap")
+    shutil.copytree(data / name, tmp_path, dirs_exist_ok=True)
+    ending = next(tmp_path.iterdir()).suffix
+    (tmp_path / f"points3D{ending}").write_bytes(bytes(8) if ending == ".bin" else b"")
+    expected = {Path(image.name).stem: image for image in pycolmap.Reconstruction(tmp_path).images.values()}
+    for camera in load_cameras(data / name):
+        pose = np.column_stack([camera.rotation, camera.translation])
+        assert np.array_equal(pose, expected[camera.name].cam_from_world().matrix())
+
+
+@pytest.mark.parametrize("name", ["plush_sparse_binary", "plush_sparse_text"])
+def test_no_library_and_no_temporary_folder(name: str, data: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    """The library would parse again what has been checked, and wants it in a folder, which a killed run would leave."""
     monkeypatch.setitem(sys.modules, "pycolmap", None)
-    refused(model, r'needs pycolmap: pip install "potr-cl\[colmap\]"', UsageError)
+    monkeypatch.setattr("tempfile.mkdtemp", lambda *args, **kwargs: pytest.fail("a temporary folder was made"))
+    assert len(load_cameras(data / name)) == 17
+
+
+def test_names_of_images_may_have_blanks(text_model: Path) -> None:
+    images = text_model / "images.txt"
+    images.write_text(images.read_text().replace("20240212_003919.jpg", "the first one.jpg"))
+    assert "the first one" in [camera.name for camera in load_cameras(text_model)]
+
+
+def test_numbers_that_stand_twice(text_model: Path, text_model_lines: Callable[[str], Path]) -> None:
+    refused(text_model_lines("1 PINHOLE 990 742 800 800 495 371\n" * 2), "camera 1 stands twice")
+    images = text_model / "images.txt"
+    images.write_text(images.read_text().replace("\n2 0.99", "\n1 0.99"))
+    refused(text_model, "two images have the same number")
+
+
+@pytest.mark.parametrize("field", ["1_0", "0x10", "١", "1e", "--1", "1 0 0"])
+def test_numbers_that_only_python_reads(text_model_lines: Callable[[str], Path], field: str) -> None:
+    refused(text_model_lines(f"1 PINHOLE 990 742 {field} 800 495 371\n"), "is not a number|is truncated")
+    refused(text_model_lines(f"1 PINHOLE {field} 742 800 800 495 371\n"), "is not a whole number|is truncated")
 
 
 @pytest.mark.filterwarnings("error")

@@ -8,9 +8,11 @@ from typing import Any
 
 import numpy as np
 import pytest
+from PIL import Image
 
 from potr_cl.formats import load_cameras
 from tests.cases.cameras import IDENTITY, nerfstudio, pixel, refused, write_image, write_json
+from tests.cases.images import png_of
 
 
 def test_transforms_have_opengl_axes(tmp_path: Path) -> None:
@@ -165,3 +167,34 @@ def test_bad_dataparser_transforms(tmp_path: Path) -> None:
     ]:
         write_json(tmp_path / "dataparser_transforms.json", content)
         refused(path, message)
+
+
+@pytest.mark.filterwarnings("error")
+@pytest.mark.parametrize(
+    ("size", "message"),
+    [
+        ((70_000, 10), "r_0.png': the width is 70000, not a number of pixels from 1 to 65536"),
+        ((10, 70_000), "r_0.png': the height is 70000, not a number of pixels from 1 to 65536"),
+        ((12_000, 12_000), "the size of the view is unknown: .* 12000 x 12000 pixels, at most"),
+        ((60_000, 60_000), "the size of the view is unknown: .* pixels"),
+        ((0, 10), "the size of the view is unknown|not a number of pixels"),
+    ],
+)
+def test_sizes_that_only_the_image_tells_have_limits(tmp_path: Path, size: tuple[int, int], message: str) -> None:
+    content = nerfstudio(["r_0.png"])
+    for key in ("w", "h"):
+        content.pop(key, None)
+    write_json(tmp_path / "transforms.json", content)
+    (tmp_path / "images").mkdir()
+    (tmp_path / "images" / "r_0.png").write_bytes(png_of(*size))
+    refused(tmp_path / "transforms.json", message)
+
+
+def test_an_image_of_another_kind_does_not_tell_a_size(tmp_path: Path) -> None:
+    content = nerfstudio(["r_0.png"])
+    for key in ("w", "h"):
+        content.pop(key, None)
+    write_json(tmp_path / "transforms.json", content)
+    (tmp_path / "images").mkdir()
+    Image.new("RGB", (8, 8)).save(tmp_path / "images" / "r_0.png", "BMP")
+    refused(tmp_path / "transforms.json", "the size of the view is unknown: .*no PNG, JPEG or WebP image")

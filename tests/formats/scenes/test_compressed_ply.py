@@ -53,3 +53,91 @@ def test_a_truncated_compressed_ply(tmp_path, data):
     path.write_bytes((data / "foreign" / "degree_3.compressed.ply").read_bytes()[:-1])
     with pytest.raises(DataError, match="truncated"):
         load_scene(path)
+
+
+def foreign(data, degree=3) -> bytes:
+    return (data / "foreign" / f"degree_{degree}.compressed.ply").read_bytes()
+
+
+#: Headers of which one reader makes 256 splats and another one a million; the latter read beyond the file's values.
+TWO_READINGS = {
+    "two spaces": (b"element vertex 1500\n", b"element vertex 1500\nelement  vertex 1000000\n"),
+    "two spaces first": (b"element vertex 1500\n", b"element  vertex 1000000\nelement vertex 1500\n"),
+    "a tabulator": (b"element vertex 1500\n", b"element\tvertex 1500\n"),
+    "a tabulator in front": (b"element vertex 1500\n", b"\telement vertex 1000000\nelement vertex 1500\n"),
+    "blanks behind": (b"element vertex 1500\n", b"element vertex 1500 \n"),
+    "a word behind": (b"element vertex 1500\n", b"element vertex 1500 1000000\n"),
+    "the element again": (b"element sh 1500\n", b"element vertex 1000000\nelement sh 1500\n"),
+    "another line end": (b"element vertex 1500\n", b"element vertex 1000000\relement vertex 1500\n"),
+    "carriage returns": (b"element vertex 1500\n", b"element vertex 1500\r\n"),
+    "a form feed": (b"element vertex 1500\n", b"element vertex 1000000\x0celement vertex 1500\n"),
+    "digits of other scripts": (b"element vertex 1500\n", "element vertex 150٠\n".encode()),
+    "a sign": (b"element vertex 1500\n", b"element vertex +1500\n"),
+    "another type": (b"property uint packed_position\n", b"property uchar packed_position\n"),
+    "another name": (b"property float min_x\n", b"property float min_w\n"),
+    "coefficients out of order": (b"property uchar f_rest_0\nproperty uchar f_rest_1\n",
+                                  b"property uchar f_rest_1\nproperty uchar f_rest_0\n"),
+    "an element more": (b"element vertex 1500\n", b"element other 4\nproperty uchar a\nelement vertex 1500\n"),
+    "a list": (b"property float min_x\n", b"property list uchar float min_x\n"),
+}  # fmt: skip
+
+
+@pytest.mark.parametrize("name", TWO_READINGS)
+def test_only_canonical_headers_are_read(tmp_path, data, name):
+    old, new = TWO_READINGS[name]
+    content = foreign(data)
+    assert old in content
+    path = tmp_path / "a.compressed.ply"
+    path.write_bytes(content.replace(old, new, 1))
+    with pytest.raises(DataError) as caught:
+        load_scene(path)
+    assert str(path) in str(caught.value)
+    assert str(caught.value).isprintable()
+
+
+@pytest.mark.parametrize("name", TWO_READINGS)
+def test_the_library_sees_no_header_but_ours(tmp_path, data, monkeypatch, name):
+    """Whatever a file says: what is handed on has one element line for each element, and no byte too few."""
+    import gsply
+
+    seen = []
+
+    def take(content):
+        seen.append(bytes(content))
+        raise ValueError("seen")
+
+    monkeypatch.setattr(gsply, "decompress_from_bytes", take)
+    monkeypatch.setattr(gsply, "plyread", lambda path: pytest.fail("the library read the file itself"))
+    old, new = TWO_READINGS[name]
+    for content in (foreign(data), foreign(data).replace(old, new, 1)):
+        (tmp_path / "a.compressed.ply").write_bytes(content)
+        with pytest.raises(DataError):
+            load_scene(tmp_path / "a.compressed.ply")
+    assert len(seen) == 1
+    header, _, values = seen[0].partition(b"end_header\n")
+    assert [line for line in header.split(b"\n") if line.startswith(b"element")] == [
+        b"element chunk 6",
+        b"element vertex 1500",
+        b"element sh 1500",
+    ]
+    assert len(values) == 6 * 72 + 1500 * (16 + 45)
+
+
+def test_comments_do_not_matter(tmp_path, data):
+    """Not even one that looks like the end of the header."""
+    for degree in (0, 3):
+        content = foreign(data, degree)
+        comments = b"comment end_header\ncomment \xff\nobj_info element vertex 9\ncomment\nelement chunk 6\n"
+        path = tmp_path / "a.ply"
+        path.write_bytes(content.replace(b"element chunk 6\n", comments, 1) + b"more")
+        expected = load_scene(data / "foreign" / f"degree_{degree}.compressed.ply")
+        got = load_scene(path)
+        for field in dataclasses.fields(expected):
+            assert np.array_equal(getattr(got, field.name), getattr(expected, field.name))
+
+
+def test_a_plain_ply_with_a_comment_about_compression_is_a_plain_one(tmp_path, data):
+    content = (data / "lego_excerpt.ply").read_bytes()
+    path = tmp_path / "a.ply"
+    path.write_bytes(content.replace(b"ply\n", b"ply\ncomment no packed_position\n", 1))
+    assert len(load_scene(path)) == 1500

@@ -4,17 +4,19 @@ from __future__ import annotations
 
 import gzip
 import struct
+import time
+import tracemalloc
 
 import numpy as np
 import pytest
+import zstandard
 
 from potr_cl.errors import DataError
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import spz
+from potr_cl.model.claims import FREE_SPLATS
 from potr_cl.reference.scenes import random_scene
 from tests.cases.scenes import in_order_of
-
-pytest.importorskip("gsply", reason="the extra convert is not installed")
 
 
 @pytest.mark.parametrize("degree", range(4))
@@ -67,13 +69,13 @@ def spz_header(splats, version=3, degree=3):
         (b"", "not an SPZ file"),
         (b"ply\n" * 20, "not an SPZ file"),
         (gzip.compress(b"nothing"), "not an SPZ file"),
-        (gzip.compress(spz_header(4_000_000_000)), "cannot hold"),
+        (gzip.compress(spz_header(4_000_000_000)), "--trust"),
         (gzip.compress(spz_header(10)), "truncated"),
         (gzip.compress(spz_header(0)), "no splat"),
         (gzip.compress(spz_header(10, degree=4)), "SH degree 4"),
         (gzip.compress(spz_header(1000) + bytes(3_000_000)), "more than the splats"),
         (gzip.compress(spz_header(10, version=9) + bytes(650)), "version 9"),
-        (spz_header(4_000_000_000, version=4) + bytes(100), "cannot hold"),
+        (spz_header(4_000_000_000, version=4) + bytes(100), "--trust"),
     ],
     # Not by the content: gzip puts the time into it, and test runners that share out tests compare these names.
     ids=lambda value: "" if isinstance(value, bytes) else value,
@@ -83,3 +85,117 @@ def test_bad_spz_files(tmp_path, content, message):
     path.write_bytes(content)
     with pytest.raises(DataError, match=message):
         load_scene(path)
+
+
+def test_a_scene_has_the_same_bytes_whenever_it_is_written(tmp_path, monkeypatch):
+    for splats in (300, 40_000):  # deflated as one, and in parts
+        scene = random_scene(splats, 2)
+        for day in (1, 2):
+            monkeypatch.setattr(time, "time", lambda day=day: 86400.0 * day)
+            spz.save(tmp_path / f"{day}.spz", scene)
+        first, second = ((tmp_path / f"{day}.spz").read_bytes() for day in (1, 2))
+        assert first == second
+        assert len(gzip.decompress(first)) == 16 + splats * (16 + 4 + 24)
+
+
+def test_nothing_is_written_but_beside_the_file(tmp_path, monkeypatch):
+    """What is killed while it writes leaves no folder elsewhere: there is none."""
+    (tmp_path / "temporary").mkdir()
+    (tmp_path / "out").mkdir()
+    monkeypatch.setattr("tempfile.tempdir", str(tmp_path / "temporary"))
+    monkeypatch.setattr("tempfile.mkdtemp", lambda *args, **kwargs: pytest.fail("a temporary folder was made"))
+    spz.save(tmp_path / "out" / "a.spz", random_scene(100))
+    assert len(spz.load(tmp_path / "out" / "a.spz")) == 100
+
+
+def test_content_and_values_are_those_of_another_program(tmp_path, data):
+    gsply = pytest.importorskip("gsply", reason="the extra convert is not installed")
+    other = pytest.importorskip("gsply.spz")
+    from potr_cl.formats.scenes.gsply_arrays import from_scene
+
+    scene = random_scene(3000, 3)
+    spz.save(tmp_path / "ours.spz", scene)
+    other.write_spz(tmp_path / "theirs.spz", from_scene(gsply, scene), version=3, fractional_bits=12)
+    ours, theirs = (gzip.decompress((tmp_path / name).read_bytes()) for name in ("ours.spz", "theirs.spz"))
+    assert len(ours) == len(theirs)
+    assert sum(a != b for a, b in zip(ours, theirs, strict=True)) <= 5  # ties that rounding breaks either way
+    for name in ("version_3.spz", "version_4.spz", "degree_1.spz"):
+        expected, got = other.read_spz(data / "foreign" / name), spz.load(data / "foreign" / name)
+        assert np.array_equal(got.means, expected.means)
+        assert np.array_equal(got.log_scales, expected.scales)
+        assert np.abs(got.quaternions - expected.quats).max() < 1e-6
+        assert np.abs(got.opacity_logits - expected.opacities).max() < 1e-4
+        assert np.abs(got.sh[:, 0] - expected.sh0).max() < 1e-6
+        assert np.array_equal(got.sh[:, 1:], expected.shN)
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_rotations_of_old_versions(tmp_path, version):
+    body = bytes(9) + bytes([255, 0, 0, 0]) + bytes(3) + bytes([255, 128, 127])
+    (tmp_path / "a.spz").write_bytes(gzip.compress(spz_header(1, version, 0) + body))
+    w, x, y, z = load_scene(tmp_path / "a.spz").quaternions[0]
+    assert (w, x) == (0, 1)
+    assert y == pytest.approx(1 / 255, abs=1e-6)
+    assert z == pytest.approx(-1 / 255, abs=1e-6)
+
+
+def version_4(splats, frames, degree=0, table=None):
+    """A file of version 4 from its frames and what its table says of each."""
+    header = struct.pack("<4sIIBBBBI12x", b"NGSP", 4, splats, degree, 12, 0, len(frames), 32)
+    said = table or [(len(frame), 0) for frame in frames]
+    return header + b"".join(struct.pack("<QQ", *entry) for entry in said) + b"".join(frames)
+
+
+def bombs():
+    splats = FREE_SPLATS + 1_000_000
+    yield "gzip", gzip.compress(spz_header(splats, degree=0) + bytes(20 * splats), 1)
+    frames = [zstandard.compress(bytes(size * splats)) for size in (9, 1, 3, 3, 4)]
+    table = [(len(frame), size * splats) for frame, size in zip(frames, (9, 1, 3, 3, 4), strict=True)]
+    yield "zstd", version_4(splats, frames, table=table)
+
+
+def test_small_files_of_countless_splats(tmp_path):
+    for name, content in bombs():
+        path = tmp_path / f"{name}.spz"
+        path.write_bytes(content)
+        tracemalloc.start()
+        with pytest.raises(DataError, match=r"1065536 splats in \d+ bytes .*--trust"):
+            load_scene(path)
+        assert tracemalloc.get_traced_memory()[1] < 4 << 20
+        tracemalloc.stop()
+        assert len(load_scene(path, trust=True)) == FREE_SPLATS + 1_000_000
+
+
+def test_a_frame_larger_than_its_table_says(tmp_path):
+    """The frame's own claim is one more that a library would believe."""
+    sizes = (9, 1, 3, 3, 4)
+    good = [zstandard.compress(bytes(size)) for size in sizes]
+    for at in range(5):
+        frames = [*good[:at], zstandard.compress(bytes(1 << 24)), *good[at + 1 :]]
+        table = [(len(frame), size) for frame, size in zip(frames, sizes, strict=True)]
+        (tmp_path / "a.spz").write_bytes(version_4(1, frames, table=table))
+        tracemalloc.start()
+        with pytest.raises(DataError, match="a stream of it is not as large"):
+            load_scene(tmp_path / "a.spz", trust=True)
+        assert tracemalloc.get_traced_memory()[1] < 1 << 22
+        tracemalloc.stop()
+
+
+def test_content_behind_the_splats_is_not_unpacked(tmp_path):
+    """One splat, and then zeros without end."""
+    (tmp_path / "a.spz").write_bytes(gzip.compress(spz_header(1, degree=0) + bytes(1 << 26), 1))
+    tracemalloc.start()
+    with pytest.raises(DataError, match="more than the splats"):
+        load_scene(tmp_path / "a.spz", trust=True)
+    assert tracemalloc.get_traced_memory()[1] < 4 << 20
+    tracemalloc.stop()
+
+
+def test_values_beyond_bytes_give_no_warning(tmp_path, recwarn):
+    scene = random_scene(20, 1)
+    scene.log_scales[0] = (3e38, -3e38, 1e30)
+    scene.sh[1] = 3e38
+    scene.quaternions[2] = (3e38, -3e38, 3e38, 3e38)
+    spz.save(tmp_path / "a.spz", scene)
+    assert len(spz.load(tmp_path / "a.spz")) == 20
+    assert not recwarn.list
