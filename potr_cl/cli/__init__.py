@@ -15,6 +15,7 @@ from potr_cl.cli import guard
 from potr_cl.cli.parser import CommandParser
 from potr_cl.cli.terminal import note
 from potr_cl.errors import PotrError
+from potr_cl.host.signals import unwinding
 from potr_cl.host.threads import in_background
 from potr_cl.plain_text import plain
 
@@ -69,7 +70,8 @@ def _run(argv: Sequence[str]) -> None:
         in_background(import_module("potr_cl.opencl.discovery").list_devices)
     args = command_parser(argv).parse_args(argv)
     guard.check(args)
-    args.run(args)
+    with unwinding():
+        args.run(args)
 
 
 def command_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:

@@ -1,13 +1,17 @@
-"""A process that is told to end, by Ctrl-C, ``kill`` or a closed terminal, ends at once and leaves nothing behind.
+"""A process that is told to end, by Ctrl-C, ``kill`` or a closed terminal, ends soon and leaves nothing behind.
 
-Only programs call this, never the library: a process that uses the library has its own way with signals.
+Only programs call this, never the library: a process that uses the library has its own way with signals. A program
+calls :func:`end_cleanly_on_signals` first of all, and does its work in :func:`unwinding`.
 """
 
 from __future__ import annotations
 
+import _thread
 import os
 import signal
-from contextlib import suppress
+import time
+from collections.abc import Iterator
+from contextlib import contextmanager, suppress
 from types import FrameType
 
 from potr_cl.host import leftovers
@@ -17,6 +21,11 @@ _SAID = {
     "SIGTERM": b"potr-cl: terminated; no file is left half written\n",
     "SIGHUP": b"potr-cl: the terminal was closed; no file is left half written\n",
 }
+#: Seconds that the work is given to let go of what it holds.
+_PATIENCE = 5.0
+
+_received: int | None = None
+_unwinds = False
 
 
 def end_cleanly_on_signals() -> None:
@@ -27,14 +36,43 @@ def end_cleanly_on_signals() -> None:
     for name in _SAID:
         number = getattr(signal, name, None)  # Windows has not all of them
         if number is not None and signal.getsignal(number) is not signal.SIG_IGN:
-            signal.signal(number, _end)
+            signal.signal(number, _handle)
 
 
-def _end(number: int, _frame: FrameType | None) -> None:
-    # No exception is raised: within an import or a library's callback it may be swallowed, or become another one.
-    for name in _SAID:
-        if hasattr(signal, name):
-            signal.signal(getattr(signal, name), signal.SIG_IGN)
+@contextmanager
+def unwinding() -> Iterator[None]:
+    """Have a signal raise KeyboardInterrupt in the block, so that libraries let go of what they hold, and end it then.
+
+    Outside, a signal ends the process at once: within an import an exception would become another one. Also here it
+    ends, whatever becomes of the exception, after a second signal, or if the block has not ended within some seconds.
+    Without :func:`end_cleanly_on_signals` this does nothing.
+    """
+    global _unwinds
+    _unwinds = True
+    try:
+        yield
+    finally:
+        _unwinds = False
+        if _received is not None:
+            _end(_received)
+
+
+def _handle(number: int, _frame: FrameType | None) -> None:
+    global _received
+    first, _received = _received is None, number
+    if not (first and _unwinds):
+        _end(number)
+    # Not a Thread: its start takes locks, one of which this thread may hold.
+    _thread.start_new_thread(_end_late, (number,))
+    raise KeyboardInterrupt
+
+
+def _end_late(number: int) -> None:
+    time.sleep(_PATIENCE)
+    _end(number)
+
+
+def _end(number: int) -> None:
     leftovers.remove_all()
     with suppress(OSError):  # the terminal may be gone
         os.write(2, (b"\n" if os.isatty(2) else b"") + _SAID[signal.Signals(number).name])

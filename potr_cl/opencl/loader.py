@@ -14,6 +14,8 @@ from typing import Any
 
 import pyopencl as cl
 
+from potr_cl.host.leftovers import removed_at_end
+
 logger = logging.getLogger("potr_cl")
 
 _ICD_VARIABLE = "OCL_ICD_VENDORS"
@@ -118,8 +120,9 @@ def _register_intel_runtime() -> None:
             return  # someone else's folder: do not load libraries that it names
         for name, text in contents.items():
             partial = folder / f".{name}.{os.getpid()}"
-            partial.write_text(text)
-            partial.replace(folder / name)
+            with removed_at_end(partial):
+                partial.write_text(text)
+                partial.replace(folder / name)
     except OSError as error:
         logger.warning("cannot register Intel's CPU runtime: %s", error)
         return

@@ -12,7 +12,7 @@ import numpy as np
 import pyopencl as cl
 import pytest
 
-from potr_cl.errors import DeviceError
+from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.opencl import discovery, loader
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, choose_device, compiler_fault, list_devices
@@ -462,3 +462,38 @@ def test_stage_times_need_profiling(device: Device) -> None:
     assert profiled.stage_times() == {}
     device.self_check()
     assert device.stage_times() == {}
+
+
+OUT_OF_MEMORY = [
+    cl.MemoryError("clEnqueueNDRangeKernel failed: MEM_OBJECT_ALLOCATION_FAILURE"),
+    cl.RuntimeError("clCreateBuffer failed: OUT_OF_HOST_MEMORY"),
+    cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES"),
+    cl.RuntimeError("clWaitForEvents failed: MEM_OBJECT_ALLOCATION_FAILURE - more"),
+    cl.LogicError("clCreateBuffer failed: INVALID_BUFFER_SIZE"),
+    MemoryError("std::bad_alloc"),
+    MemoryError(),
+]
+
+
+@pytest.mark.parametrize("error", OUT_OF_MEMORY, ids=str)
+def test_every_way_to_say_no_memory(device: Device, error: Exception) -> None:
+    with pytest.raises(DeviceMemoryError, match="ran out of memory") as caught, device.errors("failed"):
+        raise error
+    assert "\n" not in str(caught.value)
+
+
+def test_other_errors_are_not_about_memory(device: Device) -> None:
+    log = "clBuildProgram failed: BUILD_PROGRAM_FAILURE\n\nBuild on <A>:\n\nerror: OUT_OF_RESOURCES is no type"
+    with pytest.raises(DeviceError) as caught, device.errors("failed"):
+        raise cl.RuntimeError(log)
+    assert type(caught.value) is DeviceError
+
+
+def test_a_launch_that_finds_no_memory(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    def refuse(*_arguments: object) -> None:
+        raise cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_HOST_MEMORY")
+
+    kernel = device.kernel("opencl/probe.cl", "probe_integers", LANES=1)
+    monkeypatch.setattr(cl, "enqueue_nd_range_kernel", refuse)
+    with pytest.raises(DeviceMemoryError):
+        kernel.launch((64,))

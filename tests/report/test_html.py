@@ -201,3 +201,24 @@ def test_views_to_show():
     assert views_to_show(REPORT["quality"], None)[-1][0] == "first view"
     one = {"views": [view("only", None)]}
     assert views_to_show(one, None) == [("worst view, median view, first view", view("only", None))]
+
+
+def test_pictures_that_are_too_wide_for_webp():
+    """The page is the last thing that an encode makes: the file is there already."""
+    for shape in ((2, 16_384, 3), (16_384, 2, 3)):
+        wide = np.linspace(0, 1, int(np.prod(shape)), dtype=np.float32).reshape(shape)
+        page = html_report(REPORT, [PicturePair("worst view", "left", 40.0, wide, wide * np.float32(0.5))])
+        sources = re.findall(r'src="data:image/(\w+);base64,([^"]*)"', page)
+        assert [kind for kind, _ in sources] == ["png"] * 3
+        with Image.open(io.BytesIO(base64.b64decode(sources[0][1]))) as image:
+            assert np.array_equal(np.asarray(image), to_8_bits(wide))
+
+
+def test_names_that_cannot_be_written_are_shown_as_escapes():
+    report = copy.deepcopy(REPORT)
+    report["source"]["file"] = report["file"] = report["device"]["name"] = "odd\udcff\x1b[31m\u202e"
+    page = html_report(report, [PicturePair("worst view", "a\ud800\x07", 40.0, BEFORE, BEFORE)])
+    page.encode("utf-8")
+    assert "odd\\udcff\\x1b[31m\\u202e" in page
+    assert "a\\ud800\\x07" in page
+    assert all(line.isprintable() for line in page.replace("\t", " ").split("\n"))

@@ -1,0 +1,156 @@
+"""A process that is told to end leaves nothing behind, and says so in one line."""
+
+from __future__ import annotations
+
+import os
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+pytestmark = pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
+
+ROOT = Path(__file__).parents[2]
+SIGNALS = [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)]
+
+
+def run(program: str, *arguments: object, **options: object) -> subprocess.CompletedProcess[str]:
+    return subprocess.run(
+        [sys.executable, "-c", program, *map(str, arguments)],
+        cwd=ROOT, capture_output=True, text=True, timeout=60, check=False, **options,
+    )  # fmt: skip
+
+
+#: Sends itself a signal while it writes a file and has a temporary folder with things in it.
+WRITING = """
+import os, signal, sys
+from pathlib import Path
+from potr_cl.host.atomic_write import replacing
+from potr_cl.host.leftovers import temporary_folder
+from potr_cl.host import signals
+signals._PATIENCE = float(sys.argv[3])
+signals.end_cleanly_on_signals()
+number = getattr(signal, sys.argv[1])
+with signals.unwinding(), replacing(sys.argv[2]) as file, temporary_folder() as folder:
+    (Path(folder) / "inner").mkdir()
+    (Path(folder) / "inner" / "file").write_bytes(b"x")
+    file.write(b"half")
+    file.flush()
+    print(folder, flush=True)
+    how = sys.argv[4]
+    try:
+        os.kill(os.getpid(), number)
+    except BaseException as error:
+        if how == "raised":
+            raise
+        if how == "turned into another":
+            raise ImportError("no such library") from error
+    if how == "swallowed":
+        import time
+        time.sleep(30)
+    if how == "twice":
+        os.kill(os.getpid(), number)
+    print("went on", flush=True)
+"""
+
+
+@pytest.mark.parametrize("how", ["raised", "turned into another", "swallowed", "twice"])
+@pytest.mark.parametrize(("number", "code"), SIGNALS)
+def test_nothing_is_left(tmp_path: Path, number: signal.Signals, code: int, how: str) -> None:
+    target = tmp_path / "out.bin"
+    target.write_bytes(b"old")
+    result = run(WRITING, number.name, target, 0.1 if how == "swallowed" else 30, how)
+    assert result.returncode == code
+    assert result.stderr.startswith("potr-cl: ")
+    assert result.stderr.count("\n") == 1
+    folder = result.stdout.strip()
+    assert os.path.isabs(folder)
+    assert not os.path.exists(folder)
+    assert os.listdir(tmp_path) == ["out.bin"]
+    assert target.read_bytes() == b"old"
+
+
+def test_what_is_ignored_stays_ignored(tmp_path: Path) -> None:
+    """As nohup asks for."""
+    result = run(
+        "import signal; signal.signal(signal.SIGHUP, signal.SIG_IGN)\n" + WRITING,
+        "SIGHUP",
+        tmp_path / "out",
+        1,
+        "raised",
+    )
+    assert result.returncode == 0
+    assert "went on" in result.stdout
+    assert (tmp_path / "out").read_bytes() == b"half"
+
+
+#: Runs the program as python -m does, with a signal at the moment that a module is first asked for.
+WHILE_IMPORTING = """
+import os, runpy, signal, sys
+name, number, *arguments = sys.argv[1:]
+
+class Finder:
+    def find_spec(self, fullname, path=None, target=None):
+        if fullname == name:
+            os.kill(os.getpid(), getattr(signal, number))
+
+sys.meta_path.insert(0, Finder())
+sys.argv = ["potr-cl", *arguments]
+runpy.run_module("potr_cl", run_name="__main__", alter_sys=True)
+"""
+
+
+@pytest.mark.parametrize("module", ["argparse", "potr_cl.cli", "numpy", "numpy.linalg", "potr_cl.codec.decoder"])
+@pytest.mark.parametrize(("number", "code"), SIGNALS)
+def test_while_modules_are_imported(module: str, number: signal.Signals, code: int) -> None:
+    result = run(WHILE_IMPORTING, module, number.name, "info", "nothing.potr")
+    assert result.returncode == code, result.stderr
+    assert result.stderr.count("\n") == 1
+    assert result.stderr.startswith("potr-cl: ")
+
+
+def test_a_converter_that_is_told_to_end(tmp_path: Path, data: Path) -> None:
+    """At the moment when the file that a library has written is there, and not yet copied."""
+    pytest.importorskip("gsply", reason="the extra convert is not installed")
+    program = (
+        "import os, signal, sys; from potr_cl.host.signals import end_cleanly_on_signals; end_cleanly_on_signals();"
+        "import shutil; shutil.copyfileobj = lambda *_: os.kill(os.getpid(), signal.SIGTERM);"
+        "from potr_cl.cli import main; sys.exit(main(sys.argv[1:]))"
+    )
+    temporary, target = tmp_path / "temporary", tmp_path / "out.spz"
+    temporary.mkdir()
+    environment = os.environ | {"TMPDIR": str(temporary)}
+    result = run(program, "convert", data / "lego_excerpt.ply", target, env=environment)
+    assert result.returncode == 143, result.stderr
+    assert [path.name for path in tmp_path.iterdir()] == ["temporary"]
+    assert not list(temporary.glob("potr-cl-*"))
+
+
+@pytest.mark.parametrize("closed", [(0,), (1,), (2,), (0, 1, 2)])
+def test_closed_standard_files_are_not_written_to_by_accident(tmp_path: Path, closed: tuple[int, ...]) -> None:
+    program = (
+        "import os, sys; from potr_cl.host.standard_files import open_standard_files; open_standard_files();"
+        "file = open(sys.argv[1], 'wb'); assert file.fileno() > 2; os.write(1, b'x'); os.write(2, b'y');"
+        "print('z', file=sys.stderr); print('z'); file.write(b'content')"
+    )
+    # The shell closes them: whoever opens next would get their numbers.
+    redirections = " ".join(f"{number}>&-" for number in closed)
+    subprocess.run(
+        ["sh", "-c", f'exec "$0" -c "$1" "$2" {redirections}', sys.executable, program, str(tmp_path / "file")],
+        cwd=ROOT, check=True, capture_output=True, timeout=60,
+    )  # fmt: skip
+    assert (tmp_path / "file").read_bytes() == b"content"
+
+
+def test_no_folder_for_temporary_files_is_one_line(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    from potr_cl.errors import UsageError
+    from potr_cl.host.leftovers import temporary_folder
+
+    def full(*_args: object) -> None:
+        raise OSError(28, "No space left on device")
+
+    monkeypatch.setattr("os.mkdir", full)
+    with pytest.raises(UsageError, match="No space left on device: make room there"), temporary_folder():
+        pass

@@ -1,0 +1,120 @@
+"""Several threads on one device: none takes memory or arguments from another, also when one is cancelled."""
+
+from __future__ import annotations
+
+import contextlib
+import threading
+from concurrent.futures import ThreadPoolExecutor
+from functools import partial
+
+import numpy as np
+import pyopencl as cl
+import pytest
+
+from potr_cl.opencl.device import Device
+from potr_cl.raster.rasterizer import Rasterizer, render
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
+
+
+@pytest.fixture(scope="module")
+def device() -> Device:
+    return Device()
+
+
+def test_a_thread_that_fails_takes_nothing_from_another(device: Device) -> None:
+    """Each gives back what it has taken itself, whatever the order in which they come and go."""
+    before = device.allocated
+    entered, failed = threading.Event(), threading.Event()
+    array = np.arange(1000, dtype=np.uint32)
+    kept: list[cl.Buffer] = []
+    errors: list[BaseException] = []
+
+    def goes_on() -> None:
+        try:
+            with device.all_or_nothing():
+                entered.wait(10)  # now the other one has begun, and is the last that did
+                kept.append(device.upload(array, "a test"))
+                failed.set()
+                other.join(10)
+                kept.append(device.upload(array + 1, "a test"))
+        except BaseException as error:
+            errors.append(error)
+
+    def is_cancelled() -> None:
+        with contextlib.suppress(KeyboardInterrupt), device.all_or_nothing():
+            entered.set()
+            failed.wait(10)
+            device.allocate(1000, "a test")
+            raise KeyboardInterrupt
+
+    other = threading.Thread(target=is_cancelled)
+    one = threading.Thread(target=goes_on)
+    one.start()
+    other.start()
+    one.join(20)
+    assert not errors
+    assert not other.is_alive()
+    for number, buffer in enumerate(kept):
+        assert np.array_equal(device.download(buffer, array.shape, array.dtype), array + number)
+    assert device.allocated == before + sum(buffer.size for buffer in kept)
+    for buffer in kept:
+        device.free(buffer)
+    assert device.allocated == before
+
+
+def test_what_another_thread_frees_is_not_freed_again(device: Device) -> None:
+    before = device.allocated
+
+    def free(buffer: cl.Buffer) -> None:
+        thread = threading.Thread(target=device.free, args=[buffer])
+        thread.start()
+        thread.join()
+
+    with contextlib.suppress(ValueError), device.all_or_nothing():
+        free(device.allocate(1000, "a test"))
+        raise ValueError("x")
+    assert device.allocated == before
+
+
+def test_threads_share_no_kernel(device: Device) -> None:
+    """One would bind arguments between another's binding and its launch."""
+    make = partial(device.shared_kernel, "opencl/probe.cl", "probe_integers", LANES=1)
+    with ThreadPoolExecutor(1) as pool:
+        assert make() is make()
+        assert pool.submit(make).result() is not make()
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_two_threads_render_on_one_device_while_others_are_cancelled(device: Device, seed: int) -> None:
+    """What crashed: buffers of a thread that went on were freed with those of one that was cancelled."""
+    cameras = ring_of_cameras(3, size=32)
+    scenes = [random_scene(200, 0, seed=2 * seed + number) for number in range(2)]
+    wanted = [[render(scene, camera, device=device)[0] for camera in cameras] for scene in scenes]
+    before = device.allocated
+    end = threading.Event()
+
+    def draw(number: int) -> list[np.ndarray]:
+        for _ in range(6):
+            with device.all_or_nothing(), Rasterizer(device, scenes[number]) as rasterizer:
+                pictures = [rasterizer.render(camera)[0] for camera in cameras]
+        return pictures
+
+    def is_cancelled() -> None:
+        while not end.is_set():
+            with contextlib.suppress(KeyboardInterrupt), device.all_or_nothing():
+                rasterizer = Rasterizer(device, scenes[0])
+                rasterizer.render(cameras[0])
+                raise KeyboardInterrupt
+
+    with ThreadPoolExecutor(3) as pool:
+        cancelled = pool.submit(is_cancelled)
+        drawn = [pool.submit(draw, number) for number in range(2)]
+        try:
+            pictures = [future.result() for future in drawn]
+        finally:
+            end.set()
+        cancelled.result()
+    for number in range(2):
+        for picture, expected in zip(pictures[number], wanted[number], strict=True):
+            assert np.array_equal(picture, expected)
+    assert device.allocated == before
