@@ -12,6 +12,7 @@ from typing import Any
 import numpy as np
 
 from potr_cl.codec.decoder import PotrFile
+from potr_cl.errors import PotrError
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.formats.images import image_size, read_ground_truth
 from potr_cl.model.camera import Camera
@@ -30,6 +31,8 @@ from tools.stress.hostile import (
 Files = dict[str, bytes]
 
 MIB = 1 << 20
+#: Bytes that a pixel of a photograph may take while it is read.
+A_PIXEL = 48
 
 
 class WrongResult(Exception):
@@ -45,6 +48,7 @@ class Format:
         changed: makes a changed file, or several that belong together.
         read: reads the first of them, as the package's user does. Raises WrongResult if what comes out cannot be right.
         constant, a_byte: memory that reading may take, in bytes: so much for any file, and so much for each byte of it.
+        beyond: bytes besides that a certain file may take.
         twice: what was read is read again with other garbage in memory that nobody has written to: results that differ
             show that a library looked there.
     """
@@ -54,11 +58,12 @@ class Format:
     read: Callable[[Path], Any]
     constant: int
     a_byte: int
+    beyond: Callable[[Path], int] = lambda path: 0
     twice: bool = False
 
-    def allowance(self, size: int) -> int:
+    def allowance(self, path: Path, size: int) -> int:
         """Bytes that reading a file of some size may take."""
-        return self.constant + self.a_byte * size
+        return self.constant + self.a_byte * size + self.beyond(path)
 
 
 def read_potr(path: Path) -> Scene:
@@ -99,6 +104,15 @@ def read_picture(path: Path) -> Any:
     return pixels
 
 
+def bytes_of_pixels(path: Path) -> int:
+    """What the pixels of a picture may take that is not refused for its header."""
+    try:
+        width, height = image_size(path)
+    except PotrError:
+        return 0
+    return A_PIXEL * width * height
+
+
 def _checked_scene(scene: Scene) -> Scene:
     arrays = (scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh)
     if len(scene) < 1 or any(len(array) != len(scene) for array in arrays):
@@ -123,6 +137,10 @@ def _single(
     return Format(lambda: [{name: data} for data in good()], lambda rng: {name: changed(rng)}, *others, **more)
 
 
+def _picture(name: str, good: Callable[[], list[bytes]], changed: Callable[[Random], bytes]) -> Format:
+    return _single(name, good, changed, read_picture, MIB, 64, bytes_of_pixels)
+
+
 #: By name. docs/security.md states the costs.
 FORMATS: dict[str, Format] = {
     "potr": _single("a.potr", potr_files.originals, potr_files.changed, read_potr, 64 * MIB, 8192, twice=True),
@@ -145,7 +163,7 @@ FORMATS: dict[str, Format] = {
     "colmap-text": Format(
         camera_files.good_colmap_text, camera_files.changed_colmap_text, read_cameras, 32 * MIB, 256
     ),
-    "png": _single("a.png", picture_files.good_pngs, picture_files.changed_png, read_picture, 32 * MIB, 256),
-    "jpeg": _single("a.jpg", picture_files.jpeg_originals, picture_files.changed_jpeg, read_picture, 32 * MIB, 256),
-    "webp": _single("a.webp", picture_files.webp_originals, picture_files.changed_webp, read_picture, 32 * MIB, 256),
+    "png": _picture("a.png", picture_files.good_pngs, picture_files.changed_png),
+    "jpeg": _picture("a.jpg", picture_files.jpeg_originals, picture_files.changed_jpeg),
+    "webp": _picture("a.webp", picture_files.webp_originals, picture_files.changed_webp),
 }  # fmt: skip

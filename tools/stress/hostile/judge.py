@@ -26,7 +26,9 @@ from tools.stress.hostile.formats import Files, Format, WrongResult, parts_of
 LONGEST = 5.0
 #: Room that the process may take beyond what it has when it begins and what a file may cost. What is reserved and never
 #: touched counts too: stacks of threads, arenas of their allocators.
-_ROOM = 1 << 30
+_ROOM = 1 << 29
+#: More is not tried, for the sake of the machine.
+_MOST = 1 << 30
 #: A message for people: one line, of so many characters at most.
 _LONGEST_MESSAGE = 1000
 #: Numbers of glibc's mallopt, and two bytes to fill memory with that is handed out or given back.
@@ -82,11 +84,6 @@ class Judge:
         warnings.simplefilter("always")
         warnings.showwarning = lambda message, category, *_, **__: self._said.append(f"{category.__name__}: {message}")
 
-    def limit_memory(self, size: int) -> None:
-        """Have what takes much more than it may for a file of some size run into an error."""
-        most = self._memory.virtual() + self._form.allowance(size) + _ROOM
-        resource.setrlimit(resource.RLIMIT_AS, (most, resource.RLIM_INFINITY))
-
     def put(self, files: Files) -> Path:
         """Put files where they are read; those of the case before go."""
         for name in self._there - set(files):
@@ -106,6 +103,8 @@ class Judge:
             size: bytes of it and of those that belong to it.
         """
         self._cases += 1
+        allowance = self._form.allowance(path, size)
+        self._limit(allowance)
         self._said.clear()
         self._watched.found.clear()
         self._memory.reset()
@@ -118,10 +117,19 @@ class Judge:
         seconds = time.perf_counter() - began
         memory = self._memory.grown()
         if kind in ("read", "refused"):
-            kind, text = self._second_look(kind, text, memory, size)
+            kind, text = self._second_look(kind, text)
+        if kind in ("read", "refused") and memory > allowance:
+            kind, text = "memory", f"{memory} bytes for a file of {size}, which may take {allowance}"
+        if kind == "memory" and memory <= allowance > _MOST:  # more than is tried here, but no more than is promised
+            kind = "refused"
         if kind == "read" and self._form.twice and self._cases % 4 == 0:
             kind, text = self._twice(path, result)
         return Verdict(kind, text, seconds, memory)
+
+    def _limit(self, allowance: int) -> None:
+        """Have what takes much more than it may run into an error."""
+        most = self._memory.virtual() + min(allowance, _MOST) + _ROOM
+        resource.setrlimit(resource.RLIMIT_AS, (most, resource.RLIM_INFINITY))
 
     def _read(self, path: Path) -> tuple[str, str, Any]:
         try:
@@ -137,12 +145,10 @@ class Judge:
         except BaseException:
             return "exception", traceback.format_exc(), None
 
-    def _second_look(self, kind: str, text: str, memory: int, size: int) -> tuple[str, str]:
+    def _second_look(self, kind: str, text: str) -> tuple[str, str]:
         """What was read or refused may still have done what it should not."""
         if self._watched.found:
             return self._watched.found[0]
-        if memory > self._form.allowance(size):
-            return "memory", f"{memory} bytes for a file of {size}, which may take {self._form.allowance(size)}"
         for message in [text, *self._said]:
             if len(message) > _LONGEST_MESSAGE or not message.isprintable():
                 return "message", repr(message[:2000])
@@ -237,9 +243,11 @@ class _Watched:
             return
         real = os.path.normpath(os.path.join(os.getcwd(), name))
         writes = isinstance(flags, int) and bool(flags & (os.O_WRONLY | os.O_RDWR | os.O_CREAT))
+        if real == os.devnull:
+            return
         if real.startswith(self._allowed) and not (writes and real.startswith(self._allowed[0])):
             return
-        if not writes and (real.lower().endswith(_IMAGES) or real == os.devnull or real.endswith((".py", ".pyc"))):
+        if not writes and (real.lower().endswith(_IMAGES) or real.endswith((".py", ".pyc"))):
             return  # the pictures that cameras name may lie anywhere
         self.found.append(("name", f"opens {name!r:.300}{' to write' if writes else ''}"))
 

@@ -103,7 +103,6 @@ def work(job: Job) -> None:
             place = judge.put(files)
             tally.bytes += size
             tally.pack_into(shared)
-            judge.limit_memory(size)
             verdict = judge.judge(place, size)
             tally.memory = max(tally.memory, verdict.memory)
             tally.slowest = max(tally.slowest, verdict.seconds)
