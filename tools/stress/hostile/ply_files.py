@@ -24,7 +24,8 @@ _BOUNDS = tuple(
 )
 
 
-def _names(degree: int, normals: bool) -> list[str]:
+def names_of(degree: int, normals: bool = False) -> list[str]:
+    """The properties of a splat in the original order."""
     rest = 3 * (SH_COEFFICIENTS[degree] - 1)
     return [
         *("x", "y", "z"), *(("nx", "ny", "nz") if normals else ()), *(f"f_dc_{i}" for i in range(3)),
@@ -40,7 +41,7 @@ def plain_originals() -> list[bytes]:
     files = []
     for layout in _FORMATS:
         for degree, kind, normals in ((0, "float", True), (1, "double", False), (3, "float", False)):
-            names = _names(degree, normals)
+            names = names_of(degree, normals)
             rows = [[rng.uniform(-2, 2) for _ in names] for _ in range(3)]
             before = [(7, 8, 9)] if degree == 1 else []
             header = ["ply", f"format {layout} 1.0", "comment made to be changed"]

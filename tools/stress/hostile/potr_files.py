@@ -14,6 +14,7 @@ from random import Random
 import numpy as np
 import zstandard
 
+from potr_cl.model.scene import Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
@@ -37,6 +38,8 @@ _ORIGINALS = [
     ("zstd", 12, 3, "best"),
     ("npz", 5, 1, "best"),
 ]
+#: Of these, and of two that the context coder takes whole.
+_HOW_OFTEN = (1, 1, 1, 1, 1, 2, 1, 1, 2, 2)
 
 
 @dataclasses.dataclass
@@ -109,12 +112,28 @@ def originals() -> list[bytes]:
         )
         cameras = ring_of_cameras(2) if number == 0 else None
         files.append(b"".join(encode(scene, cameras, options).pieces))
+    for degree in (0, 3):
+        options = EncodeOptions(preset="best").changed(prune=False, compact=False, refit=False)
+        files.append(b"".join(encode(_predictable(800, degree), None, options).pieces))
+        if {s.coder for s in File.of(files[-1]).sections if s.prop >= _FIRST_PER_SPLAT} != {_CONTEXT}:
+            raise RuntimeError("the encoder no longer takes the context coder for predictable splats")
     return files
+
+
+def _predictable(splats: int, degree: int) -> Scene:
+    """Splats of which a model saves more than it takes, in every section that may have one."""
+    rng = np.random.default_rng(0)
+    scene = random_scene(splats, degree, seed=9)
+    alike = np.arange(splats) % 5
+    sh = scene.sh[alike] / 2
+    sh[:, 0] = np.where(rng.random((splats, 3)) < 0.9, 0, rng.integers(-9, 9, (splats, 3))) / 20
+    logits = np.where(rng.random(splats) < 0.9, 0, rng.integers(0, 9, splats)) / 4
+    return Scene(scene.means, scene.log_scales[alike], scene.quaternions[alike], logits.astype(np.float32), sh)
 
 
 def changed(rng: Random) -> bytes:
     """One of the originals, changed."""
-    data = rng.choice(originals())
+    data = rng.choices(originals(), _HOW_OFTEN)[0]
     if rng.random() < 0.15:  # as it comes, checksums and all
         for _ in range(1 + rng.randrange(3)):
             data = damaged(data, rng)
