@@ -14,9 +14,13 @@ The public interface in short; everything else has its module:
 from __future__ import annotations
 
 from importlib import import_module
-from typing import TYPE_CHECKING, Any
+
+# As typing has it, which takes long to import: until the program handles signals, Ctrl-C ends in a traceback.
+TYPE_CHECKING = False
 
 if TYPE_CHECKING:
+    from typing import Any
+
     from potr_cl.codec.decoder import decode
     from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, PotrError, UnreachableError, UsageError
     from potr_cl.formats import load_cameras, load_scene

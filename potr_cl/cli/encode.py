@@ -12,7 +12,7 @@ from potr_cl.cli.guard import ReadFile, WrittenFile
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option, as_bytes, size_in_bytes
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_trust_option, read_scene, size_of_file
+from potr_cl.cli.scenes import add_trust_option, read_scene, size_of_file, trust
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say, say_document
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
@@ -96,7 +96,7 @@ def _encode(args: argparse.Namespace) -> None:
             else:
                 found = encode_to_target(scene, cameras, target, options, progress, device, progress.tell)
                 encoded, options, search = found.encoded, found.options, search_report(target, found)
-            written, candidate = _proved(encoded)  # what cannot be decoded must not replace what can
+            written, candidate = _proved(args, encoded)  # what cannot be decoded must not replace what can
             file.write(written.data)
         watch = Stopwatch(progress)
         pictures: list[PicturePair] = []
@@ -118,19 +118,19 @@ def _encode(args: argparse.Namespace) -> None:
         say(format_encode_report(report))
 
 
-def _proved(encoded: Encoded) -> tuple[PotrFile, Scene]:
+def _proved(args: argparse.Namespace, encoded: Encoded) -> tuple[PotrFile, Scene]:
     """The file that was made and the scene that a decoder makes of it.
 
     Raises:
         PotrError: no decoder takes it.
     """
     try:
-        file = PotrFile.from_bytes(b"".join(encoded.pieces))
+        file = PotrFile.from_bytes(b"".join(encoded.pieces), **trust(args))
         return file, file.scene()
     except DataError as error:
         raise PotrError(
-            f"the encoded file cannot be decoded ({error}): nothing was written. Values of this scene are beyond what "
-            "the format holds; look for splats that are very far away or very large"
+            f"the encoded file cannot be decoded ({error}): nothing was written. If the scene has splats that are very "
+            "far away or very large, leave them out"
         ) from error
 
 

@@ -6,6 +6,7 @@ import dataclasses
 import logging
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
@@ -111,16 +112,24 @@ def test_other_failures_are_not_tried_again():
     assert len(calls) == 1
 
 
-def test_memory_errors_of_the_driver_count_too(caplog):
+@pytest.mark.parametrize(
+    "error",
+    [
+        cl.MemoryError("clEnqueueNDRangeKernel failed: MEM_OBJECT_ALLOCATION_FAILURE"),
+        cl.RuntimeError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES"),
+        cl.RuntimeError("clFinish failed: OUT_OF_HOST_MEMORY"),
+        MemoryError("std::bad_alloc"),
+    ],
+    ids=str,
+)
+def test_memory_errors_of_the_driver_count_too(caplog, error):
     """Drivers may promise memory and fail when it is used: clEnqueue… says so then."""
-    import pyopencl as cl
-
     budgets = []
 
     def work(_device, memory):
         budgets.append(memory)
         if len(budgets) < 3:
-            raise cl.MemoryError("clEnqueueNDRangeKernel failed: OUT_OF_RESOURCES")
+            raise error
         return np.pi
 
     device = Device()
