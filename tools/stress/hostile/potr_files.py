@@ -125,8 +125,8 @@ def _predictable(splats: int, degree: int) -> Scene:
     rng = np.random.default_rng(0)
     scene = random_scene(splats, degree, seed=9)
     alike = np.arange(splats) % 5
-    sh = scene.sh[alike] / 2
-    sh[:, 0] = np.where(rng.random((splats, 3)) < 0.9, 0, rng.integers(-9, 9, (splats, 3))) / 20
+    sh = scene.sh[alike] / np.float32(2)
+    sh[:, 0] = np.where(rng.random((splats, 3)) < 0.9, 0, rng.integers(-9, 9, (splats, 3)) / 20)
     logits = np.where(rng.random(splats) < 0.9, 0, rng.integers(0, 9, splats)) / 4
     return Scene(scene.means, scene.log_scales[alike], scene.quaternions[alike], logits.astype(np.float32), sh)
 
