@@ -52,7 +52,7 @@ def commands() -> list[Command]:
         Command("encode, preset paper", (*_ENCODE, "--preset", "paper", "--no-quality"), ("scene.potr",)),
         Command(
             "encode without pruning",
-            ("encode", "in/scene.ply", "-o", "out/scene.potr", "--no-prune", "--no-compact", "--no-refit"),
+            ("encode", "in/scene.ply", "-o", "out/scene.potr", "--no-prune", "--no-compact", "--refit", "off"),
             ("scene.potr",),
         ),
         Command("encode --report", (*_ENCODE, "--report", "out/a.html"), ("scene.potr", "a.html"), repeats=False),

@@ -7,8 +7,8 @@ random from its usual run, or as soon as it has a file open in the folder of its
 what it was, each output absent or the old one or the whole new one, no other file may be in its folder or in the
 temporary one (but after SIGKILL), and the command must have exited with 130, 143 or 129, without a traceback.
 
-A signal that comes before the program's first lines have run meets the interpreter, which ends as it likes: such
-moments are told by /proc and counted apart; what is on the disk is checked all the same. Linux only.
+A signal that comes before the program's first lines have run, or after its last, meets the interpreter, which ends as
+it likes: such moments are told by /proc and counted apart; what is on the disk is checked all the same. Linux only.
 """
 
 from __future__ import annotations
@@ -38,7 +38,7 @@ _COLUMNS = (
     Column("usual time", "s", ".2f"),
     Column("moments"),
     Column("while it was writing"),
-    Column("before its first lines"),
+    Column("before its first lines or after its last"),
     Column("ended by the signal"),
     Column("done already"),
     Column("outputs new"),
