@@ -452,7 +452,7 @@ class _Search:
             encoded = None
             pieces = self._code(reduced, options.changed(code=_QUICK_CODER)).pieces
             self._watch("evaluate tries", 0.0)
-            value = min(self._evaluator.psnr(decode(b"".join(pieces))), _IDENTICAL)
+            value = min(self._evaluator.psnr(decode(b"".join(pieces), trust=True)), _IDENTICAL)
             self._watch("evaluate tries", 1.0)
         self._tries.append(Try(kind, q, value))
         self._tell(f"{KINDS[kind].format(f'{q:g}')} {self._target.describe(value)}")

@@ -51,8 +51,16 @@ class SceneFile:
 
     @staticmethod
     def of(path: Path, scene: Scene) -> SceneFile:
-        """The facts of a scene that was read from ``path``."""
-        return SceneFile(path, path.stat().st_size, len(scene), scene.sh_degree)
+        """The facts of a scene that was read from ``path``.
+
+        Raises:
+            UsageError: the file is gone.
+        """
+        try:
+            size = path.stat().st_size
+        except OSError as error:
+            raise UsageError(f"cannot read '{path}': {error.strerror}") from error
+        return SceneFile(path, size, len(scene), scene.sh_degree)
 
 
 @dataclass(frozen=True)

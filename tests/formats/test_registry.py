@@ -145,6 +145,17 @@ def test_formats_that_are_not_written_say_what_to_do(tmp_path: Path) -> None:
                 save_scene(tmp_path / f"a{entry.suffixes[0]}", random_scene(3))
 
 
+@pytest.mark.parametrize("suffix", [suffix for entry in SCENE_FORMATS for suffix in entry.suffixes])
+def test_a_file_that_is_gone_or_is_none(suffix: str, tmp_path: Path) -> None:
+    """Also where it was there a moment ago, when its content told the format."""
+    for entry in SCENE_FORMATS:
+        with pytest.raises(UsageError, match=r"cannot (open|read)"):
+            entry.load(tmp_path / f"gone{suffix}")
+    (tmp_path / f"folder{suffix}").mkdir()
+    with pytest.raises(UsageError, match=r"directory|not a regular file"):
+        load_scene(tmp_path / f"folder{suffix}")
+
+
 # Extras --------------------------------------------------------------------------------------------------------------
 
 

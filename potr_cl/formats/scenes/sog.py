@@ -177,23 +177,42 @@ class _Archive:
             raise self._damaged(f"'{name}' has {width} x {height} {what} for {self._count} splats")
 
     def _size(self, name: str, index: int) -> tuple[int, int]:
-        with self._image(name, index) as image:
-            size: tuple[int, int] = image.size
-            return size
+        size = _webp_size(self._stored(name, index))
+        if size is None:
+            raise self._damaged(f"an image of '{name}' is no WebP image")
+        return size
 
     def _pixels(self, name: str, index: int) -> U8:
         """(pixels, 4) R, G, B, A of an image whose size was checked."""
-        with self._image(name, index) as image:
+        from potr_cl.formats.images import opened_image  # imported on use: few read this format
+
+        stored = self._stored(name, index)
+        with opened_image(io.BytesIO(stored), ("WEBP",)) as image:
+            if image.size != _webp_size(stored):
+                raise self._damaged(f"an image of '{name}' has two sizes")
             pixels: U8 = np.asarray(image.convert("RGBA")).reshape(-1, 4)
             return pixels
 
-    def _image(self, name: str, index: int) -> Any:
-        from potr_cl.formats.images import opened_image  # imported on use: few read this format
-
-        return opened_image(io.BytesIO(self._zip.read(self._meta[name]["files"][index])), ("WEBP",))
+    def _stored(self, name: str, index: int) -> bytes:
+        return self._zip.read(self._meta[name]["files"][index])
 
     def _damaged(self, what: str) -> DataError:
         return DataError(f"'{self._path}' is damaged: {what}")
+
+
+def _webp_size(data: bytes) -> tuple[int, int] | None:
+    """Width and height that a WebP file begins with, for which Pillow would take memory; None if it is none."""
+    head, kind = data[:30], data[12:16]
+    if len(head) < 30 or head[:4] != b"RIFF" or head[8:12] != b"WEBP":
+        return None
+    if kind == b"VP8L":
+        bits = int.from_bytes(head[21:25], "little")
+        return (bits & 0x3FFF) + 1, (bits >> 14 & 0x3FFF) + 1
+    if kind == b"VP8X":
+        return int.from_bytes(head[24:27], "little") + 1, int.from_bytes(head[27:30], "little") + 1
+    if kind == b"VP8 ":
+        return int.from_bytes(head[26:28], "little") & 0x3FFF, int.from_bytes(head[28:30], "little") & 0x3FFF
+    return None
 
 
 def _smallest_three(pixels: U8) -> FloatArray:
