@@ -37,16 +37,18 @@ def main() -> None:
     results = Results(None, args.json)
     table = results.table("bombs", "Files that unpack to far more than they are, or claim to", *_COLUMNS)
     wrong = []
-    with tempfile.TemporaryDirectory() as scratch:
-        for form in args.formats or BOMBS:
-            for name, make in BOMBS[form].items():
-                files = make()
-                source = keep(Path(scratch), Job(form, "", ""), 0, files, Verdict("", "", 0.0, 0))
-                result = read_again([source], Path(scratch, "out"))[0]
-                size = sum(map(len, files.values()))
-                table.add(form, name, size, result["kind"], round(result["seconds"], 3), result["memory"] / _MIB)
-                if result["kind"] not in ("read", "refused"):
-                    wrong.append(f"{form}, {name}: {result['kind']}\n{result['text']}")
+    for form in args.formats or BOMBS:
+        with tempfile.TemporaryDirectory() as scratch:
+            made = [make() for make in BOMBS[form].values()]
+            nothing = Verdict("", "", 0.0, 0)
+            sources = [keep(Path(scratch), Job(form, "", ""), k, files, nothing) for k, files in enumerate(made)]
+            found = read_again(sources, Path(scratch, "out"))
+        for name, files, result in zip(BOMBS[form], made, found, strict=True):
+            size = sum(map(len, files.values()))
+            seconds, memory = round(result["seconds"], 3), round(result["memory"] / _MIB, 1)
+            table.add(form, name, size, result["kind"], seconds, memory)
+            if result["kind"] not in ("read", "refused"):
+                wrong.append(f"{form}, {name}: {result['kind']}\n{result['text']}")
     print("\n".join(wrong), file=sys.stderr)
     sys.exit(1 if wrong else 0)
 

@@ -96,17 +96,17 @@ def changed_png(rng: Random) -> bytes:
         other = rng.choice(_OTHER_KINDS)
         return other if rng.random() < 0.5 else damaged(other, rng)
     data = rng.choice(png_originals())
-    chunks = _chunks(data)
+    parts = chunks(data)
     for _ in range(1 + rng.choice((0, 0, 1))):
-        at = rng.randrange(len(chunks))
-        kind, content = chunks[at]
+        at = rng.randrange(len(parts))
+        kind, content = parts[at]
         way = rng.randrange(8)
         if way <= 1:
-            content = _changed_head(chunks[0][1], rng)
+            content = _changed_head(parts[0][1], rng)
             at, kind = 0, b"IHDR"
         elif way == 2:
-            inside = next((i for i, each in enumerate(chunks) if each[0] == b"IDAT"), at)
-            at, (kind, content) = inside, chunks[inside]
+            inside = next((i for i, each in enumerate(parts) if each[0] == b"IDAT"), at)
+            at, (kind, content) = inside, parts[inside]
             try:
                 raw = damaged(zlib.decompress(content), rng)
                 content = zlib.compress(raw + bytes(rng.choice((0, 0, 1 << 16))))
@@ -119,24 +119,25 @@ def changed_png(rng: Random) -> bytes:
             text = rng.choice(
                 (b"", b"a\0\0" + zlib.compress(bytes(1 << 16)), b"Description\0\x1b[2J", rng.randbytes(30))
             )
-            chunks.insert(rng.randrange(len(chunks) + 1), (other, text))
+            parts.insert(rng.randrange(len(parts) + 1), (other, text))
             continue
         elif way == 4:
-            del chunks[at]
-            if not chunks:
+            del parts[at]
+            if not parts:
                 return _SIGNATURE
             continue
         elif way == 5:
-            chunks.insert(at, chunks[rng.randrange(len(chunks))])
+            parts.insert(at, parts[rng.randrange(len(parts))])
             continue
         else:
             content = damaged(content, rng)
-        chunks[at] = kind, content
-    out = _SIGNATURE + b"".join(chunk(*each) for each in chunks)
+        parts[at] = kind, content
+    out = _SIGNATURE + b"".join(chunk(*each) for each in parts)
     return damaged(out, rng) if rng.random() < 0.1 else out
 
 
-def _chunks(data: bytes) -> list[tuple[bytes, bytes]]:
+def chunks(data: bytes) -> list[tuple[bytes, bytes]]:
+    """The chunks of a PNG file, kind and content, as far as there are whole ones."""
     found, at = [], len(_SIGNATURE)
     while at + 8 <= len(data):
         size, kind = struct.unpack_from(">I4s", data, at)

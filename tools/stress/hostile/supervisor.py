@@ -59,7 +59,7 @@ def attack(form: str, seed: int, first: int, count: int, seconds: float, finding
     total = Outcome()
     number, stop, end, crashes = first, first + count, time.monotonic() + seconds, 0
     while number < stop and time.monotonic() < end and crashes < _MOST_CRASHES:
-        with _place() as folder:
+        with place() as folder:
             job = Job(
                 form, str(folder), str(findings), seed, number, min(_A_PROCESS, stop - number), end - time.monotonic()
             )
@@ -81,30 +81,47 @@ def attack(form: str, seed: int, first: int, count: int, seconds: float, finding
 
 
 def read_again(folders: list[Path], findings: Path, longest: float = LONGEST) -> list[dict[str, Any]]:
-    """Read files that were kept, each in a process of its own; what came of each, as finding.json has it."""
-    results = []
+    """Read files that were kept, as :func:`tools.stress.hostile.worker.keep` leaves them.
+
+    Args:
+        folders: of the files, no two of one name.
+        findings: folder to keep what comes of them in, under the same names.
+
+    Returns:
+        For each what finding.json says of it then.
+    """
+    by_format: dict[str, list[Path]] = {}
     for source in folders:
-        about = json.loads((source / "finding.json").read_text())
-        with _place() as folder:
-            job = Job(about["format"], str(folder), str(findings), given=[str(source)], longest=longest)
-            code, said = run(job)
-            if code != 0:
-                keep(findings, job, 0, _files(folder, about["names"]), _ending(code, said))
-            results.append(json.loads((findings / source.name / "finding.json").read_text()))
-    return results
+        by_format.setdefault(_about(source)["format"], []).append(source)
+    for form, sources in by_format.items():
+        # One process is faster; where a file ends it, each gets its own.
+        if _read_given(form, sources, findings, longest)[0] != 0:
+            for source in sources:
+                code, said, files = _read_given(form, [source], findings, longest)
+                if code != 0:
+                    keep(findings, Job(form, "", "", given=[str(source)]), 0, files, _ending(code, said))
+    return [_about(findings / source.name) for source in folders]
+
+
+def _about(folder: Path) -> dict[str, Any]:
+    about: dict[str, Any] = json.loads((folder / "finding.json").read_text())
+    return about
+
+
+def _read_given(form: str, sources: list[Path], findings: Path, longest: float) -> tuple[int, str, Files]:
+    """A worker's exit code, what it said, and the files that it was at."""
+    with place() as folder:
+        job = Job(form, str(folder), str(findings), given=[str(source) for source in sources], longest=longest)
+        code, said = run(job)
+        return code, said, _files(folder, _about(sources[0])["names"] if sources[1:] == [] else None)
 
 
 def run(job: Job) -> tuple[int, str]:
     """Start a worker and wait; its exit code (below 0: minus a signal's number) and the end of what it said."""
-    environment = {
-        **os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1",
-        "PYTHONMALLOC": "malloc", "MALLOC_ARENA_MAX": "2", "TMPDIR": f"{job.folder}/tmp", "PYTHONPATH": str(ROOT),
-        "PYTHONFAULTHANDLER": "1",
-    }  # fmt: skip
     done = subprocess.run(
         [sys.executable, "-m", "tools.stress.hostile.worker"],
-        input=json.dumps(dataclasses.asdict(job)), capture_output=True, text=True, env=environment, check=False,
-        cwd=f"{job.folder}/cwd", errors="replace",
+        input=json.dumps(dataclasses.asdict(job)), env=settings(Path(job.folder)), cwd=f"{job.folder}/cwd",
+        capture_output=True, text=True, errors="replace", check=False,
     )  # fmt: skip
     errors = Path(job.folder, "stderr")
     told = errors.read_text(errors="replace") if errors.exists() else ""
@@ -114,8 +131,18 @@ def run(job: Job) -> tuple[int, str]:
     return done.returncode, said
 
 
-class _place:
-    """A folder in memory for a worker."""
+def settings(folder: Path) -> dict[str, str]:
+    """The environment of a worker: one thread, memory from the system's allocator, temporary files in its folder."""
+    return {
+        **os.environ, "OMP_NUM_THREADS": "1", "OPENBLAS_NUM_THREADS": "1", "NUMBA_NUM_THREADS": "1",
+        "PYTHONMALLOC": "malloc", "MALLOC_ARENA_MAX": "2", "MALLOC_MMAP_THRESHOLD_": "131072",
+        "MALLOC_TRIM_THRESHOLD_": "131072", "TMPDIR": f"{folder}/tmp", "PYTHONPATH": str(ROOT),
+        "PYTHONFAULTHANDLER": "1",
+    }  # fmt: skip
+
+
+class place:
+    """A folder in memory for a worker, which goes when the block ends."""
 
     def __enter__(self) -> Path:
         parent = "/dev/shm" if os.access("/dev/shm", os.W_OK) else None
@@ -138,7 +165,7 @@ def _ending(code: int, said: str) -> Verdict:
 
 def _in_time(job: Job, files: Files, number: int) -> bool:
     """Whether a file that seemed to hang is read in time when it is tried alone: then the machine was busy."""
-    with tempfile.TemporaryDirectory() as scratch, _place() as folder:
+    with tempfile.TemporaryDirectory() as scratch, place() as folder:
         source = keep(Path(scratch), job, number, files, Verdict("hang", "", 0.0, 0))
         return run(Job(job.form, str(folder), str(Path(scratch, "again")), given=[str(source)]))[0] == 0
 
