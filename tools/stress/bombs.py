@@ -2,7 +2,8 @@
 
     python -m tools.stress.bombs [--format NAME …] [--json FILE]
 
-A bomb must be refused, or read within 5 s and the memory that docs/security.md promises. Exits with 1 if one is not.
+A bomb must be refused, or read within 5 s of processor time and the memory that docs/security.md promises. Exits with 1
+if one is not.
 """
 
 from __future__ import annotations
@@ -24,7 +25,7 @@ _COLUMNS = (
     Column("bomb"),
     Column("file", "bytes", ","),
     Column("outcome"),
-    Column("time", "s", ".2f"),
+    Column("time", "s of processor time", ".2f"),
     Column("memory", "MiB", ".1f"),
 )
 

@@ -5,9 +5,10 @@
 
 Each file is a small good one with changes: of bytes, and of the parts that the format has (header fields, tables,
 streams behind their coders, checksums made right again). It must be read, or refused by one line of the package's own
-errors, within 5 s, and in the memory that docs/security.md promises. Anything else is a finding: a crash, a hang,
-another exception, too much memory, values that are not finite, a warning, a message that could harm a terminal, a
-file opened or a program started because of a name in it, results that differ between two readings, files left behind.
+errors, within 5 s of processor time, and in the memory that docs/security.md promises. Anything else is a finding: a
+crash, a hang, another exception, too much memory, values that are not finite, a warning, a message that could harm a
+terminal, a file opened or a program started because of a name in it, results that differ between two readings, files
+left behind.
 
 File number n of a seed is always the same. Findings are kept in a folder each (--findings) with what went wrong;
 --replay reads them again, and exits with 1 if any is still wrong. --continue goes on where the run that wrote the JSON
@@ -33,7 +34,7 @@ _COLUMNS = (
     Column("read", format=","),
     Column("refused", format=","),
     Column("findings", format=","),
-    Column("slowest", "s", ".2f"),
+    Column("slowest", "s of processor time", ".2f"),
     Column("most memory", "MiB", ".1f"),
     Column("time", "s", ".0f"),
 )

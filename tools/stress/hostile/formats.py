@@ -32,7 +32,7 @@ Files = dict[str, bytes]
 
 MIB = 1 << 20
 #: Bytes that a pixel of a photograph may take while it is read.
-A_PIXEL = 48
+A_PIXEL = 64
 
 
 class WrongResult(Exception):

@@ -60,7 +60,6 @@ def main() -> None:
 
     for good in form.good():  # what is loaded on first use counts for no file
         judge.judge(judge.put(good), 1 << 40)
-    # What the alarm of the judge does must not be done: libFuzzer tells which file hangs.
     atheris.Setup([sys.argv[0], *options], read, custom_mutator=changed)
     atheris.Fuzz()
 

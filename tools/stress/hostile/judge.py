@@ -22,8 +22,9 @@ from typing import Any
 from potr_cl.errors import PotrError
 from tools.stress.hostile.formats import Files, Format, WrongResult, parts_of
 
-#: A file that takes longer hangs, seconds.
-LONGEST = 5.0
+#: A file that takes longer hangs: seconds of processor time, and, should it wait for something, how many times as many
+#: of the clock, for other processes may keep the processor busy.
+LONGEST, _WAITING = 5.0, 12
 #: Room that the process may take beyond what it has when it begins and what a file may cost. What is reserved and never
 #: touched counts too: stacks of threads, arenas of their allocators.
 _ROOM = 1 << 29
@@ -46,7 +47,7 @@ class Verdict:
             "garbage", "program", "name", "leftover". A process that ends instead is a "crash", or a "hang" where its
             alarm rang.
         text: of the message, or of what is wrong.
-        seconds: it took.
+        seconds: of processor time that it took.
         memory: bytes at most beyond what the process held before.
     """
 
@@ -66,7 +67,7 @@ class Judge:
     Args:
         form: the format.
         folder: to put the files into; with the folders ``tmp`` and ``cwd`` beside ``input``, which must stay empty.
-        longest: seconds that a file may take, after which an alarm ends the process.
+        longest: seconds of processor time that a file may take, after which an alarm ends the process; 0: for ever.
     """
 
     def __init__(self, form: Format, folder: Path, longest: float = LONGEST) -> None:
@@ -108,13 +109,15 @@ class Judge:
         self._said.clear()
         self._watched.found.clear()
         self._memory.reset()
-        began = time.perf_counter()
-        signal.setitimer(signal.ITIMER_REAL, self._longest)
+        began = time.process_time()
+        signal.setitimer(signal.ITIMER_PROF, self._longest)
+        signal.setitimer(signal.ITIMER_REAL, self._longest * _WAITING)
         self._watched.on = True
         kind, text, result = self._read(path)
         self._watched.on = False
+        signal.setitimer(signal.ITIMER_PROF, 0)
         signal.setitimer(signal.ITIMER_REAL, 0)
-        seconds = time.perf_counter() - began
+        seconds = time.process_time() - began
         memory = self._memory.grown()
         if kind in ("read", "refused"):
             kind, text = self._second_look(kind, text)

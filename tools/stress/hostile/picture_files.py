@@ -152,7 +152,7 @@ def _changed_head(content: bytes, rng: Random) -> bytes:
     out = bytearray(content)
     if rng.random() < 0.5:
         at = rng.choice((0, 4))
-        side = rng.choice((0, 1, 2, 7, 9, 100, 65535, 65536, 1 << 30, interesting(rng, 4)))
+        side = rng.choice((0, 1, 2, 7, 9, 12, 100, 65535, 1 << 30)) if rng.random() < 0.95 else interesting(rng, 4)
         out[at : at + 4] = struct.pack(">I", side)
     else:
         out[8 + rng.randrange(5)] = rng.choice((0, 1, 2, 3, 4, 6, 8, 16, rng.randrange(256)))
@@ -173,7 +173,8 @@ def changed_jpeg(rng: Random) -> bytes:
             frame = max(data.find(b"\xff\xc0"), data.find(b"\xff\xc2"))
             if frame >= 0:
                 field = frame + rng.choice((5, 7))
-                data[field : field + 2] = interesting(rng, 2).to_bytes(2, "big")
+                side = rng.choice((0, 1, 7, 9, 100, 3000)) if rng.random() < 0.95 else interesting(rng, 2)
+                data[field : field + 2] = side.to_bytes(2, "big")
         elif kind == 3:
             data[at + 2 + rng.randrange(12) : at + 2 + rng.randrange(14)] = rng.randbytes(rng.randrange(4))
         else:

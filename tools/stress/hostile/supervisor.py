@@ -157,7 +157,7 @@ class place:
 
 def _ending(code: int, said: str) -> Verdict:
     """What a worker's end says of the file that it was at."""
-    if code == -signal.SIGALRM:
+    if code in (-signal.SIGALRM, -signal.SIGPROF):
         return Verdict("hang", said, LONGEST, 0)
     name = signal.Signals(-code).name if code < 0 else f"exit code {code}"
     return Verdict("crash", f"{name}\n{said}", 0.0, 0)
