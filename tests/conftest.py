@@ -13,6 +13,20 @@ DATA = Path(__file__).parent / "data"
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 
 
+def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item]) -> None:
+    """Leave out, visibly, what a second OpenCL runtime would only repeat (tests/devices.py)."""
+
+    def repeats(item: pytest.Item) -> bool:
+        parameters = getattr(item, "callspec", None)
+        second = parameters is not None and any(str(value).endswith("-pocl") for value in parameters.params.values())
+        return second and item.get_closest_marker("one_runtime") is not None
+
+    repeated = [item for item in items if repeats(item)]
+    if repeated:
+        config.hook.pytest_deselected(items=repeated)
+        items[:] = [item for item in items if item not in set(repeated)]
+
+
 @pytest.fixture(scope="session")
 def data() -> Path:
     """The folder of the small excerpts."""

@@ -68,10 +68,8 @@ def reduced(scene: Scene, views: Sequence[Camera], options: EncodeOptions, devic
 
 def pictures(device: Device, scene: Scene, views: Sequence[Camera]) -> list[FloatArray]:
     """Renders, (H, W, 3) float32, clamped to [0, 1]."""
-    rasterizer = Rasterizer(device, scene)
-    images = [np.clip(rasterizer.render(view)[0], 0, 1) for view in views]
-    rasterizer.free()
-    return images
+    with Rasterizer(device, scene) as rasterizer:
+        return [np.clip(rasterizer.render(view)[0], 0, 1) for view in views]
 
 
 def scaled(camera: Camera, factor: float) -> Camera:

@@ -175,11 +175,8 @@ def _refit(args: argparse.Namespace) -> None:
         if ground_truth is not None:
             _tell_of_ground_truth(device, (reference, scene, result), held_out, ground_truth, background)
         elif held_out:
-            evaluator = Evaluator(device, reference, EvaluationViews.of(held_out), background)
-            try:
+            with Evaluator(device, reference, EvaluationViews.of(held_out), background) as evaluator:
                 psnrs = [evaluator.psnr(candidate) for candidate in (scene, result)]
-            finally:
-                evaluator.free()
             say(f"{evaluator.views}: PSNR {psnrs[0]:.2f} dB before, {psnrs[1]:.2f} dB after, mean over views")
 
 
@@ -200,11 +197,8 @@ def _tell_of_ground_truth(
         return
     psnrs = []
     for scene in scenes:
-        rasterizer = Rasterizer(device, scene, background=background)
-        try:
+        with Rasterizer(device, scene, background=background) as rasterizer:
             psnrs.append(ground_truth.psnr(rasterizer, held_out))
-        finally:
-            rasterizer.free()
     reference, before, after = psnrs
     say(
         f"{len(held_out)} held-out photographs: PSNR {before:.2f} dB before, {after:.2f} dB after, "

@@ -150,13 +150,10 @@ def _evaluate(
     watch("evaluate", 0.0)
     try:
         device = device or (Device(args.device) if opened is None else opened.result())
-        evaluator = Evaluator(device, scene, views, parse_colour(args.background))
-        try:
+        with Evaluator(device, scene, views, parse_colour(args.background)) as evaluator:
             quality = quality_report(views, evaluator.compare(candidate, lambda _, done: watch("evaluate", done)))
             shown = views_to_show(quality, args.report_view) if args.report is not None else []
             pairs = evaluator.pictures(candidate, [view["name"] for _, view in shown])
-        finally:
-            evaluator.free()
     except DeviceError as error:
         return f"not judged: {error}", []
     return quality, [
@@ -179,9 +176,8 @@ def _evaluate_by_ground_truth(
         return
     before, after = 0.0, 0.0
     for each in (scene, candidate):
-        rasterizer = Rasterizer(device, each, background=background)
-        before, after = after, ground_truth.psnr(rasterizer, views)
-        rasterizer.free()
+        with Rasterizer(device, each, background=background) as rasterizer:
+            before, after = after, ground_truth.psnr(rasterizer, views)
     note(f"{len(views)} held-out photographs: uncompressed {before:.2f} dB, file {after:.2f} dB")
     if after < before:
         note(f"warning: on held-out photographs the file is {before - after:.2f} dB worse than the uncompressed scene")

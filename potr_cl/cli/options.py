@@ -10,7 +10,7 @@ from typing import TypeAlias
 from potr_cl.errors import UsageError
 from potr_cl.opencl.discovery import DEVICE_VARIABLE
 from potr_cl.plain_text import plain
-from potr_cl.raster.rasterizer import GSPLAT, INRIA
+from potr_cl.raster.rules import GSPLAT, INRIA
 
 Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 

@@ -137,7 +137,7 @@ class Device:
             handle = cl.Kernel(self.program(source, **defines), name)
         return Kernel(self, handle, source, self._variants)
 
-    def shared_kernel(self, source: str, name: str, types: Any = None, **defines: str | int | float) -> Kernel:
+    def shared_kernel(self, source: str, name: str, **defines: str | int | float) -> Kernel:
         """A kernel object that is made once a device and thread.
 
         Who takes it binds all its arguments before each launch; another thread has another, for its own arguments.

@@ -94,15 +94,6 @@ class Kernel:
             accepted = self._accepted(parameter, value)
             self.handle.set_arg(place, accepted if parameter.dtype is None else parameter.dtype.type(accepted))
 
-    def set_args(self, *values: Any) -> None:
-        self.bind(**dict(zip(self._places, values, strict=True)))
-
-    def set_arg(self, place: int, value: Any) -> None:
-        self.set(**{self.parameters[place].name: value})
-
-    def set_scalar_arg_dtypes(self, types: Any) -> None:
-        pass
-
     def launch(
         self, items: tuple[int, ...], group: tuple[int, ...] | None = None, queue: cl.CommandQueue | None = None
     ) -> None:

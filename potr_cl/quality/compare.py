@@ -23,7 +23,8 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.quality.metrics import Lpips
-from potr_cl.quality.metrics_device import Picture, Similarity, in_batches, place_pictures, rendered
+from potr_cl.quality.metrics_device import Similarity, in_batches
+from potr_cl.quality.pictures import Picture, place_pictures, rendered
 from potr_cl.raster.rasterizer import Rasterizer
 
 _TITLES = {

@@ -18,7 +18,8 @@ from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
 from potr_cl.quality.compare import Comparison, compare
-from potr_cl.quality.metrics_device import Picture, Similarity, in_batches, rendered
+from potr_cl.quality.metrics_device import Similarity, in_batches
+from potr_cl.quality.pictures import Picture, rendered
 from potr_cl.raster.rasterizer import Rasterizer
 
 #: So many training views, spread evenly, stand for all of them where there are no test views.
@@ -109,14 +110,11 @@ class Evaluator(Owner):
         views = self.views.views
         if most is not None and most < len(views):
             views = [views[k] for k in np.linspace(0, len(views) - 1, most).round().astype(int)]
-        rasterizer = Rasterizer(self._device, candidate, background=self._background)
         values: list[float] = []
-        try:
+        with Rasterizer(self._device, candidate, background=self._background) as rasterizer:
             for some in in_batches(self._device, views):
                 with self._references(some) as references, rendered(rasterizer, some) as pictures:
                     values += [psnr for psnr, _ in self._similarity(list(zip(pictures, references, strict=True)))]
-        finally:
-            rasterizer.free()
         finite = [value for value in values if math.isfinite(value)]
         return sum(finite) / len(finite) if finite else math.inf
 
@@ -138,11 +136,8 @@ class Evaluator(Owner):
 
     def compare(self, candidate: Scene, progress: Callable[[str, float], None]) -> Comparison:
         """PSNR and SSIM from every view; see :func:`potr_cl.quality.compare.compare`."""
-        rasterizer = Rasterizer(self._device, candidate, background=self._background)
-        try:
+        with Rasterizer(self._device, candidate, background=self._background) as rasterizer:
             return compare(self._reference, rasterizer, self.views.views, progress=progress)
-        finally:
-            rasterizer.free()
 
     def pictures(self, candidate: Scene, names: Sequence[str]) -> list[tuple[FloatArray, FloatArray]]:
         """(H, W, 3) float32 pictures of both scenes from the named views.
@@ -151,17 +146,11 @@ class Evaluator(Owner):
             UsageError: there is no such view.
         """
         cameras = [self.views.named(name) for name in names]
-        rasterizer = Rasterizer(self._device, candidate, background=self._background)
-        try:
+        with Rasterizer(self._device, candidate, background=self._background) as rasterizer:
             return [(self._reference.render(camera)[0], rasterizer.render(camera)[0]) for camera in cameras]
-        finally:
-            rasterizer.free()
 
     def close(self) -> None:
-        self.free()
-
-    def free(self) -> None:
         """Give all device memory back."""
         self._kept.close()
         self._pictures = {}
-        self._reference.free()
+        self._reference.close()

@@ -11,7 +11,9 @@ from contextlib import contextmanager
 
 import pyopencl as cl
 
-from potr_cl.raster.rasterizer import Rasterizer, ViewSet
+from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.view_set import ViewSet
 
 #: At least so many launches' views should fill a budget that does not hold all: it is used up launch by launch.
 _LEAST_SETS = 16
@@ -19,7 +21,7 @@ _LEAST_SETS = 16
 _SHAPE, _COLOUR = 32, 16
 
 
-class ViewCache:
+class ViewCache(Owner):
     """What is kept of views.
 
     Args:
@@ -33,6 +35,7 @@ class ViewCache:
 
     def __init__(self, rasterizer: Rasterizer, budget: float) -> None:
         self._rasterizer = rasterizer
+        self._memory = Memory(rasterizer.device)
         self._whole: list[ViewSet] = []  # those with their geometry
         self.room = budget
         self.shared: tuple[cl.Buffer, cl.Buffer] | None = None
@@ -47,7 +50,7 @@ class ViewCache:
         return int(min(max(self.room // (_LEAST_SETS * least), 1), most))
 
     def keep(self, views: ViewSet, own: int = 0) -> bool:
-        """Keep prepared views as far as the budget allows; whether it does. If not, they are the caller's to free.
+        """Keep prepared views as far as the budget allows; whether it does. If not, they are the caller's to close.
 
         Args:
             own: bytes that the caller keeps along with them.
@@ -75,12 +78,10 @@ class ViewCache:
         return (_SHAPE + _COLOUR) * self._rasterizer.stride * len(views.views)
 
     def _share(self, splats: int) -> None:
-        device = self._rasterizer.device
-        with device.all_or_nothing():
-            self.shared = (
-                device.allocate(_SHAPE * splats, "the projected splats"),
-                device.allocate(_COLOUR * splats, "the projected splats' colours"),
-            )
+        self.shared = (
+            self._memory.allocate(_SHAPE * splats, "the projected splats"),
+            self._memory.allocate(_COLOUR * splats, "the projected splats' colours"),
+        )
 
     @contextmanager
     def geometry(self, views: ViewSet) -> Iterator[bool]:
@@ -96,8 +97,7 @@ class ViewCache:
         finally:
             views.shapes = views.colours = None
 
-    def free(self) -> None:
-        """Give back what views share; they themselves are their owners' to free."""
-        for buffer in self.shared or ():
-            self._rasterizer.device.free(buffer)
+    def close(self) -> None:
+        """Give back what views share; they themselves are their owners' to close."""
+        self._memory.close()
         self.shared, self._whole = None, []

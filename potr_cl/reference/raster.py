@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.raster.rasterizer import RasterRules
+from potr_cl.raster.rules import RasterRules
 
 Array = NDArray[np.float64]
 TILE = 16

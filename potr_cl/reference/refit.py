@@ -16,9 +16,9 @@ from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.raster.rasterizer import INRIA
+from potr_cl.raster.rules import INRIA
 from potr_cl.reference import raster as reference
-from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 
 Array = NDArray[np.float64]
 

@@ -47,7 +47,7 @@ class Case:
         return self
 
     def __exit__(self, *_: object) -> None:
-        self.rasterizer.free()
+        self.rasterizer.close()
 
 
 class Linearised:

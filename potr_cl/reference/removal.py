@@ -8,7 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
-from potr_cl.raster.rasterizer import TILE, RasterRules
+from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.view_set import TILE
 from potr_cl.reference.raster import Projected
 
 F64 = NDArray[np.float64]

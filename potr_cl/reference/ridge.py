@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.reference.raster import sh_basis
-from potr_cl.stages.compaction.ridge import ViewWeights
+from potr_cl.stages.compaction.view_weights import ViewWeights
 
 Array = NDArray[np.float64]
 Mask = NDArray[np.bool_]

@@ -5,7 +5,7 @@ from __future__ import annotations
 import math
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import get_args
 
 import numpy as np
@@ -13,7 +13,8 @@ import numpy as np
 from potr_cl.errors import UsageError
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import standpoints
-from potr_cl.stages.compaction.ridge import ColourModel, CompactionOptions, Compactor, ViewWeights, Weighting
+from potr_cl.stages.compaction.ridge import ColourModel, CompactionOptions, Compactor, Weighting
+from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.measured import Measured, measurement
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
@@ -95,7 +96,9 @@ class Compact(Stage):
         with _effects(state, bench) as effects:
             bench.progress("compact", 0.0)
             weights = ViewWeights.from_importances(len(state.scene), effects.view_importances())
-            scene = state.source.subset(state.survivors)
+            scene = state.scene
+            if not state.original_colours:
+                scene = replace(scene, sh=state.source.sh[state.survivors])
             places = standpoints(state.views, state.source.means)
             sh = Compactor(bench.opened).compact(scene, places, weights, options).sh
             bench.progress("compact", 1.0)

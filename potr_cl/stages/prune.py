@@ -150,12 +150,13 @@ class _Course:
 
     def left(self, splats: NDArray[np.int64]) -> State:
         """The state in which only these splats are left."""
-        scene = replace(self._state.scene.subset(splats), sh=self.sh[splats])
+        scene = replace(self._state.scene, sh=self.sh).subset(splats)
         return replace(self._state, scene=scene, survivors=self._state.survivors[splats])
 
     def visit(self, stage: Stage, splats: NDArray[np.int64], bench: Workbench) -> None:
         """Have another stage work on these splats, and go on with the colours that it gives them."""
         then = stage.run(replace(self.left(splats), effects=Measured(self._removal, splats)), bench)
-        self.sh = self.sh.copy()
+        if self.sh is self._state.scene.sh:  # not ours to change
+            self.sh = self.sh.copy()
         self.sh[splats] = then.scene.sh
-        self._state = replace(self._state, learnt=then.learnt)
+        self._state = replace(self._state, learnt=then.learnt, original_colours=then.original_colours)

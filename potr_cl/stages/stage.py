@@ -45,6 +45,7 @@ class State:
         survivors: (n,) int64, ascending: the number in ``source`` of each splat of ``scene``.
         views: the training views; empty if there are no cameras.
         geometry: of ``scene`` as a decoder will see it, once a stage has quantised it.
+        original_colours: whether ``scene`` has the colours that its splats have in ``source``.
         effects: importances view by view while splats are being removed, else None.
         learnt: what each stage has to tell, by its name.
     """
@@ -54,6 +55,7 @@ class State:
     survivors: NDArray[np.int64]
     views: tuple[Camera, ...]
     geometry: Geometry | None = None
+    original_colours: bool = True
     effects: Measured | None = None
     learnt: Mapping[str, Any] = field(default_factory=dict)
 
@@ -64,7 +66,7 @@ class State:
 
     def recoloured(self, sh: NDArray[np.float32]) -> State:
         """The same with other SH coefficients, (n, M, 3)."""
-        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, sh=sh))
+        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, sh=sh), original_colours=False)
 
     def having_learnt(self, name: str, result: Any) -> State:
         """The same, with what a stage has to tell."""

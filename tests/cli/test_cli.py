@@ -23,7 +23,8 @@ from potr_cl.formats.images import to_8_bits
 from potr_cl.formats.scenes import ply
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DEVICE_VARIABLE, compiler_fault, list_devices
-from potr_cl.raster.rasterizer import GSPLAT, Rasterizer
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
 
 #: Options of an encode that keeps everything, and so looks at no views.

@@ -257,7 +257,7 @@ def test_a_library_that_does_not_start(
     monkeypatch.setattr(sys, "meta_path", [Finder(), *sys.meta_path])
     for name in [name for name in sys.modules if name.partition(".")[0] == "gsply"]:
         monkeypatch.delitem(sys.modules, name)
-    code, _, err = outcome(capsys, ["convert", scene_path, scene_path.with_suffix(".spz")])
+    code, _, err = outcome(capsys, ["convert", scene_path, scene_path.with_suffix(".compressed.ply")])
     assert code == (2 if error is None else 1)
     assert "needs the library gsply" in err
 

@@ -38,10 +38,8 @@ def device():
 
 
 def psnr(device, a, b, cameras):
-    first, second = Rasterizer(device, a), Rasterizer(device, b)
-    figures = mean_view(compare(first, second, cameras).views).figures["b_against_a"]
-    first.free()
-    second.free()
+    with Rasterizer(device, a) as first, Rasterizer(device, b) as second:
+        figures = mean_view(compare(first, second, cameras).views).figures["b_against_a"]
     return figures.psnr
 
 

@@ -15,7 +15,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import describe, is_virtual, place_cameras, standpoints
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster.rasterizer import INRIA
+from potr_cl.raster.rules import INRIA
 from potr_cl.reference.raster import sh_basis
 from potr_cl.reference.scenes import random_scene
 from tests.cases.surfaces import box, flat_splats, sphere, together

@@ -28,7 +28,7 @@ def test_values_arrive_where_their_names_say(device):
     with Memory(device) as memory:
         source, result = memory.upload(rows, "rows"), memory.upload(np.full(8, -1, np.float32), "columns")
         kernel = device.kernel(*COLUMNS)
-        kernel.bind(stride_=4, width=2, result=result, first=0, rows=source).launch((3,))
+        kernel.bind(stride=4, width=2, result=result, first=0, rows=source).launch((3,))
         assert device.download(result, (2, 4), np.float32).tolist() == [[0, 2, 4, -1], [1, 3, 5, -1]]
         kernel.set(first=1)
         kernel.launch((3,))
@@ -39,7 +39,7 @@ def test_values_arrive_where_their_names_say(device):
 def test_what_is_missing_or_unknown_is_named(device):
     kernel = device.kernel(*COLUMNS)
     with pytest.raises(TypeError, match=r"kernel columns lacks first, rows and does not know start: it takes rows, f"):
-        kernel.bind(start=0, width=1, stride_=4, result=None)
+        kernel.bind(start=0, width=1, stride=4, result=None)
     with pytest.raises(TypeError, match=r"kernel columns does not know start: it takes rows, first, width"):
         kernel.set(start=0)
 

@@ -19,12 +19,12 @@ from potr_cl.stages.code import Code
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.stage import State
-from tests.devices import KERNELS, open_device
+from tests.devices import FAMILIES, open_device
 
 FEW = EncodeOptions.for_preset("paper", prune={"iterations": 6})
 
 
-@pytest.fixture(scope="module", params=KERNELS)
+@pytest.fixture(scope="module", params=FAMILIES)
 def device(request):
     device = open_device(request.param)
     yield device
@@ -38,10 +38,8 @@ def views(lego_excerpt_cameras):
 
 def psnr(device, a, b, cameras):
     """Mean over views of the second scene's pictures against the first's."""
-    first, second = Rasterizer(device, a), Rasterizer(device, b)
-    errors = [np.mean((first.render(c)[0] - second.render(c)[0]) ** 2) for c in cameras]
-    first.free()
-    second.free()
+    with Rasterizer(device, a) as first, Rasterizer(device, b) as second:
+        errors = [np.mean((first.render(c)[0] - second.render(c)[0]) ** 2) for c in cameras]
     return float(np.mean(-10 * np.log10(errors)))
 
 

@@ -51,10 +51,8 @@ def cameras(lego_excerpt_cameras):
 
 
 def psnr(device, scene, file, cameras):
-    a, b = Rasterizer(device, scene), Rasterizer(device, decode(file))
-    views = compare(a, b, [camera for camera in cameras if camera.split == "test"]).views
-    a.free()
-    b.free()
+    with Rasterizer(device, scene) as a, Rasterizer(device, decode(file)) as b:
+        views = compare(a, b, [camera for camera in cameras if camera.split == "test"]).views
     return mean_view(views).figures["b_against_a"].psnr
 
 
@@ -209,11 +207,10 @@ def test_nothing_to_see(device):
 
 def test_colours_may_be_fitted_to_ground_truth(device, lego_excerpt, cameras, tmp_path):
     """Which sets a bound to the PSNR against the renders that no quality passes."""
-    shown = Rasterizer(device, dataclasses.replace(lego_excerpt, sh=lego_excerpt.sh * np.float32(0.9)))
-    for camera in (camera for camera in cameras if camera.split == "train"):
-        with (tmp_path / f"{camera.name}.png").open("wb") as file:
-            write_png(file, to_8_bits(shown.render(camera)[0]))
-    shown.free()
+    with Rasterizer(device, dataclasses.replace(lego_excerpt, sh=lego_excerpt.sh * np.float32(0.9))) as shown:
+        for camera in (camera for camera in cameras if camera.split == "train"):
+            with (tmp_path / f"{camera.name}.png").open("wb") as file:
+                write_png(file, to_8_bits(shown.render(camera)[0]))
     options = EncodeOptions.for_preset("fast", prune={"iterations": 6}, refit={"ground_truth": tmp_path})
     target = Target(min_psnr=42)
     assert target.inside(encode_to_target(lego_excerpt, cameras, target, options, device=device).value)

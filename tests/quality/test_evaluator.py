@@ -27,9 +27,8 @@ def only_training(count):
 @pytest.fixture
 def evaluator():
     device = Device()
-    evaluator = Evaluator(device, SCENE, EvaluationViews.of(CAMERAS), (0.2, 0.0, 0.0))
-    yield evaluator
-    evaluator.free()
+    with Evaluator(device, SCENE, EvaluationViews.of(CAMERAS), (0.2, 0.0, 0.0)) as evaluator:
+        yield evaluator
     assert device.allocated == 0
 
 
@@ -72,9 +71,8 @@ def test_figures_are_those_of_the_pictures(evaluator):
 def test_pictures_that_are_not_kept_are_the_same(evaluator, monkeypatch):
     kept = evaluator.psnr(WORSE), evaluator.psnr(WORSE)
     monkeypatch.setattr("potr_cl.quality.evaluator._CACHED_PICTURES", 0)
-    other = Evaluator(Device(), SCENE, evaluator.views, (0.2, 0.0, 0.0))
-    assert (other.psnr(WORSE), other.psnr(WORSE)) == kept
-    other.free()
+    with Evaluator(Device(), SCENE, evaluator.views, (0.2, 0.0, 0.0)) as other:
+        assert (other.psnr(WORSE), other.psnr(WORSE)) == kept
 
 
 def test_pictures(evaluator):

@@ -40,20 +40,18 @@ def cameras():
 @pytest.fixture
 def folder(tmp_path, device, scene, cameras):
     """The scene's own pictures."""
-    rasterizer = Rasterizer(device, scene)
-    for camera in cameras:
-        with (tmp_path / f"{camera.name}.png").open("wb") as file:
-            write_png(file, to_8_bits(rasterizer.render(camera)[0]))
-    rasterizer.free()
+    with Rasterizer(device, scene) as rasterizer:
+        for camera in cameras:
+            with (tmp_path / f"{camera.name}.png").open("wb") as file:
+                write_png(file, to_8_bits(rasterizer.render(camera)[0]))
     return tmp_path
 
 
 def test_psnr_is_the_mean_over_the_views(device, scene, cameras, folder):
     ground_truth = GroundTruth(folder, cameras)
-    rasterizer = Rasterizer(device, dataclasses.replace(scene, sh=scene.sh + np.float32(0.1)))
-    wanted = np.mean([psnr(rasterizer.render(c)[0], ground_truth.picture(c)) for c in cameras[:2]])
-    assert ground_truth.psnr(rasterizer, cameras[:2]) == pytest.approx(wanted)
-    rasterizer.free()
+    with Rasterizer(device, dataclasses.replace(scene, sh=scene.sh + np.float32(0.1))) as rasterizer:
+        wanted = np.mean([psnr(rasterizer.render(c)[0], ground_truth.picture(c)) for c in cameras[:2]])
+        assert ground_truth.psnr(rasterizer, cameras[:2]) == pytest.approx(wanted)
 
 
 def test_a_refit_to_ground_truth_is_one_to_what_they_show(device, scene, cameras, folder):
@@ -62,9 +60,8 @@ def test_a_refit_to_ground_truth_is_one_to_what_they_show(device, scene, cameras
     options = RefitOptions(steps=20, gain=0, prior=1)
     targets = GroundTruthTargets(device, GroundTruth(folder, cameras), cameras)
     refitted = refit_colours(device, dimmed, cameras, targets, options)
-    rasterizer = Rasterizer(device, scene)
-    wanted = refit_colours(device, dimmed, cameras, RenderedTargets(rasterizer, cameras), options)
-    rasterizer.free()
+    with Rasterizer(device, scene) as rasterizer:
+        wanted = refit_colours(device, dimmed, cameras, RenderedTargets(rasterizer, cameras), options)
     assert refitted.errors[1] < 0.1 * refitted.errors[0]
     assert refitted.errors == pytest.approx(wanted.errors, abs=1e-4)
     assert np.abs(refitted.sh - wanted.sh).mean() < 0.1 * np.abs(refitted.sh - dimmed.sh).mean()

@@ -18,7 +18,8 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.formats.images import read_ground_truth
 from potr_cl.opencl.device import Device
 from potr_cl.quality.metrics import Lpips, psnr, ssim
-from potr_cl.raster.rasterizer import GSPLAT, Rasterizer
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT
 
 
 def ssim_by_definition(a, b):

@@ -7,8 +7,10 @@ import math
 import numpy as np
 import pytest
 
+from potr_cl.opencl.memory import Memory
 from potr_cl.quality.metrics import psnr, ssim
-from potr_cl.quality.metrics_device import Similarity, in_batches, place_pictures, rendered
+from potr_cl.quality.metrics_device import Similarity, in_batches
+from potr_cl.quality.pictures import place_pictures, rendered
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.scenes import random_splats
 from potr_cl.reference.scenes import straight_camera as camera
@@ -26,15 +28,13 @@ def sized(pictures):
 
 def on_device(device, images, references):
     """The figures of pictures that lie one behind the other."""
-    buffers = [
-        device.upload(np.concatenate([picture.astype(np.float32).reshape(-1) for picture in some]), "pictures")
-        for some in (images, references)
-    ]
-    pairs = zip(*(place_pictures(buffer, sized(images)) for buffer in buffers), strict=True)
-    figures = Similarity(device)(list(pairs))
-    for buffer in buffers:
-        device.free(buffer)
-    return figures
+    with Memory(device) as memory:
+        buffers = [
+            memory.upload(np.concatenate([picture.astype(np.float32).reshape(-1) for picture in some]), "pictures")
+            for some in (images, references)
+        ]
+        pairs = zip(*(place_pictures(buffer, sized(images)) for buffer in buffers), strict=True)
+        return Similarity(device)(list(pairs))
 
 
 def agree(device, image, reference):
@@ -113,21 +113,20 @@ def test_several_pictures_of_several_sizes(device):
 
 def test_rendered_pictures_are_those_of_the_rasterizer(device):
     views = [camera(50, 40), camera(33, 17), camera(50, 40, 80)]
-    rasterizer = Rasterizer(device, random_splats(200))
-    allocated = device.allocated
-    with rendered(rasterizer, views) as pictures:
+    before = device.allocated
+    with Rasterizer(device, random_splats(200)) as rasterizer, rendered(rasterizer, views) as pictures:
         for view, picture in zip(views, pictures, strict=True):
             assert np.array_equal(picture.download(device), rasterizer.render(view)[0])
-    rasterizer.free()
-    assert device.allocated < allocated
+    assert device.allocated == before
 
 
-def test_batches_hold_every_view_once_and_bounded_bytes(device, monkeypatch):
+@pytest.mark.one_runtime
+def test_batches_hold_every_view_once_and_bounded_bytes(device):
     views = [camera(64, 64, focal) for focal in range(60, 160)]
     batches = list(in_batches(device, views))
     assert [view for batch in batches for view in batch] == views
     assert len(batches) == (100 if device.family == "cpu" else 4)
-    monkeypatch.setattr("potr_cl.quality.metrics_device._MOST_BYTES", 12 * 64 * 64 * 3 + 1)
-    assert {len(batch) for batch in in_batches(device, views)} == {1} if device.family == "cpu" else {3, 1}
-    monkeypatch.setattr("potr_cl.quality.metrics_device._MOST_BYTES", 1)  # less than a view
-    assert {len(batch) for batch in in_batches(device, views)} == {1}
+    three_views = 12 * 64 * 64 * 3 + 1
+    found = {len(batch) for batch in in_batches(device, views, three_views)}
+    assert found == ({1} if device.family == "cpu" else {3, 1})
+    assert {len(batch) for batch in in_batches(device, views, most_bytes=1)} == {1}  # less than a view

@@ -29,7 +29,8 @@ from potr_cl.reference.ridge import (
     weighted_basis,
 )
 from potr_cl.reference.scenes import random_scene
-from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS, CompactionOptions, Compactor, ViewWeights, Weighting
+from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Weighting
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
 from tests.devices import KERNELS, open_device
 
@@ -133,6 +134,7 @@ def test_the_definition(device: Device, degree: int, changes: dict[str, object])
     assert differing <= 2  # a cosine or a coefficient within rounding of its threshold
 
 
+@pytest.mark.one_runtime
 def test_everything_but_sh_is_shared(device: Device) -> None:
     scene = random_scene(20)
     compacted = Compactor(device).compact(scene, on_a_sphere(10), dense_weights(sparse_weights(20, 10)))
@@ -154,11 +156,13 @@ def test_unseen_splats_keep_dc_and_lose_ac(device: Device) -> None:
     assert not nobody.sh[:, 1:].any()
 
 
+@pytest.mark.one_runtime
 def test_degree_0_is_returned_untouched(device: Device) -> None:
     scene = random_scene(5, degree=0)
     assert Compactor(device).compact(scene, on_a_sphere(3), dense_weights(sparse_weights(5, 3))) is scene
 
 
+@pytest.mark.one_runtime
 def test_an_empty_scene(device: Device) -> None:
     scene = random_scene(3).subset(np.zeros(3, bool))
     assert len(Compactor(device).compact(scene, on_a_sphere(3), dense_weights(np.zeros((0, 3))))) == 0
@@ -173,6 +177,7 @@ def test_batches_and_repetition_change_no_byte(device: Device) -> None:
         assert again.sh.tobytes() == whole.sh.tobytes()
 
 
+@pytest.mark.one_runtime
 def test_memory_that_runs_out_half_way_is_given_back(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     taken = 0
 
@@ -189,6 +194,7 @@ def test_memory_that_runs_out_half_way_is_given_back(device: Device, monkeypatch
     assert device.allocated == 0
 
 
+@pytest.mark.one_runtime
 def test_sh_of_any_strides(device: Device) -> None:
     scene = random_scene(30, seed=4)
     strided = replace(scene, sh=np.asfortranarray(scene.sh))
@@ -407,6 +413,7 @@ def test_variants_solve_easy_systems(device: Device, precision: str) -> None:
     check_optimal(scene, compacted, centres, dense, options)
 
 
+@pytest.mark.one_runtime
 def test_fp64_is_refused_where_there_is_none(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
     class WithoutDoubles:
         extensions = "cl_khr_fp16"
@@ -425,13 +432,9 @@ def test_fp64_is_refused_where_there_is_none(device: Device, monkeypatch: pytest
 
 
 def measured_weights(device: Device, scene: Scene, cameras: list[Camera]) -> ViewWeights:
-    rasterizer = Rasterizer(device, scene)
-    sweep = RemovalSweep(rasterizer, cameras)
-    sweep.measure()
-    weights = ViewWeights.from_importances(len(scene), sweep.view_importances())
-    sweep.free()
-    rasterizer.free()
-    return weights
+    with Rasterizer(device, scene) as rasterizer, RemovalSweep(rasterizer, cameras) as sweep:
+        sweep.measure()
+        return ViewWeights.from_importances(len(scene), sweep.view_importances())
 
 
 def zeros(sh: NDArray[np.floating]) -> float:
@@ -499,6 +502,7 @@ def test_a_view_that_stands_for_several_positions(device: Device, weighting: Wei
 # ------------------------------------------------------------------------------------------------ bad calls
 
 
+@pytest.mark.one_runtime
 def test_views_that_do_not_belong_to_the_scene(device: Device) -> None:
     scene, weights = random_scene(5), dense_weights(np.ones((5, 4)))
     compactor = Compactor(device)

@@ -10,7 +10,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from potr_cl.model.camera import Camera
-from potr_cl.raster.rasterizer import TILE
+from potr_cl.raster.view_set import TILE
 from potr_cl.stages.pruning.fixed_point import FixedPoint
 
 EYE = Camera("view", 16, 16, 10.0, 10.0, 8.0, 8.0, np.eye(3), np.zeros(3))

@@ -11,12 +11,12 @@ from potr_cl.stages.pruning.fixed_point import FixedPoint
 from potr_cl.stages.pruning.launcher import launcher_for
 from potr_cl.stages.pruning.prepared_views import PreparedViews
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from tests.devices import KERNELS, open_device
+from tests.devices import FAMILIES, open_device
 
 PLENTY = 1 << 40
 
 
-@pytest.fixture(scope="module", params=KERNELS)
+@pytest.fixture(scope="module", params=FAMILIES)
 def device(request):
     device = open_device(request.param)
     yield device
@@ -25,9 +25,8 @@ def device(request):
 
 @pytest.fixture
 def rasterizer(device, lego_excerpt):
-    rasterizer = Rasterizer(device, lego_excerpt)
-    yield rasterizer
-    rasterizer.free()
+    with Rasterizer(device, lego_excerpt) as rasterizer:
+        yield rasterizer
 
 
 @pytest.fixture

@@ -25,16 +25,13 @@ def cameras(lego_excerpt_cameras):
 
 
 def run(device, scene, cameras, options, sweep=None, on_device=True, after_iteration=None):
-    rasterizer = Rasterizer(device, scene)
-    removal = RemovalSweep(rasterizer, cameras, sweep or SweepOptions())
-    assert removal.steering is not None
-    if on_device:
-        result = prune_scene(removal, options, after_iteration=after_iteration and after_iteration(removal))
-    else:
-        result = prune(removal, len(scene), options)
-    left, sweeps = removal.alive, removal.sweeps
-    removal.free()
-    rasterizer.free()
+    with Rasterizer(device, scene) as rasterizer, RemovalSweep(rasterizer, cameras, sweep or SweepOptions()) as removal:
+        assert removal.steering is not None
+        if on_device:
+            result = prune_scene(removal, options, after_iteration=after_iteration and after_iteration(removal))
+        else:
+            result = prune(removal, len(scene), options)
+        left, sweeps = removal.alive, removal.sweeps
     assert np.flatnonzero(left).tolist() == result.survivors.tolist() or result.kept == 1
     return result, sweeps
 
@@ -61,27 +58,26 @@ def test_the_same_splats_go_as_in_numpy(gpu, lego_excerpt, cameras, decay):
         assert one.effect == pytest.approx(other.effect, rel=0.05, abs=1e-7)
 
 
+@pytest.mark.one_runtime
 def test_each_iteration_spends_its_budget(gpu, lego_excerpt, cameras):
     """Against the rules themselves: what went scores less than what stayed, and just reaches the budget."""
     found, _ = run(gpu, lego_excerpt, cameras, OPTIONS)
-    rasterizer = Rasterizer(gpu, lego_excerpt)
-    removal = RemovalSweep(rasterizer, cameras, SweepOptions())
-    smoothed = SmoothedEffects(removal, OPTIONS.decay)
-    alive = np.arange(len(lego_excerpt))
-    start = 0
-    for iteration in range(3):
-        delta_mse, importance = smoothed.measure()
-        gone = found.order[start : start + (found.iteration_of == iteration).sum()]
-        expected = choose(delta_mse, importance, alive, OPTIONS.iterations - iteration, OPTIONS)
-        assert abs(len(gone) - len(expected)) <= 1
-        assert len(np.setxor1d(gone, expected)) <= 1
-        smoothed.remove(gone)
-        alive = np.setdiff1d(alive, gone)
-        start += len(gone)
-    removal.free()
-    rasterizer.free()
+    with Rasterizer(gpu, lego_excerpt) as rasterizer, RemovalSweep(rasterizer, cameras, SweepOptions()) as removal:
+        smoothed = SmoothedEffects(removal, OPTIONS.decay)
+        alive = np.arange(len(lego_excerpt))
+        start = 0
+        for iteration in range(3):
+            delta_mse, importance = smoothed.measure()
+            gone = found.order[start : start + (found.iteration_of == iteration).sum()]
+            expected = choose(delta_mse, importance, alive, OPTIONS.iterations - iteration, OPTIONS)
+            assert abs(len(gone) - len(expected)) <= 1
+            assert len(np.setxor1d(gone, expected)) <= 1
+            smoothed.remove(gone)
+            alive = np.setdiff1d(alive, gone)
+            start += len(gone)
 
 
+@pytest.mark.one_runtime
 def test_order_and_history_fit_the_iterations(gpu, lego_excerpt, cameras):
     found, _ = run(gpu, lego_excerpt, cameras, OPTIONS)
     assert np.sort(found.order).tolist() == list(range(1500))
@@ -98,6 +94,7 @@ def test_twice_the_same(gpu, lego_excerpt, cameras):
     assert one.history == other.history
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize("limit", [0.0, 1e9])
 def test_only_improvements_and_everything(gpu, lego_excerpt, cameras, limit):
     options = PruningOptions(limit, 3)
@@ -108,6 +105,7 @@ def test_only_improvements_and_everything(gpu, lego_excerpt, cameras, limit):
         assert found.kept == 1
 
 
+@pytest.mark.one_runtime
 def test_nothing_to_remove(gpu):
     scene = visible_scene(40)
     found, sweeps = run(gpu, scene, ring_of_cameras(2, size=48), PruningOptions(1e-30, 5))
@@ -116,6 +114,7 @@ def test_nothing_to_remove(gpu):
     assert sweeps == 1
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize("tolerance", [-1.0, 0.0, 0.3])
 def test_tiles_are_swept_again_by_the_tolerance(gpu, lego_excerpt, cameras, tolerance):
     sweep = SweepOptions(tolerance)
@@ -127,6 +126,7 @@ def test_tiles_are_swept_again_by_the_tolerance(gpu, lego_excerpt, cameras, tole
         assert sweeps == found.iterations
 
 
+@pytest.mark.one_runtime
 def test_host_and_device_take_turns(gpu, lego_excerpt, cameras):
     """Reading weights of views or giving new colours in between leaves the device's lists as they should be."""
     seen = []
@@ -161,14 +161,12 @@ def test_the_same_without_atomics_on_64_bits(gpu, lego_excerpt, cameras):
     assert other.history == found.history
 
 
+@pytest.mark.one_runtime
 def test_options_that_only_the_host_knows(gpu, lego_excerpt, cameras):
-    rasterizer = Rasterizer(gpu, lego_excerpt)
-    for sweep in (SweepOptions(turns=2), SweepOptions(sample=0.5), SweepOptions(memory=0)):
-        removal = RemovalSweep(rasterizer, cameras, sweep)
-        assert removal.steering is None
-        assert prune_scene(removal, OPTIONS).kept < 1500
-        removal.free()
-    removal = RemovalSweep(rasterizer, cameras)
-    assert prune_scene(removal, PruningOptions(0, 3, count=700)).kept == 700
-    removal.free()
-    rasterizer.free()
+    with Rasterizer(gpu, lego_excerpt) as rasterizer:
+        for sweep in (SweepOptions(turns=2), SweepOptions(sample=0.5), SweepOptions(memory=0)):
+            with RemovalSweep(rasterizer, cameras, sweep) as removal:
+                assert removal.steering is None
+                assert prune_scene(removal, OPTIONS).kept < 1500
+        with RemovalSweep(rasterizer, cameras) as removal:
+            assert prune_scene(removal, PruningOptions(0, 3, count=700)).kept == 700

@@ -12,7 +12,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
 from potr_cl.reference.refit_cases import Case, Linearised, Pictures
 from potr_cl.reference.scenes import plain_splats, ring_of_cameras, straight_camera, tilted_camera, visible_scene
-from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, active_coefficients, refit_colours
 from tests.devices import KERNELS, open_device
 
@@ -213,6 +213,7 @@ def test_each_step_takes_the_objective_down(device):
     assert np.all(np.diff(objectives) < 0)
 
 
+@pytest.mark.one_runtime
 def test_it_stops_when_a_step_gains_too_little(case):
     assert case.solve(RefitOptions(steps=50, gain=0.05)).steps < 20
     assert case.solve(RefitOptions(steps=0)).steps == 0
@@ -229,6 +230,7 @@ def test_it_stops_where_single_precision_ends(device, degree):
     assert np.linalg.norm(to_ycocg(refitted.sh) - solution) < 1e-4 * np.linalg.norm(solution - reference.start)
 
 
+@pytest.mark.one_runtime
 def test_progress(case):
     told = []
     options = RefitOptions(steps=3, gain=0)
@@ -274,6 +276,7 @@ def test_same_bits_every_time(case):
     assert len(set(results)) == 1
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize("memory", [0, 40_000, 200_000])
 def test_a_small_memory_budget_changes_the_time_and_nothing_else(case, memory):
     everything = case.solve(RefitOptions(steps=4, gain=0, drop=1e-7))
@@ -282,6 +285,7 @@ def test_a_small_memory_budget_changes_the_time_and_nothing_else(case, memory):
     assert everything.errors == little.errors
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize("share", [0.2, 0.4, 0.6, 0.9])
 def test_the_memory_budget_is_used_and_not_exceeded(device, share):
     """What the device holds when views and targets are kept, above what it holds at most when none is."""
@@ -345,6 +349,7 @@ def test_selection_keeps_what_costs_more(device, degree):
     assert np.abs(x[~kept]).max() < 1e-6
 
 
+@pytest.mark.one_runtime
 def test_a_greater_price_keeps_fewer(case):
     kept = []
     for drop in (1e-9, 1e-7, 1e-5, 1e3):
@@ -355,6 +360,7 @@ def test_a_greater_price_keeps_fewer(case):
     assert kept[0] > kept[-1] == 0
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize(("seed", "steps", "dc"), [(0, 30, -3), (3, 8, -5), (7, 30, -3)])
 def test_a_selection_that_overshoots_is_taken_back(device, seed, steps, dc):
     """Dark scenes without a prior: so many colours are cut at 0 on the way that the steps lead astray."""
@@ -473,6 +479,7 @@ def test_views_of_different_sizes(device):
     assert np.linalg.norm(x - solution) < 1e-3 * np.linalg.norm(solution - reference.start)
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize(
     "count", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)]
 )  # fmt: skip
@@ -512,6 +519,7 @@ def test_options_out_of_range(bad):
         RefitOptions(**bad)
 
 
+@pytest.mark.one_runtime
 def test_no_view_is_an_error(device):
     with pytest.raises(UsageError, match="at least one view"):
         ColourRefit(device, visible_scene(3), [])

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from contextlib import contextmanager
 
 import numpy as np
 import pytest
@@ -10,7 +11,8 @@ import pytest
 from potr_cl.errors import DeviceMemoryError, UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.raster.rasterizer import INRIA, Rasterizer
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA
 from potr_cl.reference import raster as reference
 from potr_cl.reference.removal import BruteForce
 from potr_cl.reference.scenes import ring_of_cameras, visible_scene
@@ -55,23 +57,21 @@ def close(predicted, true):
     assert np.quantile(error, 0.95) <= 1e-2
 
 
+@contextmanager
 def sweep(device, scene, cameras, tolerance=0.0, background=(0.0, 0.0, 0.0)):
-    rasterizer = Rasterizer(device, scene, background=background)
-    return rasterizer, RemovalSweep(rasterizer, cameras, SweepOptions(tolerance, turns=1))
-
-
-def finish(rasterizer, removal):
-    removal.close()
-    rasterizer.free()
+    with (
+        Rasterizer(device, scene, background=background) as rasterizer,
+        RemovalSweep(rasterizer, cameras, SweepOptions(tolerance, turns=1)) as removal,
+    ):
+        yield removal
 
 
 @pytest.mark.parametrize("background", [(0.0, 0.0, 0.0), (1.0, 0.3, 0.0)])
 def test_single_removals(device, background):
     scene = visible_scene(60, 1)
     cameras = ring_of_cameras(3, size=48)
-    rasterizer, removal = sweep(device, scene, cameras, background=background)
-    effect, importance = removal.measure()
-    finish(rasterizer, removal)
+    with sweep(device, scene, cameras, background=background) as removal:
+        effect, importance = removal.measure()
     targets = renders(scene, cameras, background)
     close(effect, brute_force(scene, cameras, targets, range(60), background=background))
     assert (effect >= 0).all()  # nothing is better than the target itself
@@ -87,11 +87,10 @@ def test_single_removals_when_others_are_gone(device):
     cameras = ring_of_cameras(2, size=48)
     gone = np.arange(0, 25, 2)
     left = np.setdiff1d(np.arange(50), gone)
-    rasterizer, removal = sweep(device, scene, cameras)
-    removal.measure()
-    removal.remove(gone)
-    effect, _ = removal.measure()
-    finish(rasterizer, removal)
+    with sweep(device, scene, cameras) as removal:
+        removal.measure()
+        removal.remove(gone)
+        effect, _ = removal.measure()
     targets = renders(scene, cameras)
     true = brute_force(scene, cameras, targets, left, list(gone))
     assert (true < 0).any()  # some removals improve the match
@@ -112,9 +111,8 @@ def test_alpha_at_the_cap_behind_hundreds_of_layers(device):
     camera_centre = np.array([-8.0, 0, 0])
     rotation = np.array([[0.0, -1, 0], [0, 0, -1], [1, 0, 0]])
     cameras = [Camera("along", 16, 16, 60, 60, 8, 8, rotation, -rotation @ camera_centre)]
-    rasterizer, removal = sweep(device, scene, cameras)
-    effect, _ = removal.measure()
-    finish(rasterizer, removal)
+    with sweep(device, scene, cameras) as removal:
+        effect, _ = removal.measure()
     splats = [0, 150, 299, opaque, 301, 310, 319]
     true = brute_force(scene, cameras, renders(scene, cameras), splats)
     assert np.abs(effect[splats] / true - 1).max() < 1e-3
@@ -123,11 +121,10 @@ def test_alpha_at_the_cap_behind_hundreds_of_layers(device):
 def test_same_bits_every_time(device, lego_excerpt, lego_excerpt_cameras):
     results = []
     for _ in range(3):
-        rasterizer, removal = sweep(device, lego_excerpt, lego_excerpt_cameras[:3])
-        removal.measure()
-        removal.remove(np.arange(0, 1500, 7))
-        results.append(np.concatenate(removal.measure()).tobytes())
-        finish(rasterizer, removal)
+        with sweep(device, lego_excerpt, lego_excerpt_cameras[:3]) as removal:
+            removal.measure()
+            removal.remove(np.arange(0, 1500, 7))
+            results.append(np.concatenate(removal.measure()).tobytes())
     assert len(set(results)) == 1
 
 
@@ -135,69 +132,74 @@ def test_sums_kept_over_removals_are_those_of_a_new_sweep(device, lego_excerpt, 
     """Exact totals: tiles that were skipped because nothing changed add up to what sweeping all of them gives."""
     cameras = lego_excerpt_cameras[:2]
     few = np.arange(0, 20)
-    rasterizer, removal = sweep(device, lego_excerpt, cameras)
-    removal.measure()
-    removal.remove(few)
-    skipping = removal.measure()
-    removal.sweep_everything()
-    everything = removal.measure()
-    finish(rasterizer, removal)
+    with sweep(device, lego_excerpt, cameras) as removal:
+        removal.measure()
+        removal.remove(few)
+        skipping = removal.measure()
+        removal.sweep_everything()
+        everything = removal.measure()
     left = np.setdiff1d(np.arange(1500), few)
     for a, b in zip(skipping, everything, strict=True):
         assert np.array_equal(a[left], b[left])
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
 def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, lego_excerpt, lego_excerpt_cameras, share):
     cameras = lego_excerpt_cameras[:4]
     results = []
     for memory in (None, int(share * 4 * 48 * 1536)):
-        rasterizer = Rasterizer(device, lego_excerpt)
-        removal = RemovalSweep(rasterizer, cameras, SweepOptions(0, 1, memory))
-        kept = removal.cached_views
-        removal.measure()
-        for start in (0, 5):
-            removal.remove(np.arange(start, 1500, 10))
-            effects = removal.measure()
-        results.append(np.stack(effects)[:, np.arange(1, 1500, 10)])
-        finish(rasterizer, removal)
+        with (
+            Rasterizer(device, lego_excerpt) as rasterizer,
+            RemovalSweep(rasterizer, cameras, SweepOptions(0, 1, memory)) as removal,
+        ):
+            kept = removal.cached_views
+            removal.measure()
+            for start in (0, 5):
+                removal.remove(np.arange(start, 1500, 10))
+                effects = removal.measure()
+            results.append(np.stack(effects)[:, np.arange(1, 1500, 10)])
     assert kept == 0 if share == 0 else kept <= 4
     assert np.array_equal(*results)
 
 
+@pytest.mark.one_runtime
 def test_buffers_too_small_for_all_views_change_nothing(device, lego_excerpt, lego_excerpt_cameras, monkeypatch):
     """A device that allows no large buffer has fewer views at a time, and keeps them all."""
     cameras, results = lego_excerpt_cameras[:7], []
     for largest in (device.info.largest_buffer, 3 * 12 * cameras[0].width * cameras[0].height):
         monkeypatch.setattr(device, "info", dataclasses.replace(device.info, largest_buffer=largest))
-        rasterizer = Rasterizer(device, lego_excerpt)
-        removal = RemovalSweep(rasterizer, cameras, SweepOptions(0))
-        removal.measure()
-        removal.remove(np.arange(0, 1500, 10))
-        results.append(np.stack(removal.measure())[:, np.arange(1, 1500, 10)])
-        assert removal.cached_views == 7
-        finish(rasterizer, removal)
+        with (
+            Rasterizer(device, lego_excerpt) as rasterizer,
+            RemovalSweep(rasterizer, cameras, SweepOptions(0)) as removal,
+        ):
+            removal.measure()
+            removal.remove(np.arange(0, 1500, 10))
+            results.append(np.stack(removal.measure())[:, np.arange(1, 1500, 10)])
+            assert removal.cached_views == 7
     assert np.array_equal(*results)
 
 
+@pytest.mark.one_runtime
 def test_views_in_turns(device, lego_excerpt, lego_excerpt_cameras):
-    rasterizer = Rasterizer(device, lego_excerpt)
-    removal = RemovalSweep(rasterizer, lego_excerpt_cameras[:4], SweepOptions(-1, turns=2))
-    for _ in range(3):
-        removal.measure()
-    assert removal.sweeps == pytest.approx(1 + 0.5 + 0.5)
-    finish(rasterizer, removal)
+    with (
+        Rasterizer(device, lego_excerpt) as rasterizer,
+        RemovalSweep(rasterizer, lego_excerpt_cameras[:4], SweepOptions(-1, turns=2)) as removal,
+    ):
+        for _ in range(3):
+            removal.measure()
+        assert removal.sweeps == pytest.approx(1 + 0.5 + 0.5)
 
 
+@pytest.mark.one_runtime
 def test_tolerance_saves_sweeps(device, lego_excerpt, lego_excerpt_cameras):
     sweeps = []
     for tolerance in (-1, 0, 0.05):
-        rasterizer, removal = sweep(device, lego_excerpt, lego_excerpt_cameras[:2], tolerance)
-        for start in range(4):
-            removal.measure()
-            removal.remove(np.arange(start, 1500, 100))
-        sweeps.append(removal.sweeps)
-        finish(rasterizer, removal)
+        with sweep(device, lego_excerpt, lego_excerpt_cameras[:2], tolerance) as removal:
+            for start in range(4):
+                removal.measure()
+                removal.remove(np.arange(start, 1500, 100))
+            sweeps.append(removal.sweeps)
     assert sweeps[0] == pytest.approx(4)
     assert sweeps[0] > sweeps[1] > sweeps[2] >= 1
 
@@ -205,16 +207,17 @@ def test_tolerance_saves_sweeps(device, lego_excerpt, lego_excerpt_cameras):
 def test_tightened_lists_change_no_result(device, lego_excerpt, lego_excerpt_cameras):
     results, intersections = {}, {}
     for tighten in (False, True):
-        rasterizer = Rasterizer(device, lego_excerpt)
-        removal = RemovalSweep(rasterizer, lego_excerpt_cameras[:3], SweepOptions(-1, tighten=tighten))
-        measured = [removal.measure()]
-        for start in (0, 3, 5):
-            removal.remove(np.arange(start, 1500, 7))
-            measured.append(removal.measure())
-        intersections[tighten] = removal.intersections_left()
-        views = [np.concatenate([splats, weights]) for _, splats, weights in removal.view_importances()]
-        results[tighten] = np.concatenate([np.ravel(measured), *views])
-        finish(rasterizer, removal)
+        with (
+            Rasterizer(device, lego_excerpt) as rasterizer,
+            RemovalSweep(rasterizer, lego_excerpt_cameras[:3], SweepOptions(-1, tighten=tighten)) as removal,
+        ):
+            measured = [removal.measure()]
+            for start in (0, 3, 5):
+                removal.remove(np.arange(start, 1500, 7))
+                measured.append(removal.measure())
+            intersections[tighten] = removal.intersections_left()
+            views = [np.concatenate([splats, weights]) for _, splats, weights in removal.view_importances()]
+            results[tighten] = np.concatenate([np.ravel(measured), *views])
     if device.family == "cpu":
         assert np.array_equal(results[False], results[True])
     else:  # the order in which the pixels of a tile are added depends on an intersection's place in the list
@@ -229,13 +232,16 @@ def test_tightened_lists_keep_what_is_hidden(device):
     cameras = ring_of_cameras(2, size=32)
     effects = {}
     for tighten in (False, True):
-        rasterizer = Rasterizer(device, scene)
-        removal = RemovalSweep(rasterizer, cameras, SweepOptions(-1, tighten=tighten, transmittance_threshold=None))
-        hidden = removal.measure()[1][30:] == 0
-        removal.measure()
-        removal.remove(np.arange(30))
-        effects[tighten] = removal.measure()
-        finish(rasterizer, removal)
+        with (
+            Rasterizer(device, scene) as rasterizer,
+            RemovalSweep(
+                rasterizer, cameras, SweepOptions(-1, tighten=tighten, transmittance_threshold=None)
+            ) as removal,
+        ):
+            hidden = removal.measure()[1][30:] == 0
+            removal.measure()
+            removal.remove(np.arange(30))
+            effects[tighten] = removal.measure()
     assert hidden.any()
     assert np.array_equal(np.stack(effects[False])[:, 30:], np.stack(effects[True])[:, 30:])
     assert (effects[True][1][30:][hidden] > 0).any()
@@ -249,10 +255,11 @@ def test_a_removal_lets_pixels_go_on(device):
     some = np.arange(0, 900, 10)
     shares = {}
     for stop in (None, SweepOptions.transmittance_threshold):
-        rasterizer = Rasterizer(device, scene)
-        removal = RemovalSweep(rasterizer, cameras, SweepOptions(transmittance_threshold=stop))
-        effect, _ = removal.measure()
-        finish(rasterizer, removal)
+        with (
+            Rasterizer(device, scene) as rasterizer,
+            RemovalSweep(rasterizer, cameras, SweepOptions(transmittance_threshold=stop)) as removal,
+        ):
+            effect, _ = removal.measure()
         exact = BruteForce(reference.project(scene, cameras[0], INRIA), cameras[0], INRIA)
         true = exact.effects(some, [INRIA.transmittance_threshold if stop is None else stop])[1, 0] / (3 * 40 * 40)
         strong = true > 1e-4 * true.max()
@@ -261,6 +268,7 @@ def test_a_removal_lets_pixels_go_on(device):
     assert shares[SweepOptions.transmittance_threshold] > 0.98
 
 
+@pytest.mark.one_runtime
 def test_a_random_sample_of_tiles(device, lego_excerpt, lego_excerpt_cameras):
     """Reproducible, fewer sweeps, every tile when sampling is over."""
     results, sweeps = [], []
@@ -270,17 +278,18 @@ def test_a_random_sample_of_tiles(device, lego_excerpt, lego_excerpt_cameras):
         SweepOptions(0, sample=0.3, sampled=2),
         SweepOptions(0, sample=0.3, sampled=2, seed=1),
     ):
-        rasterizer = Rasterizer(device, lego_excerpt)
-        removal = RemovalSweep(rasterizer, lego_excerpt_cameras[:3], options)
-        removal.measure()
-        measured = []
-        for start in range(2):
-            removal.remove(np.arange(start, 1500, 10))
+        with (
+            Rasterizer(device, lego_excerpt) as rasterizer,
+            RemovalSweep(rasterizer, lego_excerpt_cameras[:3], options) as removal,
+        ):
+            removal.measure()
+            measured = []
+            for start in range(2):
+                removal.remove(np.arange(start, 1500, 10))
+                measured.append(np.stack(removal.measure())[:, np.arange(5, 1500, 10)])
+            sweeps.append(removal.sweeps)
             measured.append(np.stack(removal.measure())[:, np.arange(5, 1500, 10)])
-        sweeps.append(removal.sweeps)
-        measured.append(np.stack(removal.measure())[:, np.arange(5, 1500, 10)])
-        results.append(measured)
-        finish(rasterizer, removal)
+            results.append(measured)
     everything, first, again, other = results
     assert sweeps[1] < sweeps[0]
     assert np.array_equal(first, again)
@@ -313,12 +322,10 @@ def test_a_view_that_sees_nothing_changes_only_the_mean(device):
     scene = visible_scene(30, 0)
     cameras = ring_of_cameras(1, size=48)
     away = dataclasses.replace(cameras[0], name="away", translation=np.array([0, 0, -50.0]))
-    rasterizer, removal = sweep(device, scene, cameras)
-    one = removal.measure()
-    finish(rasterizer, removal)
-    rasterizer, removal = sweep(device, scene, [*cameras, away])
-    two = removal.measure()
-    finish(rasterizer, removal)
+    with sweep(device, scene, cameras) as removal:
+        one = removal.measure()
+    with sweep(device, scene, [*cameras, away]) as removal:
+        two = removal.measure()
     for a, b in zip(one, two, strict=True):
         assert np.allclose(a, 2 * b, rtol=1e-6, atol=1e-14)
 
@@ -329,106 +336,98 @@ def test_views_of_different_sizes_count_the_same(device):
     small = ring_of_cameras(2, size=48)[1]
     separate = []
     for camera in (large, small):
-        rasterizer, removal = sweep(device, scene, [camera])
-        separate.append(removal.measure())
-        finish(rasterizer, removal)
-    rasterizer, removal = sweep(device, scene, [large, small])
-    together = removal.measure()
-    finish(rasterizer, removal)
+        with sweep(device, scene, [camera]) as removal:
+            separate.append(removal.measure())
+    with sweep(device, scene, [large, small]) as removal:
+        together = removal.measure()
     for i in range(2):
         assert np.allclose(together[i], (separate[0][i] + separate[1][i]) / 2, rtol=1e-5, atol=1e-13)
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize("share", [0.2, 0.3, 0.5, 0.7, 0.95])
 def test_the_memory_budget_is_used_and_not_exceeded(device, share):
     """Lists first, then geometry of as many views as there is room for; the effects are the same whatever is kept."""
     scene = visible_scene(3000, 0)
     cameras = ring_of_cameras(40, size=48)
-    rasterizer = Rasterizer(device, scene)
+    with Rasterizer(device, scene) as rasterizer:
 
-    def measured(memory):
-        before = device.allocated
-        removal = RemovalSweep(rasterizer, cameras, SweepOptions(memory=memory))
-        taken = device.allocated - before
-        removal.measure()
-        removal.remove(np.arange(0, 3000, 3))
-        effects = np.stack(removal.measure())
-        removal.close()
-        return taken, effects
+        def measured(memory):
+            before = device.allocated
+            with RemovalSweep(rasterizer, cameras, SweepOptions(memory=memory)) as removal:
+                taken = device.allocated - before
+                removal.measure()
+                removal.remove(np.arange(0, 3000, 3))
+                return taken, np.stack(removal.measure())
 
-    nothing, _ = measured(0)
-    everything, expected = measured(None)
-    budget = int(share * (everything - nothing))
-    taken, effects = measured(budget)
-    rasterizer.free()
+        nothing, _ = measured(0)
+        everything, expected = measured(None)
+        budget = int(share * (everything - nothing))
+        taken, effects = measured(budget)
     assert 0.9 * budget <= taken - nothing <= 1.001 * budget
     left = np.arange(3000) % 3 > 0
     assert (effects[:, left] == expected[:, left]).all()
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize("share", [0.1, 0.5, 0.9, 0.99])
 def test_a_failure_gives_all_memory_back(device, monkeypatch, share):
     """Wherever the device's memory ends while a sweep is made."""
     cameras, keep_all = ring_of_cameras(5, size=48), SweepOptions(memory=1 << 40)
-    rasterizer = Rasterizer(device, visible_scene(3000))
-    before = device.allocated
-    with RemovalSweep(rasterizer, cameras, keep_all) as removal:
-        needed = device.allocated - before
-        assert removal.cached_views == 5
-    scratch = device.allocated - before
-    limit = int(before + scratch + share * (needed - scratch))
-    monkeypatch.setattr(device, "info", dataclasses.replace(device.info, memory=limit))
-    with pytest.raises(DeviceMemoryError):
-        RemovalSweep(rasterizer, cameras, keep_all)
-    rasterizer.free()  # its scratch memory may have grown meanwhile
+    with Rasterizer(device, visible_scene(3000)) as rasterizer:  # its scratch memory may grow meanwhile
+        before = device.allocated
+        with RemovalSweep(rasterizer, cameras, keep_all) as removal:
+            needed = device.allocated - before
+            assert removal.cached_views == 5
+        scratch = device.allocated - before
+        limit = int(before + scratch + share * (needed - scratch))
+        monkeypatch.setattr(device, "info", dataclasses.replace(device.info, memory=limit))
+        with pytest.raises(DeviceMemoryError):
+            RemovalSweep(rasterizer, cameras, keep_all)
     assert device.allocated == 0
 
 
 def test_identical_splats_share_their_effect(device):
     scene = visible_scene(1, 0).subset(np.zeros(40, np.int64))
     cameras = ring_of_cameras(2, size=48)
-    rasterizer, removal = sweep(device, scene, cameras)
-    effect, importance = removal.measure()
-    finish(rasterizer, removal)
+    with sweep(device, scene, cameras) as removal:
+        effect, importance = removal.measure()
     assert np.isfinite(effect).all()
     # Nearer by number: the first is in front of all others.
     assert (np.diff(importance) <= 1e-12).all()
 
 
+@pytest.mark.one_runtime
 def test_pruning_to_one_splat(device):
     scene = visible_scene(40, 0)
     cameras = ring_of_cameras(2, size=48)
-    rasterizer, removal = sweep(device, scene, cameras)
-    pruned = prune(removal, 40, PruningOptions(np.inf, 5))
-    finish(rasterizer, removal)
+    with sweep(device, scene, cameras) as removal:
+        pruned = prune(removal, 40, PruningOptions(np.inf, 5))
     assert pruned.kept == 1
 
 
+@pytest.mark.one_runtime
 def test_pruning_keeps_the_picture_better_than_importance(device, lego_excerpt, lego_excerpt_cameras):
     cameras = [c for c in lego_excerpt_cameras if c.split == "train"][:4]
-    rasterizer, removal = sweep(device, lego_excerpt, cameras)
-    _, importance = removal.measure()
-    pruned = prune(removal, 1500, PruningOptions(0, 12, count=750))
-    removal.close()
+    with sweep(device, lego_excerpt, cameras) as removal:
+        _, importance = removal.measure()
+        pruned = prune(removal, 1500, PruningOptions(0, 12, count=750))
     by_importance = np.sort(np.argsort(importance)[-750:])
 
     def error(kept):
-        other = Rasterizer(device, lego_excerpt.subset(kept))
-        total = sum(np.mean((other.render(c)[0] - rasterizer.render(c)[0]) ** 2) for c in cameras)
-        other.free()
-        return total
+        with Rasterizer(device, lego_excerpt) as whole, Rasterizer(device, lego_excerpt.subset(kept)) as other:
+            return sum(np.mean((other.render(c)[0] - whole.render(c)[0]) ** 2) for c in cameras)
 
     assert error(pruned.survivors) < 0.5 * error(by_importance)
-    rasterizer.free()
 
 
+@pytest.mark.one_runtime
 def test_no_view_is_an_error(device):
-    rasterizer = Rasterizer(device, visible_scene(3, 0))
-    with pytest.raises(UsageError, match="at least one view"):
+    with Rasterizer(device, visible_scene(3, 0)) as rasterizer, pytest.raises(UsageError, match="at least one view"):
         RemovalSweep(rasterizer, [])
-    rasterizer.free()
 
 
+@pytest.mark.one_runtime
 @pytest.mark.parametrize(
     ("kind", "integrated", "share"), [("gpu", False, 0.5), ("gpu", True, 0.3), ("cpu", True, 0.3), ("cpu", False, 0.3)]
 )

@@ -28,7 +28,8 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.reference.ridge import YCOCG, Mask, Ridges, triangles, usable_columns_of
 from potr_cl.reference.scenes import random_scene
-from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision, ViewWeights
+from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
+from potr_cl.stages.compaction.view_weights import ViewWeights
 from tools.make.large_scene import DEFAULT_SCENE
 from tools.results import threads
 from tools.study.compaction_curves import measured_weights

@@ -47,7 +47,8 @@ from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, list_dev
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.reference import raster as reference
 from potr_cl.reference.removal import BruteForce
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, Precision
@@ -169,16 +170,17 @@ def families(info: DeviceInfo) -> tuple[Family, ...]:
 
 def rasterizer_times(device: Device, load: Workload) -> dict[str, float]:
     """Seconds a view of every kernel: the best of some passes over the views."""
-    rasterizer = Rasterizer(device, load.scene, GSPLAT)
-    best: dict[str, float] = {}
-    for number in range(load.repeats + 1):
-        device.stage_times()
-        for camera in load.some:
-            rasterizer.render_device(camera)
-        times = device.stage_times()
-        if number:
-            best = {name: min(seconds / len(load.some), best.get(name, math.inf)) for name, seconds in times.items()}
-    rasterizer.free()
+    with Rasterizer(device, load.scene, GSPLAT) as rasterizer:
+        best: dict[str, float] = {}
+        for number in range(load.repeats + 1):
+            device.stage_times()
+            for camera in load.some:
+                rasterizer.render_device(camera)
+            times = device.stage_times()
+            if number:
+                best = {
+                    name: min(seconds / len(load.some), best.get(name, math.inf)) for name, seconds in times.items()
+                }
     return best
 
 
@@ -217,14 +219,11 @@ class RasterizerTruth:
 
     def errors(self, device: Device, scene: Scene) -> tuple[float, float, float, set[bytes]]:
         """Of centres, of order, of pixels; and the tile lists as a set."""
-        rasterizer = Rasterizer(device, scene, GSPLAT)
-        view = rasterizer.prepare(self.camera)
-        shapes = device.download(view.shapes, (rasterizer.stride, 8), np.float32)
-        offsets = device.download(view.offsets, (view.tiles + 1,), np.uint32).astype(np.int64)
-        intersections = device.download(view.intersections, (view.intersection_count,), np.uint32)
-        image, transmittance = rasterizer.composite(view)
-        view.free()
-        rasterizer.free()
+        with Rasterizer(device, scene, GSPLAT) as rasterizer, rasterizer.prepare(self.camera) as view:
+            shapes = device.download(view.shapes, (rasterizer.stride, 8), np.float32)
+            offsets = device.download(view.offsets, (view.tiles + 1,), np.uint32).astype(np.int64)
+            intersections = device.download(view.intersections, (view.intersection_count,), np.uint32)
+            image, transmittance = rasterizer.composite(view)
         listed = np.isin(self.projected.index, intersections)
         centres = np.abs(shapes[self.projected.index[listed], :2] - self.projected.centre[listed])
         inside = (self.projected.centre[listed] >= 0).all(axis=1)
@@ -287,25 +286,19 @@ def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]
             if stop != (default.transmittance_threshold or INRIA.transmittance_threshold):
                 ends = dataclasses.replace(default, transmittance_threshold=stop)
                 variants.append((f"{family}, pixels end at {stop:.0e}", False, plain, ends))
-    rasterizer = Rasterizer(variants[0][2], load.scene)
-    removal = RemovalSweep(rasterizer, [camera])
-    chosen = choose_splats(removal.measure()[1], SPLATS // 3 if quick else SPLATS)
-    removal.free()
-    rasterizer.free()
+    with Rasterizer(variants[0][2], load.scene) as rasterizer, RemovalSweep(rasterizer, [camera]) as removal:
+        chosen = choose_splats(removal.measure()[1], SPLATS // 3 if quick else SPLATS)
     brute = BruteForce(reference.project(load.scene, camera, INRIA), camera, INRIA)
     truths = dict(zip(stops, brute.effects(chosen, stops)[0], strict=True))
     for label, is_default, device, options in variants:
-        rasterizer = Rasterizer(device, load.scene)
-        removal = RemovalSweep(rasterizer, [camera], options)
-        effect = removal.measure()[0][chosen]
-        best = math.inf
-        for _ in range(load.repeats):
-            removal.sweep_everything()
-            started = time.perf_counter()
-            removal.measure()
-            best = min(best, time.perf_counter() - started)
-        removal.free()
-        rasterizer.free()
+        with Rasterizer(device, load.scene) as rasterizer, RemovalSweep(rasterizer, [camera], options) as removal:
+            effect = removal.measure()[0][chosen]
+            best = math.inf
+            for _ in range(load.repeats):
+                removal.sweep_everything()
+                started = time.perf_counter()
+                removal.measure()
+                best = min(best, time.perf_counter() - started)
         true = truths[options.transmittance_threshold or INRIA.transmittance_threshold] / (
             3 * camera.width * camera.height
         )
@@ -316,13 +309,12 @@ def removal_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]
 
 def prune_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
     """What the schedule may skip, see tools.bench.pruning."""
-    bench = Bench(load.folder, Device(info), quick, truth=False)
-    default = SweepOptions()
-    for row in skips(bench, (load.pruning, load.pruning // 2)):
-        is_default = row["skipped"] == f"tolerance {default.tolerance:g}"
-        error = 10 ** (-row["psnr_at_equal_count"] / 20)
-        yield Row("prune", row["skipped"], row["seconds"], error, is_default)
-    bench.free()
+    with Bench(load.folder, Device(info), quick, truth=False) as bench:
+        default = SweepOptions()
+        for row in skips(bench, (load.pruning, load.pruning // 2)):
+            is_default = row["skipped"] == f"tolerance {default.tolerance:g}"
+            error = 10 ** (-row["psnr_at_equal_count"] / 20)
+            yield Row("prune", row["skipped"], row["seconds"], error, is_default)
 
 
 def ridge_errors(scene: Scene, compacted: Scene, centres: F64, weights: Any, options: CompactionOptions) -> F64:
@@ -379,29 +371,25 @@ def refit_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
     """Steps of conjugate gradients, and family, on the more important half of the splats."""
     views = load.train if quick else load.train[:: max(len(load.train) // 16, 1)]
     device = Device(info)
-    rasterizer = Rasterizer(device, load.scene)
-    removal = RemovalSweep(rasterizer, views)
-    importance = removal.measure()[1]
-    removal.free()
-    rasterizer.free()
+    with Rasterizer(device, load.scene) as rasterizer, RemovalSweep(rasterizer, views) as removal:
+        importance = removal.measure()[1]
     kept = load.scene.subset(np.sort(np.argsort(importance)[len(importance) // 2 :]))
     default = EncodeOptions.for_preset("best").refit.steps
     for family in families(info)[: 1 if quick else 2]:
         device = Device(info, family=family)
-        rasterizer = Rasterizer(device, load.scene)
-        targets = RenderedTargets(rasterizer, views)
-        for steps in (0, 1, 2, 4, 8, 16) if quick else (0, 1, 2, 4, 8, 16, 32, 64):
-            options = RefitOptions(steps=steps, gain=0)
-            times = []
-            for _ in range(2):  # the first builds the kernels
-                started = time.perf_counter()
-                refitted = refit_colours(device, kept, views, targets, options)
-                times.append(time.perf_counter() - started)
-            error = math.sqrt(refitted.errors[1])
-            yield Row(
-                "re-fit", f"{family}, {steps} steps", times[-1], error, family == info.family and steps == default
-            )
-        rasterizer.free()
+        with Rasterizer(device, load.scene) as rasterizer:
+            targets = RenderedTargets(rasterizer, views)
+            for steps in (0, 1, 2, 4, 8, 16) if quick else (0, 1, 2, 4, 8, 16, 32, 64):
+                options = RefitOptions(steps=steps, gain=0)
+                times = []
+                for _ in range(2):  # the first builds the kernels
+                    started = time.perf_counter()
+                    refitted = refit_colours(device, kept, views, targets, options)
+                    times.append(time.perf_counter() - started)
+                error = math.sqrt(refitted.errors[1])
+                yield Row(
+                    "re-fit", f"{family}, {steps} steps", times[-1], error, family == info.family and steps == default
+                )
 
 
 def code_rows(load: Workload, quick: bool) -> Iterator[Row]:
@@ -425,7 +413,6 @@ def code_rows(load: Workload, quick: bool) -> Iterator[Row]:
 def encode_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
     """Presets, iterations, stages left out: time, bytes and PSNR over the test views."""
     device = Device(info)
-    evaluator = Evaluator(device, load.scene, EvaluationViews.of([*load.train, *load.test]), (0.0, 0.0, 0.0))
     variants: dict[str, dict[str, Any]] = {
         "paper": {"preset": "paper"},
         "fast": {"preset": "fast"},
@@ -440,15 +427,15 @@ def encode_rows(info: DeviceInfo, load: Workload, quick: bool) -> Iterator[Row]:
         "best, re-fit of 4 steps": {"preset": "best", "refit": {"steps": 4}},
         "best, re-fit of 16 steps": {"preset": "best", "refit": {"steps": 16}},
     }
-    for number, (name, changes) in enumerate(variants.items()):
-        options = EncodeOptions.for_preset(**changes)
-        for _ in range(2 if quick or number == 0 else 1):  # the first builds the kernels
-            started = time.perf_counter()
-            encoded = encode(load.scene, load.train, options, device=device)
-            seconds = time.perf_counter() - started
-        psnr = evaluator.psnr(decode(b"".join(encoded.pieces)))
-        yield Row("encode", name, seconds, 10 ** (-psnr / 20), name == "best", encoded.nbytes)
-    evaluator.free()
+    with Evaluator(device, load.scene, EvaluationViews.of([*load.train, *load.test]), (0.0, 0.0, 0.0)) as evaluator:
+        for number, (name, changes) in enumerate(variants.items()):
+            options = EncodeOptions.for_preset(**changes)
+            for _ in range(2 if quick or number == 0 else 1):  # the first builds the kernels
+                started = time.perf_counter()
+                encoded = encode(load.scene, load.train, options, device=device)
+                seconds = time.perf_counter() - started
+            psnr = evaluator.psnr(decode(b"".join(encoded.pieces)))
+            yield Row("encode", name, seconds, 10 ** (-psnr / 20), name == "best", encoded.nbytes)
 
 
 # ------------------------------------------------------------------------------------------ the run

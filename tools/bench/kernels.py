@@ -63,21 +63,17 @@ class TimedDevice(Device):
 
 def pruning(device: Device, scene: Scene, cameras: list[Camera]) -> Scene:
     """Prune; what is left."""
-    rasterizer = Rasterizer(device, scene)
-    removal = RemovalSweep(rasterizer, cameras, SweepOptions())
-    pruned = prune(removal, len(scene), PruningOptions(DELTA_MSE_MAX, ITERATIONS))
-    removal.free()
-    rasterizer.free()
+    with Rasterizer(device, scene) as rasterizer, RemovalSweep(rasterizer, cameras, SweepOptions()) as removal:
+        pruned = prune(removal, len(scene), PruningOptions(DELTA_MSE_MAX, ITERATIONS))
     return scene.subset(pruned.survivors)
 
 
 def refit(device: Device, scene: Scene, left: Scene, cameras: list[Camera]) -> None:
     """Re-fit what is left to the whole scene's pictures."""
-    rasterizer = Rasterizer(device, scene)
-    refit_colours(
-        device, left, cameras, RenderedTargets(rasterizer, cameras), RefitOptions(steps=STEPS, drop=1e-10, gain=0)
-    )
-    rasterizer.free()
+    with Rasterizer(device, scene) as rasterizer:
+        refit_colours(
+            device, left, cameras, RenderedTargets(rasterizer, cameras), RefitOptions(steps=STEPS, drop=1e-10, gain=0)
+        )
 
 
 def least_times(device: TimedDevice, work: Callable[[], object]) -> dict[str, tuple[int, float]]:

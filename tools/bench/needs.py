@@ -97,12 +97,9 @@ class Needs:
 
     def schedule(self, sweep: SweepOptions, threshold: float = DELTA_MSE_MAX) -> tuple[float, int]:
         """The pruning alone: sweeps of all tiles that it took, and iterations."""
-        rasterizer = Rasterizer(self.device, self.scene)
-        removal = RemovalSweep(rasterizer, self.views, sweep)
-        pruned = prune_scene(removal, PruningOptions(threshold, self.iterations))
-        swept = removal.sweeps
-        removal.free()
-        rasterizer.free()
+        with Rasterizer(self.device, self.scene) as rasterizer, RemovalSweep(rasterizer, self.views, sweep) as removal:
+            pruned = prune_scene(removal, PruningOptions(threshold, self.iterations))
+            swept = removal.sweeps
         return swept, pruned.iterations
 
     def render(self, rasterizer: Rasterizer) -> None:
@@ -122,10 +119,8 @@ class Needs:
 
     def two_renders(self, lean: Scene, full: Scene) -> tuple[float, float]:
         """Seconds of rendering all views of two scenes."""
-        one, other = Rasterizer(self.device, lean), Rasterizer(self.device, full)
-        seconds = in_turn(self.repeats, lambda: self.render(one), lambda: self.render(other))
-        one.free()
-        other.free()
+        with Rasterizer(self.device, lean) as one, Rasterizer(self.device, full) as other:
+            seconds = in_turn(self.repeats, lambda: self.render(one), lambda: self.render(other))
         return seconds[0], seconds[1]
 
     def lines(self) -> Iterator[Line]:
@@ -186,13 +181,12 @@ class Needs:
         depth = scene.means @ camera.rotation[2].astype(np.float32)
         sort = []
         for ordered in (scene.subset(np.argsort(depth)), scene):
-            rasterizer = Rasterizer(device, ordered)
-            best = np.inf
-            for _ in range(self.repeats + 1):
-                device.stage_times()
-                rasterizer.render_device(camera)
-                best = min(best, device.stage_times()["sort_tiles"])
-            rasterizer.free()
+            with Rasterizer(device, ordered) as rasterizer:
+                best = np.inf
+                for _ in range(self.repeats + 1):
+                    device.stage_times()
+                    rasterizer.render_device(camera)
+                    best = min(best, device.stage_times()["sort_tiles"])
             sort.append(best)
         yield Line(
             "sorting what is in order: not skipped",

@@ -26,6 +26,7 @@ import statistics
 import sys
 import time
 from collections.abc import Callable, Sequence
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +37,7 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.formats.images import read_ground_truth
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner
 from potr_cl.quality.compare import find_ground_truth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.on_device import prune_scene
@@ -82,7 +84,7 @@ def ours_name(iterations: int) -> str:
     return f"ours, {iterations} iteration{'s' if iterations > 1 else ''}"
 
 
-class Bench:
+class Bench(Owner):
     """One scene on one device: reference renders, and what pruned versions of it are worth.
 
     Attributes:
@@ -115,15 +117,14 @@ class Bench:
 
     def quality(self, survivors: Indices) -> Row:
         """PSNR of what the survivors render against the uncompressed scene, and the loss against the photographs."""
-        rasterizer = Rasterizer(self.device, self.scene.subset(survivors))
-        renders, losses = [], []
-        for number, camera in enumerate(self.test):
-            image = rasterizer.render(camera)[0]
-            renders.append(decibels(squared_error(image, self._test_renders[number])))
-            if self._ground_truth is not None:
-                error = squared_error(image, self._ground_truth[number])
-                losses.append(self._uncompressed[number] - decibels(error))
-        rasterizer.free()
+        with Rasterizer(self.device, self.scene.subset(survivors)) as rasterizer:
+            renders, losses = [], []
+            for number, camera in enumerate(self.test):
+                image = rasterizer.render(camera)[0]
+                renders.append(decibels(squared_error(image, self._test_renders[number])))
+                if self._ground_truth is not None:
+                    error = squared_error(image, self._ground_truth[number])
+                    losses.append(self._uncompressed[number] - decibels(error))
         row: Row = {"kept": len(survivors), "psnr": statistics.mean(renders)}
         if losses:
             row["loss"] = statistics.mean(losses)
@@ -133,12 +134,11 @@ class Bench:
         """PSNR of the mean squared error over all training views: what pruning tries to keep."""
         if self._train_renders is None:
             self._train_renders = self._renders(self.train)
-        rasterizer = Rasterizer(self.device, self.scene.subset(survivors))
-        errors = [
-            squared_error(rasterizer.render(camera)[0], reference)
-            for camera, reference in zip(self.train, self._train_renders, strict=True)
-        ]
-        rasterizer.free()
+        with Rasterizer(self.device, self.scene.subset(survivors)) as rasterizer:
+            errors = [
+                squared_error(rasterizer.render(camera)[0], reference)
+                for camera, reference in zip(self.train, self._train_renders, strict=True)
+            ]
         return decibels(statistics.mean(errors))
 
     def pruned(
@@ -147,20 +147,21 @@ class Bench:
         """Run a schedule, so many of its measurements of half-size views; its result and its cost in seconds and full
         sweeps."""
         started = time.perf_counter()
-        removal = RemovalSweep(self.rasterizer, cameras, sweep)
-        small = RemovalSweep(self.rasterizer, [scaled(c, 0.5) for c in cameras], sweep) if half else None
-        prepared = time.perf_counter()
-        if small:
-            result = prune(HalfSizeFirst(removal, small, half), len(self.scene), options)
-        else:
-            result = prune_scene(removal, options)
-        self.device.queue.finish()
-        ended = time.perf_counter()
-        sweeps = removal.sweeps
-        if small:
-            sweeps += small.sweeps / 4
-            small.free()
-        removal.free()
+        with ExitStack() as owned:
+            removal = owned.enter_context(RemovalSweep(self.rasterizer, cameras, sweep))
+            small: RemovalSweep | None = None
+            if half:
+                small = owned.enter_context(RemovalSweep(self.rasterizer, [scaled(c, 0.5) for c in cameras], sweep))
+            prepared = time.perf_counter()
+            if small:
+                result = prune(HalfSizeFirst(removal, small, half), len(self.scene), options)
+            else:
+                result = prune_scene(removal, options)
+            self.device.queue.finish()
+            ended = time.perf_counter()
+            sweeps = removal.sweeps
+            if small:
+                sweeps += small.sweeps / 4
         return result, {
             "prepare_seconds": prepared - started,
             "prune_seconds": ended - prepared,
@@ -183,17 +184,16 @@ class Bench:
     def baselines(self) -> dict[str, Indices]:
         """The other pruners' orders."""
         if not self._baselines:
-            sweep = RemovalSweep(self.rasterizer, self.train, SweepOptions(transmittance_threshold=None))
-            importance = sweep.measure()[1]
-            sweep.free()
+            with RemovalSweep(self.rasterizer, self.train, SweepOptions(transmittance_threshold=None)) as sweep:
+                importance = sweep.measure()[1]
             transmittance = transmittance_sums(self.rasterizer, self.train)
             found = scores(self.scene, importance, transmittance, mesongs_power(self.name))
             self._baselines = {name: removal_order(score) for name, score in found.items()}
         return self._baselines
 
-    def free(self) -> None:
+    def close(self) -> None:
         """Give the device's memory back."""
-        self.rasterizer.free()
+        self.rasterizer.close()
 
 
 # ---------------------------------------------------------------------------------------------- parts
@@ -338,14 +338,12 @@ def frame_rate(rasterizer: Rasterizer, cameras: Sequence[Camera], passes: int = 
 
 def rendering_cost(bench: Bench, survivors: Indices) -> Row:
     """Frame rate over the training views and the intersections in their tile lists."""
-    rasterizer = Rasterizer(bench.device, bench.scene.subset(survivors))
-    rate = frame_rate(rasterizer, bench.train)
-    intersections = []
-    for camera in bench.train[::8]:
-        view = rasterizer.prepare(camera)
-        intersections.append(view.intersection_count)
-        view.free()
-    rasterizer.free()
+    with Rasterizer(bench.device, bench.scene.subset(survivors)) as rasterizer:
+        rate = frame_rate(rasterizer, bench.train)
+        intersections = []
+        for camera in bench.train[::8]:
+            with rasterizer.prepare(camera) as view:
+                intersections.append(view.intersection_count)
     return {"frames_per_second": rate, "intersections": statistics.mean(intersections)}
 
 
@@ -567,20 +565,19 @@ def run(arguments: argparse.Namespace) -> Row:
     results: Row = {**about, "device": device.info.name, "quick": arguments.quick, "scenes": {}}
     for folder in arguments.scenes:
         started = time.perf_counter()
-        bench = Bench(folder, device, arguments.quick, arguments.truth)
-        found: Row = {"splats": len(bench.scene), "train": len(bench.train), "test": len(bench.test)}
-        results["scenes"][folder.name] = found
-        log(f"{folder.name}: {len(bench.scene)} splats, {time.perf_counter() - started:.1f} s to load")
-        if "curves" in arguments.parts:
-            found["curves"] = curves(bench, [p / 100 for p in arguments.removed], arguments.iterations)
-            log(f"{folder.name}: curves done after {time.perf_counter() - started:.1f} s")
-        if "skips" in arguments.parts:
-            found["skips"] = skips(bench, arguments.iterations)
-            log(f"{folder.name}: skips done after {time.perf_counter() - started:.1f} s")
-        if "frames" in arguments.parts:
-            found["frames"] = frames(bench, arguments.truth, max(arguments.iterations))
-            log(f"{folder.name}: frames done after {time.perf_counter() - started:.1f} s")
-        bench.free()
+        with Bench(folder, device, arguments.quick, arguments.truth) as bench:
+            found: Row = {"splats": len(bench.scene), "train": len(bench.train), "test": len(bench.test)}
+            results["scenes"][folder.name] = found
+            log(f"{folder.name}: {len(bench.scene)} splats, {time.perf_counter() - started:.1f} s to load")
+            if "curves" in arguments.parts:
+                found["curves"] = curves(bench, [p / 100 for p in arguments.removed], arguments.iterations)
+                log(f"{folder.name}: curves done after {time.perf_counter() - started:.1f} s")
+            if "skips" in arguments.parts:
+                found["skips"] = skips(bench, arguments.iterations)
+                log(f"{folder.name}: skips done after {time.perf_counter() - started:.1f} s")
+            if "frames" in arguments.parts:
+                found["frames"] = frames(bench, arguments.truth, max(arguments.iterations))
+                log(f"{folder.name}: frames done after {time.perf_counter() - started:.1f} s")
     return results
 
 

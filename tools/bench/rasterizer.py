@@ -17,6 +17,7 @@ import argparse
 import json
 import statistics
 import time
+from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
@@ -27,7 +28,9 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.raster.rasterizer import GSPLAT, Rasterizer
+from potr_cl.opencl.memory import Memory
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT
 
 
 def frame_times(rasterizer: Rasterizer, cameras: list[Camera], passes: int) -> list[float]:
@@ -45,28 +48,26 @@ def frame_times(rasterizer: Rasterizer, cameras: list[Camera], passes: int) -> l
 def stage_times(scene: Scene, cameras: list[Camera], spec: str | None, family: str | None) -> dict[str, float]:
     """Mean seconds a frame that the device spends in each kernel."""
     device = Device(spec, profiling=True, family=family)  # type: ignore[arg-type]
-    rasterizer = Rasterizer(device, scene, GSPLAT)
-    frame_times(rasterizer, cameras, 0)
-    device.stage_times()
-    frame_times(rasterizer, cameras, 0)
-    sums = device.stage_times()
-    rasterizer.free()
+    with Rasterizer(device, scene, GSPLAT) as rasterizer:
+        frame_times(rasterizer, cameras, 0)
+        device.stage_times()
+        frame_times(rasterizer, cameras, 0)
+        sums = device.stage_times()
     return {name: seconds / len(cameras) for name, seconds in sums.items()}
 
 
 def copy_bandwidth(device: Device) -> float:
     """Bytes a second of a copy within the device's memory, read and written bytes both counted."""
     size = min(device.info.largest_buffer, device.info.memory // 4, 1 << 30)
-    source, target = device.allocate(size, "the copy"), device.allocate(size, "the copy")
     best = np.inf
-    for _ in range(5):
-        device.queue.finish()
-        started = time.perf_counter()
-        cl.enqueue_copy(device.queue, target, source, byte_count=size)
-        device.queue.finish()
-        best = min(best, time.perf_counter() - started)
-    device.free(source)
-    device.free(target)
+    with Memory(device) as memory:
+        source, target = memory.allocate(size, "the copy"), memory.allocate(size, "the copy")
+        for _ in range(5):
+            device.queue.finish()
+            started = time.perf_counter()
+            cl.enqueue_copy(device.queue, target, source, byte_count=size)
+            device.queue.finish()
+            best = min(best, time.perf_counter() - started)
     return 2 * size / best
 
 
@@ -91,14 +92,11 @@ def bench_scene(folder: Path, spec: str | None, family: str | None, passes: int,
     scene = load_scene(folder / "point_cloud.ply")
     cameras = train_views(load_cameras(folder / "cameras.json"))[:limit]
     device = Device(spec, family=family)  # type: ignore[arg-type]
-    rasterizer = Rasterizer(device, scene, GSPLAT)
-    times = frame_times(rasterizer, cameras, passes)
-    views = [rasterizer.prepare(camera) for camera in cameras[:: max(len(cameras) // 8, 1)]]
-    intersections = statistics.mean(view.intersection_count for view in views)
-    longest = max(int(np.diff(device.download(v.offsets, (v.tiles + 1,), np.uint32)).max(initial=0)) for v in views)
-    for view in views:
-        view.free()
-    rasterizer.free()
+    with Rasterizer(device, scene, GSPLAT) as rasterizer, ExitStack() as prepared:
+        times = frame_times(rasterizer, cameras, passes)
+        views = [prepared.enter_context(rasterizer.prepare(camera)) for camera in cameras[:: max(len(cameras) // 8, 1)]]
+        intersections = statistics.mean(view.intersection_count for view in views)
+        longest = max(int(np.diff(device.download(v.offsets, (v.tiles + 1,), np.uint32)).max(initial=0)) for v in views)
     metrics = folder / "reference" / "metrics.json"
     return {
         "scene": folder.name,
@@ -177,20 +175,18 @@ def bench_growth(spec: str | None, largest: int) -> list[dict[str, Any]]:
     runs += [("overlap", 100_000, sigma, 800) for sigma in (0.0025, 0.005, 0.01, 0.02, 0.04)]
     results = []
     for varied, splats, sigma, width in runs:
-        rasterizer = Rasterizer(device, synthetic_scene(splats, sigma), GSPLAT)
-        times = frame_times(rasterizer, [synthetic_camera(width)], 5)
-        view = rasterizer.prepare(synthetic_camera(width))
-        results.append(
-            {
-                "varied": varied,
-                "splats": splats,
-                "pixels": width * width,
-                "overlap": view.intersection_count / view.tiles,
-                "seconds": statistics.median(times),
-            }
-        )
-        view.free()
-        rasterizer.free()
+        with Rasterizer(device, synthetic_scene(splats, sigma), GSPLAT) as rasterizer:
+            times = frame_times(rasterizer, [synthetic_camera(width)], 5)
+            with rasterizer.prepare(synthetic_camera(width)) as view:
+                results.append(
+                    {
+                        "varied": varied,
+                        "splats": splats,
+                        "pixels": width * width,
+                        "overlap": view.intersection_count / view.tiles,
+                        "seconds": statistics.median(times),
+                    }
+                )
     return results
 
 

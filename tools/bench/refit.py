@@ -40,6 +40,7 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import test_views, train_views
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.metrics import psnr
@@ -73,7 +74,7 @@ def log(text: str) -> None:
     print(f"[{time.strftime('%H:%M:%S')}] {text}", file=sys.stderr, flush=True)
 
 
-class Bench:
+class Bench(Owner):
     """One scene on one device."""
 
     def __init__(self, folder: Path, device: Device, options: EncodeOptions, refit: RefitOptions, every: int) -> None:
@@ -90,14 +91,14 @@ class Bench:
             self.truths = [self.ground_truth.picture(c) for c in self.test]
         self.targets = RenderedTargets(self.rasterizer, self.train)
 
-    def free(self) -> None:
-        self.rasterizer.free()
+    def close(self) -> None:
+        """Give the device's memory back."""
+        self.rasterizer.close()
 
     def evaluator(self, candidate: Scene) -> dict[str, float]:
         """Means over the test views."""
-        rasterizer = Rasterizer(self.device, candidate)
-        images = [rasterizer.render(c)[0] for c in self.test]
-        rasterizer.free()
+        with Rasterizer(self.device, candidate) as rasterizer:
+            images = [rasterizer.render(c)[0] for c in self.test]
         values = [psnr(a, b) for a, b in zip(images, self.renders, strict=True)]
         finite = [v for v in values if math.isfinite(v)]
         figures = {"psnr": float(np.mean(finite))} if finite else {}
@@ -213,12 +214,12 @@ class Bench:
 
     def times(self, scene: Scene) -> dict[str, float]:
         """Seconds of a step and of a removal sweep of every tile; the shortest of three."""
-        rasterizer = Rasterizer(self.device, scene)
-        removal = RemovalSweep(rasterizer, self.train, SweepOptions(tolerance=-1))
-        removal.measure()
-        sweeps = [_seconds(removal.measure) for _ in range(3)]
-        removal.free()
-        rasterizer.free()
+        with (
+            Rasterizer(self.device, scene) as rasterizer,
+            RemovalSweep(rasterizer, self.train, SweepOptions(tolerance=-1)) as removal,
+        ):
+            removal.measure()
+            sweeps = [_seconds(removal.measure) for _ in range(3)]
         began = time.perf_counter()
         with ColourRefit(self.device, scene, self.train) as refit:
             prepared = time.perf_counter() - began
@@ -251,26 +252,25 @@ def _measure(args: argparse.Namespace) -> None:
         "steps": args.steps, "prior": args.prior, "every": args.every, "scenes": {},
     }  # fmt: skip
     for folder in args.scenes:
-        bench = Bench(folder, device, options, refit, args.every)
-        entry: dict[str, Any] = {
-            "splats": len(bench.scene),
-            "train_views": len(bench.train),
-            "test_views": len(bench.test),
-            "uncompressed": bench.evaluator(bench.scene),
-        }
-        results["scenes"][bench.name] = entry
+        with Bench(folder, device, options, refit, args.every) as bench:
+            entry: dict[str, Any] = {
+                "splats": len(bench.scene),
+                "train_views": len(bench.train),
+                "test_views": len(bench.test),
+                "uncompressed": bench.evaluator(bench.scene),
+            }
+            results["scenes"][bench.name] = entry
 
-        def note(curves: Any, entry: dict[str, Any] = entry) -> None:
-            entry["curves"] = curves
+            def note(curves: Any, entry: dict[str, Any] = entry) -> None:
+                entry["curves"] = curves
+                write_json(args.json, results)
+
+            scene = bench.on_decoded_geometry(bench.reduced(PART, True))
+            entry["times"] = bench.times(scene)
+            entry["step_rows"] = bench.steps(scene, args.most_steps)
+            entry["cut_rows"] = bench.cuts(scene, args.most_steps)
             write_json(args.json, results)
-
-        scene = bench.on_decoded_geometry(bench.reduced(PART, True))
-        entry["times"] = bench.times(scene)
-        entry["step_rows"] = bench.steps(scene, args.most_steps)
-        entry["cut_rows"] = bench.cuts(scene, args.most_steps)
-        write_json(args.json, results)
-        bench.curves(tuple(args.removed), tuple(args.drops), note)
-        bench.free()
+            bench.curves(tuple(args.removed), tuple(args.drops), note)
 
 
 # ------------------------------------------------------------------------------------------------ report

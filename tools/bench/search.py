@@ -72,67 +72,66 @@ def bench(folder: Path, device: Device, results: Results, args: argparse.Namespa
     """One scene."""
     scene, cameras = read(folder)
     cameras = [c for split in ("train", "test") for c in [c for c in cameras if c.split == split][:: args.every]]
-    evaluator = Evaluator(device, scene, EvaluationViews.of(cameras), (0.0, 0.0, 0.0))
-    options = EncodeOptions.for_preset(args.preset)
-    few = [camera for camera in cameras if camera.split == "train"][:4]
-    encode(scene, few, options.changed(prune={"iterations": 1}), device=device)  # builds the kernels
+    with Evaluator(device, scene, EvaluationViews.of(cameras), (0.0, 0.0, 0.0)) as evaluator:
+        options = EncodeOptions.for_preset(args.preset)
+        few = [camera for camera in cameras if camera.split == "train"][:4]
+        encode(scene, few, options.changed(prune={"iterations": 1}), device=device)  # builds the kernels
 
-    def measured(encoded: Encoded) -> float:
-        return evaluator.psnr(decode(b"".join(encoded.pieces)))
+        def measured(encoded: Encoded) -> float:
+            return evaluator.psnr(decode(b"".join(encoded.pieces)))
 
-    table = results.table(
-        f"{folder.name}_plain",
-        f"{folder.name}: plain encodes, preset {args.preset}",
-        Column("quality", format="g"),
-        Column("bytes", format=","),
-        Column("PSNR", "dB", ".3f"),
-        Column("time", "s", ".1f"),
-        Column("of processors", "s", ".1f"),
-    )
-    plain: list[_Plain] = []
-    for q in sorted(args.qualities):
-        with Timed() as took:
-            encoded = encode(scene, cameras, replace(options, q=q), device=device)
-        plain.append(_Plain(math.log(encoded.nbytes), measured(encoded), took.clock, took.processors))
-        table.add(q, encoded.nbytes, plain[-1].psnr, took.clock, took.processors)
-
-    table = results.table(
-        f"{folder.name}_targets",
-        f"{folder.name}: searches for a size or a PSNR, preset {args.preset}",
-        Column("target"),
-        Column("bytes", format=","),
-        Column("PSNR", "dB", ".3f"),
-        Column("against plain", "dB", "+.3f"),
-        Column("quality", format=".4f"),
-        Column("steps"),
-        Column("time", "s", ".1f"),
-        Column("in plain encodes", format=".2f"),
-        Column("of processors, in plain encodes", format=".2f"),
-    )
-    targets = [Target(max_bytes=int(size)) for size in args.sizes] + [Target(min_psnr=psnr) for psnr in args.psnrs]
-    for target in targets:
-        try:
-            with Timed() as took:
-                found = encode_to_target(scene, cameras, target, options, device=device)
-        except UnreachableError as error:
-            table.add(str(error), *[None] * 8)
-            continue
-        psnr = measured(found.encoded)
-        kinds = Counter(step.kind for step in found.tries)
-        gain, clock, processors = _against(plain, math.log(found.encoded.nbytes), psnr, took)
-        steps = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
-        table.add(
-            str(target),
-            found.encoded.nbytes,
-            psnr,
-            gain,
-            found.options.q,
-            steps,
-            took.clock,
-            clock,
-            processors,
+        table = results.table(
+            f"{folder.name}_plain",
+            f"{folder.name}: plain encodes, preset {args.preset}",
+            Column("quality", format="g"),
+            Column("bytes", format=","),
+            Column("PSNR", "dB", ".3f"),
+            Column("time", "s", ".1f"),
+            Column("of processors", "s", ".1f"),
         )
-    evaluator.free()
+        plain: list[_Plain] = []
+        for q in sorted(args.qualities):
+            with Timed() as took:
+                encoded = encode(scene, cameras, replace(options, q=q), device=device)
+            plain.append(_Plain(math.log(encoded.nbytes), measured(encoded), took.clock, took.processors))
+            table.add(q, encoded.nbytes, plain[-1].psnr, took.clock, took.processors)
+
+        table = results.table(
+            f"{folder.name}_targets",
+            f"{folder.name}: searches for a size or a PSNR, preset {args.preset}",
+            Column("target"),
+            Column("bytes", format=","),
+            Column("PSNR", "dB", ".3f"),
+            Column("against plain", "dB", "+.3f"),
+            Column("quality", format=".4f"),
+            Column("steps"),
+            Column("time", "s", ".1f"),
+            Column("in plain encodes", format=".2f"),
+            Column("of processors, in plain encodes", format=".2f"),
+        )
+        targets = [Target(max_bytes=int(size)) for size in args.sizes] + [Target(min_psnr=psnr) for psnr in args.psnrs]
+        for target in targets:
+            try:
+                with Timed() as took:
+                    found = encode_to_target(scene, cameras, target, options, device=device)
+            except UnreachableError as error:
+                table.add(str(error), *[None] * 8)
+                continue
+            psnr = measured(found.encoded)
+            kinds = Counter(step.kind for step in found.tries)
+            gain, clock, processors = _against(plain, math.log(found.encoded.nbytes), psnr, took)
+            steps = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
+            table.add(
+                str(target),
+                found.encoded.nbytes,
+                psnr,
+                gain,
+                found.options.q,
+                steps,
+                took.clock,
+                clock,
+                processors,
+            )
 
 
 def main() -> None:

@@ -35,7 +35,7 @@ _MODULES = (
     "potr_cl.formats.",
     "potr_cl.stages.",
     "potr_cl.pipeline.",
-    "potr_cl.raster.rasterizer",
+    "potr_cl.raster.",
     "potr_cl.quality.metrics",
     "potr_cl.codec.decoder",
     "potr_cl.opencl.discovery",

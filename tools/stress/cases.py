@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.raster.rasterizer import GSPLAT, INRIA, RasterRules
+from potr_cl.raster.rules import GSPLAT, INRIA, RasterRules
 from potr_cl.reference.scenes import (
     plain_splats,
     random_scene,

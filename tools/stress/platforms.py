@@ -34,8 +34,10 @@ from potr_cl.model.camera import camera_centres
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, list_devices
 from potr_cl.quality.metrics import ssim
-from potr_cl.quality.metrics_device import Picture, Similarity
-from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.quality.metrics_device import Similarity
+from potr_cl.quality.pictures import Picture
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.reference import raster as reference
 from potr_cl.reference.refit import Array, to_ycocg
 from potr_cl.reference.refit_cases import Case, Linearised, Pictures
@@ -47,7 +49,8 @@ from potr_cl.reference.scenes import (
     tilted_camera,
     visible_scene,
 )
-from potr_cl.stages.compaction.ridge import Compactor, ViewWeights
+from potr_cl.stages.compaction.ridge import Compactor
+from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
@@ -67,10 +70,9 @@ def check_definition(device: Device, sizes: tuple[int, ...] = (30, 400)) -> dict
         for rules in (INRIA, GSPLAT):
             for size in sizes:
                 scene, view = random_splats(size, degree, seed=degree), tilted_camera(degree, 83, 61)
-                rasterizer = Rasterizer(device, scene, rules)
-                image, transmittance = rasterizer.render(view)
-                same &= image.tobytes() == rasterizer.render(view)[0].tobytes()
-                rasterizer.free()
+                with Rasterizer(device, scene, rules) as rasterizer:
+                    image, transmittance = rasterizer.render(view)
+                    same &= image.tobytes() == rasterizer.render(view)[0].tobytes()
                 wanted = reference.render(scene, view, rules)
                 error = np.abs(image - wanted.image).max(axis=2)
                 error = np.maximum(error, np.abs(transmittance - wanted.transmittance))
@@ -144,20 +146,19 @@ def _relative(value: Array, wanted: Array) -> float:
 
 def check_scene(device: Device, folder: Path) -> dict[str, float]:
     """Lowest PSNR against the reference renders, largest difference, and seconds a frame."""
-    rasterizer = Rasterizer(device, load_scene(folder / "point_cloud.ply"), GSPLAT)
-    cameras = {c.name: c for c in load_cameras(folder / "cameras.json")}
-    psnr, largest, times = np.inf, 0.0, []
-    for path in sorted((folder / "reference").glob("*.npz")):
-        image, _ = rasterizer.render(cameras[path.stem])
-        with np.load(path) as theirs:
-            error = image - theirs["rgb"]
-        psnr = min(psnr, float(-10 * np.log10(np.mean(np.square(error)))))
-        largest = max(largest, float(np.abs(error).max()))
-        for _ in range(5):
-            started = time.perf_counter()
-            rasterizer.render_device(cameras[path.stem])
-            times.append(time.perf_counter() - started)
-    rasterizer.free()
+    with Rasterizer(device, load_scene(folder / "point_cloud.ply"), GSPLAT) as rasterizer:
+        cameras = {c.name: c for c in load_cameras(folder / "cameras.json")}
+        psnr, largest, times = np.inf, 0.0, []
+        for path in sorted((folder / "reference").glob("*.npz")):
+            image, _ = rasterizer.render(cameras[path.stem])
+            with np.load(path) as theirs:
+                error = image - theirs["rgb"]
+            psnr = min(psnr, float(-10 * np.log10(np.mean(np.square(error)))))
+            largest = max(largest, float(np.abs(error).max()))
+            for _ in range(5):
+                started = time.perf_counter()
+                rasterizer.render_device(cameras[path.stem])
+                times.append(time.perf_counter() - started)
     return {"psnr": psnr, "largest": largest, "seconds": min(times)}
 
 

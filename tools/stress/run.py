@@ -42,11 +42,14 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, list_devices
-from potr_cl.raster.rasterizer import TILE, Rasterizer, RasterRules
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.view_set import TILE
 from potr_cl.reference import raster as reference
 from potr_cl.reference.refit import Reference, to_ycocg
 from potr_cl.reference.ridge import YCOCG, objective, ridge, weighted_basis
-from potr_cl.stages.compaction.ridge import Compactor, ViewWeights
+from potr_cl.stages.compaction.ridge import Compactor
+from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.refitting.refit import refit_colours
@@ -299,22 +302,20 @@ class Lists:
 def rasterized(rasterizer: Rasterizer, view: Camera) -> Lists:
     """All that the rasterizer's stages leave."""
     device = rasterizer.device
-    prepared = rasterizer.prepare(view)
-    image, transmittance = rasterizer.composite(prepared)
-    shapes = device.download(prepared.shapes, (rasterizer.stride, 8), np.float32)[: rasterizer.splats]
-    colours = device.download(prepared.colours, (rasterizer.stride, 4), np.float32)[: rasterizer.splats, :3]
-    with np.errstate(invalid="ignore"):  # colours of splats that are not drawn are never set
-        wide = colours.astype(np.float64)
-    lists = Lists(
-        shapes.astype(np.float64),
-        wide,
-        device.download(prepared.offsets, (prepared.tiles + 1,), np.uint32),
-        device.download(prepared.intersections, (prepared.intersection_count,), np.uint32),
-        image.reshape(-1, 3).astype(np.float64),
-        transmittance.ravel().astype(np.float64),
-    )
-    prepared.free()
-    return lists
+    with rasterizer.prepare(view) as prepared:
+        image, transmittance = rasterizer.composite(prepared)
+        shapes = device.download(prepared.shapes, (rasterizer.stride, 8), np.float32)[: rasterizer.splats]
+        colours = device.download(prepared.colours, (rasterizer.stride, 4), np.float32)[: rasterizer.splats, :3]
+        with np.errstate(invalid="ignore"):  # colours of splats that are not drawn are never set
+            wide = colours.astype(np.float64)
+        return Lists(
+            shapes.astype(np.float64),
+            wide,
+            device.download(prepared.offsets, (prepared.tiles + 1,), np.uint32),
+            device.download(prepared.intersections, (prepared.intersection_count,), np.uint32),
+            image.reshape(-1, 3).astype(np.float64),
+            transmittance.ravel().astype(np.float64),
+        )
 
 
 def check_projection(case: Case, lists: Lists, pixels: Pixels) -> Measures:
@@ -460,15 +461,12 @@ def check_removal(
 ) -> Measures:
     """Effects and importances once the splats of every third place are gone, by the device's own ellipses."""
     rng = np.random.default_rng(SEED)
-    removal = RemovalSweep(rasterizer, [case.view], SweepOptions(tolerance=-1, transmittance_threshold=None))
-    try:
+    with RemovalSweep(rasterizer, [case.view], SweepOptions(tolerance=-1, transmittance_threshold=None)) as removal:
         removal.measure()
         order = lists.order()
         gone = order[::3] if len(order) > 2 else order[:0]
         removal.remove(gone)
         effect, importance = removal.measure()
-    finally:
-        removal.free()
     left = np.flatnonzero(~np.isin(order, gone))
     if not (np.isfinite(effect).all() and np.isfinite(importance).all()):
         return {"removal: effect": (np.inf, ULP)}
@@ -511,8 +509,7 @@ def check(device: Device, case: Case) -> Measures:
     # By the cap that the kernels get: the float32 nearest to 0.999 lets 1.3e-5 less light through.
     cap = float(np.float32(case.rules.alpha_cap))
     case = dataclasses.replace(case, rules=dataclasses.replace(case.rules, alpha_cap=cap))
-    rasterizer = Rasterizer(device, case.scene, case.rules)
-    try:
+    with Rasterizer(device, case.scene, case.rules) as rasterizer:
         lists = rasterized(rasterizer, case.view)
         finite = np.isfinite(lists.image).all() and np.isfinite(lists.transmittance).all()
         finite &= bool(np.isfinite(lists.colours[np.unique(lists.intersections)]).all())
@@ -528,8 +525,6 @@ def check(device: Device, case: Case) -> Measures:
         composited, clear = check_composite(case, lists, pixels, raw, inside)
         found |= composited | check_render(case, lists, pixels)
         return found | check_removal(case, rasterizer, lists, pixels, raw, inside, clear)
-    finally:
-        rasterizer.free()
 
 
 def check_ridge(device: Device, case: RidgeCase) -> Measures:
@@ -569,13 +564,10 @@ def check_ridge(device: Device, case: RidgeCase) -> Measures:
 
 def check_refit(device: Device, case: RefitCase) -> Measures:
     """How far the pictures are above the optimum, cut colours staying cut, and whether anything was lost."""
-    rasterizer = Rasterizer(device, case.other)
-    try:
+    with Rasterizer(device, case.other) as rasterizer:
         pictures = [rasterizer.render(view)[0] for view in case.views]
         targets = RenderedTargets(rasterizer, case.views)
         refitted = refit_colours(device, case.scene, case.views, targets, case.options)
-    finally:
-        rasterizer.free()
     if not np.isfinite(refitted.sh).all():
         return {"re-fit: loss": (np.inf, ULP)}
     before, after = refitted.errors

@@ -96,11 +96,10 @@ def _measure(args: argparse.Namespace) -> None:
     about = circumstances(device.info)
     results: dict[str, Any] = {**about, "device": device.info.name, "q": args.quality, "scenes": {}}
     for folder in args.scenes:
-        evaluator = EvaluatedScene(folder, device)
-        steps = measure_steps(evaluator, device, args.quality)
-        results["scenes"][evaluator.name] = {**evaluator.facts(), "steps": steps}
-        write_json(args.json, results)
-        evaluator.free()
+        with EvaluatedScene(folder, device) as evaluator:
+            steps = measure_steps(evaluator, device, args.quality)
+            results["scenes"][evaluator.name] = {**evaluator.facts(), "steps": steps}
+            write_json(args.json, results)
 
 
 def _report(args: argparse.Namespace) -> None:

@@ -30,7 +30,8 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor, ViewWeights
+from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
+from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
 from tools.workloads import reduced, scaled
 
@@ -54,13 +55,9 @@ QUARTER_LOW_PASS = {"LOW_PASS": 0.3 / 4, "LOW_PASS_SQUARED": 0.09 / 16}
 
 def measured_weights(device: Device, scene: Scene, cameras: Sequence[Camera]) -> ViewWeights:
     """How much each splat shows in each view."""
-    rasterizer = Rasterizer(device, scene)
-    sweep = RemovalSweep(rasterizer, cameras)
-    sweep.measure()
-    weights = ViewWeights.from_importances(len(scene), sweep.view_importances())
-    sweep.free()
-    rasterizer.free()
-    return weights
+    with Rasterizer(device, scene) as rasterizer, RemovalSweep(rasterizer, cameras) as sweep:
+        sweep.measure()
+        return ViewWeights.from_importances(len(scene), sweep.view_importances())
 
 
 def quantized(sh: FloatArray, sf_sh: float) -> tuple[FloatArray, NDArray[np.float64], float]:
@@ -162,21 +159,20 @@ def measure(device: Device, folder: Path, every: int, powers: Sequence[float]) -
     for pruned in (False, True):
         if pruned:
             scene = reduced(scene, views, options, device)
-        rasterizer = Rasterizer(device, scene)
-        unquantized = _renders(rasterizer, tests)
-        targets = {"uncompressed": targets.get("uncompressed", unquantized), "uncompacted": unquantized}
-        if ground_truth:
-            targets["ground_truth"] = ground_truth
-        evaluator = _Judge(rasterizer, tests, targets, sf_sh)
-        evaluator.add("no compaction", scene.sh)
-        evaluator.add("AC set to 0", np.where(np.arange(scene.sh.shape[1])[:, None] == 0, scene.sh, np.float32(0)))
-        weights = measured_weights(device, scene, views)
-        compactor = Compactor(device)
-        for label, changes in settings:
-            chosen = replace(CompactionOptions(sf_sh=sf_sh), **changes)
-            sh = compactor.compact(scene, camera_centres(views), weights, chosen).sh
-            evaluator.add(label, sh, alpha=chosen.alpha, lam=chosen.lam)
-        rasterizer.free()
+        with Rasterizer(device, scene) as rasterizer:
+            unquantized = _renders(rasterizer, tests)
+            targets = {"uncompressed": targets.get("uncompressed", unquantized), "uncompacted": unquantized}
+            if ground_truth:
+                targets["ground_truth"] = ground_truth
+            evaluator = _Judge(rasterizer, tests, targets, sf_sh)
+            evaluator.add("no compaction", scene.sh)
+            evaluator.add("AC set to 0", np.where(np.arange(scene.sh.shape[1])[:, None] == 0, scene.sh, np.float32(0)))
+            weights = measured_weights(device, scene, views)
+            compactor = Compactor(device)
+            for label, changes in settings:
+                chosen = replace(CompactionOptions(sf_sh=sf_sh), **changes)
+                sh = compactor.compact(scene, camera_centres(views), weights, chosen).sh
+                evaluator.add(label, sh, alpha=chosen.alpha, lam=chosen.lam)
         yield {
             "scene": folder.name,
             "pruned": pruned,

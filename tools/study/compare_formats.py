@@ -90,16 +90,15 @@ def _measure(args: argparse.Namespace) -> None:
     tool = (version.stdout + version.stderr).strip()
     results: dict[str, Any] = {**circumstances(device.info), "tool": tool, "scenes": {}}
     for folder in args.scenes:
-        evaluator = EvaluatedScene(folder, device)
-        rows = [_through(evaluator, folder / "point_cloud.ply", f, transform, args.timeout) for f in args.formats]
-        measured = [row for row in rows if row is not None]
-        for name, (size, lost, psnr) in EARLIER.get(evaluator.name, {}).items():
-            if f".{name.lower()}" not in {row["format"] for row in measured}:
-                row = {"format": name, "bytes": round(size * 1e6), "psnr": psnr, "psnr_loss": lost}
-                measured.append({**row, "measured": False})
-        results["scenes"][evaluator.name] = {**evaluator.facts(), "formats": measured}
-        write_json(args.json, results)
-        evaluator.free()
+        with EvaluatedScene(folder, device) as evaluator:
+            rows = [_through(evaluator, folder / "point_cloud.ply", f, transform, args.timeout) for f in args.formats]
+            measured = [row for row in rows if row is not None]
+            for name, (size, lost, psnr) in EARLIER.get(evaluator.name, {}).items():
+                if f".{name.lower()}" not in {row["format"] for row in measured}:
+                    row = {"format": name, "bytes": round(size * 1e6), "psnr": psnr, "psnr_loss": lost}
+                    measured.append({**row, "measured": False})
+            results["scenes"][evaluator.name] = {**evaluator.facts(), "formats": measured}
+            write_json(args.json, results)
 
 
 # ------------------------------------------------------------------------------------------------ report

@@ -26,7 +26,8 @@ from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import compiler_fault, list_devices
-from potr_cl.raster.rasterizer import GSPLAT, Rasterizer
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT
 
 SOURCE = Path(__file__).with_suffix(".c")
 # All of -ffast-math that does not reorder sums: 2^x rounds by adding and subtracting a large number.
@@ -68,39 +69,37 @@ def peak(library: ctypes.CDLL, threads: int) -> float:
 
 def measure(library: ctypes.CDLL, device: Device, scene: Scene, cameras: list[Camera]) -> tuple[float, float, float]:
     """Seconds of the kernel and of the C loop, each the best run of every view, and the pairs evaluated."""
-    rasterizer = Rasterizer(device, scene, GSPLAT)
-    kernel_seconds = loop_seconds = pairs = 0.0
-    for camera in cameras:
-        view = rasterizer.prepare(camera)
-        splats = view.shapes.size // 32
-        shapes = device.download(view.shapes, (splats, 8), np.float32)
-        colours = device.download(view.colours, (splats, 4), np.float32)
-        offsets = device.download(view.offsets, (view.tiles + 1,), np.uint32)
-        intersections = device.download(view.intersections, (view.intersection_count,), np.uint32)
-        image = np.zeros((camera.height, camera.width, 3), np.float32)
-        transmittance = np.zeros((camera.height, camera.width), np.float32)
-        kernel_best = loop_best = np.inf
-        for _ in range(REPEATS):  # in turns, so that a busy machine slows both
-            device.stage_times()
-            ours, _ = rasterizer.composite(view)
-            kernel_best = min(kernel_best, device.stage_times()["composite"])
-            started = time.perf_counter()
-            done = library.composite(
-                *(_pointer(a) for a in (shapes, colours, offsets, intersections)),
-                *(ctypes.c_int(n) for n in (view.columns, view.rows, camera.width, camera.height)),
-                ctypes.c_float(GSPLAT.alpha_cap),
-                ctypes.c_float(GSPLAT.transmittance_threshold),
-                _pointer(image),
-                _pointer(transmittance),
-            )
-            loop_best = min(loop_best, time.perf_counter() - started)
-        difference = float(np.quantile(np.abs(ours - image), 0.999))
-        assert difference < 1e-4, f"the C loop's picture differs by {difference}"
-        kernel_seconds += kernel_best
-        loop_seconds += loop_best
-        pairs += done
-        view.free()
-    rasterizer.free()
+    with Rasterizer(device, scene, GSPLAT) as rasterizer:
+        kernel_seconds = loop_seconds = pairs = 0.0
+        for camera in cameras:
+            with rasterizer.prepare(camera) as view:
+                splats = view.shapes.size // 32
+                shapes = device.download(view.shapes, (splats, 8), np.float32)
+                colours = device.download(view.colours, (splats, 4), np.float32)
+                offsets = device.download(view.offsets, (view.tiles + 1,), np.uint32)
+                intersections = device.download(view.intersections, (view.intersection_count,), np.uint32)
+                image = np.zeros((camera.height, camera.width, 3), np.float32)
+                transmittance = np.zeros((camera.height, camera.width), np.float32)
+                kernel_best = loop_best = np.inf
+                for _ in range(REPEATS):  # in turns, so that a busy machine slows both
+                    device.stage_times()
+                    ours, _ = rasterizer.composite(view)
+                    kernel_best = min(kernel_best, device.stage_times()["composite"])
+                    started = time.perf_counter()
+                    done = library.composite(
+                        *(_pointer(a) for a in (shapes, colours, offsets, intersections)),
+                        *(ctypes.c_int(n) for n in (view.columns, view.rows, camera.width, camera.height)),
+                        ctypes.c_float(GSPLAT.alpha_cap),
+                        ctypes.c_float(GSPLAT.transmittance_threshold),
+                        _pointer(image),
+                        _pointer(transmittance),
+                    )
+                    loop_best = min(loop_best, time.perf_counter() - started)
+                difference = float(np.quantile(np.abs(ours - image), 0.999))
+                assert difference < 1e-4, f"the C loop's picture differs by {difference}"
+                kernel_seconds += kernel_best
+                loop_seconds += loop_best
+                pairs += done
     return kernel_seconds, loop_seconds, pairs
 
 

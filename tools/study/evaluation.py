@@ -11,11 +11,12 @@ from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, test_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner
 from potr_cl.quality.compare import compare, find_ground_truth, mean_view
 from potr_cl.raster.rasterizer import Rasterizer
 
 
-class EvaluatedScene:
+class EvaluatedScene(Owner):
     """An uncompressed scene on the device, ready to be compared with others.
 
     Args:
@@ -51,11 +52,8 @@ class EvaluatedScene:
             ``truth_ssim`` against those, and ``psnr_loss`` and ``ssim_loss``, what the uncompressed scene has more.
             A PSNR of None means identical pictures.
         """
-        rasterizer = Rasterizer(self._device, candidate)
-        try:
+        with Rasterizer(self._device, candidate) as rasterizer:
             mean = mean_view(compare(self._rasterizer, rasterizer, self.views, self._ground_truth).views).figures
-        finally:
-            rasterizer.free()
         names = {"b_against_a": ("psnr", "ssim")}
         if self._ground_truth is not None:
             names["b_against_truth"] = ("truth_psnr", "truth_ssim")
@@ -76,6 +74,6 @@ class EvaluatedScene:
             "uncompressed": self(self.source),
         }
 
-    def free(self) -> None:
+    def close(self) -> None:
         """Give the device's memory back."""
-        self._rasterizer.free()
+        self._rasterizer.close()

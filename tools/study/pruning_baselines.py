@@ -23,7 +23,9 @@ from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.raster.rasterizer import TILE, Rasterizer, camera_struct
+from potr_cl.opencl.memory import Memory
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.view_set import TILE, camera_struct
 
 F64 = NDArray[np.float64]
 Indices = NDArray[np.int64]
@@ -56,20 +58,18 @@ def transmittance_sums(rasterizer: Rasterizer, cameras: Sequence[Camera]) -> F64
     group = TILE * TILE if device.family == "gpu" else 1
     total = np.zeros(rasterizer.splats)
     for camera in cameras:
-        view = rasterizer.prepare(camera)
-        sums = device.allocate(4 * view.intersection_count, "the sums of transmittances")
-        kernel.bind(
-            shapes=view.shapes,
-            offsets=view.offsets,
-            intersections=view.intersections,
-            view=camera_struct(camera),
-            sums=sums,
-        ).launch((view.tiles * group,), (group,))
-        weights = device.download(sums, (view.intersection_count,), np.float32)
-        splats = device.download(view.intersections, (view.intersection_count,), np.uint32)
-        total += np.bincount(splats, weights, rasterizer.splats)
-        device.free(sums)
-        view.free()
+        with rasterizer.prepare(camera) as view, Memory(device) as memory:
+            sums = memory.allocate(4 * view.intersection_count, "the sums of transmittances")
+            kernel.bind(
+                shapes=view.shapes,
+                offsets=view.offsets,
+                intersections=view.intersections,
+                view=camera_struct(camera),
+                sums=sums,
+            ).launch((view.tiles * group,), (group,))
+            weights = device.download(sums, (view.intersection_count,), np.float32)
+            splats = device.download(view.intersections, (view.intersection_count,), np.uint32)
+            total += np.bincount(splats, weights, rasterizer.splats)
     return total
 
 

@@ -96,20 +96,21 @@ def _measure(args: argparse.Namespace) -> None:
         results = json.loads(args.json.read_text())
     results |= {**circumstances(device.info), "device": device.info.name}
     for folder in args.scenes:
-        evaluator = EvaluatedScene(folder, device)
-        entry = results["scenes"].setdefault(evaluator.name, {**evaluator.facts(), "series": {}})
-        for name, options in series.items():
-            curve = entry["series"].setdefault(name, {"options": options, "encodes": []})
-            done = {point["q"] for point in curve["encodes"]}
-            for q in args.qualities:
-                if q in done:
-                    continue
-                point = measure_encode(evaluator, encode_options({**options, "q": q}), device)
-                curve["encodes"].append(point)
-                curve["encodes"].sort(key=lambda p: p["q"])
-                write_json(args.json, results)
-                print(f"{evaluator.name} {name} q {q:g}: {point['bytes']} bytes, {point['psnr']:.2f} dB", flush=True)
-        evaluator.free()
+        with EvaluatedScene(folder, device) as evaluator:
+            entry = results["scenes"].setdefault(evaluator.name, {**evaluator.facts(), "series": {}})
+            for name, options in series.items():
+                curve = entry["series"].setdefault(name, {"options": options, "encodes": []})
+                done = {point["q"] for point in curve["encodes"]}
+                for q in args.qualities:
+                    if q in done:
+                        continue
+                    point = measure_encode(evaluator, encode_options({**options, "q": q}), device)
+                    curve["encodes"].append(point)
+                    curve["encodes"].sort(key=lambda p: p["q"])
+                    write_json(args.json, results)
+                    print(
+                        f"{evaluator.name} {name} q {q:g}: {point['bytes']} bytes, {point['psnr']:.2f} dB", flush=True
+                    )
 
 
 # ------------------------------------------------------------------------------------------------ report

@@ -68,11 +68,8 @@ class Bench:
         return load_scene(self._kept)
 
     def render(self, scene: Scene) -> list[FloatArray]:
-        rasterizer = Rasterizer(self.device, scene)
-        try:
+        with Rasterizer(self.device, scene) as rasterizer:
             return [np.clip(rasterizer.render(view)[0], 0, 1) for view in self.views]
-        finally:
-            rasterizer.free()
 
     def error(self, scene: Scene, pictures: Sequence[FloatArray] | None = None) -> float:
         """Mean squared error against the uncompressed scene's pictures, or others; geometric mean of the views."""

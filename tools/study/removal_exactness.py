@@ -27,7 +27,8 @@ from numpy.typing import NDArray
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.opencl.device import Device
-from potr_cl.raster.rasterizer import INRIA, Rasterizer
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA
 from potr_cl.reference.raster import project
 from potr_cl.reference.removal import BruteForce
 from potr_cl.stages.pruning.removal import RemovalSweep
@@ -60,17 +61,16 @@ def spent(device: Device) -> float:
 def predicted(rasterizer: Rasterizer, cameras: Sequence[Camera], stop: float) -> tuple[F64, F64, float]:
     """ΔMSE, importance, and the seconds of a sweep, the best of some."""
     own = rasterizer.rules.transmittance_threshold
-    removal = RemovalSweep(
+    with RemovalSweep(
         rasterizer, cameras, SweepOptions(transmittance_threshold=None if np.float32(stop) == np.float32(own) else stop)
-    )
-    effect, importance = removal.measure()
-    seconds = []
-    for _ in range(REPEATS):
-        removal.sweep_everything()
-        started = spent(rasterizer.device)
-        removal.measure()
-        seconds.append(spent(rasterizer.device) - started)
-    removal.free()
+    ) as removal:
+        effect, importance = removal.measure()
+        seconds = []
+        for _ in range(REPEATS):
+            removal.sweep_everything()
+            started = spent(rasterizer.device)
+            removal.measure()
+            seconds.append(spent(rasterizer.device) - started)
     return effect, importance, min(seconds)
 
 
@@ -81,9 +81,8 @@ def measure(folder: Path, devices: Sequence[Device], views: int, splats: int) ->
     cameras = training[:: max(1, len(training) // views)][:views]
     predictions = []
     for device in devices:
-        rasterizer = Rasterizer(device, scene)
-        predictions.append([predicted(rasterizer, cameras, stop) for stop in THRESHOLDS])
-        rasterizer.free()
+        with Rasterizer(device, scene) as rasterizer:
+            predictions.append([predicted(rasterizer, cameras, stop) for stop in THRESHOLDS])
     chosen = choose_splats(predictions[0][0][1], splats)
 
     truth = np.zeros((2, len(THRESHOLDS), len(chosen)))

@@ -18,6 +18,7 @@ from __future__ import annotations
 
 import argparse
 from collections.abc import Sequence
+from contextlib import ExitStack
 from pathlib import Path
 
 import numpy as np
@@ -28,7 +29,8 @@ from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import Family
-from potr_cl.raster.rasterizer import INRIA, Rasterizer
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA
 from potr_cl.reference import raster as reference
 from potr_cl.reference.removal import BruteForce
 from potr_cl.stages.pruning.removal import RemovalSweep
@@ -60,12 +62,11 @@ def measure(device: Device, scene: Scene, cameras: Sequence[Camera]) -> tuple[F6
     """ΔMSE and importance of all splats of a whole scene, see
     :meth:`potr_cl.stages.pruning.removal.RemovalSweep.measure`.
     """
-    rasterizer = Rasterizer(device, scene)
-    removal = RemovalSweep(rasterizer, cameras, SweepOptions(transmittance_threshold=TRANSMITTANCE_THRESHOLD))
-    result = removal.measure()
-    removal.free()
-    rasterizer.free()
-    return result
+    with (
+        Rasterizer(device, scene) as rasterizer,
+        RemovalSweep(rasterizer, cameras, SweepOptions(transmittance_threshold=TRANSMITTANCE_THRESHOLD)) as removal,
+    ):
+        return removal.measure()
 
 
 def truth(scene: Scene, camera: Camera, splats: NDArray[np.int64]) -> F64:
@@ -121,20 +122,16 @@ def print_scene_errors(name: str, scene: Scene, camera: Camera, pair: tuple[Devi
 
 def time_sweeps(scene: Scene, cameras: Sequence[Camera], pair: tuple[Device, Device]) -> F64:
     """Seconds of a sweep over all tiles of all views, (repeats, 2), the formulas taking turns."""
-    rasterizers = [Rasterizer(device, scene) for device in pair]
-    removals = [
-        RemovalSweep(rasterizer, cameras, SweepOptions(-1, transmittance_threshold=TRANSMITTANCE_THRESHOLD))
-        for rasterizer in rasterizers
-    ]
+    options = SweepOptions(-1, transmittance_threshold=TRANSMITTANCE_THRESHOLD)
     seconds = np.zeros((REPEATS + 1, 2))
-    for times in seconds:
-        for i, (device, removal) in enumerate(zip(pair, removals, strict=True)):
-            started = spent(device)
-            removal.measure()
-            times[i] = spent(device) - started
-    for removal, rasterizer in zip(removals, rasterizers, strict=True):
-        removal.free()
-        rasterizer.free()
+    with ExitStack() as owned:
+        rasterizers = [owned.enter_context(Rasterizer(device, scene)) for device in pair]
+        removals = [owned.enter_context(RemovalSweep(rasterizer, cameras, options)) for rasterizer in rasterizers]
+        for times in seconds:
+            for i, (device, removal) in enumerate(zip(pair, removals, strict=True)):
+                started = spent(device)
+                removal.measure()
+                times[i] = spent(device) - started
     return seconds[1:]
 
 

@@ -53,8 +53,8 @@ kernel void removal(
     uint living = ALL_SUBTILES;
     uint kept = begin, swept = begin;
     for (uint read = begin; read < end; ++read) {
-        if (living && read + AHEAD < end)
-            prefetch_splat(shapes, colours, intersections[read + AHEAD]);
+        if (living && read + PREFETCH_AHEAD < end)
+            prefetch_splat(shapes, colours, intersections[read + PREFETCH_AHEAD]);
         const uint number = intersections[read];
         if (!alive[number] || sums[read].y < 0.0f)
             continue;
@@ -81,7 +81,7 @@ kernel void removal(
                 b[i] = MAD(weight, (vfloat)(splat.blue), b[i]);
             }
         }
-        if ((kept - begin) % AHEAD == 0)
+        if ((kept - begin) % PREFETCH_AHEAD == 0)
             living = living_subtiles(t);
     }
     lengths[tile] = kept - begin;
@@ -131,9 +131,9 @@ kernel void removal(
     }
 
     for (uint e = begin; e < swept; ++e) {
-        if (e + AHEAD < swept)
-            prefetch_splat(shapes, colours, intersections[e + AHEAD]);
-        if ((e - begin) % AHEAD == 0) {
+        if (e + PREFETCH_AHEAD < swept)
+            prefetch_splat(shapes, colours, intersections[e + PREFETCH_AHEAD]);
+        if ((e - begin) % PREFETCH_AHEAD == 0) {
             living = 0;
             for (int i = 0; i < SUBTILES; ++i)
                 if (ends[i] >= (int)(e - begin))

@@ -3,13 +3,14 @@
 
    Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2, INT64_ATOMICS, and TIGHTEN for what is shared. */
 
+/* As in prune/removal_gpu.cl. */
+#define SUMS 2
+#define PART float2
 #define ROUND 8
-#include "include/subtile_lists.clh"
+#define PADDING SHARE
+#include "include/subtile_batches.clh"
 #include "prune/removal.clh"
 #include "prune/staleness_gpu.clh"
-
-/* From one sub-tile's parts to the next: a little more than they need, so that sub-tiles lie in different banks. */
-#define NEXT_PARTS (PARTS + SHARE)
 
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 void removal(
@@ -36,11 +37,10 @@ void removal(
     volatile global uint *totals)
 {
     local State state;
-    local Batch near;
+    local Batch batch;
+    local Walk walk;
     local float behind_r[TILE * TILE], behind_g[TILE * TILE], behind_b[TILE * TILE];
-    local float2 all_parts[SUBTILES * NEXT_PARTS];
-    local int levels[2 * LEVELS * BATCH];
-    local int unfinished[2], end_of_subtile[SUBTILES], rounds[2];
+    local int unfinished[2];
 
     const int lid = get_local_id(0), share = lid % SHARE;
     const uint set_tile = tiles[start + get_group_id(0)];
@@ -59,12 +59,11 @@ void removal(
     const float weight = most_pixels / ((float)picture.x * picture.y);
     const float view_scale = scale * weight, view_bound = bound / weight;
 
-    for (int subtile = lid; subtile < SUBTILES; subtile += ITEMS)
-        end_of_subtile[subtile] = 0;
+    start_walk(&walk, lid);
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
-    uint batch;
+    uint first; /* of the intersections of the batch */
     const uint swept = forward(
-        &state, &near, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &batch);
+        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &first);
     /* What lies behind the last pixel's end has no effect any more. */
     for (uint e = swept + lid; e < length; e += ITEMS) {
         replace_sums(totals + TOTAL_WORDS * (size_t)intersections[e], sums[e], (float2)(0.0f), view_scale, view_bound);
@@ -92,27 +91,23 @@ void removal(
     }
     if (swept == 0)
         return;
-    atomic_max(&end_of_subtile[mine.subtile], end);
-    if (lid == 0)
-        rounds[0] = 0;
+    end_subtile(&walk, mine.subtile, end);
     barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
     if (lid < SUBTILES)
-        near.places[lid] = 0;
+        batch.places[lid] = 0;
 
-    local float2 *parts = all_parts + lid / SHARE * NEXT_PARTS;
-    int parity = 0;
-    for (batch = 0; batch < swept; batch += BATCH) {
-        const int size = min(swept - batch, (uint)BATCH);
-        fetch(&near, shapes, colours, intersections + batch, subtiles + batch, size, lid);
+    local PART *parts = walk.parts + lid / SHARE * SUBTILE_PARTS;
+    int turn = 0;
+    for (first = 0; first < swept; first += BATCH) {
+        const int size = min(swept - first, (uint)BATCH);
+        fetch(&batch, shapes, colours, intersections + first, subtiles + first, size, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
-        make_lists(&near, lid);
-        mine = pixels_of(near.dealt[lid / SHARE], origin, lid);
-        local const uchar *list = near.lists + mine.subtile * LIST_ROOM;
-        const int count = near.counts[mine.subtile];
-        const int place = near.places[mine.subtile];
-        const int left = clamp(end_of_subtile[mine.subtile] - place, 0, count);
-        if (share == 0)
-            atomic_max(&rounds[parity], (left + ROUND - 1) / ROUND);
+        make_lists(&batch, lid);
+        mine = pixels_of(batch.dealt[lid / SHARE], origin, lid);
+        local const uchar *list = batch.lists + mine.subtile * LIST_ROOM;
+        const int count = batch.counts[mine.subtile];
+        const int place = batch.places[mine.subtile];
+        const int left = intersections_left(&walk, mine.subtile, place, count, turn, lid);
         float t[PIXELS], r[PIXELS], g[PIXELS], b[PIXELS];
         float dr[PIXELS], dg[PIXELS], db[PIXELS], pr[PIXELS], pg[PIXELS], pb[PIXELS];
         int last[PIXELS];
@@ -134,21 +129,16 @@ void removal(
                 db[p] = 2.0f * (b[p] - pixel[2]);
             }
         }
-        for (int i = lid; i < BATCH; i += ITEMS)
-            for (int level = 0; level < 2 * LEVELS; ++level)
-                levels[level * BATCH + i] = 0;
+        clear_sums(&walk, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
-        const int all_rounds = rounds[parity];
-        parity ^= 1;
-        if (lid == 0)
-            rounds[parity] = 0;
+        const int rounds = agree_on_rounds(&walk, &turn, lid);
         if (share == 0)
-            near.places[mine.subtile] = place + places(count);
-        for (int first = 0; first < all_rounds * ROUND; first += ROUND) {
-            const int now = min(left - first, ROUND);
+            batch.places[mine.subtile] = place + places(count);
+        for (int done = 0; done < rounds * ROUND; done += ROUND) {
+            const int now = min(left - done, ROUND);
             for (int j = 0; j < now; ++j) {
-                const int i = first + j;
-                local const float4 *splat = near.shapes + 3 * list[i];
+                const int i = done + j;
+                local const float4 *splat = batch.shapes + 3 * list[i];
                 const float4 s0 = splat[0], s1 = splat[1];
                 const float blue_k = splat[2].x;
                 const float u0 = s0.z * (mine.x - s0.x);
@@ -178,15 +168,10 @@ void removal(
                 parts[j * SHARE + share] = (float2)(effect, importance);
             }
             barrier(CLK_LOCAL_MEM_FENCE);
-            const int summed = share / (SHARE / ROUND);
+            const int summed = summed_splat(share);
             if (summed < now) {
-                float2 sum = (float2)(0.0f);
-                for (int j = 0; j < ROUND; ++j)
-                    sum += parts[share * ROUND + ((j + summed) & (ROUND - 1))];
-                sum = clamp(sum, -view_bound / SUBTILES, view_bound / SUBTILES);
-                const int k = list[first + summed];
-                add_parts(levels + k, BATCH, sum.x);
-                add_parts(levels + LEVELS * BATCH + k, BATCH, sum.y);
+                const float2 sum = clamp(sum_parts(parts, share), -view_bound / SUBTILES, view_bound / SUBTILES);
+                add_to_sums(&walk, list[done + summed], sum);
             }
             barrier(CLK_LOCAL_MEM_FENCE);
         }
@@ -199,11 +184,9 @@ void removal(
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int i = lid; i < size; i += ITEMS) {
-            const float2 after =
-                (float2)(whole_sum(levels + i, BATCH), whole_sum(levels + LEVELS * BATCH + i, BATCH));
-            const float2 before = sums[batch + i];
-            replace_sums(totals + TOTAL_WORDS * (size_t)near.splats[i], before, after, view_scale, view_bound);
-            sums[batch + i] = after;
+            const float2 before = sums[first + i], after = sums_of(&walk, i);
+            replace_sums(totals + TOTAL_WORDS * (size_t)batch.splats[i], before, after, view_scale, view_bound);
+            sums[first + i] = after;
         }
     }
 }

@@ -35,13 +35,12 @@ def test_what_is_skipped_costs_less(needs):
 
 
 def test_views_that_look_away_see_nothing(needs):
-    rasterizer = Rasterizer(needs.device, needs.scene)
-    for camera in needs.views:
-        image, transmittance = rasterizer.render(looking_away(camera))
-        assert not image.any()
-        assert (transmittance == 1).all()
-        assert np.allclose(looking_away(camera).centre, camera.centre)
-    rasterizer.free()
+    with Rasterizer(needs.device, needs.scene) as rasterizer:
+        for camera in needs.views:
+            image, transmittance = rasterizer.render(looking_away(camera))
+            assert not image.any()
+            assert (transmittance == 1).all()
+            assert np.allclose(looking_away(camera).centre, camera.centre)
 
 
 def test_splats_that_nobody_sees_are_in_no_list(needs):
@@ -49,12 +48,9 @@ def test_splats_that_nobody_sees_are_in_no_list(needs):
     assert len(twice) == 2 * len(needs.scene)
     counts = []
     for scene in (needs.scene, twice):
-        rasterizer = Rasterizer(needs.device, scene)
-        view = rasterizer.prepare(needs.views[0])
-        counts.append(view.intersection_count)
-        view.free()
-        removal = RemovalSweep(rasterizer, needs.views, SweepOptions())
-        assert (removal.measure()[1][len(needs.scene) :] == 0).all()
-        removal.free()
-        rasterizer.free()
+        with Rasterizer(needs.device, scene) as rasterizer:
+            with rasterizer.prepare(needs.views[0]) as view:
+                counts.append(view.intersection_count)
+            with RemovalSweep(rasterizer, needs.views, SweepOptions()) as removal:
+                assert (removal.measure()[1][len(needs.scene) :] == 0).all()
     assert counts[0] == counts[1] > 0

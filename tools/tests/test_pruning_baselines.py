@@ -8,18 +8,19 @@ import numpy as np
 import pytest
 
 from potr_cl.opencl.device import Device
-from potr_cl.raster.rasterizer import GSPLAT, INRIA, Rasterizer
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.reference import raster as reference
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from tests.devices import KERNELS, open_device
+from tests.devices import FAMILIES, open_device
 from tools.bench.pruning import pareto
 from tools.study import pruning_baselines as baselines
 from tools.study.pruning_baselines import mesongs_power, removal_order, scores, transmittance_sums
 
 
-@pytest.fixture(scope="module", params=KERNELS)
+@pytest.fixture(scope="module", params=FAMILIES)
 def device(request):
     chosen = open_device(request.param)
     device = Device(chosen.info, family=chosen.family, variants=baselines.KERNELS)
@@ -63,13 +64,11 @@ def sums_by_definition(scene, camera, rules):
 def test_transmittance_sums(device, rules):
     scene = layered_scene(150, 3)
     cameras = ring_of_cameras(3, size=50)  # the last tiles are cut
-    rasterizer = Rasterizer(device, scene, rules)
-    found = transmittance_sums(rasterizer, cameras)
-    again = transmittance_sums(rasterizer, cameras)
-    sweep = RemovalSweep(rasterizer, cameras, SweepOptions(0, 1, transmittance_threshold=None))
-    importance = sweep.measure()[1] * sum(c.width * c.height for c in cameras)
-    sweep.free()
-    rasterizer.free()
+    with Rasterizer(device, scene, rules) as rasterizer:
+        found = transmittance_sums(rasterizer, cameras)
+        again = transmittance_sums(rasterizer, cameras)
+        with RemovalSweep(rasterizer, cameras, SweepOptions(0, 1, transmittance_threshold=None)) as sweep:
+            importance = sweep.measure()[1] * sum(c.width * c.height for c in cameras)
     wanted = [sums_by_definition(scene, c, rules) for c in cameras]
     assert sum(w[2] for w in wanted) > 100, "no pixel ends early: the rule is not tested"
     plain = sum(w[0] for w in wanted)
@@ -84,9 +83,8 @@ def test_transmittance_sums(device, rules):
 def test_a_view_that_sees_nothing(device):
     scene = layered_scene(20, 1)
     scene = dataclasses.replace(scene, means=scene.means + np.float32(100))
-    rasterizer = Rasterizer(device, scene)
-    assert not transmittance_sums(rasterizer, ring_of_cameras(2)[:1]).any()
-    rasterizer.free()
+    with Rasterizer(device, scene) as rasterizer:
+        assert not transmittance_sums(rasterizer, ring_of_cameras(2)[:1]).any()
 
 
 def test_scores():

@@ -14,14 +14,14 @@ from tools.study.removal_formulas import devices
 
 def measure(device, scene, cameras, background):
     """Effects and importances of the whole scene, and of what is left when every third splat is gone."""
-    rasterizer = Rasterizer(device, scene, background=background)
-    removal = RemovalSweep(rasterizer, cameras, SweepOptions(0))
-    whole = np.stack(removal.measure())
-    gone = np.arange(0, len(scene), 3)
-    removal.remove(gone)
-    rest = np.delete(np.stack(removal.measure()), gone, axis=1)
-    removal.free()
-    rasterizer.free()
+    with (
+        Rasterizer(device, scene, background=background) as rasterizer,
+        RemovalSweep(rasterizer, cameras, SweepOptions(0)) as removal,
+    ):
+        whole = np.stack(removal.measure())
+        gone = np.arange(0, len(scene), 3)
+        removal.remove(gone)
+        rest = np.delete(np.stack(removal.measure()), gone, axis=1)
     assert device.allocated == 0
     return whole, rest
 

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from potr_cl.raster.rasterizer import INRIA
+from potr_cl.raster.rules import INRIA
 from potr_cl.reference import raster as reference
 from potr_cl.reference.scenes import random_splats, ring_of_cameras
 from tools.results import ROOT, Column, Results, circumstances, write_json

@@ -8,15 +8,15 @@ import numpy as np
 import pytest
 
 from potr_cl.opencl.device import Device
-from potr_cl.raster.rasterizer import GSPLAT, INRIA
+from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.reference import raster as reference
 from potr_cl.reference.scenes import random_splats, tilted_camera
-from tests.devices import KERNELS, open_device
+from tests.devices import FAMILIES, open_device
 from tools.stress import cases as stress_cases
 from tools.stress import run as stress
 
 
-@pytest.fixture(scope="module", params=KERNELS)
+@pytest.fixture(scope="module", params=FAMILIES)
 def device(request):
     device = open_device(request.param)
     yield device

@@ -1,21 +1,29 @@
-/* Spherical-harmonics energy compaction: a weighted ridge regression a splat and colour channel (paper section
-   "Spherical harmonics energy compaction"), LANES splats a work-item in structure-of-arrays form.
+/* Spherical-harmonics energy compaction: a weighted ridge regression for each splat and colour channel (paper section
+   "Spherical harmonics energy compaction"). A work-item does LANES splats in structure-of-arrays form. Both kernel
+   families use it.
 
-   Per splat: the SH basis in the directions from the views that see it, rows times weights, is reduced to a triangle
-   (ridge_orthogonal.clh or ridge_cholesky.clh); nearly parallel columns are dropped; each channel is solved, the AC
-   coefficients that quantise to zero are dropped, and it is solved again. The colours to match are the basis times the
-   splat's own coefficients, so they are never formed: only the difference to the known coefficients enters. The DC term
-   is not penalised, so the unknown is its change, which keeps its digits out of the AC terms' rounding.
+   For a splat, the rows of its basis matrix are the SH basis in the directions from the views that see it, times the
+   views' weights. The matrix is reduced to a triangle (ridge_orthogonal.clh or ridge_cholesky.clh), and nearly parallel
+   columns are dropped. Each channel is solved, the AC coefficients that quantise to zero are dropped, and it is solved
+   again. The colours to match are the basis times the splat's own coefficients, so they are never formed: only the
+   difference to the known coefficients matters. The DC term is not penalised, so the unknown is its change, which keeps
+   its digits out of the rounding of the AC terms.
 
-   Macros: LANES, DOUBLE, SH_COUNT (4, 9 or 16), BLOCK (rows reduced at a time), ORTHOGONAL, SHIFT_DC, and those of
-   ridge_cholesky.clh. */
+   Macros:
+       LANES, DOUBLE        see reals.clh; LANES is 1 on GPUs;
+       SH_COUNT             coefficients of a channel: 4, 9 or 16;
+       BLOCK                rows of the matrix that are reduced at a time;
+       ORTHOGONAL           1: reduce by reflections (ridge_orthogonal.clh);
+                            0: by the normal equations (ridge_cholesky.clh);
+       SHIFT_DC             1: solve for the change of the DC term, 0: for the term itself;
+       SCALED, REFINEMENTS  see ridge_cholesky.clh. */
 
 #include "include/reals.clh"
 #include "include/sh_basis.clh"
 
 #define TRIANGLE (SH_COUNT * (SH_COUNT + 1) / 2)
 #define AT(row, column) ((row) * (2 * SH_COUNT - (row) - 1) / 2 + (column))
-/* Relative size under which what remains of a column is rounding. */
+/* Of a column of which less than this part remains, only rounding remains. */
 #define TOLERANCE (4 * ROUNDING)
 /* An AC coefficient is at most this times the larger of 1 and the norm of the channel's original coefficients. */
 #define LARGEST_GROWTH 4
@@ -26,7 +34,8 @@
 #include "compact/ridge_cholesky.clh"
 #endif
 
-/* 1 for the columns to use: not zero, and |cosine| to every column used before it at most threshold. */
+/* keep becomes 1 for the columns to use. They are not zero, and the |cosine| to every column used before is at most
+   `threshold`. */
 inline void drop_parallel(const VREAL *state, REAL threshold, VREAL *keep)
 {
     VREAL norm[SH_COUNT];
@@ -42,18 +51,18 @@ inline void drop_parallel(const VREAL *state, REAL threshold, VREAL *keep)
 }
 
 kernel void compact(
-    global float *sh,                /* splats x SH_COUNT x 3, R, G, B; replaced */
+    global float *sh,                    /* splats x SH_COUNT x 3, R, G, B; replaced */
     global const float4 *means,
-    global const uint *order,        /* splats seen by any view in the order of their numbers of views */
-    global const uint *offsets,      /* of each splat's run in views and weights, splats + 1 */
-    global const uint *views,
+    global const uint *order,            /* the splats that any view sees, by how many views see them */
+    global const uint *offsets,          /* where each splat's run in view_numbers and weights begins; splats + 1 */
+    global const uint *view_numbers,
     global const float *weights,
-    global const float4 *camera_centres,       /* two a view: the high and the low part of its position */
-    uint splats,
+    global const float4 *camera_centres, /* two for each view: the high and the low part of its position */
+    uint splats,                         /* that order holds */
     float threshold,
     float lambda_luma,
     float lambda_chroma,
-    float scale_factor,              /* of the quantiser; 0: one pass only */
+    float scale_factor,                  /* of the quantiser; 0: one pass only */
     int ycocg)
 {
     const uint first = get_global_id(0) * LANES;
@@ -68,8 +77,9 @@ kernel void compact(
         centre[lane] = TO_REAL4(means[splat[lane]]);
         longest = max(longest, end[lane] - cursor[lane]);
     }
-    /* Work-items beyond the last splat. Not known by their number alone: Intel's CPU runtime would run a work-group cut
-       short by that through its scalar code, which rounds differently (it fuses other products and sums). */
+    /* Work-items beyond the last splat end here. Their number alone must not tell that: Intel's CPU runtime would run a
+       work-group cut short by it through its scalar code, which rounds differently (it fuses other products and
+       sums). */
     if (longest == 0)
         return;
 
@@ -83,8 +93,9 @@ kernel void compact(
                 uint entry = cursor[lane] + done + b;
                 bool present = entry < end[lane];
                 entry = present ? entry : cursor[lane];
-                uint view = views[entry];
-                REAL4 to_splat = centre[lane] - TO_REAL4(camera_centres[2 * view]) - TO_REAL4(camera_centres[2 * view + 1]);
+                uint view = view_numbers[entry];
+                REAL4 high = TO_REAL4(camera_centres[2 * view]), low = TO_REAL4(camera_centres[2 * view + 1]);
+                REAL4 to_splat = centre[lane] - high - low;
                 ray[b][0][lane] = to_splat.x;
                 ray[b][1][lane] = to_splat.y;
                 ray[b][2][lane] = to_splat.z;
@@ -138,7 +149,7 @@ kernel void compact(
             solve(state, target, keep, lambda, x);
         }
 
-        /* The minimum is no larger than the objective at the original coefficients with the dropped ones zeroed. */
+        /* The minimum must not be larger than the objective at the original coefficients with the dropped ones zero. */
         VREAL error[SH_COUNT], start_error[SH_COUNT];
         VREAL penalty = 0, start_penalty = 0, largest = 0;
         for (int k = 0; k < SH_COUNT; ++k) {
@@ -158,8 +169,9 @@ kernel void compact(
         x[0] += coefficients[c][0];
 #endif
         for (int k = 0; k < SH_COUNT; ++k) {
-            /* Read before the choice: Intel's CPU compiler makes of a choice between two private array elements a read
-               at a chosen address, and its vectoriser gives all work-items what the first one reads there. */
+            /* It is read before the choice. Of a choice between two elements of private arrays Intel's CPU compiler
+               makes a read at a chosen address, and its vectoriser gives all work-items what the first one reads
+               there. */
             VREAL own = coefficients[c][k];
             VREAL accepted = objective <= LITERAL(1.01) * start + noise ? x[k] : own;
             coefficients[c][k] = largest <= limit ? accepted : own;

@@ -1,22 +1,26 @@
-/* The pruning controller's choice on the device: which splats go in an iteration. See pruning.py for the rules.
+/* The choice of the pruning controller on the device: which splats go in an iteration. The rules are those of
+   stages/pruning/schedule.py, which is its twin on the host.
 
-   Candidates go by ascending score, up to and including the one with which their importances reach the iteration's budget.
-   The score of that one is found digit by digit: histograms of the candidates' importances over 8 bits of the score at a
-   time. Importances are integers (totals.clh), so that no sum depends on the order of its terms. */
+   Candidates go by ascending score, up to and including the one with which their importances reach the iteration's
+   budget. The score of that one is found digit by digit, from histograms of the candidates' importances over 8 bits of
+   the score at a time. Importances are integers (totals.clh), so that no sum depends on the order of its terms.
+
+   Macros: INT64_ATOMICS (see totals.clh). */
 
 #include "include/totals.clh"
 #include "prune/removal.clh"
 
-/* Bits of a key looked at at a time, as the number of their values, and how many times. */
+/* How many values a digit of a key has, and how many digits a key has. */
 #define DIGIT 256
 #define DIGITS 4
 
-/* A splat's score as an unsigned integer that sorts like it; two values are left over. */
+/* A splat's key is its score as an unsigned integer that sorts like the score. Two values mean something else. */
 #define GOES_AT_ONCE 0u
 #define STAYS 0xFFFFFFFFu
 #define LAST_KEY 0xFFFFFFFEu
 
-/* In the state buffer: a histogram a digit, each bin a total of two words; what is known after each digit; a counter. */
+/* The state buffer holds a histogram for each digit, of which each bin is a total of two words; then CUT words of what
+   is known after each digit; then the number of splats that go. */
 #define HISTOGRAM (2 * DIGIT)
 #define CUTS (DIGITS * HISTOGRAM)
 #define CUT 4
@@ -38,7 +42,7 @@ inline float mapping(float x, float a)
     return x >= 0.0f ? x : (sqrt(1.0f - 2.0f * a * x) - 1.0f) / a;
 }
 
-/* Add a candidate's importance to a bin of a work-group's own histogram. */
+/* Adds a candidate's importance to a bin of the work-group's own histogram. */
 inline void add_local(volatile local uint *bin, ulong importance)
 {
     const uint low = (uint)importance, before = atomic_add(bin, low);
@@ -59,9 +63,10 @@ typedef struct {
     ulong rest;
 } Cut;
 
-/* One digit more: the first bin with which the budget is reached. Every work-group finds it for itself; the first one
-   leaves it in the state for the next digit. */
-inline Cut next_cut(global uint *state, int digit, uint remaining, uint lid, local ulong *sums, volatile local uint *found)
+/* Finds one digit more of the last key that goes: the first bin with which the budget is reached. Every work-group
+   finds it for itself; the first one leaves it in the state for the next digit. */
+inline Cut next_cut(
+    global uint *state, int digit, uint remaining, uint lid, local ulong *sums, volatile local uint *found)
 {
     global const uint *bin = state + digit * HISTOGRAM + 2 * lid;
     sums[lid] = (ulong)bin[1] << 32 | bin[0];
@@ -97,14 +102,14 @@ inline Cut next_cut(global uint *state, int digit, uint remaining, uint lid, loc
     return cut;
 }
 
-/* A work-group's histogram to that of all. */
+/* Adds a work-group's histogram to that of all work-groups. */
 inline void merge(global uint *state, int digit, local const uint *bins, uint lid)
 {
     const ulong sum = (ulong)bins[2 * lid + 1] << 32 | bins[2 * lid];
     add_fixed(state + digit * HISTOGRAM + 2 * lid, (long)sum);
 }
 
-/* Every splat's smoothed effect and key, and the histogram of the keys' first digit. */
+/* Finds every splat's smoothed effect and key, and the histogram of the keys' first digit. */
 kernel __attribute__((reqd_work_group_size(DIGIT, 1, 1)))
 void rank(
     uint splats,
@@ -145,7 +150,7 @@ void rank(
     merge(state, 0, bins, lid);
 }
 
-/* The histogram of another digit, of the keys that begin as the last one that goes. */
+/* Finds the histogram of another digit, of those keys that begin like the last one that goes. */
 kernel __attribute__((reqd_work_group_size(DIGIT, 1, 1)))
 void refine(
     uint splats,
@@ -172,7 +177,7 @@ void refine(
     merge(state, digit, bins, lid);
 }
 
-/* Mark those that go as just removed, note when and at what cost, and count them. */
+/* Marks the splats that go as just removed, notes when they went and at what cost, and counts them. */
 kernel __attribute__((reqd_work_group_size(DIGIT, 1, 1)))
 void mark(
     uint splats,

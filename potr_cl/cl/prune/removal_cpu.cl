@@ -226,8 +226,8 @@ kernel void removal(
             walk_back(splats, lists[i], walked, twice[i], behind[i], memory, fresh);
         }
         for (uint k = 0; k < count; ++k) {
-            if (k + AHEAD < count)
-                PREFETCH_TO_WRITE(totals + TOTAL_WORDS * intersections[from + k + AHEAD]);
+            if (k + PREFETCH_AHEAD < count)
+                PREFETCH_TO_WRITE(totals + TOTAL_WORDS * intersections[from + k + PREFETCH_AHEAD]);
             replace_sums(totals + TOTAL_WORDS * intersections[from + k], sums[from + k], fresh[k], scale, bound);
             sums[from + k] = TIGHTEN && !touching[k] ? NEVER : fresh[k];
         }

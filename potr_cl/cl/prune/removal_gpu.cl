@@ -1,15 +1,17 @@
-/* Removal effects for GPUs, all views of a set in one launch: one work-group a tile. See removal_cpu.cl for the method, and
-   subtile_lists.clh for how a tile's work is shared out.
+/* Removal effects for GPUs, all views of a set in one launch: one work-group a tile. See removal_cpu.cl, its twin, for the
+   method, subtile_lists.clh for how a tile's work is shared out, and subtile_batches.clh for the walk back.
 
-   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, TIGHTEN, NATIVE_EXP2, INT64_ATOMICS. */
+   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2 (see subtile_lists.clh), INT64_ATOMICS (see totals.clh), TIGHTEN (1:
+   mark the intersections that touch no pixel). */
 
+/* A splat's effect and importance, of eight splats at a time; with the padding, sub-tiles lie in different banks. */
+#define SUMS 2
+#define PART float2
 #define ROUND 8
-#include "include/subtile_lists.clh"
+#define PADDING SHARE
+#include "include/subtile_batches.clh"
 #include "prune/removal.clh"
 #include "prune/staleness_gpu.clh"
-
-/* From one sub-tile's parts to the next: a little more than they need, so that sub-tiles lie in different banks. */
-#define NEXT_PARTS (PARTS + SHARE)
 
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 void removal(
@@ -36,11 +38,10 @@ void removal(
     volatile global uint *totals)
 {
     local State state;
-    local Batch near;
+    local Batch batch;
+    local Walk walk;
     local float behind_r[TILE * TILE], behind_g[TILE * TILE], behind_b[TILE * TILE];
-    local float2 all_parts[SUBTILES * NEXT_PARTS];
-    local int levels[2 * LEVELS * BATCH];
-    local int unfinished[2], end_of_subtile[SUBTILES], rounds[2];
+    local int unfinished[2];
 #if TIGHTEN
     local int reached[BATCH];
 #endif
@@ -62,12 +63,11 @@ void removal(
     const float weight = most_pixels / ((float)picture.x * picture.y);
     const float view_scale = scale * weight, view_bound = bound / weight;
 
-    for (int subtile = lid; subtile < SUBTILES; subtile += ITEMS)
-        end_of_subtile[subtile] = 0;
+    start_walk(&walk, lid);
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
-    uint batch;
+    uint first; /* of the intersections of the batch */
     const uint swept = forward(
-        &state, &near, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &batch);
+        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &first);
     /* What lies behind the last pixel's end has no effect any more. */
     for (uint e = swept + lid; e < length; e += ITEMS) {
         replace_sums(totals + TOTAL_WORDS * (size_t)intersections[e], sums[e], (float2)(0.0f), view_scale, view_bound);
@@ -103,23 +103,19 @@ void removal(
 #if TIGHTEN
     end = INT_MAX; /* every intersection shows whether it touches a pixel */
 #endif
-    atomic_max(&end_of_subtile[mine.subtile], end);
-    if (lid == 0)
-        rounds[0] = 0;
+    end_subtile(&walk, mine.subtile, end);
     barrier(CLK_LOCAL_MEM_FENCE);
 
     /* Back, from the last splat to the first. */
-    local float2 *parts = all_parts + lid / SHARE * NEXT_PARTS;
-    int parity = 0;
+    local PART *parts = walk.parts + lid / SHARE * SUBTILE_PARTS;
+    int turn = 0;
     for (;;) {
-        const int size = min(swept - batch, (uint)BATCH);
-        mine = pixels_of(near.dealt[lid / SHARE], origin, lid);
-        local const uchar *list = near.lists + mine.subtile * LIST_ROOM;
-        const int count = near.counts[mine.subtile];
-        const int place = near.places[mine.subtile] - places(count);
-        int left = clamp(end_of_subtile[mine.subtile] - place, 0, count);
-        if (share == 0)
-            atomic_max(&rounds[parity], (left + ROUND - 1) / ROUND);
+        const int size = min(swept - first, (uint)BATCH);
+        mine = pixels_of(batch.dealt[lid / SHARE], origin, lid);
+        local const uchar *list = batch.lists + mine.subtile * LIST_ROOM;
+        const int count = batch.counts[mine.subtile];
+        const int place = batch.places[mine.subtile] - places(count);
+        int left = intersections_left(&walk, mine.subtile, place, count, turn, lid);
         float t[PIXELS], r[PIXELS], g[PIXELS], b[PIXELS], br[PIXELS], bg[PIXELS], bb[PIXELS];
         int last[PIXELS];
         for (int p = 0; p < PIXELS; ++p) {
@@ -133,27 +129,22 @@ void removal(
             bg[p] = behind_g[i];
             bb[p] = behind_b[i];
         }
-        for (int i = lid; i < BATCH; i += ITEMS) {
-            for (int level = 0; level < 2 * LEVELS; ++level)
-                levels[level * BATCH + i] = 0;
+        clear_sums(&walk, lid);
 #if TIGHTEN
+        for (int i = lid; i < BATCH; i += ITEMS)
             reached[i] = 0;
 #endif
-        }
         barrier(CLK_LOCAL_MEM_FENCE);
-        const int all_rounds = rounds[parity];
-        parity ^= 1;
-        if (lid == 0)
-            rounds[parity] = 0;
+        const int rounds = agree_on_rounds(&walk, &turn, lid);
         if (share == 0)
-            near.places[mine.subtile] = place;
-        for (int round = 0; round < all_rounds; ++round, left -= ROUND) {
+            batch.places[mine.subtile] = place;
+        for (int round = 0; round < rounds; ++round, left -= ROUND) {
             const int now = min(left, ROUND);
 #pragma unroll 2
             for (int j = 0; j < now; ++j) {
                 const int i = left - 1 - j;
                 const int k = list[i];
-                local const float4 *splat = near.shapes + 3 * k;
+                local const float4 *splat = batch.shapes + 3 * k;
                 const float4 s0 = splat[0], s1 = splat[1];
                 const float blue_k = splat[2].x;
                 const float u0 = s0.z * (mine.x - s0.x);
@@ -183,16 +174,10 @@ void removal(
                 parts[j * SHARE + share] = (float2)(effect, importance);
             }
             barrier(CLK_LOCAL_MEM_FENCE);
-            const int summed = share / (SHARE / ROUND);
+            const int summed = summed_splat(share);
             if (summed < now) {
-                float2 sum = (float2)(0.0f);
-                for (int j = 0; j < ROUND; ++j)
-                    /* Turned by the work-item's number, so that neighbours read from different banks. */
-                    sum += parts[share * ROUND + ((j + summed) & (ROUND - 1))];
-                sum = clamp(sum, -view_bound / SUBTILES, view_bound / SUBTILES);
-                const int k = list[left - 1 - summed];
-                add_parts(levels + k, BATCH, sum.x);
-                add_parts(levels + LEVELS * BATCH + k, BATCH, sum.y);
+                const float2 sum = clamp(sum_parts(parts, share), -view_bound / SUBTILES, view_bound / SUBTILES);
+                add_to_sums(&walk, list[left - 1 - summed], sum);
             }
             barrier(CLK_LOCAL_MEM_FENCE);
         }
@@ -205,21 +190,19 @@ void removal(
         }
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int i = lid; i < size; i += ITEMS) {
-            const float2 after =
-                (float2)(whole_sum(levels + i, BATCH), whole_sum(levels + LEVELS * BATCH + i, BATCH));
-            const float2 before = sums[batch + i];
-            replace_sums(totals + TOTAL_WORDS * (size_t)near.splats[i], before, after, view_scale, view_bound);
+            const float2 before = sums[first + i], after = sums_of(&walk, i);
+            replace_sums(totals + TOTAL_WORDS * (size_t)batch.splats[i], before, after, view_scale, view_bound);
 #if TIGHTEN
-            sums[batch + i] = reached[i] ? after : NEVER;
+            sums[first + i] = reached[i] ? after : NEVER;
 #else
-            sums[batch + i] = after;
+            sums[first + i] = after;
 #endif
         }
-        if (batch == 0)
+        if (first == 0)
             break;
-        batch -= BATCH;
-        fetch(&near, shapes, colours, intersections + batch, subtiles + batch, BATCH, lid);
+        first -= BATCH;
+        fetch(&batch, shapes, colours, intersections + first, subtiles + first, BATCH, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
-        make_lists(&near, lid);
+        make_lists(&batch, lid);
     }
 }

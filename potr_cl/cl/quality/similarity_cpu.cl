@@ -1,22 +1,23 @@
-/* The sums of PSNR and SSIM for CPUs: ROWS rows of BLOCK values a work-item.
+/* The sums of PSNR and SSIM, for CPUs: ROWS rows of BLOCK values a work-item. similarity_gpu.cl is its twin.
 
-   Rows are taken as they lie in memory, R, G and B in turn: what is k pixels away in the same channel is 3 k values away.
-   Each row's means under the window along it go into a ring of as many rows as the window has, those under the whole window
-   are taken from there. Pictures go on with zeros beyond their borders.
+   Rows are taken as they lie in memory, with R, G and B in turn: what is k pixels away in the same channel is 3 k
+   values away. Each row's means under the window along the row go into a ring that has as many rows as the window. The
+   means under the whole window are made from that ring. Beyond its borders a picture goes on with zeros.
 
-   Macros: LANES, and those of similarity.clh. */
+   Macros: LANES (8 or 16, see lanes.clh), and those of similarity.clh. */
 
 #include "include/lanes.clh"
 #include "quality/similarity.clh"
 
 #define ROWS 32
 #define BLOCK 96
-#define BESIDE 16 /* values of the window on either side of a block, and one more, to be a multiple of LANES */
+#define BESIDE 16 /* values of the window on either side of a block, and one more to make a multiple of LANES */
 #define WIDE (BLOCK + 2 * BESIDE)
 #define RING (2 * RADIUS + 1)
 #define VECTORS (BLOCK / LANES)
 
-/* Adds a row's sum to the rows' before it, with what rounding has lost: values that are all alike are all rounded alike. */
+/* Adds a row's sum to that of the rows before it, and makes up for what rounding has lost: where all values are alike,
+   all are rounded in the same direction. */
 #define ADD_ROW(value, sum, lost) \
     { \
         const vfloat mended = (value) - lost, total = sum + mended; \
@@ -24,7 +25,7 @@
         sum = total; \
     }
 
-/* sums: of each work-item, squared errors and 1 - SSIM. */
+/* sums[first_sum + i] becomes work-item i's sums of squared errors and of 1 - SSIM. */
 kernel void similarity(
     global const float *images,
     ulong first_image,
@@ -98,7 +99,8 @@ kernel void similarity(
         }
         if (row < top + RADIUS)
             continue;
-        /* The window's middle row is RADIUS rows up; its rows lie in the ring from the slot after this one on. */
+        /* The window's middle row is RADIUS rows above this one. Its rows lie in the ring from the slot after this one
+           on. */
         int slots[RING];
         for (int k = 0; k < RING; ++k)
             slots[k] = (slot + 1 + k) % RING;

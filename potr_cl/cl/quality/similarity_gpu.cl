@@ -1,6 +1,9 @@
-/* The sums of PSNR and SSIM for GPUs: a work-group of GROUP x GROUP items a tile of as many pixels, channel by channel.
+/* The sums of PSNR and SSIM, for GPUs: a work-group of GROUP x GROUP work-items does a tile of as many pixels, channel
+   by channel. similarity_cpu.cl is its twin.
 
-   Pictures go on with zeros beyond their borders. Macros: those of similarity.clh. */
+   Beyond its borders a picture goes on with zeros.
+
+   Macros: those of similarity.clh. */
 
 #define LANES 1
 #include "include/lanes.clh"
@@ -9,7 +12,7 @@
 #define GROUP 16
 #define WIDE (GROUP + 2 * RADIUS)
 
-/* sums: of each work-group, squared errors and 1 - SSIM. */
+/* sums[first_sum + i] becomes work-group i's sums of squared errors and of 1 - SSIM. */
 kernel __attribute__((reqd_work_group_size(GROUP, GROUP, 1))) void similarity(
     global const float *images,
     ulong first_image,
@@ -32,7 +35,8 @@ kernel __attribute__((reqd_work_group_size(GROUP, GROUP, 1))) void similarity(
 
     float2 sum = (float2)(0.0f, 0.0f);
     for (int channel = 0; channel < 3; ++channel) {
-        const float middle_x = CLAMPED(image[3 * middle + channel]), middle_y = CLAMPED(reference[3 * middle + channel]);
+        const float middle_x = CLAMPED(image[3 * middle + channel]);
+        const float middle_y = CLAMPED(reference[3 * middle + channel]);
         const float2 taken = (float2)(middle_x + middle_y, middle_x - middle_y);
         for (int i = item; i < WIDE * WIDE; i += GROUP * GROUP) {
             const int column = left + i % WIDE - RADIUS, row = top + i / WIDE - RADIUS;

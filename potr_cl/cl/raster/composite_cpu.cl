@@ -1,13 +1,22 @@
-/* Compositing for CPUs: one tile a work-item, splat by splat, over the sub-tiles that the splat's ellipse touches.
+/* Composites the splats to a picture, for CPUs: one tile a work-item. It goes splat by splat over the sub-tiles that
+   the splat's ellipse touches. composite_gpu.cl is its twin.
 
-   The 256 pixels' state lives in private memory, a vector a sub-tile. A pixel that has ended keeps the negative of its
-   transmittance. Every AHEAD splats the sub-tiles that go on are found; the tile ends when none does.
+   The state of the 256 pixels lives in private memory, one vector for each sub-tile. A pixel that has ended keeps the
+   negative of its transmittance. Every LOOK_EVERY splats it is found which sub-tiles go on. The tile ends when none
+   does.
 
-   Macros: LANES, ALPHA_CAP, TRANSMITTANCE_THRESHOLD (a pixel ends before its transmittance would fall below it). */
+   Macros:
+       LANES                               8 or 16, see lanes.clh;
+       ALPHA_CAP, TRANSMITTANCE_THRESHOLD  see subtile_vectors.clh;
+       LOOK_EVERY                          16 by default. */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
 #include "include/subtile_vectors.clh"
+
+#ifndef LOOK_EVERY
+#define LOOK_EVERY 16
+#endif
 
 kernel void composite(
     global const float4 *shapes,
@@ -36,8 +45,8 @@ kernel void composite(
     uint living = ALL_SUBTILES;
     const uint begin = min(offsets[tile], capacity);
     for (uint e = begin; e < end && living; ++e) {
-        if (e + AHEAD < end)
-            prefetch_splat(shapes, colours, intersections[e + AHEAD]);
+        if (e + PREFETCH_AHEAD < end)
+            prefetch_splat(shapes, colours, intersections[e + PREFETCH_AHEAD]);
         uint todo = subtiles[e] & living;
         if (todo) {
             const Splat splat = load_splat(shapes, colours, intersections[e]);
@@ -50,7 +59,7 @@ kernel void composite(
                 b[i] = MAD(weight, (vfloat)(splat.blue), b[i]);
             }
         }
-        if ((e - begin) % AHEAD == AHEAD - 1)
+        if ((e - begin) % LOOK_EVERY == LOOK_EVERY - 1)
             living = living_subtiles(t);
     }
 

@@ -1,31 +1,33 @@
-/* Compositing of one view alone for GPUs: one work-group a tile, one pixel a work-item (32 in a row make a block of 8 x 4
-   pixels), splats fetched into local memory in batches.
+/* Composites one view alone, for GPUs: one work-group a tile, one pixel a work-item (32 in a row make a block of 8 x 4
+   pixels). Splats are fetched into local memory in batches.
 
-   A frame that nothing runs beside takes as long as its longest tile list, which one work-group walks. This kernel is the
-   faster one there, and needs no sub-tiles; composite_gpu.cl does less work in all, and is for many views at a time. Both do
-   the same to a pixel in the same order, so that their pictures have the same bits.
+   A frame that nothing runs beside takes as long as its longest tile list, which one work-group walks. This kernel is
+   the faster one there, and needs no sub-tiles. composite_gpu.cl does less work in all, and is for many views at a
+   time. Both do the same to a pixel in the same order, so that their pictures have the same bits.
 
-   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD (a pixel ends before its transmittance would fall below it), NATIVE_EXP2. */
+   Macros:
+       ALPHA_CAP                largest alpha of a splat in a pixel;
+       TRANSMITTANCE_THRESHOLD  a pixel ends before its transmittance would fall below it;
+       NATIVE_EXP2              see lanes.clh;
+       AT_ONCE                  splats whose exponents are computed before the first of them is composited: a divisor of
+                                BATCH, 8 by default. */
 
 #define LANES 1
 #include "include/lanes.clh"
 #include "include/splat.clh"
 #include "include/view_set.clh"
 
-#if NATIVE_EXP2
-#define EXP2 native_exp2
-#else
-#define EXP2 exp2_polynomial
+#define BATCH (TILE * TILE)
+/* The exponents do not depend on each other, which hides latency. */
+#ifndef AT_ONCE
+#define AT_ONCE 8
 #endif
 
-#define BATCH (TILE * TILE)
-/* Splats whose exponents are computed before the first is composited: independent work to hide latency behind. */
-#define AHEAD 8
-
-/* One splat of the next batch into registers, long before it is needed; past the end one that touches nothing. */
+/* Takes one splat of the next batch into registers, long before it is needed. Past the end it is one that touches
+   nothing. */
 #define FETCH                                              \
     if (next < end) {                                      \
-        const uint splat = intersections[next];                  \
+        const uint splat = intersections[next];            \
         s0 = shapes[2 * (size_t)splat];                    \
         s1 = shapes[2 * (size_t)splat + 1];                \
         colour = colours[splat];                           \
@@ -38,7 +40,7 @@
 
 kernel __attribute__((reqd_work_group_size(BATCH, 1, 1)))
 void composite_frame(
-    global const SetView *view,
+    global const SetView *views,
     global const float4 *shapes,
     global const float4 *colours,
     global const uint *offsets,
@@ -50,16 +52,16 @@ void composite_frame(
     global float *image,
     global float *transmittance)
 {
-    local float4 near_s0[BATCH], near_s1[BATCH];
-    local float near_blue[BATCH];
+    local float4 batch_s0[BATCH], batch_s1[BATCH];
+    local float batch_blue[BATCH];
     local int living[2];
 
     const int lid = get_local_id(0);
     const int tile = get_group_id(0);
-    const int columns = view->view.columns, width = view->view.width;
+    const int columns = views->view.columns, width = views->view.width;
     const int column = tile % columns * TILE + (lid & 7) + (lid >> 2 & 8);
     const int row = tile / columns * TILE + (lid >> 3 & 3) + (lid >> 6 << 2);
-    const int inside = column < width && row < view->view.height;
+    const int inside = column < width && row < views->view.height;
     const float x = column + 0.5f, y = row + 0.5f;
     const uint begin = min(offsets[tile], capacity), end = min(offsets[tile + 1], capacity);
     uint next = begin + lid;
@@ -73,19 +75,19 @@ void composite_frame(
     for (uint batch = begin; batch < end && tile_alive; batch += BATCH) {
         const int size = min((uint)BATCH, end - batch);
         barrier(CLK_LOCAL_MEM_FENCE);
-        near_s0[lid] = s0;
-        near_s1[lid] = (float4)(s1.x, s1.y, colour.x, colour.y);
-        near_blue[lid] = colour.z;
+        batch_s0[lid] = s0;
+        batch_s1[lid] = (float4)(s1.x, s1.y, colour.x, colour.y);
+        batch_blue[lid] = colour.z;
         if (lid == 0)
             living[parity] = 0;
         barrier(CLK_LOCAL_MEM_FENCE);
         FETCH
-        for (int k = 0; k < size && alive; k += AHEAD) {
-            float powers[AHEAD];
+        for (int k = 0; k < size && alive; k += AT_ONCE) {
+            float powers[AT_ONCE];
             float most = LOG2_ALPHA_MIN - 1.0f;
-            for (int j = 0; j < AHEAD; ++j) {
-                const float4 n0 = near_s0[k + j];
-                const float2 n1 = near_s1[k + j].xy;
+            for (int j = 0; j < AT_ONCE; ++j) {
+                const float4 n0 = batch_s0[k + j];
+                const float2 n1 = batch_s1[k + j].xy;
                 const float dy = y - n0.y;
                 const float u = MAD(n0.w, dy, n0.z * (x - n0.x)), v = n1.x * dy;
                 powers[j] = MAD(-u, u, MAD(-v, v, n1.y));
@@ -93,17 +95,17 @@ void composite_frame(
             }
             if (most < LOG2_ALPHA_MIN)
                 continue;
-            /* Without branches from here on: a pixel that this splat misses or that has ended adds nothing. */
-            float alphas[AHEAD];
-            for (int j = 0; j < AHEAD; ++j)
+            /* There are no branches from here on: a pixel that has ended, or that the splat misses, adds nothing. */
+            float alphas[AT_ONCE];
+            for (int j = 0; j < AT_ONCE; ++j)
                 alphas[j] = powers[j] >= LOG2_ALPHA_MIN ? fmin(EXP2(powers[j]), ALPHA_CAP) : 0.0f;
-            for (int j = 0; j < AHEAD; ++j) {
+            for (int j = 0; j < AT_ONCE; ++j) {
                 const float after = MAD(-alphas[j], t, t);
                 alive = alive && after >= TRANSMITTANCE_THRESHOLD;
                 const float weight = alive ? alphas[j] * t : 0.0f;
-                r = MAD(weight, near_s1[k + j].z, r);
-                g = MAD(weight, near_s1[k + j].w, g);
-                b = MAD(weight, near_blue[k + j], b);
+                r = MAD(weight, batch_s1[k + j].z, r);
+                g = MAD(weight, batch_s1[k + j].w, g);
+                b = MAD(weight, batch_blue[k + j], b);
                 t = alive ? after : t;
             }
         }

@@ -1,9 +1,9 @@
-/* Compositing for GPUs: one work-group a tile; get_group_id(1) is the view's number in its set. See subtile_lists.clh for how
-   a tile's work is shared out.
+/* Composites the splats to a picture, for GPUs: one work-group a tile; get_group_id(1) is the view's number in its set.
+   See subtile_lists.clh for how a tile's work is shared out. composite_cpu.cl is its twin; composite_frame_gpu.cl does
+   a view alone.
 
-   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2. */
+   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2 (see subtile_lists.clh). */
 
-#define ROUND 1 /* there is nothing to sum */
 #include "include/subtile_lists.clh"
 
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
@@ -23,7 +23,7 @@ void composite(
     global float *transmittance)
 {
     local State state;
-    local Batch near;
+    local Batch batch;
     local int unfinished[2];
 
     const int lid = get_local_id(0);
@@ -41,9 +41,10 @@ void composite(
     intersections += views->first_intersection + begin;
     subtiles += views->first_intersection + begin;
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
-    uint last_batch;
+    const uint length = end - begin;
+    uint last; /* batch, which nobody needs */
     forward(
-        &state, &near, unfinished, origin, picture, shapes, colours, intersections, subtiles, end - begin, lid, &last_batch);
+        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &last);
     const Mine mine = pixels_of(lid / SHARE, origin, lid);
     for (int p = 0; p < PIXELS; ++p)
         if (inside(mine, p, picture)) {

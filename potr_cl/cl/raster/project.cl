@@ -1,10 +1,15 @@
-/* Projection of every splat into each view of a set, LANES splats a work-item, and the colour of those that can be seen;
-   get_global_id(1) is the view's number.
+/* Projects every splat into each view of a set, and finds the colour of those that can be seen. A work-item does LANES
+   splats; get_global_id(1) is the view's number. Both kernel families use it.
 
-   Parameters come as structure of arrays, each `stride` splats long, already activated: standard deviations, unit
-   quaternions, log2 of the opacity. Padding splats have log2 opacity -INFINITY.
+   The splats' parameters come as a structure of arrays, each `stride` splats long. They are already activated: standard
+   deviations, unit quaternions, log2 of the opacity. Padding splats have a log2 opacity of -INFINITY.
 
-   Macros: LANES, SH_COUNT, NEAR, SQUARE_EXTENT (1: the original's square of three standard deviations). */
+   Macros:
+       LANES          see lanes.clh; 1 on GPUs;
+       SH_COUNT       see sh.clh;
+       NEAR           splats whose depth is at or below it are not drawn, in world units;
+       SQUARE_EXTENT  1: a splat is drawn only in the tiles that the original's square of three standard deviations
+                      touches; 0: wherever its alpha reaches 1/255. */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
@@ -19,12 +24,12 @@
 
 /* sqrt(log2(e) / 2): turns exp(-q / 2) into exp2(-q'). */
 #define EXPONENT_SCALE 0.84932180f
-/* Projected axes are clamped to this many pixels: far more than any image has, and its fourth power is finite. */
+/* Projected axes are cut to so many pixels, which is far more than any image has. The fourth power is still finite. */
 #define AXIS_LIMIT 1e8f
 
-/* Half-open range of tiles along one axis of `size` pixels, in whole numbers: those with a pixel centre within reach of
-   the position and, with the square extent, that touch the square around it. The original numbers pixel centres from 0,
-   half a pixel less than here. */
+/* The half-open range of tiles along one axis of `size` pixels, in whole numbers: those with a pixel centre within
+   reach of the position which also, with the square extent, touch the square around it. The original's pixel centres
+   have whole coordinates, half a pixel less than here. */
 inline void tile_range(vfloat position, vfloat reach, vfloat radius, int size, vfloat *first, vfloat *end)
 {
     const float tiles = (size + TILE - 1) / TILE;
@@ -46,24 +51,25 @@ kernel void project(
     global const float *quaternions,
     global const float *log2_opacities,
     global const float *sh,
-    uint stride_,
+    uint stride,
     global const SetView *views,
     global float4 *shapes,
     global float4 *colours,
     global ushort4 *bounds)
 {
     const size_t index = get_global_id(0);
-    const size_t stride = stride_;
+    const size_t column = stride; /* a parameter's columns lie so far apart */
     global const View *view = &views[get_global_id(1)].view;
-    shapes += 2 * stride * get_global_id(1);
-    colours += stride * get_global_id(1);
-    bounds += stride * get_global_id(1);
+    shapes += 2 * column * get_global_id(1);
+    colours += column * get_global_id(1);
+    bounds += column * get_global_id(1);
 
     vfloat lo = VLOAD(index, log2_opacities);
-    /* Relative to the camera centre first: both are large where a scene is far from the origin, their difference is not. */
+    /* The camera centre is subtracted first: both are large where a scene is far from the origin, their difference is
+       not. */
     vfloat dx = (VLOAD(index, means) - view->camera_centre_high[0]) - view->camera_centre_low[0];
-    vfloat dy = (VLOAD(index, means + stride) - view->camera_centre_high[1]) - view->camera_centre_low[1];
-    vfloat dz = (VLOAD(index, means + 2 * stride) - view->camera_centre_high[2]) - view->camera_centre_low[2];
+    vfloat dy = (VLOAD(index, means + column) - view->camera_centre_high[1]) - view->camera_centre_low[1];
+    vfloat dz = (VLOAD(index, means + 2 * column) - view->camera_centre_high[2]) - view->camera_centre_low[2];
     global const float *w = view->rotation;
     vfloat tx = w[0] * dx + w[1] * dy + w[2] * dz;
     vfloat ty = w[3] * dx + w[4] * dy + w[5] * dz;
@@ -78,11 +84,12 @@ kernel void project(
     ratio_x = fmin(fmax(ratio_x, -view->limit_x), view->limit_x);
     ratio_y = fmin(fmax(ratio_y, -view->limit_y), view->limit_y);
 
-    /* Columns of the rotation, times the scale, through the view's rotation and the Jacobian: the axes on screen. */
+    /* The ellipse's axes on screen: the rotation's columns times the scales, through the view's rotation and the
+       Jacobian. */
     vfloat qw = VLOAD(index, quaternions);
-    vfloat qx = VLOAD(index, quaternions + stride);
-    vfloat qy = VLOAD(index, quaternions + 2 * stride);
-    vfloat qz = VLOAD(index, quaternions + 3 * stride);
+    vfloat qx = VLOAD(index, quaternions + column);
+    vfloat qy = VLOAD(index, quaternions + 2 * column);
+    vfloat qz = VLOAD(index, quaternions + 3 * column);
     vfloat axes[9] = {
         1.0f - 2.0f * (qy * qy + qz * qz), 2.0f * (qx * qy + qw * qz), 2.0f * (qx * qz - qw * qy),
         2.0f * (qx * qy - qw * qz), 1.0f - 2.0f * (qx * qx + qz * qz), 2.0f * (qy * qz + qw * qx),
@@ -93,14 +100,15 @@ kernel void project(
         vfloat ux = w[0] * axis[0] + w[1] * axis[1] + w[2] * axis[2];
         vfloat uy = w[3] * axis[0] + w[4] * axis[1] + w[5] * axis[2];
         vfloat uz = w[6] * axis[0] + w[7] * axis[1] + w[8] * axis[2];
-        vfloat scale = VLOAD(index, scales + k * stride) * inverse_z;
+        vfloat scale = VLOAD(index, scales + k * column) * inverse_z;
         mx[k] = view->fx * scale * (ux - ratio_x * uz);
         my[k] = view->fy * scale * (uy - ratio_y * uz);
         vfloat shrink = fmin(AXIS_LIMIT / fmax(fmax(fabs(mx[k]), fabs(my[k])), 1.0f), 1.0f);
         mx[k] *= shrink;
         my[k] *= shrink;
     }
-    /* Covariance with the dilation, and its determinant by Lagrange's identity: a sum of squares, no cancellation. */
+    /* The covariance with the dilation. Its determinant comes from Lagrange's identity, a sum of squares that cannot
+       cancel. */
     vfloat sxx = mx[0] * mx[0] + mx[1] * mx[1] + mx[2] * mx[2];
     vfloat sxy = mx[0] * my[0] + mx[1] * my[1] + mx[2] * my[2];
     vfloat syy = my[0] * my[0] + my[1] * my[1] + my[2] * my[2];
@@ -133,7 +141,7 @@ kernel void project(
     vfloat rgb[3] = {(vfloat)(0.0f), (vfloat)(0.0f), (vfloat)(0.0f)};
     if (VANY(drawn)) {
         vfloat inverse_length = 1.0f / sqrt(dx * dx + dy * dy + dz * dz);
-        sh_colour(sh, stride, index, dx * inverse_length, dy * inverse_length, dz * inverse_length, rgb);
+        sh_colour(sh, column, index, dx * inverse_length, dy * inverse_length, dz * inverse_length, rgb);
     }
 
 #if LANES == 1

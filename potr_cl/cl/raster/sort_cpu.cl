@@ -1,17 +1,22 @@
-/* Depth order of each tile's list, for CPUs: one tile a work-item, insertion sort of short runs, then merges. */
+/* The depth order of each tile's list, for CPUs: one tile a work-item, which sorts short runs by insertion and then
+   merges them. sort_gpu.cl is its twin.
 
+   Macros: RUN (keys of a run; 16 by default). */
+
+#ifndef RUN
 #define RUN 16
+#endif
 
-/* all_keys holds the keys and behind them, from capacity on, as much room to merge into. */
+/* Behind the keys, from `capacity` on, there is as much room again to merge into. */
 kernel void sort_tiles(
-    global ulong *all_keys, global const uint *offsets, global uint *intersections, global uint *counts, uint capacity)
+    global ulong *keys, global const uint *offsets, global uint *intersections, global uint *counts, uint capacity)
 {
     const uint tile = get_global_id(0);
     const uint begin = min(offsets[tile], capacity);
     const uint n = min(offsets[tile + 1], capacity) - begin;
     counts[tile] = 0; /* ready for the next view */
 
-    global ulong *keys = all_keys + begin;
+    keys += begin;
     for (uint run = 0; run < n; run += RUN) {
         uint end = min(run + RUN, n);
         for (uint i = run + 1; i < end; ++i) {

@@ -1,15 +1,19 @@
-/* Depth order of each tile's list, for GPUs: one work-group a tile, get_group_id(1) the view's number in its set; a bitonic
-   network.
+/* The depth order of each tile's list, for GPUs, by a bitonic network: one work-group a tile; get_group_id(1) is the
+   view's number in its set. sort_cpu.cl is its twin.
 
-   Every merge of size `size` begins with a mirrored step (partner = index ^ (size - 1)), so all comparisons put the
-   smaller key first and positions beyond the end behave like infinite keys without being stored. Lists of up to
-   SORT_CAPACITY keys stay in local memory; in longer ones, steps that reach further than that run in global memory. */
+   Every merge of size `size` begins with a mirrored step (partner = index ^ (size - 1)). So all comparisons put the
+   smaller key first, and positions beyond the end behave like infinite keys without being stored. Lists of up to
+   SORT_CAPACITY keys stay in local memory. In longer ones, steps that reach further than that run in global memory.
+
+   Macros: SORT_CAPACITY (a power of two; must be given), COUNTER_STRIDE (as in tile_lists_gpu.cl; 1 by default). */
 
 #include "include/splat.clh"
 #include "include/view_set.clh"
 
 #define GROUP 256
-#define COUNTER_STRIDE 8 /* as in tile_lists_gpu.cl */
+#ifndef COUNTER_STRIDE
+#define COUNTER_STRIDE 1
+#endif
 
 #define ORDER(memory, low, high)                        \
     {                                                   \
@@ -20,7 +24,8 @@
         }                                               \
     }
 
-/* Lower index of the i-th pair of a step over distance `reach`, a power of two (no division: they are slow). */
+/* The lower index of the i-th pair of a step over the distance `reach`, which is a power of two. There is no division
+   in it because divisions are slow. */
 inline uint pair_low(uint i, uint reach)
 {
     return 2 * i - (i & (reach - 1));
@@ -31,7 +36,7 @@ inline uint pair_high(uint low, uint reach, int mirrored)
     return mirrored ? low ^ (2 * reach - 1) : low + reach;
 }
 
-/* Steps of distance reach, reach / 2, … 1 on keys in local memory; the first mirrored if asked. */
+/* The steps of distance reach, reach / 2, ..., 1 on keys in local memory. The first one is mirrored if asked for. */
 inline void merge_local(local ulong *keys, uint n, uint reach, int mirrored, uint lid)
 {
     for (; reach > 0; reach /= 2) {
@@ -49,41 +54,41 @@ inline void merge_local(local ulong *keys, uint n, uint reach, int mirrored, uin
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void sort_tiles(
     global const SetView *views,
-    global ulong *all_keys,
+    global ulong *keys,
     global const uint *offsets,
     global uint *intersections,
     global uint *counts,
     uint capacity)
 {
-    local ulong near[SORT_CAPACITY];
+    local ulong piece_keys[SORT_CAPACITY];
     const uint lid = get_local_id(0);
     const uint tile = get_group_id(0);
     views += get_group_id(1);
     if (tile >= (uint)(views->view.columns * views->view.rows))
         return;
     offsets += views->first_offset + tile;
-    /* Offsets that did not fit 32 bits are at their end: no overflow below. */
+    /* Offsets that did not fit 32 bits are 2^32 - 1, so that nothing overflows below. */
     const uint room = capacity - min(capacity, views->first_intersection);
     const uint begin = views->first_intersection + min(offsets[0], room);
     const uint n = views->first_intersection + min(offsets[1], room) - begin;
-    global ulong *keys = all_keys + begin;
+    keys += begin;
     if (lid == 0)
         counts[(views->first_tile + tile) * COUNTER_STRIDE] = 0; /* ready for the next view */
 
-    /* Pieces that fit local memory, sorted one by one. */
+    /* Pieces that fit local memory are sorted one by one. */
     for (uint piece = 0; piece < n; piece += SORT_CAPACITY) {
         uint m = min(n - piece, (uint)SORT_CAPACITY);
         for (uint i = lid; i < m; i += GROUP)
-            near[i] = keys[piece + i];
+            piece_keys[i] = keys[piece + i];
         for (uint reach = 1; reach < m; reach *= 2)
-            merge_local(near, m, reach, 1, lid);
+            merge_local(piece_keys, m, reach, 1, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
         if (n <= SORT_CAPACITY) {
             for (uint i = lid; i < m; i += GROUP)
-                intersections[begin + i] = (uint)near[i];
+                intersections[begin + i] = (uint)piece_keys[i];
         } else {
             for (uint i = lid; i < m; i += GROUP)
-                keys[piece + i] = near[i];
+                keys[piece + i] = piece_keys[i];
         }
         barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
     }
@@ -107,11 +112,11 @@ void sort_tiles(
         for (uint piece = 0; piece < n; piece += SORT_CAPACITY) {
             uint m = min(n - piece, (uint)SORT_CAPACITY);
             for (uint i = lid; i < m; i += GROUP)
-                near[i] = keys[piece + i];
-            merge_local(near, m, SORT_CAPACITY / 2, 0, lid);
+                piece_keys[i] = keys[piece + i];
+            merge_local(piece_keys, m, SORT_CAPACITY / 2, 0, lid);
             barrier(CLK_LOCAL_MEM_FENCE);
             for (uint i = lid; i < m; i += GROUP)
-                keys[piece + i] = near[i];
+                keys[piece + i] = piece_keys[i];
             barrier(CLK_LOCAL_MEM_FENCE | CLK_GLOBAL_MEM_FENCE);
         }
     }

@@ -1,13 +1,13 @@
-/* Which sub-tiles of its tile each intersection touches, for CPUs: one tile a work-item, LANES intersections at a time. Found once a view,
-   however often its lists are swept.
+/* Which sub-tiles of its tile each intersection touches, for CPUs: one tile a work-item, LANES intersections at a time.
+   It is found once for a view, however often its lists are swept. subtile_masks_gpu.cl is its twin.
 
-   Macros: LANES. */
+   Macros: LANES (8 or 16, see lanes.clh), and those of subtile_vectors.clh for prefetching. */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
 #include "include/subtile_vectors.clh"
 
-/* sub-tiles[e]: the bits of touched_subtiles for intersection e. */
+/* subtiles[e] becomes the mask of touched_subtiles (subtiles.clh) for intersection e. */
 kernel void subtile_masks(
     global const float4 *shapes,
     global const uint *offsets,

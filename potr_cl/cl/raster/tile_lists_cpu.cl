@@ -1,14 +1,15 @@
-/* Which splats touch which tile, for CPUs: one splat a work-item. See tile_lists_gpu.cl for the scheme. */
+/* Which splats touch which tile, for CPUs: one splat a work-item. See tile_lists_gpu.cl, its twin, for the scheme.
+
+   Macros: none. */
 
 #include "include/splat.clh"
 
 #define GROUP 1
-#define COUNTER_STRIDE 1
 
 #include "raster/scan_tiles.clh"
 
 kernel void count_tiles(
-    global const ushort4 *bounds, global const float4 *shapes, uint splats, View view, volatile global uint *counts)
+    global const ushort4 *bounds, global const float4 *shapes, View view, volatile global uint *counts)
 {
     const uint splat = get_global_id(0);
     const int4 around = convert_int4(bounds[splat]);
@@ -22,9 +23,8 @@ kernel void count_tiles(
 kernel void fill_tiles(
     global const ushort4 *bounds,
     global const float4 *shapes,
-    uint splats,
     View view,
-    volatile global uint *cursors,
+    volatile global uint *counts,
     global ulong *keys,
     uint capacity)
 {
@@ -36,7 +36,7 @@ kernel void fill_tiles(
     for (int row = around.z; row < around.w; ++row) {
         int2 columns = splat_tile_columns(shapes, splat, around, row, view.width, view.height);
         for (int column = columns.x; column < columns.y; ++column) {
-            uint slot = atomic_inc(&cursors[row * view.columns + column]);
+            uint slot = atomic_inc(&counts[row * view.columns + column]);
             if (slot < capacity)
                 keys[slot] = key;
         }

@@ -1,22 +1,23 @@
-/* Which splats touch which tile, for GPUs; the second dimension's work-items are a set's views.
+/* Which splats touch which tile, for GPUs; get_global_id(1) is the view's number in its set. tile_lists_cpu.cl is its
+   twin.
 
-   count_tiles adds one to a tile's count for every splat whose ellipse touches it; scan_tiles turns the counts into
-   offsets; fill_tiles runs the same tests again and drops each splat's key into its tiles' segments. The order inside a
-   segment is whatever the atomics made it: sorting by unique keys makes it the same on every run.
+   count_tiles adds one to a tile's count for every splat whose ellipse touches it. scan_tiles turns the counts into
+   offsets. fill_tiles runs the same tests again and puts each splat's key into its tiles' segments. The order inside a
+   segment depends on which work-item came first; sorting by unique keys makes it the same on every run.
 
-   A splat's rows of tiles are its unit of work. A work-group strings the rows of its 256 splats together and deals them
-   out evenly, so that one huge splat does not keep one work-item busy while the others wait. */
+   The unit of work is one row of tiles of one splat. A work-group strings the rows of its 256 splats together and deals
+   them out evenly, so that one huge splat does not keep one work-item busy while the others wait.
+
+   Macros: COUNTER_STRIDE (see scan_tiles.clh; sort_gpu.cl must be given the same). */
 
 #include "include/splat.clh"
 #include "include/view_set.clh"
 
 #define GROUP 256
-/* Every tile's counter has 32 bytes to itself: the memory system does one atomic at a time in so many. */
-#define COUNTER_STRIDE 8
 
 #include "raster/scan_tiles.clh"
 
-/* first[s] = number of rows of the splats before s; first[GROUP] = all of them. */
+/* first[s] becomes the number of rows that the splats before s have; first[GROUP] that of all of them. */
 inline void string_rows(global const ushort4 *bounds, local int *first, local ushort4 *around)
 {
     const int lid = get_local_id(0);
@@ -36,7 +37,7 @@ inline void string_rows(global const ushort4 *bounds, local int *first, local us
     }
 }
 
-/* The splat of the group that row number `row` belongs to. */
+/* The splat of the work-group that row number `row` belongs to. */
 inline int row_owner(local const int *first, int row)
 {
     int low = 0, high = GROUP;
@@ -83,7 +84,7 @@ void fill_tiles(
     uint stride,
     global const ushort4 *bounds,
     global const float4 *shapes,
-    volatile global uint *cursors,
+    volatile global uint *counts,
     global ulong *keys,
     uint capacity)
 {
@@ -92,7 +93,7 @@ void fill_tiles(
     views += get_global_id(1);
     bounds += (size_t)stride * get_global_id(1);
     shapes += 2 * (size_t)stride * get_global_id(1);
-    cursors += COUNTER_STRIDE * (size_t)views->first_tile;
+    counts += COUNTER_STRIDE * (size_t)views->first_tile;
     keys += views->first_intersection;
     capacity -= min(capacity, views->first_intersection);
     const int width = views->view.width, height = views->view.height, tiles_across = views->view.columns;
@@ -105,14 +106,14 @@ void fill_tiles(
         int2 columns = splat_tile_columns(shapes, splat, tiles, tile_row, width, height);
         ulong key = depth_key(shapes[2 * splat + 1].z, splat);
         for (int column = columns.x; column < columns.y; ++column) {
-            uint slot = atomic_inc(&cursors[(tile_row * tiles_across + column) * COUNTER_STRIDE]);
+            uint slot = atomic_inc(&counts[(tile_row * tiles_across + column) * COUNTER_STRIDE]);
             if (slot < capacity)
                 keys[slot] = key;
         }
     }
 }
 
-/* One work-group a view. */
+/* One work-group does a view. */
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void scan_tiles(global const SetView *views, global uint *counts, global uint *offsets)
 {

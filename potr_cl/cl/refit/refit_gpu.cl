@@ -1,15 +1,16 @@
 /* The picture's dependence on the splats' colours, for GPUs, all views of a set in one launch: one work-group a tile;
-   get_group_id(1) is the view's number. See refit_cpu.cl for the method, and subtile_lists.clh for how a tile's work is shared
-   out.
+   get_group_id(1) is the view's number. See refit_cpu.cl, its twin, for the method, subtile_lists.clh for how a tile's work is
+   shared out, and subtile_batches.clh for the second walk.
 
-   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, WEIGHTS, NATIVE_EXP2, INT64_ATOMICS. */
+   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2 (see subtile_lists.clh), INT64_ATOMICS (see totals.clh), WEIGHTS (1:
+   sum w^2 too). */
 
-#define ROUND 4
-#include "include/subtile_lists.clh"
-#include "refit/refit.clh"
-
-/* Sums a splat: of w times the pixel's three channels, and of w^2. */
+/* A splat's sums of w times the pixel's three channels, and of w^2; of four splats at a time. */
 #define SUMS (3 + WEIGHTS)
+#define PART float4
+#define ROUND 4
+#include "include/subtile_batches.clh"
+#include "refit/refit.clh"
 
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 void refit_sweep(
@@ -30,10 +31,9 @@ void refit_sweep(
     volatile global uint *totals)
 {
     local State state;
-    local Batch near;
-    local float4 all_parts[SUBTILES * PARTS];
-    local int levels[SUMS * LEVELS * BATCH];
-    local int unfinished[2], end_of_subtile[SUBTILES], rounds[2];
+    local Batch batch;
+    local Walk walk;
+    local int unfinished[2];
     local float item_errors[ITEMS];
 
     const int lid = get_local_id(0), share = lid % SHARE;
@@ -51,12 +51,11 @@ void refit_sweep(
     intersections += views->first_intersection + offsets[0];
     subtiles += views->first_intersection + offsets[0];
 
-    for (int subtile = lid; subtile < SUBTILES; subtile += ITEMS)
-        end_of_subtile[subtile] = 0;
+    start_walk(&walk, lid);
     const int2 origin = (int2)(tile % columns, tile / columns) * TILE;
     uint last_batch;
     const uint swept = forward(
-        &state, &near, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &last_batch);
+        &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &last_batch);
 
     /* From here on r, g, b are the pixels' values to multiply by. */
     Mine mine = pixels_of(lid / SHARE, origin, lid);
@@ -89,11 +88,9 @@ void refit_sweep(
     }
     item_errors[lid] = error;
     if (swept > 0)
-        atomic_max(&end_of_subtile[mine.subtile], end);
+        end_subtile(&walk, mine.subtile, end);
     if (last_batch > 0 && lid < SUBTILES)
-        near.places[lid] = 0;
-    if (lid == 0)
-        rounds[0] = 0;
+        batch.places[lid] = 0;
     for (int step = ITEMS / 2; step > 0; step /= 2) {
         barrier(CLK_LOCAL_MEM_FENCE);
         if (lid < step)
@@ -105,22 +102,20 @@ void refit_sweep(
         return;
 
     /* The same way again, now with the pixels' values known. A single batch is still there. */
-    local float4 *parts = all_parts + lid / SHARE * PARTS;
-    int parity = 0;
-    for (uint batch = 0; batch < swept; batch += BATCH) {
-        const int size = min(swept - batch, (uint)BATCH);
+    local PART *parts = walk.parts + lid / SHARE * SUBTILE_PARTS;
+    int turn = 0;
+    for (uint first = 0; first < swept; first += BATCH) {
+        const int size = min(swept - first, (uint)BATCH);
         if (last_batch > 0) {
-            fetch(&near, shapes, colours, intersections + batch, subtiles + batch, size, lid);
+            fetch(&batch, shapes, colours, intersections + first, subtiles + first, size, lid);
             barrier(CLK_LOCAL_MEM_FENCE);
-            make_lists(&near, lid);
+            make_lists(&batch, lid);
         }
-        mine = pixels_of(near.dealt[lid / SHARE], origin, lid);
-        local const uchar *list = near.lists + mine.subtile * LIST_ROOM;
-        const int count = near.counts[mine.subtile];
-        const int place = last_batch > 0 ? near.places[mine.subtile] : 0;
-        const int left = clamp(end_of_subtile[mine.subtile] - place, 0, count);
-        if (share == 0)
-            atomic_max(&rounds[parity], (left + ROUND - 1) / ROUND);
+        mine = pixels_of(batch.dealt[lid / SHARE], origin, lid);
+        local const uchar *list = batch.lists + mine.subtile * LIST_ROOM;
+        const int count = batch.counts[mine.subtile];
+        const int place = last_batch > 0 ? batch.places[mine.subtile] : 0;
+        const int left = intersections_left(&walk, mine.subtile, place, count, turn, lid);
         float t[PIXELS], r[PIXELS], g[PIXELS], b[PIXELS];
         int last[PIXELS];
         for (int p = 0; p < PIXELS; ++p) {
@@ -131,22 +126,17 @@ void refit_sweep(
             b[p] = state.b[i];
             last[p] = state.last[i];
         }
-        for (int i = lid; i < BATCH; i += ITEMS)
-            for (int level = 0; level < SUMS * LEVELS; ++level)
-                levels[level * BATCH + i] = 0;
+        clear_sums(&walk, lid);
         barrier(CLK_LOCAL_MEM_FENCE);
-        const int all_rounds = rounds[parity];
-        parity ^= 1;
-        if (lid == 0)
-            rounds[parity] = 0;
+        const int rounds = agree_on_rounds(&walk, &turn, lid);
         if (share == 0)
-            near.places[mine.subtile] = place + places(count);
-        for (int first = 0; first < all_rounds * ROUND; first += ROUND) {
-            const int now = min(left - first, ROUND);
+            batch.places[mine.subtile] = place + places(count);
+        for (int done = 0; done < rounds * ROUND; done += ROUND) {
+            const int now = min(left - done, ROUND);
 #pragma unroll 2
             for (int j = 0; j < now; ++j) {
-                const int i = first + j;
-                local const float4 *splat = near.shapes + 3 * list[i];
+                const int i = done + j;
+                local const float4 *splat = batch.shapes + 3 * list[i];
                 const float4 s0 = splat[0], s1 = splat[1];
                 const float u0 = s0.z * (mine.x - s0.x);
                 float4 sum = (float4)(0.0f);
@@ -168,34 +158,15 @@ void refit_sweep(
                 parts[j * SHARE + share] = sum;
             }
             barrier(CLK_LOCAL_MEM_FENCE);
-            const int summed = share / (SHARE / ROUND);
-            if (summed < now) {
-                float4 sum = (float4)(0.0f);
-                for (int j = 0; j < ROUND; ++j)
-                    /* Turned by the work-item's number, so that neighbours read from different banks. */
-                    sum += parts[share * ROUND + ((j + summed) & (ROUND - 1))];
-                const int k = list[first + summed];
-                add_parts(levels + k, BATCH, sum.x);
-                add_parts(levels + LEVELS * BATCH + k, BATCH, sum.y);
-                add_parts(levels + 2 * LEVELS * BATCH + k, BATCH, sum.z);
-#if WEIGHTS
-                add_parts(levels + 3 * LEVELS * BATCH + k, BATCH, sum.w);
-#endif
-            }
+            const int summed = summed_splat(share);
+            if (summed < now)
+                add_to_sums(&walk, list[done + summed], sum_parts(parts, share));
             barrier(CLK_LOCAL_MEM_FENCE);
         }
         for (int p = 0; p < PIXELS; ++p)
             state.t[mine.first + p * SHARE] = t[p];
         barrier(CLK_LOCAL_MEM_FENCE);
-        for (int i = lid; i < size; i += ITEMS) {
-            float4 sum = (float4)(0.0f);
-            sum.x = whole_sum(levels + i, BATCH);
-            sum.y = whole_sum(levels + LEVELS * BATCH + i, BATCH);
-            sum.z = whole_sum(levels + 2 * LEVELS * BATCH + i, BATCH);
-#if WEIGHTS
-            sum.w = whole_sum(levels + 3 * LEVELS * BATCH + i, BATCH);
-#endif
-            add_sums(totals, near.splats[i], sum, scale);
-        }
+        for (int i = lid; i < size; i += ITEMS)
+            add_sums(totals, batch.splats[i], sums_of(&walk, i), scale);
     }
 }

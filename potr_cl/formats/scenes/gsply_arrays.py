@@ -7,7 +7,7 @@ from typing import Any
 
 import numpy as np
 
-from potr_cl.errors import UsageError
+from potr_cl.errors import PotrError, UsageError
 from potr_cl.formats.declaration import install_command
 from potr_cl.formats.scenes.scene_files import arranged, cleaned, first_line
 from potr_cl.model.scene import Scene
@@ -20,7 +20,8 @@ def library(path: str | os.PathLike[str]) -> Any:
     """The module gsply, which ``path`` needs.
 
     Raises:
-        UsageError: it is not installed, or there is too little memory to load it.
+        UsageError: it is not installed.
+        PotrError: it does not start.
     """
     try:
         import gsply
@@ -29,9 +30,10 @@ def library(path: str | os.PathLike[str]) -> Any:
             f"'{path}': this kind of file needs the library gsply, which cannot be loaded ({first_line(error)}): "
             f"{install_command(EXTRA)}"
         ) from None
-    except Exception as error:  # its compiler fails in many ways where memory is short
-        raise UsageError(
-            f"'{path}': the library gsply cannot be loaded ({first_line(error)}): there may be too little memory"
+    except Exception as error:  # compilers that do not fit the memory: OSError, SystemError, RuntimeError
+        raise PotrError(
+            f"'{path}': this kind of file needs the library gsply, which does not start here, perhaps for want of "
+            f"memory ({first_line(error)})"
         ) from None
     return gsply
 

@@ -9,7 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
-from potr_cl.raster.rasterizer import TILE
+from potr_cl.raster.view_set import TILE
 
 F64 = NDArray[np.float64]
 

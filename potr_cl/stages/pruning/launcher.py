@@ -6,7 +6,8 @@ from typing import Protocol
 
 import pyopencl as cl
 
-from potr_cl.raster.rasterizer import Rasterizer, totals_limits
+from potr_cl.raster.macros import totals_limits
+from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.fixed_point import FixedPoint
 from potr_cl.stages.pruning.launch_cpu import CpuLauncher
 from potr_cl.stages.pruning.launch_gpu import GpuLauncher

@@ -11,8 +11,10 @@ from collections.abc import Callable
 import numpy as np
 import pyopencl as cl
 
+from potr_cl.opencl.kernel import Kernel
+from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.structs import struct_dtype
-from potr_cl.raster.rasterizer import totals_limits
+from potr_cl.raster.macros import totals_limits
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Iteration, Pruned, PruningOptions, ascending, prune
 from potr_cl.stages.pruning.steering import Steering
@@ -43,30 +45,31 @@ def prune_scene(
     """
     if removal.steering is None or options.count is not None or not np.isfinite(options.delta_mse_max):
         return prune(removal, removal.splats, options, progress, after_iteration)
-    controller = _Controller(removal.steering, options)
-    try:
+    with _Controller(removal.steering, options) as controller:
         return controller.run(progress, after_iteration)
-    finally:
-        controller.free()
 
 
-class _Controller:
+class _Controller(Owner):
+    """The schedule with its state in the device's memory.
+
+    Raises:
+        DeviceError: the device has no room for the state.
+    """
+
     def __init__(self, removal: Steering, options: PruningOptions) -> None:
         self._removal, self._options = removal, options
         self._device = device = removal.device
         self._splats = removal.splats
-        self._groups = -(-self._splats // _DIGIT)
+        self._memory = memory = Memory(device)
         with device.all_or_nothing():
-            self._smoothed = device.allocate(4 * self._splats, "the smoothed effects")
-            self._keys = device.allocate(4 * self._splats, "the splats' scores")
-            self._removed = device.upload(np.zeros(self._splats, _REMOVED), "the removed splats")
-            self._state = device.allocate(4 * _STATE, "the pruning's state")
-        limits = totals_limits(device)
-        self._rank, self._refine, self._mark = (device.kernel(_SOURCE, n, **limits) for n in ("rank", "refine", "mark"))
-        number, real, buffer = np.uint32, np.float32, None
-        self._rank.set_scalar_arg_dtypes([number, buffer, buffer, *[real] * 4, *[buffer] * 3])
-        self._refine.set_scalar_arg_dtypes([number, buffer, buffer, np.int32, number, buffer])
-        self._mark.set_scalar_arg_dtypes([number, buffer, buffer, real, real, number, number, *[buffer] * 3])
+            self._smoothed = memory.allocate(4 * self._splats, "the smoothed effects")
+            self._keys = memory.allocate(4 * self._splats, "the splats' scores")
+            self._removed = memory.upload(np.zeros(self._splats, _REMOVED), "the removed splats")
+            self._state = memory.allocate(4 * _STATE, "the pruning's state")
+            macros = totals_limits(device)
+            self._rank, self._refine, self._mark = (
+                device.kernel(_SOURCE, name, **macros) for name in ("rank", "refine", "mark")
+            )
 
     def run(self, progress: Callable[[int, int], None] | None, after_iteration: Callable[[int], None] | None) -> Pruned:
         removal, options = self._removal, self._options
@@ -88,28 +91,43 @@ class _Controller:
 
     def _choose(self, iteration: int, weight: float) -> int:
         """Mark the splats that go in an iteration; how many."""
-        removal, options, n = self._removal, self._options, self._splats
+        removal, options = self._removal, self._options
         remaining = options.iterations - iteration
-        totals, alive = removal.totals, removal.marks
         effect_unit, importance_unit = removal.units
+        everywhere = {"splats": self._splats, "totals": removal.totals, "keys": self._keys, "state": self._state}
         cl.enqueue_fill_buffer(self._device.queue, self._state, np.uint32(0), 0, 4 * _STATE)
-        numbers = (effect_unit, weight, options.delta_mse_max, options.a)
-        self._rank.set_args(n, totals, alive, *numbers, self._smoothed, self._keys, self._state)
+        self._rank.bind(
+            **everywhere,
+            alive=removal.marks,
+            effect_unit=effect_unit,
+            weight=weight,
+            limit=options.delta_mse_max,
+            a=options.a,
+            smoothed=self._smoothed,
+        )
         self._launch(self._rank)
         if remaining > 1:
             for digit in range(1, _DIGITS):
-                self._refine.set_args(n, totals, self._keys, digit, remaining, self._state)
+                self._refine.bind(**everywhere, digit=digit, remaining=remaining)
                 self._launch(self._refine)
-        units = (effect_unit, importance_unit)
-        self._mark.set_args(n, totals, self._keys, *units, iteration, remaining, alive, self._removed, self._state)
+        self._mark.bind(
+            **everywhere,
+            alive=removal.marks,
+            effect_unit=effect_unit,
+            importance_unit=importance_unit,
+            iteration=iteration,
+            remaining=remaining,
+            removed=self._removed,
+        )
         self._launch(self._mark)
         gone = np.empty(1, np.uint32)
         with self._device.errors("failed while computing"):
             cl.enqueue_copy(self._device.queue, gone, self._state, src_offset=4 * _COUNTER, is_blocking=True)
         return int(gone[0])
 
-    def _launch(self, kernel: cl.Kernel) -> None:
-        self._device.launch(kernel, (self._groups * _DIGIT,), (_DIGIT,))
+    def _launch(self, kernel: Kernel) -> None:
+        groups = -(-self._splats // _DIGIT)
+        kernel.launch((groups * _DIGIT,), (_DIGIT,))
 
     def _pruned(self, done: int) -> Pruned:
         device, n = self._device, self._splats
@@ -142,6 +160,5 @@ class _Controller:
             for count, weight, effect, largest in zip(*columns, strict=True)
         )
 
-    def free(self) -> None:
-        for buffer in (self._smoothed, self._keys, self._removed, self._state):
-            self._device.free(buffer)
+    def close(self) -> None:
+        self._memory.close()

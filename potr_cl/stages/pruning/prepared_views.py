@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.rasterizer import TILE, Rasterizer, View, ViewSet
+from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_cache import ViewCache
+from potr_cl.raster.view_set import TILE, View, ViewSet
 
 
 class PreparedViews(Owner):
@@ -136,7 +137,7 @@ class PreparedViews(Owner):
         for prepared in self.cached:
             prepared.close()
         self.cached = []
-        self._cache.free()
+        self._cache.close()
 
 
 class PreparedSet(Owner):
@@ -209,5 +210,5 @@ class PreparedSet(Owner):
 
     def close(self) -> None:
         """Give the memory back, that of the views too."""
-        self.views.free()
+        self.views.close()
         self._memory.close()

@@ -190,5 +190,3 @@ class RemovalSweep(Owner):
     def close(self) -> None:
         """Give all device memory back."""
         self._owned.close()
-
-    free = close

@@ -21,8 +21,9 @@ from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.rasterizer import TILE, Rasterizer, ViewSet
-from potr_cl.stages.compaction.ridge import REFERENCE_PIXELS
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.view_set import TILE, ViewSet
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.launcher import Launcher

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from potr_cl.raster.rasterizer import TILE
+from potr_cl.raster.view_set import TILE
 
 #: Pixel values beyond this are cut in the kernels (macro LARGEST_VALUE of cl/refit/refit.clh): no sum can overflow.
 LARGEST_VALUE = 64.0

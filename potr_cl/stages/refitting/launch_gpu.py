@@ -8,7 +8,9 @@ import pyopencl as cl
 
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
-from potr_cl.raster.rasterizer import RasterRules, ViewSet, gpu_limits
+from potr_cl.raster.macros import gpu_limits
+from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.view_set import ViewSet
 from potr_cl.stages.refitting.fixed_point import LARGEST_VALUE, fixed_point_scale
 
 #: Work-items of a tile's work-group.

@@ -9,7 +9,8 @@ import pyopencl as cl
 
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
-from potr_cl.raster.rasterizer import RasterRules, ViewSet
+from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.view_set import ViewSet
 from potr_cl.stages.refitting.launch_cpu import CpuLauncher
 from potr_cl.stages.refitting.launch_gpu import GpuLauncher
 

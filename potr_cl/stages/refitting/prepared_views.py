@@ -8,8 +8,9 @@ from contextlib import contextmanager
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.memory import Owner
-from potr_cl.raster.rasterizer import Rasterizer, ViewSet
+from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_cache import ViewCache
+from potr_cl.raster.view_set import ViewSet
 
 #: Part of the device's memory not yet taken that is the budget unless the caller sets one.
 _SHARE = 0.25
@@ -71,7 +72,7 @@ class PreparedViews(Owner):
             kept = self.budget.keep(views)
         finally:
             if not kept:
-                views.free()
+                views.close()
         if kept:
             self._kept[numbers] = views
 
@@ -95,11 +96,11 @@ class PreparedViews(Owner):
                 yield views, projected or kept is None
         finally:
             if kept is None:
-                views.free()
+                views.close()
 
     def close(self) -> None:
         """Give all device memory back."""
         for views in self._kept.values():
-            views.free()
+            views.close()
         self._kept = {}
-        self.budget.free()
+        self.budget.close()

@@ -22,7 +22,8 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
-from potr_cl.raster.rasterizer import INRIA, Rasterizer, RasterRules
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients, Layout, Ridge
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
@@ -148,8 +149,7 @@ class ColourRefit(Owner):
             raise UsageError("a re-fit needs at least one view")
         with ExitStack() as owned:
             # The rasterizer's own colours are never looked at.
-            rasterizer = Rasterizer(device, replace(scene, sh=scene.sh[:, :1]), rules)
-            owned.callback(rasterizer.free)
+            rasterizer = owned.enter_context(Rasterizer(device, replace(scene, sh=scene.sh[:, :1]), rules))
             launcher = launcher_for(device, rules)
             layout = Layout(len(scene), rasterizer.stride, scene.sh.shape[1], launcher.lanes)
             self.coefficients = owned.enter_context(Coefficients(device, layout))

@@ -439,7 +439,7 @@ def test_made_up_headers(tokens: list[bytes], body: bytes, tmp_path_factory: pyt
 @pytest.mark.slow
 @pytest.mark.filterwarnings("error")
 @given(draw=st.data())
-@settings(max_examples=20_000, deadline=None)
+@settings(max_examples=5_000, deadline=None)
 def test_many_mutated_files(
     draw: st.DataObject, fuzz_seeds: list[bytes], tmp_path_factory: pytest.TempPathFactory
 ) -> None:

@@ -1,0 +1,46 @@
+"""The rules in which rasterizers of 3D Gaussian splats differ."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+
+from potr_cl.errors import UsageError
+
+
+@dataclass(frozen=True)
+class RasterRules:
+    """The rules in which rasterizers differ.
+
+    Attributes:
+        near: splats whose view-space depth is at or below this, in world units, are not drawn.
+        alpha_cap: largest alpha of a splat in a pixel.
+        square_extent: draw a splat only in the tiles that the square of half side ceil(3 sigma_max) around its centre
+            touches, as the original does; without, wherever its alpha reaches 1/255.
+        threshold_included: a pixel ends before a splat that would bring its transmittance to 1e-4 exactly; without,
+            only below.
+    """
+
+    near: float = 0.2
+    alpha_cap: float = 0.99
+    square_extent: bool = True
+    threshold_included: bool = False
+
+    def __post_init__(self) -> None:
+        if not (np.isfinite(self.near) and self.near > 0):
+            raise UsageError(f"the near plane must be a positive distance, not {self.near}")
+        if not 1 / 255 <= self.alpha_cap < 1:
+            raise UsageError(f"the alpha cap must lie in [1/255, 1), not {self.alpha_cap}")
+
+    @property
+    def transmittance_threshold(self) -> float:
+        """A pixel ends before its transmittance would fall below this float32."""
+        threshold = np.float32(1e-4)
+        return float(np.nextafter(threshold, np.float32(1)) if self.threshold_included else threshold)
+
+
+#: The original 3DGS rasterizer.
+INRIA = RasterRules()
+#: gsplat's rasterizer, with the original's near plane instead of its own default of 0.01.
+GSPLAT = RasterRules(alpha_cap=0.999, square_extent=False, threshold_included=True)

@@ -1,0 +1,240 @@
+"""Views on a device: their cameras as the kernels take them, and the buffers that the rasterizer's stages fill."""
+
+from __future__ import annotations
+
+import itertools
+from collections.abc import Sequence
+from functools import lru_cache
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from potr_cl.errors import DeviceMemoryError, UsageError
+from potr_cl.model.camera import Camera
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.opencl.structs import struct_dtype
+
+#: Pixels along a side of a tile.
+TILE = 16
+
+#: Tiles along a side of the image: the kernels number them in 16 bits.
+_MOST_TILES = 0xFFFF
+
+#: ``View`` of the kernels, and ``SetView``, which has one.
+_CAMERA = struct_dtype("include/splat.clh", "View")
+_SET_VIEW = struct_dtype("include/view_set.clh", "SetView")
+
+
+class ViewSet(Owner):
+    """Views whose buffers lie one after another, so that one launch can do them all.
+
+    Made by :meth:`potr_cl.raster.rasterizer.Rasterizer.prepare_set`.
+
+    Args:
+        device: that the buffers lie on.
+        cameras: whose views they are.
+        stride: splats of the scene, padded.
+        subtile_bytes: of an element of ``subtiles``.
+
+    Attributes:
+        views: each with the parts of the buffers that are its own.
+        stride: as given.
+        tiles, pixels: of all views.
+        capacity: room for intersections, of all views.
+        intersection_starts: where each view's intersections begin, and their end.
+        table: where each view's part begins, ``SetView`` in cl/include/view_set.clh.
+        shapes, colours, offsets, intersections: as :class:`View` has them, and N splats a view.
+        subtiles: (capacity,), a bit for each sub-tile of its tile that an intersection touches
+            (cl/include/subtiles.clh), uint32 for CPU kernels, uint16 for GPU kernels.
+
+    Raises:
+        UsageError: an image is too large.
+        DeviceMemoryError: the device has no room for the buffers.
+    """
+
+    shapes: cl.Buffer
+    colours: cl.Buffer
+    offsets: cl.Buffer
+    intersections: cl.Buffer
+    subtiles: cl.Buffer
+
+    def __init__(self, device: Device, cameras: Sequence[Camera], stride: int, subtile_bytes: int) -> None:
+        self._device = device
+        self._memory = Memory(device)
+        self._subtile_bytes = subtile_bytes
+        self.stride = stride
+        self.views = [View(self, camera) for camera in cameras]
+        self.tiles = sum(view.tiles for view in self.views)
+        self.pixels = sum(view.pixels for view in self.views)
+        self.capacity = 0
+        self.intersection_starts = [0] * (len(cameras) + 1)
+        self._offset_starts = [0, *itertools.accumulate(view.tiles + 1 for view in self.views)]
+        try:
+            self.shapes = self._memory.allocate(32 * stride * len(cameras), "the projected splats")
+            self.colours = self._memory.allocate(16 * stride * len(cameras), "the projected splats' colours")
+            self._geometry: tuple[cl.Buffer, ...] = (self.shapes, self.colours)
+            self.offsets = self._memory.allocate(4 * self._offset_starts[-1], "the tile offsets")
+            self.table = self._memory.allocate(_SET_VIEW.itemsize * len(cameras), "the views")
+        except BaseException:
+            self.close()
+            raise
+        self._write_table()
+
+    def _write_table(self) -> None:
+        table = np.zeros(len(self.views), _SET_VIEW)
+        table["first_intersection"] = self.intersection_starts[:-1]
+        table["first_offset"] = self._offset_starts[:-1]
+        tile = pixel = 0
+        for row, view in zip(table, self.views, strict=True):
+            row["view"] = camera_struct(view.camera)
+            row["first_tile"], row["first_pixel"] = tile, pixel
+            tile += view.tiles
+            pixel += view.pixels
+        cl.enqueue_copy(self._device.queue, self.table, table, is_blocking=True)
+
+    def aim(self, camera: Camera) -> bool:
+        """Make the only view another camera's, if that has as many tiles across and down; whether it has."""
+        (view,) = self.views
+        if (view.columns, view.rows) != _tiles(camera):
+            return False
+        if camera is not view.camera:
+            view.camera = camera
+            self.pixels = view.pixels
+            self._write_table()
+        return True
+
+    def make_room(self, counts: Sequence[int]) -> None:
+        """Room for so many intersections of each view; those there are get lost.
+
+        Raises:
+            DeviceMemoryError: the device has not that much, or not all in one buffer.
+        """
+        if self.capacity:
+            self._memory.free(self.intersections, self.subtiles)
+            self.capacity = 0
+        starts = [0, *itertools.accumulate(counts)]
+        if max(starts[-1], self.pixels) > 0xFFFFFFFF:
+            raise DeviceMemoryError(f"{len(counts)} views have more intersections or pixels than can be numbered")
+        self.intersections = self._memory.allocate(4 * starts[-1], "the tile lists")
+        self.subtiles = self._memory.allocate(self._subtile_bytes * starts[-1], "the intersections' sub-tiles")
+        for view, count in zip(self.views, counts, strict=True):
+            view.capacity = count
+        self.intersection_starts, self.capacity = starts, starts[-1]
+        if len(self.views) > 1:
+            self._write_table()
+
+    def read_offsets(self) -> list[NDArray[np.uint32]]:
+        """Each view's ``offsets``, once the device has found them."""
+        words = self._device.download(self.offsets, (self._offset_starts[-1],), np.uint32)
+        return [words[start:stop] for start, stop in itertools.pairwise(self._offset_starts)]
+
+    def read_counts(self) -> list[int]:
+        """Each view's intersections, once the device has found them; 2^32 - 1 for more than that."""
+        if len(self.views) > 1:
+            return [int(offsets[-1]) for offsets in self.read_offsets()]
+        last = np.empty(1, np.uint32)
+        with self._device.errors("failed while computing"):
+            cl.enqueue_copy(
+                self._device.queue, last, self.offsets, src_offset=4 * self.views[0].tiles, is_blocking=True
+            )
+        return [int(last[0])]
+
+    @property
+    def nbytes_cached(self) -> int:
+        """Bytes of all but shapes and colours."""
+        nbytes: int = self._memory.nbytes - sum(buffer.size for buffer in self._geometry)
+        return nbytes
+
+    def free_geometry(self) -> None:
+        """Give shapes and colours back, for those who keep the lists and project again (:meth:`Rasterizer.project`)."""
+        self._memory.free(*self._geometry)
+        self._geometry = ()
+        self.shapes = self.colours = None
+
+    def close(self) -> None:
+        self._memory.close()
+
+
+class View(Owner):
+    """One camera's part of a :class:`ViewSet`; the only view of a set stands for the set, buffers and all.
+
+    Attributes:
+        owner: the set.
+        camera: whose view it is.
+        columns, rows: tiles across and down.
+        intersection_count: intersections there are; set once the device is known to have found them all.
+        capacity: intersections that there is room for.
+    """
+
+    def __init__(self, owner: ViewSet, camera: Camera) -> None:
+        self.owner = owner
+        self.camera = camera
+        self.columns, self.rows = _tiles(camera)
+        if max(self.columns, self.rows) > _MOST_TILES:
+            raise UsageError(
+                f"view '{camera.name}': {camera.width} x {camera.height} pixels are more than {_MOST_TILES * TILE} "
+                "on a side; render a smaller image"
+            )
+        self.intersection_count = self.capacity = 0
+
+    @property
+    def tiles(self) -> int:
+        """Number of tiles."""
+        return self.columns * self.rows
+
+    @property
+    def pixels(self) -> int:
+        """Number of pixels."""
+        return self.camera.width * self.camera.height
+
+    @property
+    def shapes(self) -> cl.Buffer:
+        """(N, 8) float32, a splat's ellipse, see cl/include/splat.clh."""
+        return self._alone.shapes
+
+    @property
+    def colours(self) -> cl.Buffer:
+        """(N, 4) float32; R, G, B of the splats that are drawn, the rest unset."""
+        return self._alone.colours
+
+    @property
+    def offsets(self) -> cl.Buffer:
+        """(columns * rows + 1,) uint32, where each tile's run of ``intersections`` begins."""
+        return self._alone.offsets
+
+    @property
+    def intersections(self) -> cl.Buffer:
+        """(capacity,) uint32 splat numbers, tile by tile, front to back within a tile."""
+        return self._alone.intersections
+
+    @property
+    def _alone(self) -> ViewSet:
+        (_,) = self.owner.views
+        return self.owner
+
+    def close(self) -> None:
+        self._alone.close()
+
+
+@lru_cache(maxsize=4096)
+def camera_struct(camera: Camera) -> NDArray[Any]:
+    """The camera as the kernels take it (``View`` in cl/include/splat.clh)."""
+    struct = np.zeros((), _CAMERA)
+    struct["rotation"] = camera.rotation.ravel()
+    struct["camera_centre_high"] = camera.centre
+    struct["camera_centre_low"] = camera.centre - struct["camera_centre_high"]
+    struct["fx"], struct["fy"] = camera.fx, camera.fy
+    struct["cx"], struct["cy"] = camera.cx, camera.cy
+    struct["limit_x"] = 1.3 * camera.width / (2 * camera.fx)
+    struct["limit_y"] = 1.3 * camera.height / (2 * camera.fy)
+    struct["width"], struct["height"] = camera.width, camera.height
+    struct["columns"], struct["rows"] = _tiles(camera)
+    return struct
+
+
+def _tiles(camera: Camera) -> tuple[int, int]:
+    """Columns and rows of tiles that cover the image."""
+    return -(-camera.width // TILE), -(-camera.height // TILE)
