@@ -9,6 +9,7 @@ import struct
 import zipfile
 import zlib
 from collections.abc import Callable
+from functools import cache
 from typing import Any
 
 import numpy as np
@@ -181,6 +182,7 @@ def _spz_streams(splats: int, said: int | None = None) -> Files:
     return {"a.spz": spz_files.streamed(said or splats, 3, streams, sizes)}
 
 
+@cache
 def _webp(side: int) -> bytes:
     out = io.BytesIO()
     Image.new("RGBA", (side, side), (1, 2, 3, 255)).save(out, "WEBP", lossless=True, method=0)
@@ -326,8 +328,8 @@ BOMBS: dict[str, dict[str, Callable[[], Files]]] = {
         "streams of a million, one splat claimed": lambda: _spz_streams(1_000_000, 1),
     },
     "sog": {
-        "pictures of 8,000², all splats claimed": lambda: _sog_pictures(8000, 64_000_000),
-        "pictures of 8,000², one splat claimed": lambda: _sog_pictures(8000, 1),
+        "pictures of 4,000², all splats claimed": lambda: _sog_pictures(4000, 16_000_000),
+        "pictures of 4,000², one splat claimed": lambda: _sog_pictures(4000, 1),
         "pictures of 256², all splats claimed": lambda: _sog_pictures(256, 65_536),
         "64 MB of blanks as description": lambda: _sog_member("meta.json", b" " * _LONG + b"{}"),
         "64 MB of brackets as description": lambda: _sog_member("meta.json", b"[" * _LONG),

@@ -149,19 +149,19 @@ FORMATS: dict[str, Format] = {
         "a.compressed.ply", ply_files.compressed_originals, ply_files.changed_compressed, read_scene, 32 * MIB, 64,
         twice=True,
     ),
-    "spz": _single("a.spz", spz_files.originals, spz_files.changed, read_scene, 64 * MIB, 8192, twice=True),
-    "sog": _single("a.sog", sog_files.originals, sog_files.changed, read_scene, 64 * MIB, 8192, twice=True),
+    "spz": _single("a.spz", spz_files.originals, spz_files.changed, read_scene, 64 * MIB, 2048, twice=True),
+    "sog": _single("a.sog", sog_files.originals, sog_files.changed, read_scene, 64 * MIB, 2048, twice=True),
     "cameras.json": Format(
-        camera_files.good_cameras_json, camera_files.changed_cameras_json, read_cameras, 32 * MIB, 256
+        camera_files.good_cameras_json, camera_files.changed_cameras_json, read_cameras, 32 * MIB, 128
     ),
     "transforms.json": Format(
-        camera_files.good_transforms_json, camera_files.changed_transforms_json, read_cameras, 32 * MIB, 256
+        camera_files.good_transforms_json, camera_files.changed_transforms_json, read_cameras, 32 * MIB, 128
     ),
     "colmap-binary": Format(
-        camera_files.good_colmap_binary, camera_files.changed_colmap_binary, read_cameras, 32 * MIB, 256
+        camera_files.good_colmap_binary, camera_files.changed_colmap_binary, read_cameras, 32 * MIB, 128
     ),
     "colmap-text": Format(
-        camera_files.good_colmap_text, camera_files.changed_colmap_text, read_cameras, 32 * MIB, 256
+        camera_files.good_colmap_text, camera_files.changed_colmap_text, read_cameras, 32 * MIB, 128
     ),
     "png": _picture("a.png", picture_files.good_pngs, picture_files.changed_png),
     "jpeg": _picture("a.jpg", picture_files.jpeg_originals, picture_files.changed_jpeg),

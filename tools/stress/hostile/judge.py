@@ -25,6 +25,8 @@ from tools.stress.hostile.formats import Files, Format, WrongResult, parts_of
 #: A file that takes longer hangs: seconds of processor time, and, should it wait for something, how many times as many
 #: of the clock, for other processes may keep the processor busy.
 LONGEST, _WAITING = 5.0, 12
+#: Bytes from which on memory that was freed is given back to the system before the next file.
+_MUCH = 1 << 19
 #: Room that the process may take beyond what it has when it begins and what a file may cost. What is reserved and never
 #: touched counts too: stacks of threads, arenas of their allocators.
 _ROOM = 1 << 29
@@ -79,7 +81,10 @@ class Judge:
         self._memory = _Memory()
         self._errors = os.open(folder / "stderr", os.O_RDWR | os.O_CREAT | os.O_TRUNC, 0o600)
         os.dup2(self._errors, 2)
-        self._perturb: Callable[[int, int], int] | None = getattr(ctypes.CDLL(None), "mallopt", None)
+        system = ctypes.CDLL(None)
+        self._perturb: Callable[[int, int], int] | None = getattr(system, "mallopt", None)
+        self._trim: Callable[[int], int] | None = getattr(system, "malloc_trim", None)
+        self._freed = _MUCH
         self._cases = 0
         logging.getLogger("potr_cl").addHandler(_Kept(self._said))
         warnings.simplefilter("always")
@@ -108,6 +113,10 @@ class Judge:
         self._limit(allowance)
         self._said.clear()
         self._watched.found.clear()
+        if (
+            self._freed >= _MUCH and self._trim is not None
+        ):  # what a file before has freed would hide what this one takes
+            self._trim(0)
         self._memory.reset()
         began = time.process_time()
         signal.setitimer(signal.ITIMER_PROF, self._longest)
@@ -118,7 +127,7 @@ class Judge:
         signal.setitimer(signal.ITIMER_PROF, 0)
         signal.setitimer(signal.ITIMER_REAL, 0)
         seconds = time.process_time() - began
-        memory = self._memory.grown()
+        memory = self._freed = self._memory.grown()
         if kind in ("read", "refused"):
             kind, text = self._second_look(kind, text)
         if kind in ("read", "refused") and memory > allowance:
