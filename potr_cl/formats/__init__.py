@@ -4,8 +4,12 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable
+from contextlib import AbstractContextManager
 from functools import partial
 from pathlib import Path
+from typing import Any
+
+import numpy as np
 
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats import registry
@@ -29,7 +33,8 @@ def load_scene(path: str | os.PathLike[str], trust: bool = False) -> Scene:
         DataError: its content is damaged, or it holds too many splats for its size.
     """
     path = Path(path)
-    return registry.reader_of(path)(path, trust)
+    with _silent_overflows():
+        return registry.reader_of(path)(path, trust)
 
 
 def scene_writer(path: str | os.PathLike[str]) -> Callable[[Scene], None]:
@@ -68,9 +73,15 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
     """
     path = Path(path)
     try:
-        return _from_folder(path) if path.is_dir() else _from_file(path)
+        with _silent_overflows():
+            return _from_folder(path) if path.is_dir() else _from_file(path)
     except OSError as error:
         raise UsageError(f"cannot read '{error.filename or path}': {error.strerror or error}") from error
+
+
+def _silent_overflows() -> AbstractContextManager[Any]:
+    """Of a block in which numpy gives no warnings: what overflows is dropped or refused by name."""
+    return np.errstate(all="ignore")
 
 
 def _from_file(path: Path) -> list[Camera]:

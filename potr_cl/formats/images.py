@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import contextlib
+import io
 import os
 import stat
 import warnings
@@ -64,6 +65,19 @@ def opened_image(source: Any, formats: tuple[str, ...]) -> Image.Image:
     return image
 
 
+class _File(io.BufferedReader):
+    """A file in which nothing is read beyond its end: Pillow asks for as many bytes as a file says of its parts, and
+    Python makes room for all that it is asked for."""
+
+    def __init__(self, path: Path) -> None:
+        super().__init__(io.FileIO(path))
+        self._size = os.fstat(self.fileno()).st_size
+
+    def read(self, size: int | None = -1, /) -> bytes:
+        left = max(self._size - self.tell(), 0)
+        return super().read(left if size is None or size < 0 else min(size, left))
+
+
 @contextlib.contextmanager
 def _opened_photograph(path: Path) -> Iterator[Image.Image]:
     """A photograph whose pixels fit the memory; Pillow's many errors for a bad file become ours."""
@@ -71,11 +85,13 @@ def _opened_photograph(path: Path) -> Iterator[Image.Image]:
         # Before it is opened: a pipe would be waited for.
         if not stat.S_ISREG(os.stat(path).st_mode):
             raise UsageError(f"cannot read '{path}': it is not a regular file")
-        with opened_image(path, _FORMATS) as image:
-            width, height = image.size
-            if width * height > _MOST_PIXELS:
-                raise DataError(f"'{path}' has {width} x {height} pixels, at most {_MOST_PIXELS} are read")
-            yield image
+        with _File(path) as file, warnings.catch_warnings():
+            warnings.simplefilter("ignore")  # Pillow tells of parts that it leaves out: no colour depends on them
+            with opened_image(file, _FORMATS) as image:
+                width, height = image.size
+                if width * height > _MOST_PIXELS:
+                    raise DataError(f"'{path}' has {width} x {height} pixels, at most {_MOST_PIXELS} are read")
+                yield image
     except PotrError:
         raise
     except (FileNotFoundError, NotADirectoryError, PermissionError) as error:

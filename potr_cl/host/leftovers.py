@@ -36,13 +36,12 @@ def temporary_folder() -> Iterator[str]:
         UsageError: there is no such folder that can be written to.
     """
     import secrets
-    import tempfile
 
     from potr_cl.errors import UsageError
 
     advice = "make room there, or name another by the environment variable TMPDIR"
     try:
-        name = os.path.join(tempfile.gettempdir(), f"potr-cl-{secrets.token_hex(8)}")
+        name = os.path.join(place_for_temporary_files(), f"potr-cl-{secrets.token_hex(8)}")
     except OSError as error:
         raise UsageError(f"there is no folder for temporary files that can be written to: {advice}") from error
     with removed_at_end(name):
@@ -51,6 +50,22 @@ def temporary_folder() -> Iterator[str]:
         except OSError as error:
             raise UsageError(f"cannot make the temporary folder '{name}': {error.strerror}: {advice}") from error
         yield name
+
+
+def place_for_temporary_files() -> str:
+    """The system's folder for temporary files, as :func:`tempfile.gettempdir` finds it, but without the file that it
+    makes there for a trial, which a signal may leave behind.
+
+    Raises:
+        OSError: there is none that can be written to.
+    """
+    if os.name == "posix":
+        for name in (*map(os.environ.get, ("TMPDIR", "TEMP", "TMP")), "/tmp", "/var/tmp", "/usr/tmp"):
+            if name and os.path.isdir(name) and os.access(name, os.W_OK | os.X_OK):
+                return os.path.abspath(name)
+    import tempfile
+
+    return tempfile.gettempdir()
 
 
 def remove_all() -> None:

@@ -7,14 +7,13 @@ import hashlib
 import importlib.metadata
 import logging
 import os
-import tempfile
 from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
 import pyopencl as cl
 
-from potr_cl.host.leftovers import removed_at_end
+from potr_cl.host.leftovers import place_for_temporary_files, removed_at_end
 
 logger = logging.getLogger("potr_cl")
 
@@ -114,7 +113,7 @@ def _register_intel_runtime() -> None:
     contents["potr_cl_intel_cpu.icd"] = f"{library}\n"
     digest = hashlib.sha256(repr(sorted(contents.items())).encode()).hexdigest()[:16]
     try:
-        folder = Path(tempfile.gettempdir()) / f"potr_cl_icd_{os.getuid()}_{digest}"
+        folder = Path(place_for_temporary_files()) / f"potr_cl_icd_{os.getuid()}_{digest}"
         folder.mkdir(mode=0o700, exist_ok=True)
         if folder.stat().st_uid != os.getuid():
             return  # someone else's folder: do not load libraries that it names

@@ -73,6 +73,8 @@ class _Archive:
         entries = self._zip.infolist()
         if sum(entry.file_size for entry in entries) > 2 * size + _DESCRIPTION_BYTES:
             raise self._damaged("it would unpack to far more than its size")
+        if any(entry.compress_size > size for entry in entries):
+            raise self._damaged("its contents are said to be larger than itself")  # room would be made for them
         if any(entry.compress_type not in _METHODS for entry in entries):
             raise self._damaged("it is packed in a way that no SOG file is")
         meta = json.loads(self._zip.read("meta.json"))

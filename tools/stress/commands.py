@@ -1,0 +1,131 @@
+"""Every command that writes files, on a small scene: what signals and repetitions are tried on (:func:`commands`)."""
+
+from __future__ import annotations
+
+import dataclasses
+import hashlib
+import json
+import os
+import sys
+from pathlib import Path
+
+from PIL import Image
+
+from potr_cl.formats import save_scene
+from potr_cl.model.camera import Camera
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.reference.scenes import ring_of_cameras, visible_scene
+from tools.results import ROOT
+
+SPLATS, VIEWS, SIDE = 400, 6, 48
+
+
+@dataclasses.dataclass(frozen=True)
+class Command:
+    """A command line.
+
+    Attributes:
+        name: for tables.
+        arguments: after ``potr-cl``; those that begin with "in/" or "out/" are files.
+        outputs: that it writes, in the folder "out".
+        repeats: whether each run makes the same bytes; a report tells of times.
+    """
+
+    name: str
+    arguments: tuple[str, ...]
+    outputs: tuple[str, ...]
+    repeats: bool = True
+
+    def argv(self) -> list[str]:
+        return [sys.executable, "-m", "potr_cl", *self.arguments]
+
+
+_VIEWS = ("--cameras", "in/cameras.json")
+_ENCODE = ("encode", "in/scene.ply", *_VIEWS, "-o", "out/scene.potr")
+
+
+def commands() -> list[Command]:
+    """All of them, in the order of the help."""
+    return [
+        Command("encode", _ENCODE, ("scene.potr",)),
+        Command("encode, preset paper", (*_ENCODE, "--preset", "paper", "--no-quality"), ("scene.potr",)),
+        Command(
+            "encode without pruning",
+            ("encode", "in/scene.ply", "-o", "out/scene.potr", "--no-prune", "--no-compact", "--refit", "off"),
+            ("scene.potr",),
+        ),
+        Command("encode --report", (*_ENCODE, "--report", "out/a.html"), ("scene.potr", "a.html"), repeats=False),
+        Command("encode --max-size", (*_ENCODE, "--max-size", "12k", "--no-quality"), ("scene.potr",)),
+        Command(
+            "prune --order",
+            ("prune", "in/scene.ply", *_VIEWS, "-o", "out/a.ply", "--order", "out/a.npy"),
+            ("a.ply", "a.npy"),
+        ),
+        Command("compact", ("compact", "in/scene.ply", *_VIEWS, "-o", "out/a.ply"), ("a.ply",)),
+        Command(
+            "refit", ("refit", "in/scene.potr", "--reference", "in/scene.ply", *_VIEWS, "-o", "out/a.ply"), ("a.ply",)
+        ),
+        Command("decode", ("decode", "in/scene.potr", "-o", "out/a.ply"), ("a.ply",)),
+        *(
+            Command(f"convert to {suffix}", ("convert", "in/scene.potr", f"out/a.{suffix}"), (f"a.{suffix}",))
+            for suffix in ("ply", "compressed.ply", "spz")
+        ),
+        Command(
+            "render",
+            ("render", "in/scene.ply", *_VIEWS, "-o", "out", "--split", "all"),
+            tuple(f"view_{k}.png" for k in range(VIEWS)),
+        ),
+        Command("compare -o", ("compare", "in/scene.ply", "in/scene.potr", *_VIEWS, "-o", "out/a.png"), ("a.png",)),
+    ]
+
+
+def prepare(folder: Path) -> dict[str, str]:
+    """Make the inputs in ``folder/in``; their hashes by name."""
+    inputs = folder / "in"
+    inputs.mkdir(parents=True)
+    (folder / "out").mkdir()
+    (folder / "tmp").mkdir()
+    scene = visible_scene(SPLATS, 1, seed=1)
+    cameras = ring_of_cameras(VIEWS, size=SIDE)
+    save_scene(inputs / "scene.ply", scene)
+    coded = encode(scene, None, EncodeOptions().changed(prune=False, compact=False, refit=False))
+    (inputs / "scene.potr").write_bytes(b"".join(coded.pieces))
+    (inputs / "cameras.json").write_text(json.dumps([_entry(camera) for camera in cameras]))
+    return hashes(inputs)
+
+
+def _entry(camera: Camera) -> dict[str, object]:
+    return {
+        "img_name": camera.name, "width": camera.width, "height": camera.height, "fx": camera.fx, "fy": camera.fy,
+        "rotation": camera.rotation.T.tolist(), "position": camera.centre.tolist(), "split": camera.split,
+    }  # fmt: skip
+
+
+def environment(folder: Path, **more: str) -> dict[str, str]:
+    """For a command: temporary files go to ``folder/tmp``, what drivers keep to ``folder/cache``."""
+    cache = os.fspath(folder / "cache")
+    return {
+        **os.environ, "PYTHONPATH": os.fspath(ROOT), "TMPDIR": os.fspath(folder / "tmp"), "XDG_CACHE_HOME": cache,
+        "POCL_CACHE_DIR": cache, **more,
+    }  # fmt: skip
+
+
+def hashes(folder: Path) -> dict[str, str]:
+    """The SHA-256 of every file of a folder by its name, those in folders within it too."""
+    return {
+        str(path.relative_to(folder)): hashlib.sha256(path.read_bytes()).hexdigest()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+
+
+def is_whole(path: Path) -> bool:
+    """Whether a file of which there is no equal copy is complete: a report, or a picture."""
+    if path.suffix == ".html":
+        return path.read_bytes().rstrip().endswith(b"</html>")
+    if path.suffix == ".png":
+        with Image.open(path) as image:
+            image.load()
+        return True
+    return False

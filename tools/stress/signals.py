@@ -1,0 +1,240 @@
+"""End every command that writes at random moments, and see that nothing is harmed and nothing is left.
+
+    python -m tools.stress.signals [--moments N] [--seed SEED] [--command NAME …] [--json FILE]
+
+Each moment starts a command on a small scene and sends SIGKILL, SIGINT, SIGTERM or SIGHUP: at a time that is drawn at
+random from its usual run, or as soon as it has a file open in the folder of its output. Afterwards every input must be
+what it was, each output absent or the old one or the whole new one, no other file may be in its folder or in the
+temporary one (but after SIGKILL), and the command must have exited with 130, 143 or 129, without a traceback.
+
+A signal that comes before the program's first lines have run, or after its last, meets the interpreter, which ends as
+it likes: such moments are told by /proc and counted apart; what is on the disk is checked all the same. Linux only.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import os
+import shutil
+import signal
+import subprocess
+import sys
+import tempfile
+import time
+from collections import Counter
+from pathlib import Path
+from random import Random
+
+from tools.results import Column, Results
+from tools.stress.commands import Command, commands, environment, hashes, is_whole, prepare
+
+_SIGNALS = (signal.SIGKILL, signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
+#: A command that has not ended so long after a signal hangs, seconds.
+_PATIENCE = 30.0
+_OLD = b"what was there before"
+_COLUMNS = (
+    Column("command"),
+    Column("usual time", "s", ".2f"),
+    Column("moments"),
+    Column("while it was writing"),
+    Column("before its first lines or after its last"),
+    Column("ended by the signal"),
+    Column("done already"),
+    Column("outputs new"),
+    Column("left by SIGKILL"),
+    Column("wrong"),
+)
+
+
+@dataclasses.dataclass
+class Usual:
+    """An undisturbed run: seconds, the hashes of what it wrote, and what it keeps in the temporary folder on purpose.
+
+    That is the list of OpenCL drivers that :mod:`potr_cl.opencl.loader` makes once for a user.
+    """
+
+    seconds: float
+    outputs: dict[str, str]
+    kept: set[str]
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--moments", type=int, default=500, metavar="N", help="of all commands; default 500")
+    parser.add_argument("--seed", type=int, default=1, help="default 1")
+    parser.add_argument("--command", action="append", dest="names", metavar="NAME", help="default: all")
+    parser.add_argument("--json", type=Path, metavar="FILE", help="keep the figures")
+    args = parser.parse_args()
+    chosen = [each for each in commands() if args.names is None or each.name in args.names]
+    if not chosen:
+        parser.error(f"no such command; there are: {'; '.join(each.name for each in commands())}")
+    results = Results(None, args.json)
+    table = results.table("signals", "Commands ended at random moments", *_COLUMNS)
+    wrong: list[str] = []
+    with tempfile.TemporaryDirectory() as scratch:
+        folder = Path(scratch)
+        inputs = prepare(folder)
+        for number, command in enumerate(chosen):
+            usual = run_usually(folder, command)
+            moments = len(range(number, args.moments, len(chosen)))
+            counts: Counter[str] = Counter()
+            for k in range(moments):
+                rng = Random(f"{args.seed}/{command.name}/{k}")
+                found = try_moment(folder, command, usual, inputs, _SIGNALS[k % len(_SIGNALS)], rng, counts)
+                counts["wrong"] += bool(found)
+                wrong += [f"{command.name}, seed {args.seed}, moment {k}: {each}" for each in found]
+            kinds = ("writing", "before", "ended", "done", "new", "left", "wrong")
+            table.add(command.name, round(usual.seconds, 3), moments, *(counts[kind] for kind in kinds))
+    print("\n".join(wrong), file=sys.stderr)
+    sys.exit(1 if wrong else 0)
+
+
+def run_usually(folder: Path, command: Command) -> Usual:
+    """Run a command to its end; the second time counts, when its kernels are built.
+
+    Raises:
+        RuntimeError: it fails, or leaves something behind.
+    """
+    for _ in range(2):
+        _clear(folder)
+        began = time.monotonic()
+        done = subprocess.run(
+            command.argv(), cwd=folder, env=environment(folder), capture_output=True, text=True, check=False
+        )
+        seconds = time.monotonic() - began
+        written = hashes(folder / "out")
+        kept = _temporary(folder)
+        unknown = [name for name in kept if not name.startswith("potr_cl_icd_")]
+        if done.returncode != 0 or set(written) != set(command.outputs) or unknown:
+            raise RuntimeError(f"{command.name} fails, or leaves files: {sorted(written)} {unknown}\n{done.stderr}")
+    return Usual(seconds, written, kept)
+
+
+def try_moment(
+    folder: Path,
+    command: Command,
+    usual: Usual,
+    inputs: dict[str, str],
+    number: signal.Signals,
+    rng: Random,
+    counts: Counter[str],
+) -> list[str]:
+    """Start a command, end it at a random moment, and look at what there is; what is wrong, a line each."""
+    _clear(folder)
+    old = [name for name in command.outputs if rng.random() < 0.5]
+    for name in old:
+        (folder / "out" / name).write_bytes(_OLD)
+    waits_for_file = rng.random() < 0.35
+    moment = rng.random() * (0.02 if waits_for_file else usual.seconds * 1.02)
+    process = subprocess.Popen(
+        command.argv(), cwd=folder, env=environment(folder), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
+        stderr=subprocess.PIPE, start_new_session=True,
+    )  # fmt: skip
+    try:
+        if waits_for_file:
+            counts["writing"] += _wait_for_file(folder, process, set(old))
+        time.sleep(moment)
+        ready = _handles(process.pid, signal.SIGTERM)
+        process.send_signal(number)
+        try:
+            _, said = process.communicate(timeout=_PATIENCE)
+        except subprocess.TimeoutExpired:
+            return [f"{number.name}: it did not end in {_PATIENCE:.0f} s"]
+    finally:
+        if process.poll() is None:
+            process.kill()
+            process.wait()
+    counts["before"] += not ready and process.returncode != 0
+    found = _exit(process.returncode, number, ready, said.decode("utf-8", "replace"), counts)
+    found += _disk(folder, command, usual, inputs, set(old), process.returncode, number, counts)
+    return [f"{number.name} ({'writing' if waits_for_file else f'{moment:.3f} s'}): {each}" for each in found]
+
+
+def _exit(code: int, number: signal.Signals, ready: bool, said: str, counts: Counter[str]) -> list[str]:
+    if code == 0:
+        counts["done"] += 1
+    if number == signal.SIGKILL:
+        counts["ended"] += code != 0
+        return [] if code in (-number, 0) else [f"exit code {code}\n{said}"]
+    if not ready:
+        return []
+    counts["ended"] += code == 128 + number
+    found = []
+    if code not in (128 + number, 0):
+        found.append(f"exit code {code}\n{said}")
+    if "Traceback" in said or "Error" in said:
+        found.append(f"it said\n{said}")
+    return found
+
+
+def _disk(
+    folder: Path,
+    command: Command,
+    usual: Usual,
+    inputs: dict[str, str],
+    old: set[str],
+    code: int,
+    number: signal.Signals,
+    counts: Counter[str],
+) -> list[str]:
+    found = []
+    if hashes(folder / "in") != inputs:
+        found.append("an input was harmed")
+    there = hashes(folder / "out")
+    fresh = 0
+    for name in command.outputs:
+        path = folder / "out" / name
+        if name not in there:
+            if name in old:
+                found.append(f"'{name}' is gone")
+        elif path.read_bytes() == _OLD:
+            if name not in old:
+                found.append(f"'{name}' is not what it can be")
+        elif there[name] == usual.outputs[name] or (not command.repeats and is_whole(path)):
+            fresh += 1
+        else:
+            found.append(f"'{name}' is neither the old file nor the new one, {path.stat().st_size} bytes")
+    counts["new"] += fresh == len(command.outputs)
+    if code == 0 and fresh != len(command.outputs):
+        found.append("it says that all went well, and did not write all")
+    left = [*(set(there) - set(command.outputs)), *(_temporary(folder) - usual.kept)]
+    if left and number == signal.SIGKILL:
+        counts["left"] += 1
+    elif left:
+        found.append(f"left behind: {', '.join(left)}")
+    return found
+
+
+def _clear(folder: Path) -> None:
+    for name in ("out", "tmp"):
+        shutil.rmtree(folder / name)
+        (folder / name).mkdir()
+
+
+def _wait_for_file(folder: Path, process: subprocess.Popen[bytes], there: set[str]) -> bool:
+    """Wait until a file appears beside the output that was not there; whether one did."""
+    while process.poll() is None:
+        if set(os.listdir(folder / "out")) - there:
+            return True
+        time.sleep(0.0005)
+    return False
+
+
+def _temporary(folder: Path) -> set[str]:
+    """Files and folders in the temporary folder."""
+    return {str(path.relative_to(folder / "tmp")) for path in (folder / "tmp").rglob("*")}
+
+
+def _handles(pid: int, number: signal.Signals) -> bool:
+    """Whether a process has a handler of its own for a signal."""
+    try:
+        status = Path(f"/proc/{pid}/status").read_text()
+    except OSError:
+        return False
+    caught = next((line.split()[1] for line in status.splitlines() if line.startswith("SigCgt")), "0")
+    return bool(int(caught, 16) >> (number - 1) & 1)
+
+
+if __name__ == "__main__":
+    main()

@@ -1,0 +1,148 @@
+"""The judge of readers sees what it is there to see; a file number stands for one file; findings can be read again."""
+
+from __future__ import annotations
+
+import json
+import subprocess
+import sys
+from pathlib import Path
+from random import Random
+
+import pytest
+
+from tools.stress.hostile.bomb_files import BOMBS
+from tools.stress.hostile.formats import FORMATS
+from tools.stress.hostile.judge import Verdict
+from tools.stress.hostile.potr_files import File, originals, sealed
+from tools.stress.hostile.supervisor import attack, read_again
+from tools.stress.hostile.worker import Job, changed_files, keep
+
+pytestmark = pytest.mark.skipif(not sys.platform.startswith("linux"), reason="the judge looks into /proc")
+
+ROOT = Path(__file__).parents[2]
+
+#: Judges a reader whose body is given, of a format that allows 16 MiB, and prints the verdict.
+PROGRAM = """
+import json, os, signal, subprocess, sys, time, warnings
+from pathlib import Path
+import numpy as np
+from potr_cl.errors import DataError, PotrError
+from tools.stress.hostile.formats import Format, WrongResult
+from tools.stress.hostile.judge import Judge
+
+folder = Path(sys.argv[1])
+for name in ("input", "tmp", "cwd"):
+    (folder / name).mkdir()
+os.environ["TMPDIR"] = str(folder / "tmp")
+os.chdir(folder / "cwd")
+quiet = [True]
+
+def reader(path):
+    if quiet:
+        return b""
+    BODY
+
+form = Format(list, lambda rng: {}, reader, 16 << 20, 0, twice=True)
+judge = Judge(form, folder, longest=1.0)
+path = judge.put({"a": b"abc"})
+for _ in range(3):
+    judge.judge(path, 3)
+quiet.clear()
+out = os.dup(1)
+verdict = judge.judge(path, 3)
+os.write(out, json.dumps([verdict.kind, verdict.text]).encode())
+"""
+
+SEEN = {
+    "read": "return b'x'",
+    "refused": "raise DataError('no')",
+    "exception": "raise KeyError('a')",
+    "result": "raise WrongResult('a')",
+    "memory": "np.ones(1 << 22).sum()",
+    "memory reserved": "return np.empty(1 << 34, np.uint8) is None",
+    "memory that became an error": """
+    try:
+        np.empty(1 << 40, np.uint8)
+    except MemoryError:
+        raise DataError("too large") from None
+""",
+    "message": "error = DataError('a'); error.args = ('a\\x1b[2J',); raise error",
+    "message too long": "error = DataError('a'); error.args = ('a' * 5000,); raise error",
+    "warning": "np.array([1.0]) / np.array([0.0])",
+    "terminal": "os.write(2, b'\\x1b[2J'); return b''",
+    "garbage": "return bytes(np.empty(1 << 16, np.uint8))",
+    "program": "subprocess.run(['true'])",
+    "name": "open('/etc/hostname', 'rb').close()",
+    "name to write": "open(path.parent / 'other', 'wb').close()",
+    "leftover": "(folder / 'tmp' / 'x').write_bytes(b'')",
+}
+
+
+def judged(tmp_path: Path, body: str) -> subprocess.CompletedProcess[str]:
+    program = PROGRAM.replace("BODY", body.strip())
+    return subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path)],
+        env={"PYTHONPATH": str(ROOT), "PYTHONMALLOC": "malloc", "PATH": "/usr/bin:/bin"},
+        cwd=ROOT, capture_output=True, text=True, check=False,
+    )  # fmt: skip
+
+
+@pytest.mark.parametrize("what", SEEN)
+def test_the_judge_sees(what, tmp_path):
+    done = judged(tmp_path, SEEN[what])
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout)[0] == what.split()[0], done.stdout
+
+
+@pytest.mark.parametrize(
+    ("body", "code"),
+    [("while True: pass", -27), ("os.kill(os.getpid(), signal.SIGSEGV)", -11), ("os.abort()", -6)],
+    ids=["hang", "segmentation fault", "abort"],
+)
+def test_what_ends_the_process(body, code, tmp_path):
+    assert judged(tmp_path, body).returncode == code
+
+
+@pytest.mark.parametrize("form", FORMATS)
+def test_a_number_of_a_seed_is_one_file(form):
+    for number in range(30):
+        assert changed_files(form, 3, number) == changed_files(form, 3, number)
+    assert len({str(changed_files(form, 3, number)) for number in range(30)}) > 15
+
+
+def test_every_format_has_bombs():
+    assert list(BOMBS) == list(FORMATS)
+
+
+def test_potr_files_are_taken_apart_and_put_together():
+    for data in originals():
+        assert File.of(data).bytes() == sealed(data) == data
+    assert {section.coder for data in originals() for section in File.of(data).sections} == {0, 1, 2, 3}
+
+
+def test_a_damaged_potr_file_is_sealed():
+    data = bytearray(originals()[0])
+    data[-1] ^= 1
+    assert sealed(bytes(data))[:-1] != bytes(data)[:-1]
+    assert len(sealed(bytes(data))) == len(data)
+    assert sealed(b"POTR") == b"POTR"
+
+
+def test_findings_are_read_again(tmp_path):
+    """Good files and others, as if they were findings."""
+    rng = Random(1)
+    sources = []
+    for number, form in enumerate(["png", "potr", "png"]):
+        files = FORMATS[form].good()[0] if number < 2 else {"a.png": rng.randbytes(100)}
+        job = Job(form, "", "", seed=number)
+        sources.append(keep(tmp_path / "kept", job, number, files, Verdict("exception", "a", 0.0, 0)))
+    results = read_again(sources, tmp_path / "again")
+    assert [result["kind"] for result in results] == ["read", "read", "refused"]
+
+
+def test_a_run_goes_on_where_another_ended(tmp_path):
+    whole = attack("png", 5, 0, 300, 60, tmp_path)
+    parts = [attack("png", 5, first, 150, 60, tmp_path) for first in (0, 150)]
+    assert whole.files == 300
+    assert whole.read == sum(part.read for part in parts)
+    assert whole.findings == 0
