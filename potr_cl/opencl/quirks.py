@@ -97,8 +97,8 @@ SIMULATOR = Quirk(
 SMALL_GROUPS = Quirk(
     vendor="PoCL",
     versions="3.0 and 3.1",
-    reason="it keeps the private memory of a whole work-group on its stack, and makes groups of thousands of work-items "
-    "where it may choose: the stack overflows",
+    reason="it keeps the private memory of a whole work-group on its stack, and makes groups of thousands of "
+    "work-items where it may choose: the stack overflows",
     still_needed="let the launchers of CPU kernels take groups of 64 and run tests/raster",
     test=lambda platform, version: is_pocl(platform),
 )
@@ -126,8 +126,8 @@ NO_PREFETCH = Quirk(
 CAREFUL_VECTORISER = Quirk(
     vendor="Intel's CPU runtime",
     versions="2026.2",
-    reason="a work-group that is cut short by work-items' numbers runs through scalar code, which rounds differently; a "
-    "choice between elements of private arrays gives all work-items what the first one reads",
+    reason="a work-group that is cut short by work-items' numbers runs through scalar code, which rounds differently; "
+    "a choice between elements of private arrays gives all work-items what the first one reads",
     still_needed="write both the short way and run tests/stages/test_compaction.py",
     test=lambda platform, version: "intel" in platform and "fpga" not in platform,
 )
