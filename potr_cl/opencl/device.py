@@ -14,7 +14,7 @@ import numpy as np
 import pyopencl as cl
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
-from potr_cl.opencl import compiler, quirks
+from potr_cl.opencl import compiler, program_cache, quirks
 from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, compiler_fault, compiles_nothing
 from potr_cl.opencl.kernel import Kernel, declared_parameters
 from potr_cl.opencl.loader import new_context
@@ -131,8 +131,9 @@ class Device:
         if key not in self._programs:
             options = ["-cl-std=CL1.2", *self._build_options, *(f"-D{name}={value}" for name, value in macros)]
             with self.errors(f"failed to build {source}"), warnings.catch_warnings():
-                warnings.simplefilter("ignore", cl.CompilerWarning)  # some drivers chat without being asked
-                self._programs[key] = cl.Program(self.context, kernel_source(source, self._variants)).build(options)
+                warnings.simplefilter("ignore")  # some drivers chat without being asked, and a full disk stops no build
+                program = cl.Program(self.context, kernel_source(source, self._variants))
+                self._programs[key] = program.build(options, cache_dir=program_cache.folder())
         return self._programs[key]
 
     def kernel(self, source: str, name: str, **defines: str | int | float) -> Kernel:
