@@ -92,5 +92,45 @@ SIMULATOR = Quirk(
     test=lambda platform, version: "oclgrind" in platform or "fpga emulation" in platform,
 )
 
+#: Work-groups of the CPU kernels have one work-item, and those of the kernels on splats a fixed size
+#: (raster/launch_cpu.py, raster/scene_buffers.py, stages/pruning/launch_cpu.py). Harmless elsewhere, so nobody asks.
+SMALL_GROUPS = Quirk(
+    vendor="PoCL",
+    versions="3.0 and 3.1",
+    reason="it keeps the private memory of a whole work-group on its stack, and makes groups of thousands of "
+    "work-items where it may choose: the stack overflows",
+    still_needed="let the launchers of CPU kernels take groups of 64 and run tests/raster",
+    test=lambda platform, version: is_pocl(platform),
+)
+
+#: ``MAD``, ``LESSER`` and ``GREATER`` of cl/include/lanes.clh stand in for built-in functions. As fast elsewhere.
+CALLED_BUILTINS = Quirk(
+    vendor="PoCL",
+    versions="3.0 and 3.1",
+    reason="built-in functions such as mad and fma stay calls: they alone doubled a kernel's time",
+    still_needed="make MAD the function mad and run tools/bench/kernels.py",
+    test=lambda platform, version: is_pocl(platform),
+)
+
+#: cl/include/subtile_vectors.clh prefetches only where this macro of NVIDIA's is not defined.
+NO_PREFETCH = Quirk(
+    vendor="NVIDIA, Oclgrind",
+    versions="driver 580; 21.10",
+    reason="NVIDIA's compiler says that it knows __builtin_prefetch, and fails; Oclgrind does not know it",
+    still_needed='build raster/composite_cpu.cl there without the test of __NV_CL_C_VERSION (Device(family="cpu"))',
+    test=lambda platform, version: "nvidia" in platform or "oclgrind" in platform,
+)
+
+#: cl/compact/ridge.cl asks how many views a splat has, not its number alone, before a work-item ends early, and reads
+#: an element of a private array before it chooses. Both are right everywhere.
+CAREFUL_VECTORISER = Quirk(
+    vendor="Intel's CPU runtime",
+    versions="2026.2",
+    reason="a work-group that is cut short by work-items' numbers runs through scalar code, which rounds differently; "
+    "a choice between elements of private arrays gives all work-items what the first one reads",
+    still_needed="write both the short way and run tests/stages/test_compaction.py",
+    test=lambda platform, version: "intel" in platform and "fpga" not in platform,
+)
+
 #: All of the above by name, as docs/architecture.md lists them.
 ALL = {name: value for name, value in list(globals().items()) if isinstance(value, Quirk)}

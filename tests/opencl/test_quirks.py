@@ -24,6 +24,10 @@ CONCERNED = {
     "UNKNOWN_CPU": {"PoCL 3", "PoCL 4"},
     "SHORT_LOOPS": {"rusticl"},
     "SIMULATOR": {"Oclgrind", "FPGA emulation"},
+    "SMALL_GROUPS": {"PoCL 3", "PoCL 4"},
+    "CALLED_BUILTINS": {"PoCL 3", "PoCL 4"},
+    "NO_PREFETCH": {"NVIDIA", "Oclgrind"},
+    "CAREFUL_VECTORISER": {"Intel"},
 }
 
 

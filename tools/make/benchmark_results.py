@@ -94,6 +94,7 @@ class Result:
         date: of the measurement, YYYY-MM-DD, or several; empty if unknown.
         command: what measures it again; several are run one after the other.
         state: "current" if it tells of the code as it is, "history" if of an earlier state.
+        commit: of the code that was measured; empty if unknown.
         options: values of options that it was measured with and that were defaults then, by name of
             :func:`package_defaults`. Where a default has changed since, the line under the table says so.
         remark: what else a reader must know, a sentence.
@@ -108,6 +109,7 @@ class Result:
     state: str
     columns: tuple[Column, ...]
     rows: tuple[tuple[Cell, ...], ...]
+    commit: str = ""
     options: dict[str, float] = field(default_factory=dict)
     remark: str = ""
     transpose: int = 0
@@ -171,6 +173,7 @@ def load(folder: Path = RESULTS) -> dict[str, Result]:
 
 
 def _result(where: str, raw: dict[str, Any]) -> Result:
+    raw = {"state": "current", **raw}
     unknown = set(raw) - {each.name for each in fields(Result)}
     if unknown:
         raise ResultError(f"{where}: '{min(unknown)}' is no part of a result")
@@ -236,7 +239,8 @@ def _markdown(heads: list[str], rows: list[list[str]]) -> str:
 
 def circumstances(result: Result) -> str:
     """Machine, date and command of a result, and which defaults have changed since, in a line for under its table."""
-    parts = [part for part in (result.machine, result.date or "date unknown") if part]
+    commit = f"commit {result.commit}" if result.commit else ""
+    parts = [part for part in (result.machine, result.date or "date unknown", commit) if part]
     line = ", ".join(parts)
     if result.command:
         line += ": " + ", then ".join(f"`{command}`" for command in result.command)

@@ -21,6 +21,9 @@ def result(columns, rows, **more):
 def copy(tmp_path, monkeypatch):
     """A copy of the pages, their results and pictures, to be changed."""
     docs = tmp_path / "docs"
+    docs.mkdir()
+    for page in benchmark_pages.PAGES.parent.glob("*.md"):  # that links lead to
+        shutil.copy(page, docs)
     pages = shutil.copytree(benchmark_pages.PAGES, docs / "benchmarks")
     images = shutil.copytree(benchmark_plots.IMAGES, docs / "images")
     monkeypatch.setattr(benchmark_pages, "PAGES", pages)
