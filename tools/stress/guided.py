@@ -75,7 +75,7 @@ def _guided(name: str, seconds: int, findings: Path) -> tuple[int, int, int, int
             env=settings(folder), cwd=folder / "cwd", capture_output=True, text=True, errors="replace", check=False,
         )  # fmt: skip
         elapsed = time.monotonic() - began
-        said = done.stderr + (folder / "stderr").read_text(errors="replace")
+        said = done.stderr
         coverage = [int(each) for each in re.findall(r"cov: (\d+)", said)]
         executed = re.search(r"number_of_executed_units: +(\d+)", said)
         if not coverage or (executed is None and not artifact.exists()):

@@ -7,6 +7,7 @@ file that reaches new code is kept and changed further.
 from __future__ import annotations
 
 import gzip
+import os
 import sys
 import zlib
 from collections import Counter
@@ -32,7 +33,9 @@ _LONGEST = 1 << 16
 def main() -> None:
     name, folder, findings, *options = sys.argv[1:]
     form = FORMATS[name]
+    errors = os.dup(2)
     judge = Judge(form, Path(folder), longest=0.0)  # libFuzzer has an alarm of its own
+    os.dup2(errors, 2)  # and says there how it gets on, which the judge would take for the reader's words
     job = Job(name, folder, findings)
     kept: Counter[str] = Counter()
     file = next(iter(form.good()[0]))
