@@ -64,17 +64,15 @@ def main() -> None:
     table = results.table("files", "Changed files, what became of them, and the worst of them", *_COLUMNS)
     kept: list[str] = []
     wrong = 0
-    for name in FORMATS:
+    for earlier in before.values():  # kept, should this run be cut off
+        table.put(*earlier)
+    for name in args.formats or FORMATS:
         row = before.get(name)
-        if args.formats and name not in args.formats:
-            if row is not None:
-                table.add(*row)
-            continue
         first = int(row[1]) if row is not None else 0
         outcome = attack(name, args.seed, first, args.count, args.seconds, findings)
         kept += outcome.kept
         wrong += outcome.findings
-        table.add(*_row(name, outcome, row))
+        table.put(*_row(name, outcome, row))
     for folder in kept:
         about = json.loads(Path(folder, "finding.json").read_text())
         print(f"\n{folder}: {about['kind']}\n{about['text']}", file=sys.stderr)
