@@ -303,7 +303,7 @@ def test_registering_a_runtime_keeps_the_others(tmp_path: Path, monkeypatch: pyt
             return library
 
     monkeypatch.setattr(loader.importlib.metadata, "files", lambda package: [Installed()])
-    monkeypatch.setattr(loader.tempfile, "gettempdir", lambda: str(tmp_path))
+    monkeypatch.setattr(loader, "place_for_temporary_files", lambda: str(tmp_path))
     monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))
     loader._register_intel_runtime()
     made = Path(os.environ["OCL_ICD_VENDORS"])
