@@ -6,7 +6,7 @@ import argparse
 
 from potr_cl.cli.guard import ReadFile, WrittenFile
 from potr_cl.cli.options import Commands
-from potr_cl.cli.scenes import add_trust_option, read_scene, size_of_file
+from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene, size_of_file
 from potr_cl.cli.terminal import say
 from potr_cl.formats import scene_writer
 from potr_cl.formats.registry import extras_needed, suffixes_read, suffixes_written
@@ -31,4 +31,5 @@ def add_convert(commands: Commands) -> None:
     p.add_argument("scene", type=ReadFile, metavar="IN")
     p.add_argument("output", type=WrittenFile, metavar="OUT")
     add_trust_option(p)
+    add_antialiased_option(p)
     p.set_defaults(run=_convert)

@@ -20,13 +20,15 @@ from potr_cl.model.scene import Scene
 __all__ = ["load_cameras", "load_scene", "save_scene", "scene_writer"]
 
 
-def load_scene(path: str | os.PathLike[str], trust: bool = False) -> Scene:
+def load_scene(path: str | os.PathLike[str], trust: bool = False, antialiased: bool | None = None) -> Scene:
     """Read a trained scene; the extension tells the format, the content where formats share an extension.
 
     Args:
         path: of a file in one of ``registry.SCENE_FORMATS``. A .potr file is decoded.
         trust: whether the file may hold more splats a byte than a real scene has. Without, memory and time are in
             proportion to its size.
+        antialiased: whether the scene was trained with antialiasing and is to be rendered so; None: as the file says,
+            which those of gsplat and nerfstudio do not.
 
     Raises:
         UsageError: the file cannot be opened, its extension is unknown, or it needs an extra.
@@ -34,7 +36,7 @@ def load_scene(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     """
     path = Path(path)
     with _silent_overflows():
-        return registry.reader_of(path)(path, trust)
+        return registry.reader_of(path)(path, trust).rendered(antialiased)
 
 
 def scene_writer(path: str | os.PathLike[str]) -> Callable[[Scene], None]:

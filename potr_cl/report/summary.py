@@ -58,6 +58,7 @@ def encode_report(
             "bytes": source_bytes,
             "splats": len(scene),
             "sh_degree": scene.sh_degree,
+            "antialiased": scene.antialiased,
         },
         "file": str(target),
         "bytes": len(file.data),

@@ -17,9 +17,11 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.scenes.filter_3d import FILTER_3D, folded
+from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, says_antialiased
 from potr_cl.formats.scenes.scene_files import cleaned
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
+from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
 
 _log = logging.getLogger("potr_cl")
 
@@ -38,20 +40,24 @@ class _Header:
         byte_order: "<" or ">"; of no meaning for text.
         elements: with their number of rows, in file order.
         size: bytes up to the first value.
+        antialiased: whether a comment says that the scene is.
     """
 
     text: bool
     byte_order: str
     elements: list[tuple[PlyElement, int]]
     size: int
+    antialiased: bool
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     """Read a trained scene from a PLY file.
 
     Accepted are binary files of either byte order and ASCII ones, properties in any order and of any numeric type,
-    with or without normals, SH degree 0 to 3 with ``f_rest_*`` channel after channel. Further properties and
-    elements are dropped. What had to be dropped or mended is reported once to the logger "potr_cl".
+    with or without normals, SH degree 0 to 3 with ``f_rest_*`` channel after channel. Comments tell whether it is
+    antialiased (:mod:`potr_cl.formats.scenes.ply_comments`), or the property ``filter_3D``, which is folded into scales
+    and opacities (:mod:`potr_cl.formats.scenes.filter_3d`). Further properties and elements are dropped. What had to be
+    dropped or mended is reported once to the logger "potr_cl".
 
     Args:
         path: of the PLY file.
@@ -86,7 +92,9 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
     """Write a scene in the original layout, which every viewer opens.
 
     Binary little-endian float32: x y z, nx ny nz (zero), f_dc_*, f_rest_* (all red, all green, all blue), opacity,
-    scale_*, rot_*. The file appears under its name only when it is whole.
+    scale_*, rot_*. The header of an antialiased scene says so in a comment, as Brush's does; one with Mip-Splatting's
+    low-pass filter also has the property filter_3D, which is 0, as nothing is left to be folded in. The file appears
+    under its name only when it is whole.
 
     Args:
         path: of the file to write.
@@ -98,7 +106,13 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
     """
     rest = scene.sh.shape[1] - 1
     names = ["x", "y", "z", *_NORMALS, *_property_names(rest * 3)[3:]]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(scene)}"]
+    end = len(names)
+    if scene.low_pass == MIP_SPLATTING_LOW_PASS:
+        names.append(FILTER_3D)
+    header = ["ply", "format binary_little_endian 1.0"]
+    if scene.antialiased:
+        header.append(f"comment {ANTIALIASED_COMMENT}")
+    header.append(f"element vertex {len(scene)}")
     header += [f"property float {name}" for name in names]
     header += ["end_header", ""]
     height = _BLOCK_BYTES // (4 * len(names))
@@ -112,9 +126,9 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
             block[:, 6:9] = scene.sh[span, 0]
             for channel in range(3):
                 block[:, 9 + channel * rest : 9 + (channel + 1) * rest] = scene.sh[span, 1:, channel]
-            block[:, -8] = scene.opacity_logits[span]
-            block[:, -7:-4] = scene.log_scales[span]
-            block[:, -4:] = scene.quaternions[span]
+            block[:, end - 8] = scene.opacity_logits[span]
+            block[:, end - 7 : end - 4] = scene.log_scales[span]
+            block[:, end - 4 : end] = scene.quaternions[span]
             file.write(block.data)
 
 
@@ -157,6 +171,9 @@ def _read(path: str | os.PathLike[str], stream: io.FileIO, size: int) -> Scene:
         np.empty((count, 1 + rest // 3, 3), dtype=np.float32),
     )
     columns = _columns(scene)
+    filters = np.empty(count, dtype=np.float32) if FILTER_3D in {p.name for p in vertex.properties} else None
+    if filters is not None:
+        columns[FILTER_3D] = filters
     start = 0
     stream.seek(offset)
     blocks = _text_blocks if header.text else _binary_blocks
@@ -166,7 +183,9 @@ def _read(path: str | os.PathLike[str], stream: io.FileIO, size: int) -> Scene:
             for name, column in columns.items():
                 column[start : start + len(block)] = block[name]
             start += len(block)
-    return scene
+    if filters is not None:
+        return folded(scene, filters)
+    return scene.rendered(header.antialiased)
 
 
 def _columns(scene: Scene) -> dict[str, FloatArray]:
@@ -192,6 +211,7 @@ def _read_header(path: str | os.PathLike[str], stream: io.FileIO) -> _Header:
     if newline is None:
         raise DataError(f"'{path}' is not a PLY file: it does not start with the line 'ply'")
     lines: list[bytes] = []
+    comments: list[str] = []
     counts = []
     position = 0
     while not (lines and lines[-1] == b"end_header"):
@@ -202,7 +222,8 @@ def _read_header(path: str | os.PathLike[str], stream: io.FileIO) -> _Header:
         position = end + len(newline)
         fields = line.split()
         if fields[:1] in ([b"comment"], [b"obj_info"]):
-            continue  # may be in any encoding
+            comments.append(line.partition(fields[0])[2].decode("latin-1"))  # may be in any encoding
+            continue
         if fields[:1] == [b"element"] and len(fields) == 3:
             counts.append(_count(path, fields[2]))
             line = b"element %s 0" % fields[1]
@@ -210,7 +231,8 @@ def _read_header(path: str | os.PathLike[str], stream: io.FileIO) -> _Header:
     # With counts of zero the library parses the header and has no values to read.
     try:
         ply = PlyData.read(io.BytesIO(b"\n".join([*lines, b""])))
-        return _Header(ply.text, ply.byte_order, list(zip(ply.elements, counts, strict=True)), position)
+        elements = list(zip(ply.elements, counts, strict=True))
+        return _Header(ply.text, ply.byte_order, elements, position, says_antialiased(comments))
     except Exception as error:  # the library raises what its parts happen to raise
         raise DataError(f"'{path}' has a damaged PLY header: {_one_line(error)}") from error
 
@@ -284,7 +306,7 @@ def _check_size(path: str | os.PathLike[str], header: _Header, size: int) -> int
 
 
 def _report_dropped(path: str | os.PathLike[str], header: _Header, vertex: PlyElement, rest: int) -> None:
-    known = {*_property_names(rest), *_NORMALS}
+    known = {*_property_names(rest), *_NORMALS, FILTER_3D}
     extra = [p.name for p in vertex.properties if p.name not in known]
     if extra:
         _log.warning("'%s': dropped %d unknown properties: %s", path, len(extra), _shortened(", ".join(extra)))

@@ -14,7 +14,7 @@ import numpy as np
 
 from potr_cl.codec import octree
 from potr_cl.errors import DataError, PotrError, UsageError
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import LOW_PASS, Scene
 
 _log = logging.getLogger("potr_cl")
 
@@ -68,6 +68,18 @@ def cleaned(path: str | os.PathLike[str], scene: Scene) -> Scene:
     if report.zero_quaternions:
         _log.warning("'%s': turned %d quaternions of length zero into no rotation", path, report.zero_quaternions)
     return scene
+
+
+def tell_of_low_pass(path: str | os.PathLike[str], scene: Scene) -> None:
+    """Say that a format which knows only the usual low-pass filter cannot hold a scene's own."""
+    if scene.low_pass != LOW_PASS:
+        _log.warning(
+            "'%s': this format cannot say that the scene has Mip-Splatting's low-pass filter of %g square pixels: it "
+            "will be drawn with the usual %g, a little softer",
+            path,
+            scene.low_pass,
+            LOW_PASS,
+        )
 
 
 def arranged(scene: Scene) -> Scene:

@@ -27,6 +27,8 @@ _DESCRIPTION_BYTES = 1 << 22
 #: Others take memory that an archive's size does not bound.
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _CODEBOOK = 256
+#: The "model" of a scene that was trained with antialiasing; one without has none.
+_ANTIALIASED = "antialiased"
 #: Most entries of a palette of SH coefficients; they stand 64 in a row.
 _PALETTE, _PALETTE_COLUMNS = 1 << 16, 64
 #: The alpha of a quaternion's pixel: this and the number of its largest part, of w, x, y, z.
@@ -125,7 +127,7 @@ class _Archive:
             scene.opacity_logits[block] = logits.take(colours[block, 3])
         if coefficients > 1:
             self._fill_rest(scene.sh[:, 1:])
-        return scene
+        return scene.rendered(self._meta.get("model") == _ANTIALIASED)
 
     def _fill_means(self, means: FloatArray) -> None:
         low, high = self._pixels("means", 0), self._pixels("means", 1)

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, arranged, cleaned, opened
+from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, arranged, cleaned, opened, tell_of_low_pass
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.claims import check_claim
@@ -96,9 +96,7 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
             header, properties = _read_gzip(path, file, size, trust)
         else:
             header, properties = _read_streams(path, file.read(), trust)
-        scene = _unpacked(header, properties)
-    if header.flags & _ANTIALIASED:
-        _log.warning("'%s' was trained for a rasterizer with antialiasing: it is rendered without", path)
+        scene = _unpacked(header, properties).rendered(bool(header.flags & _ANTIALIASED))
     if header.flags & _EXTENSIONS:
         _log.warning("'%s' has extensions: they are left out, and axes are kept as they are", path)
     return cleaned(path, scene)
@@ -122,7 +120,9 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
         raise DataError(f"'{path}': SPZ cannot hold a splat {largest:.3g} units from the origin")
     if bits < _FRACTIONAL_BITS:
         _log.warning("'%s': the scene is large for SPZ: positions are stored in steps of 1/%d unit", path, 2**bits)
-    header = _HEADER.pack(_MAGIC, 3, len(scene), scene.sh_degree, bits, 0, 0)
+    tell_of_low_pass(path, scene)
+    flags = _ANTIALIASED if scene.antialiased else 0
+    header = _HEADER.pack(_MAGIC, 3, len(scene), scene.sh_degree, bits, flags, 0)
     content = b"".join([header, *_packed(arranged(scene), bits)])
     with replacing(path) as file:
         _write_gzip(file, content)
