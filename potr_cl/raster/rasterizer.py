@@ -307,15 +307,17 @@ def render(
     device: Device | None = None,
     rules: RasterRules = INRIA,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    antialiased: bool | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Render one view of a scene; for many views keep a :class:`Rasterizer`.
 
     Args:
         device: to render on; the best one there is by default.
+        antialiased: whether to render it as an antialiased scene; None: as it was trained.
 
     Returns, Raises: as :meth:`Rasterizer.render`.
     """
-    with Rasterizer(device or Device(), scene, rules, background) as rasterizer:
+    with Rasterizer(device or Device(), scene.rendered(antialiased), rules, background) as rasterizer:
         return rasterizer.render(camera)
 
 
