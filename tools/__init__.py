@@ -29,6 +29,7 @@ study.rate_distortion      size against quality: the curves that other studies c
 study.ablation             what does each part of the codec contribute?
 study.compare_formats      what would people use instead?
 study.rates                where do the bits go, and what do they buy?
+study.antialiasing         what is lost if an antialiased scene is encoded as a classic one?
 study.compaction_curves    what does the compaction do to sparsity and pictures?
 study.removal_exactness    how far are predicted removal effects from removals in float64?
 study.removal_formulas     back to front or prefix sums: which formula of removal effects?

@@ -125,6 +125,8 @@ def test_a_file_keeps_how_its_scene_is_rendered(device, preset, low_pass):
     back = potr_cl.codec.decoder.PotrFile.from_bytes(data).scene()
     assert (back.antialiased, back.low_pass) == (True, low_pass)
     assert 0 < len(back) <= len(scene)
+    keyword = b"".join(encode(scene.rendered(False), cameras, options, device=device, antialiased=True).pieces)
+    assert (keyword == data) == (low_pass == LOW_PASS)
     errors = []
     for candidate in (back, back.rendered(False)):
         pictures = [reference.render(each, view, INRIA).image for view in cameras[:2] for each in (scene, candidate)]

@@ -49,14 +49,13 @@ def test_a_large_scene_is_stored_more_coarsely(tmp_path, caplog):
     assert not (tmp_path / "b.spz").exists()
 
 
-@pytest.mark.parametrize(("flag", "said"), [(1, "antialiasing"), (2, "extensions")])
-def test_flags_that_matter_are_said(tmp_path, data, caplog, flag, said):
+def test_extensions_are_said(tmp_path, data, caplog):
     content = bytearray(gzip.decompress((data / "foreign" / "version_3.spz").read_bytes()))
-    content[14] |= flag
+    content[14] |= 2
     path = tmp_path / "a.spz"
     path.write_bytes(gzip.compress(bytes(content)))
     assert len(load_scene(path)) == 1500
-    assert said in caplog.text
+    assert "extensions" in caplog.text
 
 
 def spz_header(splats, version=3, degree=3):
