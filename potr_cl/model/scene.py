@@ -22,7 +22,8 @@ _OPAQUE = np.float32(20)
 SH_COEFFICIENTS = (1, 4, 9, 16)
 
 #: Variance of the low-pass filter that a picture's splats are widened by, square pixels: that of the original
-#: rasterizer, gsplat, Brush and the viewers; and Mip-Splatting's own, which only antialiased scenes can have.
+#: rasterizer, of gsplat and of viewers; and that of Mip-Splatting's code and of Brush's mip mode, which only
+#: antialiased scenes can have.
 LOW_PASS, MIP_SPLATTING_LOW_PASS = 0.3, 0.1
 
 

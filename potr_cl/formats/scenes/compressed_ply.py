@@ -13,7 +13,7 @@ from typing import BinaryIO
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.gsply_arrays import EXTRA, from_scene, library, to_scene
-from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, says_antialiased
+from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
 from potr_cl.formats.scenes.scene_files import opened, tell_of_low_pass
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
@@ -54,9 +54,9 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     """
     with opened(path) as (file, size):
         gsply = library(path)
-        content, antialiased = _canonical(path, file, size)
+        content, comments = _canonical(path, file, size)
         data = gsply.decompress_from_bytes(content)
-    return to_scene(path, data).rendered(antialiased)
+    return marked(to_scene(path, data), comments)
 
 
 def save(path: str | os.PathLike[str], scene: Scene) -> None:
@@ -87,8 +87,8 @@ FORMAT = SceneFormat(
 )
 
 
-def _canonical(path: str | os.PathLike[str], file: BinaryIO, size: int) -> tuple[bytearray, bool]:
-    """A file with a header of our own, and whether its own says that the scene is antialiased.
+def _canonical(path: str | os.PathLike[str], file: BinaryIO, size: int) -> tuple[bytearray, list[str]]:
+    """A file with a header of our own, and the comments of its own.
 
     Not as bytes: the library's kernels are compiled for arrays that can change.
     """
@@ -108,7 +108,7 @@ def _canonical(path: str | os.PathLike[str], file: BinaryIO, size: int) -> tuple
     if len(content) < values:
         raise DataError(f"'{path}' became shorter while it was read")
     whole += content
-    return whole, says_antialiased(comments)
+    return whole, comments
 
 
 def _header_lines(path: str | os.PathLike[str], head: bytes) -> tuple[list[str], list[str], int]:

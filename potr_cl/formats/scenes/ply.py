@@ -18,7 +18,7 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.filter_3d import FILTER_3D, folded
-from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, says_antialiased
+from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
 from potr_cl.formats.scenes.scene_files import cleaned
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
@@ -40,14 +40,14 @@ class _Header:
         byte_order: "<" or ">"; of no meaning for text.
         elements: with their number of rows, in file order.
         size: bytes up to the first value.
-        antialiased: whether a comment says that the scene is.
+        comments: without the word "comment".
     """
 
     text: bool
     byte_order: str
     elements: list[tuple[PlyElement, int]]
     size: int
-    antialiased: bool
+    comments: list[str]
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
@@ -185,7 +185,7 @@ def _read(path: str | os.PathLike[str], stream: io.FileIO, size: int) -> Scene:
             start += len(block)
     if filters is not None:
         return folded(scene, filters)
-    return scene.rendered(header.antialiased)
+    return marked(scene, header.comments)
 
 
 def _columns(scene: Scene) -> dict[str, FloatArray]:
@@ -231,8 +231,7 @@ def _read_header(path: str | os.PathLike[str], stream: io.FileIO) -> _Header:
     # With counts of zero the library parses the header and has no values to read.
     try:
         ply = PlyData.read(io.BytesIO(b"\n".join([*lines, b""])))
-        elements = list(zip(ply.elements, counts, strict=True))
-        return _Header(ply.text, ply.byte_order, elements, position, says_antialiased(comments))
+        return _Header(ply.text, ply.byte_order, list(zip(ply.elements, counts, strict=True)), position, comments)
     except Exception as error:  # the library raises what its parts happen to raise
         raise DataError(f"'{path}' has a damaged PLY header: {_one_line(error)}") from error
 

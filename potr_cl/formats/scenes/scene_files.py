@@ -74,8 +74,8 @@ def tell_of_low_pass(path: str | os.PathLike[str], scene: Scene) -> None:
     """Say that a format which knows only the usual low-pass filter cannot hold a scene's own."""
     if scene.low_pass != LOW_PASS:
         _log.warning(
-            "'%s': this format cannot say that the scene has Mip-Splatting's low-pass filter of %g square pixels: it "
-            "will be drawn with the usual %g, a little softer",
+            "'%s': this format cannot say that the scene has a low-pass filter of %g square pixels, as Mip-Splatting's "
+            "have: it will be drawn with the usual %g, a little softer",
             path,
             scene.low_pass,
             LOW_PASS,
