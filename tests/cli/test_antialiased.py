@@ -35,7 +35,7 @@ def run(*arguments) -> None:
     [(False, [], False), (True, [], True), (False, ["--antialiased", "yes"], True),
      (True, ["--antialiased", "no"], False), (True, ["--antialiased", "auto"], True)],
 )  # fmt: skip
-def test_every_command_that_writes_a_scene(tmp_path, paths, marked, option, expected):
+def test_every_command_that_writes_a_scene(tmp_path, paths, capsys, marked, option, expected):
     scene, cameras = paths[marked], paths[2]
     few = ["--iterations", 2]
     for command in (
@@ -47,6 +47,8 @@ def test_every_command_that_writes_a_scene(tmp_path, paths, marked, option, expe
         ["refit", scene, "--reference", scene, "--cameras", cameras, "-o", tmp_path / "d.ply", "--steps", 1],
     ):
         run(*command, *option)
+        said = capsys.readouterr().out
+        assert ("as an antialiased scene" in said) == (expected and command[0] == "encode")
     for name in ("a.potr", "a.spz", "a.ply", "b.ply", "c.ply", "d.ply"):
         assert load_scene(tmp_path / name).antialiased is expected, name
     run("decode", tmp_path / "a.potr", "-o", tmp_path / "e.ply")
