@@ -147,6 +147,22 @@ def test_filters_beyond_all_bounds(tmp_path, caplog):
     assert back.opacities[1] < 1e-30  # 87 decades smaller than its filter
 
 
+def test_any_bits_for_values_and_filters_give_a_finite_scene(tmp_path, recwarn):
+    """Whatever 32 bits mean as a number: such a splat is dropped or mended, and nothing is warned of but by us."""
+    rng = np.random.default_rng(0)
+    count = 20_000
+    bits = rng.integers(0, 2**32, (5, count), np.uint32).view(np.float32)
+    scene = random_scene(count, 0)
+    some = rng.random((4, count)) < 0.3
+    for axis in range(3):
+        scene.log_scales[some[axis], axis] = bits[axis, some[axis]]
+    scene.opacity_logits[some[3]] = bits[3, some[3]]
+    back = load_scene(mip_splatting_ply(tmp_path / "a.ply", scene, bits[4]))
+    assert 0 < len(back) < count
+    assert all(np.isfinite(getattr(back, name)).all() for name in ARRAYS)
+    assert not recwarn.list
+
+
 def test_a_mip_splatting_ply_there_and_back(tmp_path):
     """What is read is written with a filter of nothing, which Mip-Splatting's renderer, too, reads as it is."""
     filters = np.full(50, 0.01)
