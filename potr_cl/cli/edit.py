@@ -142,6 +142,12 @@ def _refit(args: argparse.Namespace) -> None:
         assert cameras is not None
         ground_truth = GroundTruth(args.photos, cameras, background)
     scene, reference = read_scene(args, args.scene), read_scene(args, args.reference)
+    if scene.antialiased != reference.antialiased:
+        names = (args.scene, args.reference) if scene.antialiased else (args.reference, args.scene)
+        raise UsageError(
+            f"'{names[0]}' says that it is antialiased and '{names[1]}' does not, so their pictures cannot be alike: "
+            "give --antialiased yes or no for both"
+        )
     device = Device(args.device)
     with contextlib.closing(Progress()) as progress:
         cameras = cameras or virtual_cameras(args, reference, progress)

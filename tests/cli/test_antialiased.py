@@ -101,6 +101,17 @@ def test_encode_is_judged_as_the_scene_is_rendered(tmp_path, paths, capsys):
     assert unlike["mean"]["b_against_a"]["psnr"] < said - 5
 
 
+def test_refit_takes_both_scenes_alike(tmp_path, paths, capsys):
+    """As after ``prune --antialiased yes`` of a file without a mark: the result has one, the original has none."""
+    plain, marked, cameras = paths
+    command = ["refit", marked, "--reference", plain, "--cameras", cameras, "-o", str(tmp_path / "a.ply")]
+    assert cli.main(command) == 2
+    assert f"'{marked}' says that it is antialiased and '{plain}' does not" in capsys.readouterr().err
+    assert not (tmp_path / "a.ply").exists()
+    run(*command, "--antialiased", "yes", "--steps", 1)
+    assert load_scene(tmp_path / "a.ply").antialiased
+
+
 def test_a_wrong_choice_is_told(paths, capsys):
     with pytest.raises(SystemExit) as ended:
         cli.main(["convert", paths[0], "x.spz", "--antialiased", "perhaps"])
