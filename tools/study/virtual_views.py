@@ -3,10 +3,11 @@
     python -m tools.study.virtual_views SCENE … [--views 96x700@80 300x600@50 …] [--json FILE]
 
 A SCENE is a folder with point_cloud.ply and cameras.json. It is encoded with its training cameras at the qualities of
---qualities, and then with virtual views of each number, size and field of view (NUMBERxPIXELS@DEGREES). PSNR is the mean over the true test
-views, against the uncompressed scene's renders. Bytes are compared at the PSNR that the true cameras reach at q = 0.5,
-interpolated in the logarithm of the bytes; time is that of the encodes at the first quality, as a multiple of the true
-cameras'; memory is the most that the device had given away whenever the encode reported how far it was.
+--qualities, and then with virtual views of each number, size and field of view (NUMBERxPIXELS@DEGREES). PSNR is the
+mean over the true test views, against the uncompressed scene's renders. Bytes are compared at the PSNR that the true
+cameras reach at the first quality, interpolated in the logarithm of the bytes; time is that of the encodes at the first
+quality, as a multiple of the true cameras'; memory is the most that the device had given away whenever the encode
+reported how far it was.
 
 --fraction F takes all pictures smaller, and --iterations N prunes in fewer iterations: enough to compare placements on
 a CPU, not for publication.
@@ -122,7 +123,7 @@ def main() -> None:
         options = options.changed(prune={"iterations": args.iterations})
     table = Results(device.info, args.json).table(
         "study",
-        "Virtual views by number, size and field: bytes at the PSNR that the true cameras reach at q = 0.5, time and memory",
+        "Virtual views by number, size and field: bytes at the true cameras' PSNR, time and memory",
         Column("scene"),
         Column("views"),
         Column("width and height", "pixels"),
