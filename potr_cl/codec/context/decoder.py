@@ -268,4 +268,6 @@ class Stream:
 def _bits(packed: U8, start: int, stop: int) -> Bits:
     """Bits from one number to another of packed ones."""
     first = start // 8
-    return np.unpackbits(packed[first : (stop + 7) // 8], bitorder="little").view(bool)[start - 8 * first : stop - 8 * first]
+    return np.unpackbits(packed[first : (stop + 7) // 8], bitorder="little").view(bool)[
+        start - 8 * first : stop - 8 * first
+    ]

@@ -125,7 +125,10 @@ class Functions:
         contexts, alphabet = narrow.shape
         entries = np.empty(contexts * _TOTAL, np.uint32)
         wrong = self._c["potr_context_table"](
-            _address(narrow, np.uint16, narrow.size), contexts, alphabet, _address(entries, np.uint32, entries.size, True)
+            _address(narrow, np.uint16, narrow.size),
+            contexts,
+            alphabet,
+            _address(entries, np.uint32, entries.size, True),
         )
         return None if wrong else entries
 
@@ -161,7 +164,11 @@ class Functions:
             Words that are taken afterwards; None if there are too few.
         """
         steps, lanes = tokens.shape
-        if int(contexts.max()) >= len(entries) // _TOTAL or int(lane_counts.max()) > lanes or int(lane_counts.min()) < 0:
+        if (
+            int(contexts.max()) >= len(entries) // _TOTAL
+            or int(lane_counts.max()) > lanes
+            or int(lane_counts.min()) < 0
+        ):
             raise TypeError("the native path was given contexts without entries, or more splats than lanes")
         if len(known) > _CONTEXT_TERMS or not 0 <= read <= len(words) // 2:
             raise TypeError("the native path was given impossible sizes")

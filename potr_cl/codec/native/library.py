@@ -26,7 +26,9 @@ def native() -> Functions | None:
     """
     asked = os.environ.get(VARIABLE, "")
     if asked not in ("", "0", "1"):
-        raise UsageError(f"{VARIABLE} is '{asked}': set it to 0 for NumPy, to 1 for the compiled library, or not at all")
+        raise UsageError(
+            f"{VARIABLE} is '{asked}': set it to 0 for NumPy, to 1 for the compiled library, or not at all"
+        )
     if asked == "0":
         return None
     functions = _loaded(os.environ.get(LIBRARY_VARIABLE) or _built())
