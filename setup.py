@@ -11,7 +11,8 @@ from setuptools import Extension, setup
 
 NATIVE = Path("potr_cl", "codec", "native")
 # Vectors; and each operation on floats rounded by itself, so that every machine decodes the same numbers.
-OPTIONS = ["/O2", "/fp:precise"] if sys.platform == "win32" else ["-std=c11", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden"]
+OPTIONS = ["-std=c11", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden"]
+OPTIONS_OF_MSVC = ["/O2", "/fp:precise"]
 
 setup(
     ext_modules=[
@@ -19,7 +20,7 @@ setup(
             "potr_cl.codec.native._library",
             sources=sorted(str(source) for source in NATIVE.glob("*.c")),
             depends=[str(NATIVE / "potr_native.h")],
-            extra_compile_args=OPTIONS,
+            extra_compile_args=OPTIONS_OF_MSVC if sys.platform == "win32" else OPTIONS,
             py_limited_api=True,
             optional=True,
         )

@@ -122,7 +122,7 @@ class _NumpyCoder:
     ) -> None:
         self._weights, self._signed, self._counts = weights, signed, lanes.counts
         self._tables = [_table(model, signed) for model in models]
-        self._rans = rans.Decoder(states.astype(np.int64), memoryview(words), what)
+        self._rans = rans.Decoder(states, words.data, what)
 
     def stream(self, s: int, history: Sizes) -> U8:
         """(steps, lanes) tokens of the next stream, number ``s``, whose sizes go into ``history.next``.

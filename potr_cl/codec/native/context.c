@@ -11,7 +11,7 @@ enum {
     MOST_TOKENS = 252,
     MOST_EXTRA = 35,      /* bits beside the largest token */
     LOWEST = 1 << 16,
-    GROUP = 64,           /* lanes whose contexts are computed at a time */
+    GROUP = 128,          /* lanes whose contexts are computed at a time */
     TURNED = 32           /* steps and lanes that are turned round at a time */
 };
 
@@ -50,29 +50,30 @@ POTR_EXPORT int potr_context_table(
 /* Tokens of `count` lanes, at most GROUP, in a step. Words are read without asking whether there are more: `count` of
  * them at least are there. Returns how many were read.
  *
- * What needs no lookup stands in loops of its own, of which compilers make vector instructions; what is a choice in one
- * lane out of two stands there without a branch, which processors would foretell wrongly. */
+ * What needs no lookup stands in loops of its own, of which compilers make vector instructions. Whether a state takes a
+ * word is as good as chance, and processors foretell such branches wrongly: so every lane is given the next word, and
+ * only those that need it go on to the one after. */
 static INLINE size_t group_of_tokens(
     const uint32_t *restrict entries, const uint32_t *restrict bases, const int16_t *restrict size_of,
     const int32_t *restrict expected, const uint8_t *restrict words, uint32_t *restrict states,
     int32_t *restrict recent, uint8_t *restrict tokens, int16_t *restrict sizes, size_t count)
 {
     uint32_t found[GROUP], next[GROUP];
-    for (size_t i = 0; i < count; i++)
-        found[i] = entries[bases[expected[i]] + (states[i] & (TOTAL - 1))];
+    uint16_t low[GROUP];
+    for (size_t i = 0; i < count; i++) {
+        const uint32_t entry = entries[bases[expected[i]] + (states[i] & (TOTAL - 1))];
+        found[i] = entry;
+        sizes[i] = size_of[entry >> 24];
+    }
     for (size_t i = 0; i < count; i++)
         next[i] = ((found[i] & (TOTAL - 1)) + 1) * (states[i] >> PRECISION) + (found[i] >> 12 & (TOTAL - 1));
     size_t read = 0;
     for (size_t i = 0; i < count; i++) {
-        uint16_t word;
-        memcpy(&word, words + 2 * read, 2);
-        const uint32_t few = next[i] < LOWEST;
-        const uint32_t mask = 0 - few;
-        states[i] = (next[i] & ~mask) | ((next[i] << 16 | word) & mask);
-        read += few;
+        memcpy(&low[i], words + 2 * read, 2);
+        read += next[i] < LOWEST;
     }
     for (size_t i = 0; i < count; i++)
-        sizes[i] = size_of[found[i] >> 24];
+        states[i] = next[i] < LOWEST ? next[i] << 16 | low[i] : next[i];
     for (size_t i = 0; i < count; i++)
         tokens[i] = (uint8_t)(found[i] >> 24);
     for (size_t i = 0; i < count; i++)

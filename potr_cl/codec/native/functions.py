@@ -37,8 +37,7 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_context_table": (_NUMBER, [_POINTER, _SIZE, _SIZE, _POINTER]),
     "potr_context_stream": (
         _NUMBER,
-        [_POINTER, _SIZE, _POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _POINTER, _POINTER, _POINTER, _POINTER]
-        + [_POINTER, _SIZE, _POINTER, _POINTER],
+        [_POINTER, _SIZE, *[_POINTER] * 3, _SIZE, *[_POINTER] * 6, _SIZE, _POINTER, _POINTER],
     ),
     "potr_context_beside": (_WORD, [_POINTER, _SIZE, _POINTER]),
     "potr_context_join": (None, [_POINTER, _SIZE, _SIZE, _POINTER]),
@@ -56,8 +55,7 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     ),
     "potr_octree_centres": (
         _NUMBER,
-        [_POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _POINTER, _WORD, _WORD, _NUMBER, _POINTER]
-        + [_POINTER, _POINTER, _POINTER, _POINTER, _POINTER, _WORD],
+        [_POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _POINTER, _WORD, _WORD, _NUMBER, *[_POINTER] * 6, _WORD],
     ),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
     "potr_join_planes": (None, [_POINTER, _SIZE, ctypes.c_uint, _NUMBER, _POINTER]),
@@ -112,25 +110,28 @@ class Functions:
 
     # -------------------------------------------------------------------------------------- context coder
 
-    def context_table(self, frequencies: NDArray[np.integer]) -> U32 | None:
+    def context_table(self, frequencies: NDArray[np.integer]) -> U32:
         """What each slot of each context stands for, for :meth:`context_stream`.
 
         Args:
             frequencies: (contexts, alphabet), at most 32 and 252.
 
         Returns:
-            (contexts · 4096,), or None if the frequencies of a context do not add up to 4096.
+            (contexts · 4096,).
+
+        Raises:
+            TypeError: the frequencies of a context do not add up to 4096.
         """
         narrow = np.ascontiguousarray(frequencies, np.uint16)
         contexts, alphabet = narrow.shape
         entries = np.empty(contexts * _TOTAL, np.uint32)
-        wrong = self._c["potr_context_table"](
+        rows, slots = (
             _address(narrow, np.uint16, narrow.size),
-            contexts,
-            alphabet,
-            _address(entries, np.uint32, entries.size, True),
+            _address(entries, np.uint32, len(entries), True),
         )
-        return None if wrong else entries
+        if self._c["potr_context_table"](rows, contexts, alphabet, slots):
+            raise TypeError("the native path was given frequencies that do not add up")
+        return entries
 
     def context_stream(
         self,
@@ -215,7 +216,7 @@ class Functions:
         )
         return joined
 
-    def integers_of_tokens(self, tokens: U8, bits: U8, first: int, is_signed: bool, predicted: bool) -> I64 | None:
+    def integers_of_tokens(self, tokens: U8, bits: U8, first: int, is_signed: bool, predicted: bool) -> I64:
         """The integers of a stream in the order of splats.
 
         Args:
@@ -226,7 +227,10 @@ class Functions:
             predicted: undo the prediction from the four integers before in the lane.
 
         Returns:
-            (lanes · steps,), or None if there are too few bits.
+            (lanes · steps,).
+
+        Raises:
+            TypeError: there are too few bits.
         """
         steps, lanes = tokens.shape
         values = np.empty(steps * lanes, np.int64)
@@ -243,7 +247,9 @@ class Functions:
             _address(work, np.int64, work.size, True),
             _address(values, np.int64, values.size, True),
         )
-        return None if short else values
+        if short:
+            raise TypeError("the native path was given fewer bits than tokens ask for")
+        return values
 
     # ---------------------------------------------------------------------------------------------- octree
 

@@ -34,7 +34,7 @@ def native() -> Functions | None:
     functions = _loaded(os.environ.get(LIBRARY_VARIABLE) or _built())
     if functions is None and asked == "1":
         raise UsageError(
-            f"{VARIABLE} is 1, but the compiled library is not there: install potr_cl again with a C compiler, or unset it"
+            f"{VARIABLE} is 1, but the compiled library is missing: unset it, or install potr_cl with a C compiler"
         )
     return functions
 
