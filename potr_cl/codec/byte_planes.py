@@ -70,7 +70,7 @@ class PlaneStream:
 
     @cached_property
     def joined(self) -> NDArray[Any]:
-        """All of them: uint8, mapped to unsigned, where they are that small; else 64 bits each."""
+        """All of them: uint8, mapped to unsigned, where they are that small; else 32 or 64 bits each."""
         if self.planes == 0:
             return np.zeros(self.count, np.uint8)
         if self.planes == 1:

@@ -33,6 +33,8 @@ from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 
 #: More threads would find nothing to do.
 _MOST_THREADS = 16
+#: Coefficients and other properties whose integers may wait for a thread to make values of them.
+_MOST_WAITING = 6
 
 _EMPTY = np.empty(0, np.uint8)
 
@@ -190,7 +192,11 @@ class PotrFile:
         left: list[Future[None]] = []
 
         def leave(work: Callable[[], None]) -> None:
-            left.append(pool.submit(work))
+            # What waits holds memory; where much does, threads are not what is missing.
+            if sum(not future.done() for future in left) < _MOST_WAITING:
+                left.append(pool.submit(work))
+            else:
+                work()
 
         submit: _Submit = _now if threads == 1 else leave
 

@@ -34,7 +34,7 @@ class IntegerStream(Protocol):
 
     @property
     def joined(self) -> NDArray[Any]:
-        """All of them: uint8, mapped to unsigned, where they are that small; else 64 bits each."""
+        """All of them: uint8, mapped to unsigned, where they are that small; else 32 or 64 bits each."""
 
 
 @dataclass(frozen=True)
@@ -132,13 +132,13 @@ class Dequantizer:
         small = levels.dtype == np.uint8
         table = dequantize(np.arange(_SMALL_TABLE if small else _LARGE_TABLE), factor)
         if functions.look_up(levels, table, out, column):
-            beyond = np.flatnonzero(levels.view(np.uint64) >= len(table))
+            beyond = np.flatnonzero(levels >= len(table))
             out[beyond, column] = dequantize(levels[beyond], factor)
 
 
 def _summed(functions: Functions, levels: NDArray[Any]) -> NDArray[np.int64]:
-    wide = functions.widen(levels, True) if levels.dtype == np.uint8 else levels.view(np.int64)
-    return np.cumsum(wide, out=np.empty_like(wide))
+    differences = functions.widened(levels, True) if levels.dtype == np.uint8 else levels
+    return np.cumsum(differences, dtype=np.int64)
 
 
 def _wider(levels: list[NDArray[np.integer]]) -> list[NDArray[Any]]:

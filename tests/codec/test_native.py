@@ -281,7 +281,7 @@ def test_arrays_of_other_sizes_are_refused(functions):
 
 def test_tails_and_bits_that_are_too_short_are_refused(functions):
     with pytest.raises(TypeError, match="fewer bits"):
-        functions.integers_of_tokens(np.full((2, 2), 200, np.uint8), np.zeros(3, np.uint8), 0, True, False)
+        functions.integers_of_tokens(np.full((2, 2), 200, np.uint8), np.zeros(3, np.uint8), 0, 1 << 30, True, False)
     tree = Tree(np.zeros(108, np.uint64), 4, 0)
     counts = np.zeros(53, np.uint64)
     counts[3] = 4

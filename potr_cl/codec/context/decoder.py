@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from potr_cl.codec import rans
 from potr_cl.codec.context.lanes import Lanes, from_residuals
 from potr_cl.codec.context.model import CHANNELS, HEAD, Model, Sizes, read_description
-from potr_cl.codec.context.tokens import ALPHABET, SIZES, Bits, bits_beside, detokenise
+from potr_cl.codec.context.tokens import ALPHABET, SIZES, Bits, bits_beside, detokenise, largest_integer
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import native
 from potr_cl.errors import DataError
@@ -96,12 +96,12 @@ class Reader:
         for s in range(self._streams):
             tokens = self._coder.stream(s, self._history)
             self._history.added()
-            count = bits_beside(tokens) if self._functions is None else self._functions.bits_beside(tokens)
+            count, largest = bits_beside(tokens) if self._functions is None else self._functions.bits_beside(tokens)
             first = self._bits_read
             self._bits_read += count
             if self._bits_read > all_bits:
                 raise self._damaged("ends too early")
-            yield Stream(self._lanes, tokens, self._beside, first, count, self._signed, self._predicted)
+            yield Stream(self._lanes, tokens, largest, self._beside, first, count, self._signed, self._predicted)
         self._coder.finish()
         if all_bits - self._bits_read >= 8 or _bits(self._beside, self._bits_read, all_bits).any():
             raise self._damaged("holds more bits than its integers ask for")
@@ -226,12 +226,14 @@ class Stream:
 
     Attributes:
         tokens: (steps, lanes).
+        largest: the largest token.
         beside: bytes of the section's bits beside tokens.
         first, bits: number of the first bit that is this stream's, and how many are.
     """
 
     lanes: Lanes
     tokens: U8
+    largest: int
     beside: U8
     first: int
     bits: int
@@ -252,13 +254,15 @@ class Stream:
 
     @cached_property
     def joined(self) -> NDArray[np.integer]:
-        """(n,) uint8, mapped to unsigned, where all integers are that small; else int64."""
+        """(n,) uint8, mapped to unsigned, where all integers are that small; else int32 or int64."""
         functions = native()
         tokens = self.tokens
         if not (self.bits or self.predicted):
             return self.lanes.join(tokens) if functions is None else functions.join_lanes(tokens)[: self.lanes.splats]
         if functions is not None:
-            found = functions.integers_of_tokens(tokens, self.beside, self.first, self.signed, self.predicted)
+            # The largest in magnitude of all that are mapped to what this token stands for.
+            most = largest_integer(self.largest) // (2 if self.signed else 1) + 1
+            found = functions.integers_of_tokens(tokens, self.beside, self.first, most, self.signed, self.predicted)
             return found[: self.lanes.splats]
         bits = _bits(self.beside, self.first, self.first + self.bits)
         values = detokenise(tokens, bits, self.signed)

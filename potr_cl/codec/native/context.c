@@ -179,66 +179,84 @@ POTR_EXPORT void potr_context_join(
 }
 
 /* Adds to each integer the mean of the four before in its lane, rounded. Sums wrap round. */
-static void add_predictions(int64_t *values, size_t steps, size_t lanes)
-{
-    for (size_t step = 1; step < steps; step++) {
-        const size_t before = step < 4 ? step : 4;
-        int64_t *row = values + step * lanes;
-        for (size_t l = 0; l < lanes; l++) {
-            uint64_t sum = 2;
-            for (size_t k = 1; k <= before; k++)
-                sum += (uint64_t)row[l - k * lanes];
-            /* ⌊sum / 4⌋, without the shift of a negative number, which compilers may understand as they like. */
-            const uint64_t sign = sum >> 63;
-            row[l] = (int64_t)((uint64_t)row[l] + (sum >> 2 | (0 - sign) << 62));
-        }
+#define ADD_PREDICTIONS(kind, type) \
+    static void add_predictions_##kind(type *values, size_t steps, size_t lanes) \
+    { \
+        for (size_t step = 1; step < steps; step++) { \
+            const size_t before = step < 4 ? step : 4; \
+            type *row = values + step * lanes; \
+            for (size_t l = 0; l < lanes; l++) { \
+                type sum = 2; \
+                for (size_t k = 1; k <= before; k++) \
+                    sum += row[l - k * lanes]; \
+                /* ⌊sum / 4⌋, without the shift of a negative number, which compilers may understand as they like. */ \
+                const type sign = sum >> (8 * sizeof sum - 1); \
+                row[l] += sum >> 2 | (0 - sign) << (8 * sizeof sum - 2); \
+            } \
+        } \
     }
-}
 
-/* The integers of tokens and the bits beside them, in the order of splats.
- *
- * tokens: (steps, lanes), below MOST_TOKENS. bits: (available) bits, eight a byte, lowest first, all of them of this
- * stream from number `first` on. is_signed: undo the mapping of signed integers. predicted: they are differences from
- * the mean of the four before in the lane. work, values: (lanes · steps) each; only `values` is a result.
- *
- * Returns 0, or 1 if there are too few bits. */
-POTR_EXPORT int potr_context_integers(
-    const uint8_t *restrict tokens, size_t steps, size_t lanes, const uint8_t *restrict bits, uint64_t first,
-    uint64_t available, int is_signed, int predicted, int64_t *restrict work, int64_t *restrict values)
+ADD_PREDICTIONS(medium, uint32_t)
+ADD_PREDICTIONS(wide, uint64_t)
+
+/* Where the next lowest, second lowest, … bit of the tokens stands: first those of all tokens that have the one, and so
+ * on. Returns the number of the bit behind the last. */
+static uint64_t bit_planes(const uint8_t *tokens, size_t number, uint64_t first, uint64_t at[MOST_EXTRA + 1])
 {
-    const size_t number = steps * lanes;
-    /* Where the next lowest, second lowest, … bit stands: first those of all tokens that have the one, and so on. */
-    uint64_t at[MOST_EXTRA + 1] = { 0 };
+    memset(at, 0, (MOST_EXTRA + 1) * sizeof *at);
     for (size_t i = 0; i < number; i++)
         if (tokens[i] >= DIRECT)
             at[extra_bits(tokens[i])]++;
     for (int b = MOST_EXTRA - 1; b >= 1; b--)
         at[b] += at[b + 1]; /* tokens with at least b bits */
-    uint64_t next = first;
     for (int b = 0; b < MOST_EXTRA; b++) {
         const uint64_t having = at[b + 1];
-        at[b] = next;
-        next += having;
+        at[b] = first;
+        first += having;
     }
-    if (next > available)
-        return 1;
-    for (size_t i = 0; i < number; i++) {
-        uint64_t u = tokens[i];
-        if (u >= DIRECT) {
-            const unsigned extra = extra_bits(tokens[i]);
-            u = (uint64_t)(4 + (tokens[i] - DIRECT) % 4) << extra;
-            for (unsigned b = 0; b < extra; b++, at[b - 1]++)
-                u |= (uint64_t)(bits[at[b] >> 3] >> (at[b] & 7) & 1) << b;
-        }
-        work[i] = (int64_t)(is_signed ? u >> 1 ^ (0 - (u & 1)) : u);
-    }
-    if (predicted)
-        add_predictions(work, steps, lanes);
-    for (size_t lane = 0; lane < lanes; lane += TURNED / 4) {
-        const size_t width = lanes - lane < TURNED / 4 ? lanes - lane : TURNED / 4;
-        for (size_t step = 0; step < steps; step++)
-            for (size_t l = 0; l < width; l++)
-                values[(lane + l) * steps + step] = work[step * lanes + lane + l];
-    }
-    return 0;
+    return first;
 }
+
+/* The integers of tokens and the bits beside them, in the order of splats: medium ones, which the caller knows to be
+ * below 2^29 in magnitude, or wide ones.
+ *
+ * tokens: (steps, lanes), below 252. bits: (available) bits, eight a byte, lowest first, all of them of this stream from
+ * number `first` on. is_signed: undo the mapping of signed integers. predicted: they are differences from the mean of
+ * the four before in the lane. work, values: (lanes · steps) each; only `values` is a result.
+ *
+ * Returns 0, or 1 if there are too few bits. */
+#define INTEGERS(kind, type) \
+    POTR_EXPORT int potr_context_integers_##kind( \
+        const uint8_t *restrict tokens, size_t steps, size_t lanes, const uint8_t *restrict bits, uint64_t first, \
+        uint64_t available, int is_signed, int predicted, type *restrict work, type *restrict values) \
+    { \
+        const size_t number = steps * lanes; \
+        uint64_t at[MOST_EXTRA + 1]; \
+        if (bit_planes(tokens, number, first, at) > available) \
+            return 1; \
+        for (size_t i = 0; i < number; i++) { \
+            type u = tokens[i]; \
+            if (u >= DIRECT) { \
+                const unsigned extra = extra_bits(tokens[i]); \
+                u = (type)(4 + (tokens[i] - DIRECT) % 4) << extra; \
+                for (unsigned b = 0; b < extra; b++) { \
+                    u |= (type)(bits[at[b] >> 3] >> (at[b] & 7) & 1) << b; \
+                    at[b]++; \
+                } \
+            } \
+            work[i] = is_signed ? u >> 1 ^ (0 - (u & 1)) : u; \
+        } \
+        if (predicted) \
+            add_predictions_##kind(work, steps, lanes); \
+        enum { WIDTH = 64 / sizeof(type) }; \
+        for (size_t lane = 0; lane < lanes; lane += WIDTH) { \
+            const size_t width = lanes - lane < WIDTH ? lanes - lane : WIDTH; \
+            for (size_t step = 0; step < steps; step++) \
+                for (size_t l = 0; l < width; l++) \
+                    values[(lane + l) * steps + step] = work[step * lanes + lane + l]; \
+        } \
+        return 0; \
+    }
+
+INTEGERS(medium, uint32_t)
+INTEGERS(wide, uint64_t)

@@ -41,10 +41,6 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     ),
     "potr_context_beside": (_WORD, [_POINTER, _SIZE, _POINTER]),
     "potr_context_join": (None, [_POINTER, _SIZE, _SIZE, _POINTER]),
-    "potr_context_integers": (
-        _NUMBER,
-        [_POINTER, _SIZE, _SIZE, _POINTER, _WORD, _WORD, _NUMBER, _NUMBER, _POINTER, _POINTER],
-    ),
     "potr_octree_levels": (
         _NUMBER,
         [_POINTER, _SIZE, _POINTER, _SIZE, _NUMBER, _NUMBER, _POINTER, _POINTER, _POINTER],
@@ -58,14 +54,31 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
         [_POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _POINTER, _WORD, _WORD, _NUMBER, *[_POINTER] * 6, _WORD],
     ),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
-    "potr_join_planes": (None, [_POINTER, _SIZE, ctypes.c_uint, _NUMBER, _POINTER]),
-    "potr_colours_of_narrow": (None, [_POINTER, _POINTER, _POINTER, _SIZE, _REAL, _POINTER, _POINTER, _POINTER]),
-    "potr_colours_of_wide": (None, [_POINTER, _POINTER, _POINTER, _SIZE, _REAL, _POINTER, _POINTER, _POINTER]),
-    "potr_look_up_narrow": (None, [_POINTER, _SIZE, _POINTER, _POINTER, _SIZE]),
-    "potr_look_up_wide": (_WORD, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER, _SIZE]),
-    "potr_rotations_of_narrow": (None, [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _SIZE, _POINTER]),
-    "potr_rotations_of_wide": (None, [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _SIZE, _POINTER]),
 }
+#: Those that there are for several kinds of integers, by what their names begin with.
+_OF_KINDS: dict[str, tuple[Any, list[Any], tuple[str, ...]]] = {
+    "potr_context_integers_": (
+        _NUMBER,
+        [_POINTER, _SIZE, _SIZE, _POINTER, _WORD, _WORD, _NUMBER, _NUMBER, _POINTER, _POINTER],
+        ("medium", "wide"),
+    ),
+    "potr_join_planes_": (None, [_POINTER, _SIZE, ctypes.c_uint, _NUMBER, _POINTER], ("medium", "wide")),
+    "potr_colours_of_": (
+        None,
+        [_POINTER, _POINTER, _POINTER, _SIZE, _REAL, _POINTER, _POINTER, _POINTER],
+        ("narrow", "medium", "wide"),
+    ),
+    "potr_look_up_": (_WORD, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER, _SIZE], ("narrow", "medium", "wide")),
+    "potr_rotations_of_": (
+        None,
+        [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _SIZE, _POINTER],
+        ("narrow", "medium", "wide"),
+    ),
+}
+#: What integers of each kind are stored as; those of 64 bits may be unsigned.
+_KINDS: dict[str, type[np.generic]] = {"narrow": np.uint8, "medium": np.int32, "wide": np.int64}
+#: Integers of the kind "medium" are below this in magnitude, so that sums of three fit.
+_MEDIUM = 1 << 29
 
 
 def _address(array: NDArray[Any], dtype: type[np.generic], number: int, writable: bool = False) -> int:
@@ -107,6 +120,11 @@ class Functions:
             function = library[name]
             function.restype, function.argtypes = result, arguments
             self._c[name] = function
+        for start, (result, arguments, kinds) in _OF_KINDS.items():
+            for kind in kinds:
+                function = library[start + kind]
+                function.restype, function.argtypes = result, arguments
+                self._c[start + kind] = function
 
     # -------------------------------------------------------------------------------------- context coder
 
@@ -200,12 +218,13 @@ class Functions:
         )
         return None if short else taken.value
 
-    def bits_beside(self, tokens: U8) -> int:
-        """How many bits stand beside some tokens, all below 252."""
+    def bits_beside(self, tokens: U8) -> tuple[int, int]:
+        """How many bits stand beside some tokens, all below 252, and the largest token."""
         largest = ctypes.c_uint8()
-        return int(
-            self._c["potr_context_beside"](_address(tokens, np.uint8, tokens.size), tokens.size, ctypes.byref(largest))
+        bits = self._c["potr_context_beside"](
+            _address(tokens, np.uint8, tokens.size), tokens.size, ctypes.byref(largest)
         )
+        return int(bits), largest.value
 
     def join_lanes(self, laid: U8) -> U8:
         """(steps, lanes) bytes to (lanes · steps,)."""
@@ -216,26 +235,31 @@ class Functions:
         )
         return joined
 
-    def integers_of_tokens(self, tokens: U8, bits: U8, first: int, is_signed: bool, predicted: bool) -> I64:
+    def integers_of_tokens(
+        self, tokens: U8, bits: U8, first: int, largest: int, is_signed: bool, predicted: bool
+    ) -> NDArray[Any]:
         """The integers of a stream in the order of splats.
 
         Args:
             tokens: (steps, lanes), below 252.
             bits: bytes of the bits beside tokens.
             first: number of the first bit that belongs to these tokens.
+            largest: no integer is beyond this in magnitude, before the prediction is undone.
             is_signed: undo the mapping of signed integers.
             predicted: undo the prediction from the four integers before in the lane.
 
         Returns:
-            (lanes · steps,).
+            (lanes · steps,) int32 or int64.
 
         Raises:
             TypeError: there are too few bits.
         """
         steps, lanes = tokens.shape
-        values = np.empty(steps * lanes, np.int64)
-        work = np.empty(steps * lanes, np.int64)
-        short = self._c["potr_context_integers"](
+        # A step adds to the largest before it at most that, and what rounding makes of the mean.
+        kind = "medium" if (largest + 1) * (steps if predicted else 1) < _MEDIUM else "wide"
+        dtype = _KINDS[kind]
+        values, work = np.empty(steps * lanes, dtype), np.empty(steps * lanes, dtype)
+        short = self._c[f"potr_context_integers_{kind}"](
             _address(tokens, np.uint8, tokens.size),
             steps,
             lanes,
@@ -244,8 +268,8 @@ class Functions:
             8 * len(bits),
             is_signed,
             predicted,
-            _address(work, np.int64, work.size, True),
-            _address(values, np.int64, values.size, True),
+            _address(work, dtype, work.size, True),
+            _address(values, dtype, values.size, True),
         )
         if short:
             raise TypeError("the native path was given fewer bits than tokens ask for")
@@ -335,29 +359,26 @@ class Functions:
 
     # ---------------------------------------------------------------------------------------------- values
 
-    def widen(self, narrow: U8, is_signed: bool) -> I64:
-        """Bytes, mapped to unsigned if ``is_signed``, to the 64-bit integers that they stand for."""
-        wide = np.empty(len(narrow), np.int64)
-        self._c["potr_widen"](
-            _address(narrow, np.uint8, len(narrow)), len(narrow), is_signed, _address(wide, np.int64, len(narrow), True)
-        )
-        return wide
-
-    def join_planes(self, raw: U8, planes: int, is_signed: bool) -> U64:
-        """Integers of byte planes, as :func:`potr_cl.codec.byte_planes.pack_integers` makes them, in 64 bits each."""
+    def join_planes(self, raw: U8, planes: int, is_signed: bool) -> NDArray[Any]:
+        """Integers of byte planes, as :func:`potr_cl.codec.byte_planes.pack_integers` makes them: int32 or 64 bits."""
         number = len(raw) // planes
-        wide = np.empty(number, np.uint64)
-        self._c["potr_join_planes"](
-            _address(raw, np.uint8, number * planes), number, planes, is_signed, _address(wide, np.uint64, number, True)
+        kind = "medium" if planes <= 3 else "wide"
+        levels = np.empty(number, np.int32 if kind == "medium" else np.int64 if is_signed else np.uint64)
+        self._c[f"potr_join_planes_{kind}"](
+            _address(raw, np.uint8, number * planes),
+            number,
+            planes,
+            is_signed,
+            _address(levels, levels.dtype.type, number, True),
         )
-        return wide
+        return levels
 
     def colours(self, levels: Sequence[NDArray[Any]], divisor: float, out: F32) -> None:
         """Levels of Y, Co, Cg to R, G, B in ``out`` (3, n)."""
         number = out.shape[1]
-        alike = self._alike(levels)
+        kind, alike = self._alike(levels)
         red, green, blue = (_address(row, np.float32, number, True) for row in out)
-        self._c[f"potr_colours_of_{_kind(alike)}"](*_addresses(alike, number), number, divisor, red, green, blue)
+        self._c[f"potr_colours_of_{kind}"](*_addresses(kind, alike, number), number, divisor, red, green, blue)
 
     def look_up(self, levels: NDArray[Any], table: F32, out: F32, column: int) -> int:
         """Values of unsigned levels from a table into a column of ``out`` (n, columns).
@@ -375,36 +396,46 @@ class Functions:
         start = _address(out, np.float32, out.size, True) + out.itemsize * column
         if not 0 <= column < columns or len(table) < 256:
             raise TypeError("the native path was given a column or a table that is too small")
+        kind = _kind(levels)
+        (where,) = _addresses(kind, [levels], number)
         values = _address(table, np.float32, len(table))
-        if levels.dtype == np.uint8:
-            self._c["potr_look_up_narrow"](_address(levels, np.uint8, number), number, values, start, columns)
-            return 0
-        wide = _address(levels.view(np.uint64), np.uint64, number)
-        return int(self._c["potr_look_up_wide"](wide, number, values, len(table), start, columns))
+        return int(self._c[f"potr_look_up_{kind}"](where, number, values, len(table), start, columns))
 
     def rotations(self, levels: Sequence[NDArray[Any]], factors: F32, out: F32) -> None:
         """Levels of x, y, z to quaternions in ``out`` (n, 4); ``factors`` are (n,), or (1,) for all the same."""
         number = len(out)
-        alike = self._alike(levels)
+        kind, alike = self._alike(levels)
         step = 0 if len(factors) == 1 else 1
         where = _address(factors, np.float32, number if step else 1)
-        self._c[f"potr_rotations_of_{_kind(alike)}"](
-            *_addresses(alike, number), number, where, step, _address(out, np.float32, 4 * number, True)
+        self._c[f"potr_rotations_of_{kind}"](
+            *_addresses(kind, alike, number), number, where, step, _address(out, np.float32, 4 * number, True)
         )
 
-    def _alike(self, levels: Sequence[NDArray[Any]]) -> list[NDArray[Any]]:
-        """Signed levels, bytes if all of them are, else all in 64 bits."""
-        if all(level.dtype == np.uint8 for level in levels):
-            return list(levels)
-        return [self.widen(level, True) if level.dtype == np.uint8 else level for level in levels]
+    def widened(self, narrow: U8, is_signed: bool) -> I32:
+        """Bytes, mapped to unsigned if ``is_signed``, to the integers that they stand for."""
+        medium = np.empty(len(narrow), np.int32)
+        self._c["potr_widen"](
+            _address(narrow, np.uint8, len(narrow)),
+            len(narrow),
+            is_signed,
+            _address(medium, np.int32, len(narrow), True),
+        )
+        return medium
+
+    def _alike(self, levels: Sequence[NDArray[Any]]) -> tuple[str, list[NDArray[Any]]]:
+        """Signed levels, all of the kind of the widest, and that kind."""
+        kind = _kind(max(levels, key=lambda level: level.itemsize))
+        if kind == "narrow":
+            return kind, list(levels)
+        numbers = [self.widened(level, True) if level.dtype == np.uint8 else level for level in levels]
+        return kind, [number.astype(_KINDS[kind], copy=False) for number in numbers]
 
 
-def _kind(levels: Sequence[NDArray[Any]]) -> str:
-    return "narrow" if levels[0].dtype == np.uint8 else "wide"
+def _kind(levels: NDArray[Any]) -> str:
+    return {1: "narrow", 4: "medium", 8: "wide"}[levels.itemsize]
 
 
-def _addresses(levels: Sequence[NDArray[Any]], number: int) -> list[int]:
+def _addresses(kind: str, levels: Sequence[NDArray[Any]], number: int) -> list[int]:
     """Of levels of one kind; int64 and uint64 are the same to C, where sums wrap round."""
-    if levels[0].dtype == np.uint8:
-        return [_address(level, np.uint8, number) for level in levels]
-    return [_address(level.view(np.int64), np.int64, number) for level in levels]
+    dtype = _KINDS[kind]
+    return [_address(level.view(dtype) if kind == "wide" else level, dtype, number) for level in levels]
