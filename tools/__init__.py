@@ -41,6 +41,7 @@ What happens at the limits (``stress``):
 stress.run         every kernel against float64 on the worst inputs: what error is the kernel's own?
 stress.platforms   the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
 stress.fuzz        does any changed file do more than be refused or decode to finite numbers?
+stress.native      does the compiled decoder touch memory that is not its own, or differ from NumPy's, on changed files?
 =================  =====================================================================================================
 
 What tests and pages are made of (``make``):
@@ -50,6 +51,7 @@ make.large_scene      a scene of any size with the statistics of a real one
 make.test_data        the excerpts in tests/data
 make.foreign_files    the excerpt in other tools' formats
 make.golden_files     files that every later decoder must read to the same values
+make.native           the compiled part of the decoder, in the checkout
 make.docs             the pages and tables of README and docs that are made from the code (see CONTRIBUTING.md)
 make.benchmark_pages  the tables and plots of docs/benchmarks, from the results beside them
 ====================  ==================================================================================================
