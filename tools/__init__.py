@@ -12,6 +12,7 @@ bench.pruning          what does pruning keep, against other pruners, and what m
 bench.refit            what does the re-fit of the colours bring, and what does it take?
 bench.compaction       speed of the compaction, and its error against float64
 bench.compact_at       when within the pruning schedule to compact?
+bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
 bench.codec            speed, memory and size of the codec alone
 bench.search           what does encoding to a size or a PSNR cost, against one plain encode?
 bench.virtual_cameras  what does encoding without cameras cost?
@@ -32,6 +33,7 @@ study.rates                where do the bits go, and what do they buy?
 study.compaction_curves    what does the compaction do to sparsity and pictures?
 study.removal_exactness    how far are predicted removal effects from removals in float64?
 study.removal_formulas     back to front or prefix sums: which formula of removal effects?
+study.decoder_roads        which road to a quick decoder: compiled C or OpenCL kernels? (for bench.decode --part roads)
 study.composite_yardstick  the compositing kernel beside a loop in C
 =========================  =============================================================================================
 
