@@ -145,26 +145,36 @@ class PotrFile:
         self._decode_opacities(out, _now)
         return out
 
-    def sh(self) -> NDArray[np.float32]:
-        """(N, M, 3) float32 SH coefficients, each contiguous in memory. Raises DataError if damaged."""
-        planar = self._empty_sh()
+    def sh(self, degree: int | None = None) -> NDArray[np.float32]:
+        """(N, M, 3) float32 SH coefficients, each contiguous in memory.
+
+        Args:
+            degree: those up to this degree, 0 for the DC alone; sections of others are not looked at. None: all.
+
+        Raises:
+            UsageError: there is no such degree.
+            DataError: damaged.
+        """
+        planar = self._empty_sh(degree)
         for _, job in self._sh_jobs(planar):
             job(_now)
         return planar.transpose(2, 0, 1)
 
-    def scene(self, threads: int = 0) -> Scene:
-        """Decode everything.
+    def scene(self, threads: int = 0, sh_degree: int | None = None) -> Scene:
+        """Decode everything, or all but some SH coefficients.
 
         Args:
             threads: 0: one a processor.
+            sh_degree: as ``degree`` of :meth:`sh`.
 
         Raises:
+            UsageError: there is no such degree.
             DataError: damaged.
         """
         header = self.header
         _ = self.metadata  # it takes no part in the scene, but damage anywhere is damage
         try:
-            planar = self._empty_sh()
+            planar = self._empty_sh(sh_degree)
             log_scales = np.empty((header.splats, 3), np.float32)
             quaternions = np.empty((header.splats, 4), np.float32)
             opacity_logits = np.empty(header.splats, np.float32)
@@ -178,7 +188,7 @@ class PotrFile:
             ]
             means = self._run(jobs, threads or min(os.cpu_count() or 1, _MOST_THREADS))
         except MemoryError:
-            needed = header.splats * (11 + 3 * SH_COEFFICIENTS[header.sh_degree]) * 4
+            needed = header.splats * (11 + 3 * self._coefficients(sh_degree)) * 4
             raise DataError(f"the scene needs {needed / 1e9:.1f} GB of memory, more than there is") from None
         return Scene(means, log_scales, quaternions, opacity_logits, planar.transpose(2, 0, 1))
 
@@ -270,12 +280,20 @@ class PotrFile:
     def _decode_opacities(self, out: NDArray[np.float32], submit: _Submit) -> None:
         submit(partial(self._dequantizer.opacities, self._streams(Property.OPACITY)[0], out))
 
-    def _empty_sh(self) -> NDArray[np.float32]:
-        return np.empty((SH_COEFFICIENTS[self.header.sh_degree], 3, self.header.splats), np.float32)
+    def _coefficients(self, degree: int | None) -> int:
+        """How many there are up to a degree, which need not be in the file."""
+        if degree is not None and not 0 <= degree < len(SH_COEFFICIENTS):
+            raise UsageError(f"SH degree {degree} is unknown: choose 0 to {len(SH_COEFFICIENTS) - 1}")
+        return SH_COEFFICIENTS[self.header.sh_degree if degree is None else min(degree, self.header.sh_degree)]
+
+    def _empty_sh(self, degree: int | None) -> NDArray[np.float32]:
+        return np.empty((self._coefficients(degree), 3, self.header.splats), np.float32)
 
     def _sh_jobs(self, planar: NDArray[np.float32]) -> list[tuple[bool, _Job]]:
-        """What decodes all SH coefficients into ``planar`` (M, 3, N), and whether it takes the context coder."""
-        chained = [s for s in self.header.sections if s.kind == Property.SH and s.coder == Coder.CONTEXT and s.index]
+        """What decodes M SH coefficients into ``planar`` (M, 3, N), and whether it takes the context coder."""
+        stop = 3 * len(planar)
+        contextual = [s for s in self.header.sections if s.kind == Property.SH and s.coder == Coder.CONTEXT]
+        chained = [s for s in contextual if 0 < s.index < stop]
         in_chain = {s.index // 3 + m for s in chained for m in range(s.streams // 3)}
         alone = [m for m in range(len(planar)) if m not in in_chain]
         jobs: list[tuple[bool, _Job]] = [(True, partial(self._decode_chain, chained, planar))] if chained else []
@@ -308,22 +326,23 @@ def _now(work: Callable[[], None]) -> None:
     work()
 
 
-def decode(source: bytes | str | os.PathLike[str], trust: bool = False) -> Scene:
+def decode(source: bytes | str | os.PathLike[str], trust: bool = False, sh_degree: int | None = None) -> Scene:
     """Decode a .potr file, given as bytes or as a path.
 
     Args:
         source: the file.
         trust: whether it may hold more splats a byte than a real scene has. Without, the memory taken is in proportion
             to the size of the file.
+        sh_degree: leave out SH coefficients of higher degrees; None: none.
 
     Raises:
-        UsageError: the path cannot be read.
+        UsageError: the path cannot be read, or there is no such degree.
         DataError: damaged, or too many splats for its size.
     """
     if isinstance(source, bytes):
-        return PotrFile.from_bytes(source, trust).scene()
+        return PotrFile.from_bytes(source, trust).scene(sh_degree=sh_degree)
     try:
-        return PotrFile.open(source, trust).scene()
+        return PotrFile.open(source, trust).scene(sh_degree=sh_degree)
     except DataError as error:
         where = os.fspath(source)
         raise error if where in str(error) else DataError(f"'{where}': {error}") from None
