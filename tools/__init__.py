@@ -12,6 +12,7 @@ bench.pruning          what does pruning keep, against other pruners, and what m
 bench.refit            what does the re-fit of the colours bring, and what does it take?
 bench.compaction       speed of the compaction, and its error against float64
 bench.compact_at       when within the pruning schedule to compact?
+bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
 bench.codec            speed, memory and size of the codec alone
 bench.search           what does encoding to a size or a PSNR cost, against one plain encode?
 bench.virtual_cameras  what does encoding without cameras cost?
@@ -35,6 +36,7 @@ study.antialiasing         what is lost if an antialiased scene is encoded as a 
 study.compaction_curves    what does the compaction do to sparsity and pictures?
 study.removal_exactness    how far are predicted removal effects from removals in float64?
 study.removal_formulas     back to front or prefix sums: which formula of removal effects?
+study.decoder_roads        which road to a quick decoder: compiled C or OpenCL kernels? (for bench.decode --part roads)
 study.composite_yardstick  the compositing kernel beside a loop in C
 =========================  =============================================================================================
 
@@ -44,6 +46,7 @@ What happens at the limits (``stress``):
 stress.run         every kernel against float64 on the worst inputs: what error is the kernel's own?
 stress.platforms   the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
 stress.fuzz        does any changed file do more than be refused or decode to finite numbers?
+stress.native      does the compiled decoder touch memory that is not its own, or differ from NumPy's, on changed files?
 =================  =====================================================================================================
 
 What tests and pages are made of (``make``):
@@ -53,6 +56,7 @@ make.large_scene      a scene of any size with the statistics of a real one
 make.test_data        the excerpts in tests/data
 make.foreign_files    the excerpt in other tools' formats
 make.golden_files     files that every later decoder must read to the same values
+make.native           the compiled part of the decoder, in the checkout
 make.docs             the pages and tables of README and docs that are made from the code (see CONTRIBUTING.md)
 make.benchmark_pages  the tables and plots of docs/benchmarks, from the results beside them
 ====================  ==================================================================================================

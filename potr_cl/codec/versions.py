@@ -86,6 +86,9 @@ class FormatVersion(abc.ABC):
         """(N, 3) imaginary parts of unit quaternions to levels of x, y and z, (N,) each; ``scales`` as quantised."""
 
     @abc.abstractmethod
+    def rotation_factors(self, scales: Sequence[Levels], sf_rotation: float) -> F32:
+        """float32 scale factors of rotations: (N,), or (1,) if all are the same; ``scales`` as of the next."""
+
     def dequantize_rotations(
         self, levels: Sequence[Levels], scales: Sequence[Levels], sf_rotation: float, out: F32
     ) -> None:
@@ -97,6 +100,7 @@ class FormatVersion(abc.ABC):
             sf_rotation: scale factor.
             out: float32.
         """
+        quantize.dequantize_rotations(levels, self.rotation_factors(scales, sf_rotation), out)
 
     @abc.abstractmethod
     def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
@@ -124,10 +128,8 @@ class Version1(FormatVersion):
     ) -> Iterable[Integers]:
         return run(lambda part: quantize.quantize_rotations(part, sf_rotation), imaginary.T)
 
-    def dequantize_rotations(
-        self, levels: Sequence[Levels], scales: Sequence[Levels], sf_rotation: float, out: F32
-    ) -> None:
-        quantize.dequantize_rotations(levels, sf_rotation, out)
+    def rotation_factors(self, scales: Sequence[Levels], sf_rotation: float) -> F32:
+        return np.full(1, sf_rotation, np.float32)
 
     def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
         return quantize.quantize_opacities(logits, sf_opacity)
@@ -172,10 +174,8 @@ class Version2(FormatVersion):
         ball = (scales[0] == scales[1]) & (scales[1] == scales[2])
         return run(lambda part: np.where(ball, 0, quantize.quantize_rotations(part, factors)), imaginary.T)
 
-    def dequantize_rotations(
-        self, levels: Sequence[Levels], scales: Sequence[Levels], sf_rotation: float, out: F32
-    ) -> None:
-        quantize.dequantize_rotations(levels, quantize.rotation_factors(scales, sf_rotation), out)
+    def rotation_factors(self, scales: Sequence[Levels], sf_rotation: float) -> F32:
+        return quantize.rotation_factors(scales, sf_rotation)
 
     def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
         return quantize.quantize_logits(logits, sf_opacity)
