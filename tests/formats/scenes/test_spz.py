@@ -72,7 +72,7 @@ def spz_header(splats, version=3, degree=3):
         (gzip.compress(spz_header(4_000_000_000)), "--trust"),
         (gzip.compress(spz_header(10)), "truncated"),
         (gzip.compress(spz_header(0)), "no splat"),
-        (gzip.compress(spz_header(10, degree=4)), "SH degree 4"),
+        (gzip.compress(spz_header(10, degree=5)), "SH degree 5"),
         (gzip.compress(spz_header(1000) + bytes(3_000_000)), "more than the splats"),
         (gzip.compress(spz_header(10, version=9) + bytes(650)), "version 9"),
         (spz_header(4_000_000_000, version=4) + bytes(100), "--trust"),
