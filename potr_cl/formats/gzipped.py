@@ -40,7 +40,8 @@ def unpacked(path: Path, trust: bool = False) -> Iterator[Path]:
         PotrError: there is no room for what it unpacks to.
     """
     inner = path.with_name(path.name[: -len(SUFFIX)])
-    packed = registry.format_of(inner).packed
+    with _called(inner, path):
+        packed = registry.format_of(inner).packed
     times, free = (_MOST_TIMES_PACKED, _FREE_PACKED) if packed else (_MOST_TIMES, _FREE)
     with temporary_folder() as folder:
         file = Path(folder, inner.name)

@@ -16,6 +16,7 @@ import numpy as np
 from potr_cl.codec import octree
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError, PotrError, UsageError
+from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
 from potr_cl.model.scene import FloatArray, Scene
 
 _log = logging.getLogger("potr_cl")
@@ -89,14 +90,16 @@ def related(file: Path, name: object) -> Path:
     """A file that ``file`` names, beside it or in a folder below.
 
     Raises:
-        DataError: the name is none, or leads out of the folder.
+        DataError: the name is none, or leads out of the folder; or there is a Git-LFS pointer in the file's place.
     """
     parts = PurePosixPath(name).parts if isinstance(name, str) else ()
     if not parts or not all(part.isprintable() for part in parts) or {"..", "/", "//"} & set(parts):
         raise DataError(f"'{file}' is damaged: it names a file {shown(name)}")
     if PureWindowsPath(*parts).drive or any("\\" in part for part in parts):
         raise DataError(f"'{file}' is damaged: it names a file {shown(name)}")
-    return file.parent.joinpath(*parts)
+    found = file.parent.joinpath(*parts)
+    refuse_lfs_pointer(found)
+    return found
 
 
 def shown(value: object) -> str:
