@@ -33,6 +33,8 @@ _POINTS = 0
 _SRGB, _LINEAR = "srgb_rec709_display", "lin_rec709_display"
 #: Extensions of the asset that change nothing of what is read here, or are read.
 _HARMLESS = {_EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}
+#: Every scene may have so many meshes with splats, each of which takes time.
+_MOST_PARTS = 4096
 #: Largest difference from a rotation that a node's matrix may have by rounding.
 _ROUNDING = 1e-3
 
@@ -67,13 +69,12 @@ FORMAT = SceneFormat(
 
 def _scene(path: str | os.PathLike[str], asset: Asset, trust: bool) -> Scene:
     others = [name for name in asset.description.get("extensionsRequired", []) if name not in _HARMLESS]
-    found: list[tuple[dict[str, Any], Matrix]] = []
+    found: list[tuple[dict[str, Any], _Node]] = []
     left_out = 0
-    for node, matrix in _nodes(asset):
-        mesh = asset.entry("meshes", node["mesh"])
-        for primitive in mesh.get("primitives", []):
+    for node in _nodes(asset):
+        for primitive in asset.entry("meshes", node.entry["mesh"]).get("primitives", []):
             if isinstance(primitive, dict) and _EXTENSION in primitive.get("extensions", {}):
-                found.append((primitive, matrix))
+                found.append((primitive, node))
             else:
                 left_out += 1
     if not found:
@@ -81,21 +82,47 @@ def _scene(path: str | os.PathLike[str], asset: Asset, trust: bool) -> Scene:
             f"'{path}' holds no Gaussian splats: no part of its scene has the extension {_EXTENSION}; it is a mesh or "
             "a point cloud"
         )
-    for primitive, _ in found:
+    primitives = {id(primitive): primitive for primitive, _ in found}
+    for primitive in primitives.values():
         _check_kind(path, asset, primitive)
     if others:
         raise DataError(f"'{path}' needs the glTF extension {shown(others[0])}, which is not known here")
+    counts = {number: _count(asset, primitive) for number, primitive in primitives.items()}
     try:
-        check_claim(sum(_count(asset, primitive) for primitive, _ in found), asset.size, MOST_A_BYTE, trust)
+        check_claim(sum(counts[id(primitive)] for primitive, _ in found), asset.size, MOST_A_BYTE, trust)
+        if len(found) > _MOST_PARTS and not trust:
+            raise DataError(f"{len(found)} meshes with splats are more than are read without --trust (trust=True)")
     except DataError as error:
         raise DataError(f"'{path}': {error}") from None
     if left_out:
         _log.warning("'%s': left out %d parts of the scene that are no splats", path, left_out)
-    return joined([_placed(path, _splats(path, asset, primitive), matrix) for primitive, matrix in found])
+    scenes = {number: _splats(path, asset, primitive) for number, primitive in primitives.items()}
+    return joined([_placed(path, scenes[id(primitive)], node.matrix(asset)) for primitive, node in found])
 
 
-def _nodes(asset: Asset) -> list[tuple[dict[str, Any], Matrix]]:
-    """The nodes of the scene that have a mesh, and where they are."""
+@dataclasses.dataclass
+class _Node:
+    """A node of the scene: what the file says of it, and the node above it."""
+
+    entry: dict[str, Any]
+    above: _Node | None
+    known: Matrix | None = None
+
+    def matrix(self, asset: Asset) -> Matrix:
+        """(4, 4) from its axes to those of the scene."""
+        chain: list[_Node] = []
+        node: _Node | None = self
+        while node is not None and node.known is None:
+            chain.append(node)
+            node = node.above
+        matrix = np.eye(4) if node is None or node.known is None else node.known
+        for below in reversed(chain):
+            matrix = below.known = matrix @ _matrix(asset, below.entry)
+        return matrix
+
+
+def _nodes(asset: Asset) -> list[_Node]:
+    """The nodes of the scene that have a mesh."""
     nodes = asset.description.get("nodes", [])
     if "scenes" in asset.description:
         roots = asset.entry("scenes", asset.description.get("scene", 0)).get("nodes", [])
@@ -103,17 +130,16 @@ def _nodes(asset: Asset) -> list[tuple[dict[str, Any], Matrix]]:
         children = {child for node in nodes for child in node.get("children", [])}
         roots = [number for number in range(len(nodes)) if number not in children]
     found, seen = [], set()
-    left = [(number, np.eye(4)) for number in reversed(roots)]
+    left: list[tuple[Any, _Node | None]] = [(number, None) for number in reversed(roots)]
     while left:
         number, above = left.pop()
-        node = asset.entry("nodes", number)
+        node = _Node(asset.entry("nodes", number), above)
         if number in seen:
             raise asset.damaged(f"node {number} stands twice in its scene")
         seen.add(number)
-        matrix = above @ _matrix(asset, node)
-        if "mesh" in node:
-            found.append((node, matrix))
-        left += [(child, matrix) for child in reversed(node.get("children", []))]
+        if "mesh" in node.entry:
+            found.append(node)
+        left += [(child, node) for child in reversed(node.entry.get("children", []))]
     return found
 
 

@@ -17,7 +17,16 @@ import numpy as np
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.levels import path_and_level
-from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, cleaned, file_in_folder, joined, opened, related, shown
+from potr_cl.formats.scenes.scene_files import (
+    MOST_A_BYTE,
+    cleaned,
+    file_in_folder,
+    joined,
+    opened,
+    reading,
+    related,
+    shown,
+)
 from potr_cl.formats.scenes.sog import Folder, Sog
 from potr_cl.model.claims import check_claim
 from potr_cl.model.scene import Scene
@@ -55,7 +64,10 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     folders = [(Folder(file), file, parts) for file, parts in names.items()]
     total = sum(folder.size for folder, _, _ in folders)
     # All are described before one is unpacked: each by itself may hold some splats for nothing.
-    sogs = [Sog(file, folder.description(), folder.stored, folder.size, True) for folder, file, _ in folders]
+    sogs = []
+    for folder, where, _ in folders:
+        with reading(where):
+            sogs.append(Sog(where, folder.description(), folder.stored, folder.size, True))
     try:
         check_claim(sum(sog.count for sog in sogs), total, MOST_A_BYTE, trust)
     except DataError as error:
@@ -143,7 +155,8 @@ class _Meta:
 
 def _part(path: Path, sog: Sog, ranges: list[_Range]) -> Scene:
     """The splats of a SOG folder that a level has; all if there are no ranges."""
-    scene = sog.scene()
+    with reading(path):
+        scene = sog.scene()
     if not ranges:
         return scene
     ranges = sorted(ranges)
