@@ -163,7 +163,9 @@ class Sog:
         if meta.get("version") != 2:
             version = meta.get("version", 1)
             said = version if type(version) is int and abs(version) < 1000 else "unknown"
-            raise DataError(f"'{path}' is a SOG file of version {said}, only 2 can be read")
+            raise DataError(
+                f"'{path}' is a SOG file of version {said}, only 2 can be read: convert it with splat-transform"
+            )
         self._meta = meta
         self.count = _whole(meta["count"])
         if not 0 < self.count < 2**31:

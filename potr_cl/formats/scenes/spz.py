@@ -37,6 +37,8 @@ _STREAM = struct.Struct("<QQ")
 _ANTIALIASED, _EXTENSIONS = 1, 2
 #: Versions that are one stream, usually gzipped.
 _LEGACY = range(1, 4)
+#: The version whose positions are half floats.
+_HALF_FLOATS = 1
 _LARGEST_DEGREE = 4
 #: A file may have extensions behind its splats; no known one comes near.
 _EXTENSION_BYTES = 1 << 20
@@ -74,8 +76,8 @@ class _Header:
     @property
     def sizes(self) -> list[int]:
         """Bytes of positions, opacities, colours, scales, rotations and SH, in this order."""
-        rotation = 3 if self.version < 3 else 4
-        return [self.splats * size for size in (9, 1, 3, 3, rotation, 3 * ((self.degree + 1) ** 2 - 1))]
+        position, rotation = 6 if self.version == _HALF_FLOATS else 9, 3 if self.version < 3 else 4
+        return [self.splats * size for size in (position, 1, 3, 3, rotation, 3 * ((self.degree + 1) ** 2 - 1))]
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
@@ -205,7 +207,7 @@ def _header(path: str | os.PathLike[str], start: bytes, versions: range, size: i
         raise DataError(f"'{path}' has SH degree {degree}: export at most 3 bands")
     if splats == 0:
         raise DataError(f"'{path}' holds no splat")
-    if not 1 <= bits <= _MOST_FRACTIONAL_BITS:
+    if version != _HALF_FLOATS and not 1 <= bits <= _MOST_FRACTIONAL_BITS:
         raise DataError(f"'{path}' is damaged: positions with {bits} fractional bits")
     try:
         check_claim(splats, size, MOST_A_BYTE, trust)
@@ -255,7 +257,7 @@ def _unpacked(header: _Header, properties: list[bytes | memoryview]) -> Scene:
     dc = (byte / np.float32(255) - np.float32(0.5)) / np.float32(_COLOUR_SCALE)
     for start in range(0, count, _BLOCK):
         block = slice(start, start + _BLOCK)
-        scene.means[block] = _positions(positions[block], header.fractional_bits)
+        scene.means[block] = _positions(positions[block], header)
         scene.log_scales[block] = (byte / 16 - 10).take(scales[block])
         scene.quaternions[block] = _smallest_three(rotations[block]) if header.version > 2 else _xyz(rotations[block])
         scene.opacity_logits[block] = logits.take(opacities[block, 0])
@@ -266,11 +268,13 @@ def _unpacked(header: _Header, properties: list[bytes | memoryview]) -> Scene:
     return scene
 
 
-def _positions(stored: U8, fractional_bits: int) -> FloatArray:
+def _positions(stored: U8, header: _Header) -> FloatArray:
+    if header.version == _HALF_FLOATS:
+        return np.ascontiguousarray(stored).view("<f2").astype(np.float32)
     parts = stored.reshape(-1, 3, 3).astype(np.int32)
     values = parts[..., 0] | parts[..., 1] << 8 | parts[..., 2] << 16
     values = (values ^ 0x800000) - 0x800000
-    positions: FloatArray = values.astype(np.float32) * np.float32(2.0**-fractional_bits)
+    positions: FloatArray = values.astype(np.float32) * np.float32(2.0**-header.fractional_bits)
     return positions
 
 

@@ -131,7 +131,7 @@ def test_content_and_values_are_those_of_another_program(tmp_path, data):
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_rotations_of_old_versions(tmp_path, version):
-    body = bytes(9) + bytes([255, 0, 0, 0]) + bytes(3) + bytes([255, 128, 127])
+    body = bytes(6 if version == 1 else 9) + bytes([255, 0, 0, 0]) + bytes(3) + bytes([255, 128, 127])
     (tmp_path / "a.spz").write_bytes(gzip.compress(spz_header(1, version, 0) + body))
     w, x, y, z = load_scene(tmp_path / "a.spz").quaternions[0]
     assert (w, x) == (0, 1)
@@ -226,7 +226,7 @@ def test_coefficients_of_degree_4_are_left_out(tmp_path, caplog, version):
 
 @pytest.mark.parametrize("version", [1, 2, 3])
 def test_content_that_is_not_gzipped(tmp_path, version):
-    content = spz_header(100, version, 1) + np.random.default_rng(0).bytes(100 * (19 + (version == 3) + 9))
+    content = spz_header(100, version, 1) + np.random.default_rng(0).bytes(100 * ((16, 19, 20)[version - 1] + 9))
     (tmp_path / "packed.spz").write_bytes(gzip.compress(content))
     (tmp_path / "raw.spz").write_bytes(content)
     packed, raw = load_scene(tmp_path / "packed.spz"), load_scene(tmp_path / "raw.spz")
@@ -239,3 +239,15 @@ def test_content_that_is_not_gzipped(tmp_path, version):
     (tmp_path / "raw.spz").write_bytes(spz_header(4_000_000_000, version, 1) + bytes(1000))
     with pytest.raises(DataError, match="--trust"):
         load_scene(tmp_path / "raw.spz")
+
+
+def test_positions_of_version_1_are_half_floats(tmp_path):
+    """As Niantic's library reads them, and gaussforge and spz-js with it."""
+    rng = np.random.default_rng(0)
+    positions = rng.normal(size=(70, 3)).astype("<f2")
+    body = positions.tobytes() + rng.bytes(70 * 10)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 1, 70, 0, 0, 0, 0) + body))
+    scene = load_scene(tmp_path / "a.spz")
+    assert np.array_equal(scene.means, positions.astype(np.float32))
+    rows = np.frombuffer(body[420:], np.uint8)
+    assert np.array_equal(scene.log_scales, rows[280:490].reshape(70, 3) / np.float32(16) - 10)
