@@ -54,7 +54,8 @@ What tests and pages are made of (``make``):
 ====================  ==================================================================================================
 make.large_scene      a scene of any size with the statistics of a real one
 make.test_data        the excerpts in tests/data
-make.foreign_files    the excerpt in other tools' formats
+make.foreign_files    the excerpt in splat-transform's formats
+make.other_tools      some splats in the formats of six tools, and how splat-transform reads them
 make.golden_files     files that every later decoder must read to the same values
 make.native           the compiled part of the decoder, in the checkout
 make.docs             the pages and tables of README and docs that are made from the code (see CONTRIBUTING.md)

@@ -26,7 +26,8 @@ def add_convert(commands: Commands) -> None:
         "convert",
         help="a scene from one format to another, for other tools",
         description=f"Read a scene ({suffixes_read()}) and write it as {suffixes_written()}. Nothing but what the "
-        f"format itself rounds is changed; axes are kept. {extras_needed()}.",
+        f"format itself rounds is changed; axes are kept. {extras_needed()}. All may be gzipped (.ply.gz). SOG is read "
+        "from folders too (meta.json, lod-meta.json), level N of streamed SOG by FOLDER#N.",
     )
     p.add_argument("scene", type=ReadFile, metavar="IN")
     p.add_argument("output", type=WrittenFile, metavar="OUT")

@@ -3,11 +3,11 @@
 from __future__ import annotations
 
 import argparse
-import os
 from pathlib import Path
 from typing import Any
 
 from potr_cl.formats import load_scene
+from potr_cl.formats.scene_size import bytes_of_scene
 from potr_cl.model.scene import Scene
 
 _ANTIALIASED = {"yes": True, "no": False, "auto": None}
@@ -48,8 +48,5 @@ def read_scene(args: argparse.Namespace, path: Path) -> Scene:
 
 
 def size_of_file(path: Path) -> int | None:
-    """Bytes of a file; None where there is none, which whoever reads it will say."""
-    try:
-        return os.stat(path).st_size if os.path.isfile(path) else None
-    except (OSError, ValueError):
-        return None
+    """Bytes of a file, or of a scene's folder; None where there is none, which whoever reads it will say."""
+    return bytes_of_scene(path)

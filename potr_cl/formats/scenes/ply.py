@@ -19,7 +19,7 @@ from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.filter_3d import FILTER_3D, folded
 from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
-from potr_cl.formats.scenes.scene_files import cleaned
+from potr_cl.formats.scenes.scene_files import NO_EXTENT, cleaned
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
 
@@ -29,6 +29,8 @@ _log = logging.getLogger("potr_cl")
 _BLOCK_BYTES = 1 << 20
 _MAX_HEADER_BYTES = 1 << 20
 _NORMALS = ("nx", "ny", "nz")
+#: Properties f_rest_* of degree 3, and of degree 4, of which those of degree 3 are read.
+_MOST_REST, _REST_OF_DEGREE_4 = 45, 72
 
 
 @dataclass(frozen=True)
@@ -54,10 +56,11 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     """Read a trained scene from a PLY file.
 
     Accepted are binary files of either byte order and ASCII ones, properties in any order and of any numeric type,
-    with or without normals, SH degree 0 to 3 with ``f_rest_*`` channel after channel. Comments tell whether it is
-    antialiased (:mod:`potr_cl.formats.scenes.ply_comments`), or the property ``filter_3D``, which is folded into scales
-    and opacities (:mod:`potr_cl.formats.scenes.filter_3d`). Further properties and elements are dropped. What had to be
-    dropped or mended is reported once to the logger "potr_cl".
+    with or without normals, SH degree 0 to 3 with ``f_rest_*`` channel after channel; of degree 4, the coefficients of
+    degree 4 are dropped. Splats with two scales (2DGS) are flat along their third axis. Comments tell whether the scene
+    is antialiased (:mod:`potr_cl.formats.scenes.ply_comments`), or the property ``filter_3D``, which is folded into
+    scales and opacities (:mod:`potr_cl.formats.scenes.filter_3d`). Further properties and elements are dropped. What
+    had to be dropped or mended is reported once to the logger "potr_cl".
 
     Args:
         path: of the PLY file.
@@ -136,20 +139,20 @@ FORMAT = SceneFormat(
     name="3DGS PLY",
     suffixes=(".ply",),
     note="as the original implementation, gsplat, nerfstudio, Postshot, Brush and SuperSplat write it: SH degree 0 to "
-    "3, binary or ASCII, properties in any order; the original layout is written",
+    "3 (of 4, what 3 has), binary or ASCII, properties in any order, 2DGS too; the original layout is written",
     load=load,
     save=save,
 )
 
 
-def _property_names(rest: int) -> list[str]:
+def _property_names(rest: int, scales: int = 3) -> list[str]:
     """The properties that hold a splat with ``rest`` AC coefficients, in the original order, without normals."""
     return [
         *("x", "y", "z"),
         *(f"f_dc_{i}" for i in range(3)),
         *(f"f_rest_{i}" for i in range(rest)),
         "opacity",
-        *(f"scale_{i}" for i in range(3)),
+        *(f"scale_{i}" for i in range(scales)),
         *(f"rot_{i}" for i in range(4)),
     ]
 
@@ -157,20 +160,27 @@ def _property_names(rest: int) -> list[str]:
 def _read(path: str | os.PathLike[str], stream: io.FileIO, size: int) -> Scene:
     header = _read_header(path, stream)
     vertex, count = _vertex_element(path, header)
-    rest = _check_properties(path, header, vertex)
+    rest, scales = _check_properties(path, header, vertex)
     offset = _check_size(path, header, size)
     if count == 0:
         raise DataError(f"'{path}' holds no splat")
     _report_dropped(path, header, vertex, rest)
+    kept = min(rest, _MOST_REST)
+    if rest > kept:
+        _log.warning("'%s': SH degree 4 is left out: only degrees 0 to 3 are kept", path)
+    if scales < 3:
+        _log.warning("'%s' has two scales a splat (2DGS): the third is read as 1e-9 unit, along the third axis", path)
 
     scene = Scene(
         np.empty((count, 3), dtype=np.float32),
         np.empty((count, 3), dtype=np.float32),
         np.empty((count, 4), dtype=np.float32),
         np.empty(count, dtype=np.float32),
-        np.empty((count, 1 + rest // 3, 3), dtype=np.float32),
+        np.empty((count, 1 + kept // 3, 3), dtype=np.float32),
     )
-    columns = _columns(scene)
+    columns = _columns(scene, rest // 3)
+    if scales < 3:
+        columns.pop("scale_2")[:] = NO_EXTENT
     filters = np.empty(count, dtype=np.float32) if FILTER_3D in {p.name for p in vertex.properties} else None
     if filters is not None:
         columns[FILTER_3D] = filters
@@ -188,13 +198,12 @@ def _read(path: str | os.PathLike[str], stream: io.FileIO, size: int) -> Scene:
     return marked(scene, header.comments)
 
 
-def _columns(scene: Scene) -> dict[str, FloatArray]:
-    """Where in the scene's arrays each property belongs: views of N values."""
+def _columns(scene: Scene, rest: int) -> dict[str, FloatArray]:
+    """Where in the scene's arrays each property belongs: views of N values. A channel has ``rest`` AC coefficients."""
     columns = {name: scene.means[:, i] for i, name in enumerate("xyz")}
-    rest = scene.sh.shape[1] - 1
     for channel in range(3):
         columns[f"f_dc_{channel}"] = scene.sh[:, 0, channel]
-        for i in range(rest):
+        for i in range(scene.sh.shape[1] - 1):
             columns[f"f_rest_{channel * rest + i}"] = scene.sh[:, 1 + i, channel]
     columns["opacity"] = scene.opacity_logits
     columns |= {f"scale_{i}": scene.log_scales[:, i] for i in range(3)}
@@ -250,8 +259,8 @@ def _vertex_element(path: str | os.PathLike[str], header: _Header) -> tuple[PlyE
     raise DataError(f"'{path}' is no 3DGS scene: it has no element 'vertex' (its elements: {_shortened(found)})")
 
 
-def _check_properties(path: str | os.PathLike[str], header: _Header, vertex: PlyElement) -> int:
-    """Check that the properties of a splat are all there; return the number of f_rest_* among them."""
+def _check_properties(path: str | os.PathLike[str], header: _Header, vertex: PlyElement) -> tuple[int, int]:
+    """Check that the properties of a splat are all there; return the numbers of f_rest_* and scale_* among them."""
     names = {p.name for p in vertex.properties}
     if "packed_position" in names:
         raise DataError(
@@ -259,8 +268,9 @@ def _check_properties(path: str | os.PathLike[str], header: _Header, vertex: Ply
             "or run 'splat-transform IN.compressed.ply OUT.ply'"
         )
     rest = sum(str(name).startswith("f_rest_") for name in names)
-    accepted = [3 * (m - 1) for m in SH_COEFFICIENTS]
-    missing = [name for name in _property_names(rest) if name not in names]
+    accepted = [*(3 * (m - 1) for m in SH_COEFFICIENTS), _REST_OF_DEGREE_4]
+    scales = 3 if "scale_2" in names or "scale_1" not in names else 2
+    missing = [name for name in _property_names(rest, scales) if name not in names]
     if missing:
         message = f"'{path}' is no 3DGS scene: its vertices lack the properties {_shortened(', '.join(missing))}"
         if "opacity" in names and {"red", "green", "blue"} <= names:
@@ -269,12 +279,11 @@ def _check_properties(path: str | os.PathLike[str], header: _Header, vertex: Ply
             message += "; this is a mesh or a point cloud"
         raise DataError(message)
     if rest not in accepted:
-        hint = " (SH degree 4: export at most 3 bands)" if rest == 72 else ""
-        raise DataError(f"'{path}': {rest} f_rest properties{hint}, expected one of {accepted}")
+        raise DataError(f"'{path}': {rest} f_rest properties, expected one of {accepted}")
     before = itertools.takewhile(lambda entry: entry[0] is not vertex, header.elements)
     if any(isinstance(p, PlyListProperty) for element in (vertex, *(e for e, _ in before)) for p in element.properties):
         raise DataError(f"'{path}': list properties in or before the element 'vertex' are not supported")
-    return rest
+    return rest, scales
 
 
 def _check_size(path: str | os.PathLike[str], header: _Header, size: int) -> int:
