@@ -24,9 +24,10 @@ if TYPE_CHECKING:
     from typing import Any
 
     from potr_cl.api.comparing import SceneComparison, compare
+    from potr_cl.api.describing import SceneInfo, info
     from potr_cl.api.editing import CompactedScene, PrunedScene, RefittedScene, compact, prune, refit
     from potr_cl.api.encoding import encode
-    from potr_cl.api.files import SceneInfo, convert, decode, info, save
+    from potr_cl.api.files import convert, decode, save
     from potr_cl.api.pictures import Rendering, Renderings, preview, render
     from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, PotrError, UnreachableError, UsageError
     from potr_cl.formats import load_cameras, load_scene, read_cameras, read_scene
@@ -97,7 +98,7 @@ _HOMES = {
     "Renderings": "api.pictures",
     "Scene": "model.scene",
     "SceneComparison": "api.comparing",
-    "SceneInfo": "api.files",
+    "SceneInfo": "api.describing",
     "Target": "pipeline.search",
     "UnreachableError": "errors",
     "UsageError": "errors",
@@ -107,7 +108,7 @@ _HOMES = {
     "decode": "api.files",
     "encode": "api.encoding",
     "encode_to_target": "pipeline.search",
-    "info": "api.files",
+    "info": "api.describing",
     "load_cameras": "formats",
     "load_scene": "formats",
     "look_around": "model.viewpoints",

@@ -240,7 +240,7 @@ def stage_options(
     """
     alone = {stage.name: {"on": isinstance(stage, kind)} for stage in EncodeOptions().stages if stage.needs_views}
     options = EncodeOptions(q=q).changed(**alone)
-    options = encode_options(options, None, choices, background=background, memory=memory)
+    options = encode_options(options, None, choices, background=background, memory=memory, stages=[kind])
     if sf_sh is not None:
         options = options.with_parameters(sf_sh=sf_sh)
         _ = options.parameters

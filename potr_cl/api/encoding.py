@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -42,7 +42,7 @@ from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.report.html import PicturePair, html_report, views_to_show
 from potr_cl.report.summary import encode_report, quality_report, search_report
 from potr_cl.stages.refit import Refit
-from potr_cl.stages.stage import Progress
+from potr_cl.stages.stage import Progress, Stage
 
 
 def encode(
@@ -164,12 +164,14 @@ def encode_options(
     memory: float | None = None,
     threads: int | None = None,
     source_bytes: int | None = None,
+    stages: Collection[type[Stage]] | None = None,
 ) -> EncodeOptions:
     """The options that keywords ask for, checked.
 
     Args:
         options: to be changed by the others; None: those of the preset.
         choices: of stages, see :func:`potr_cl.pipeline.keywords.stage_changes`.
+        stages: of which choices are allowed; None: of all.
         memory: in GiB.
 
     Raises:
@@ -184,7 +186,7 @@ def encode_options(
         "threads": threads,
         "source_bytes": source_bytes,
     }
-    changes = {name: value for name, value in changes.items() if value is not None} | stage_changes(choices)
+    changes = {name: value for name, value in changes.items() if value is not None} | stage_changes(choices, stages)
     if options is None:
         options = EncodeOptions.for_preset(preset or DEFAULT, **changes)
     elif preset is not None:

@@ -1,23 +1,21 @@
-"""Files of scenes: :func:`save`, :func:`convert`, :func:`decode`, and :func:`info`, what a file holds."""
+"""Files of scenes: :func:`save`, :func:`convert` and :func:`decode`.
+
+To decode takes less time than to import what other functions need, so little is imported here.
+"""
 
 from __future__ import annotations
 
 import os
-from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING
 
-from potr_cl.api.inputs import SceneSource, bytes_of_file, name_of, scene_of
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.api.inputs import SceneSource, encoded_bytes, scene_of
 from potr_cl.codec.decoder import decode as decode_file
-from potr_cl.errors import UsageError
-from potr_cl.formats import load_scene, registry, scene_writer
-from potr_cl.formats.scenes.potr import FORMAT as POTR
-from potr_cl.formats.scenes.scene_files import noting_mends
-from potr_cl.model.scene import CleanReport, Scene
-from potr_cl.pipeline.encode import Encoded
-from potr_cl.report.file import file_report, format_report
-from potr_cl.report.scene import format_histograms, format_scene, format_suspicious, scene_report
+from potr_cl.host.atomic_write import replacing
+from potr_cl.model.scene import Scene
+
+if TYPE_CHECKING:
+    from potr_cl.pipeline.encode import Encoded
 
 
 def save(scene: SceneSource, path: str | os.PathLike[str]) -> None:
@@ -32,8 +30,12 @@ def save(scene: SceneSource, path: str | os.PathLike[str]) -> None:
         UsageError: no format that is written has these suffixes, ``path`` cannot be written to, or an extra is missing.
         PotrError: the format cannot hold the scene, or the system failed to write.
     """
-    if isinstance(scene, Encoded) and Path(path).suffix.lower() in POTR.suffixes:
-        scene.save(path)
+    from potr_cl.formats import scene_writer
+
+    data = encoded_bytes(scene)
+    if data is not None and Path(path).suffix.lower() == ".potr":
+        with replacing(path) as file:
+            file.write(data)
         return
     write = scene_writer(path)  # a wrong name is told before anything is read
     write(scene_of(scene))
@@ -53,6 +55,8 @@ def convert(scene: SceneSource, output: str | os.PathLike[str], *, trust: bool =
     Raises:
         UsageError, DataError: as :func:`potr_cl.load_scene` and :func:`save`.
     """
+    from potr_cl.formats import scene_writer
+
     write = scene_writer(output)
     read = scene_of(scene, trust)
     write(read)
@@ -73,87 +77,13 @@ def decode(
         UsageError: the path cannot be read, or ``output`` not be written to.
         DataError: not a .potr file, a damaged one, or too many splats for its size.
     """
-    write = scene_writer(output) if output is not None else None
-    scene = decode_file(file.data if isinstance(file, Encoded) else file, **({"trust": True} if trust else {}))
+    write = None
+    if output is not None:
+        from potr_cl.formats import scene_writer
+
+        write = scene_writer(output)
+    data = encoded_bytes(file)
+    scene = decode_file(file if data is None else data, **({"trust": True} if trust else {}))  # type: ignore[arg-type]
     if write is not None:
         write(scene)
     return scene
-
-
-@dataclass(frozen=True, repr=False)
-class SceneInfo:
-    """What a scene holds; printed, it is the table that the command ``info`` shows.
-
-    Attributes:
-        facts: by name, ready for JSON: those of :func:`potr_cl.report.scene.scene_report` with ``file``, ``format`` and
-            ``bytes``; of a .potr file also those of :func:`potr_cl.report.file.file_report`.
-    """
-
-    facts: dict[str, Any]
-
-    @property
-    def suspicious(self) -> list[str]:
-        """What looks wrong, a line each."""
-        return [entry["said"] for entry in self.facts["suspicious"]]
-
-    def __getitem__(self, name: str) -> Any:
-        return self.facts[name]
-
-    def __repr__(self) -> str:
-        facts = self.facts
-        size = "" if facts["bytes"] is None else f", {facts['bytes']:,} bytes"
-        wrong = f"{len(self.suspicious)} suspicious" if self.suspicious else "nothing suspicious"
-        kind = facts["format"] or "in memory"
-        return f"SceneInfo({kind}, {facts['splats']:,} splats of SH degree {facts['sh_degree']}{size}, {wrong})"
-
-    def __str__(self) -> str:
-        facts = self.facts
-        if "sections" in facts:
-            return "\n".join([format_report(facts), "", *format_histograms(facts), "", *format_suspicious(facts)])
-        head = [f"format          {facts['format']}"] if facts["format"] else []
-        if facts["bytes"] is not None:
-            head.append(f"size            {facts['bytes']:,} bytes, {facts['bytes'] / facts['splats']:.2f} a splat")
-        return "\n".join([*head, format_scene(facts)])
-
-
-def info(file: SceneSource, trust: bool = False) -> SceneInfo:
-    """What a scene holds, and what looks wrong with it, as the command ``info`` tells.
-
-    Args:
-        file: of any format that is read, or a scene in memory.
-        trust: as of :func:`potr_cl.load_scene`.
-
-    Raises:
-        UsageError, DataError: as :func:`potr_cl.load_scene`.
-    """
-    own = {"file": str(name_of(file)), "format": None, "bytes": bytes_of_file(file)}
-    if isinstance(file, Scene):
-        scene, mended = _as_it_would_be_read(file)
-        return SceneInfo({**own, **scene_report(scene, mended)})
-    told = {"trust": True} if trust else {}
-    if isinstance(file, (Encoded, bytes)):
-        opened = PotrFile.from_bytes(file.data if isinstance(file, Encoded) else file, **told)
-    else:
-        kind = _format_of(Path(file))
-        if kind is not POTR:
-            with noting_mends() as mended:
-                scene = load_scene(file, **told)
-            return SceneInfo({**own, "format": kind.name, **scene_report(scene, mended)})
-        opened = PotrFile.open(file, **told)
-    # Two reports of one file: what it says itself of counts and bounds is the same as what the scene says.
-    return SceneInfo({**own, "format": POTR.name, **file_report(opened), **scene_report(opened.scene())})
-
-
-def _as_it_would_be_read(scene: Scene) -> tuple[Scene, list[CleanReport]]:
-    """A scene in memory, which nobody may have cleaned."""
-    clean, report = scene.cleaned()
-    return clean, [report]
-
-
-def _format_of(path: Path) -> Any:
-    """The format that reads a file; .potr where no suffix says another one, as content tells these."""
-    try:
-        reader = registry.reader_of(path)
-    except UsageError:
-        return POTR
-    return next((entry for entry in registry.SCENE_FORMATS if entry.load is reader), POTR)

@@ -5,21 +5,25 @@ from __future__ import annotations
 import os
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import TYPE_CHECKING, Any, TypeAlias
 
 from potr_cl.codec.decoder import decode
 from potr_cl.errors import UsageError
-from potr_cl.formats import load_cameras, load_scene
-from potr_cl.formats.images import Colour, parse_colour
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene
-from potr_cl.opencl.device import Device
-from potr_cl.opencl.discovery import DeviceInfo
-from potr_cl.pipeline.encode import Encoded
-from potr_cl.raster.rules import RULES, RasterRules
 
-#: A scene, or what one is read from: a path of any format that is read, an encode's result, or a .potr file's bytes.
-SceneSource: TypeAlias = "Scene | str | os.PathLike[str] | Encoded | bytes"
+# What reads files, colours and devices is imported where it is needed: to decode takes less time than to import it.
+if TYPE_CHECKING:
+    from potr_cl.api.editing import Edited
+    from potr_cl.formats.images import Colour
+    from potr_cl.opencl.device import Device
+    from potr_cl.opencl.discovery import DeviceInfo
+    from potr_cl.pipeline.encode import Encoded
+    from potr_cl.raster.rules import RasterRules
+
+#: A scene, or what one is taken from: a path of any format that is read, the result of a stage or of an encode, or a
+#: .potr file's bytes.
+SceneSource: TypeAlias = "Scene | str | os.PathLike[str] | Edited | Encoded | bytes"
 #: Cameras, or what they are read from.
 CamerasSource: TypeAlias = "Sequence[Camera] | str | os.PathLike[str]"
 #: A colour as numbers from 0 to 1, or as the command line takes it.
@@ -40,11 +44,26 @@ def scene_of(source: SceneSource, trust: bool = False) -> Scene:
     """
     if isinstance(source, Scene):
         return source
-    if isinstance(source, Encoded):
-        return decode(source.data)
+    data = encoded_bytes(source)
+    if data is not None:
+        return decode(data, **_trusting(trust))
+    scene = getattr(source, "scene", None)
+    if isinstance(scene, Scene):
+        return scene
+    if isinstance(source, (str, os.PathLike)):
+        from potr_cl.formats import load_scene
+
+        return load_scene(source, **_trusting(trust))
+    raise UsageError(f"a scene is wanted, or the path of its file, not {type(source).__name__}")
+
+
+def encoded_bytes(source: object) -> bytes | None:
+    """The bytes of a .potr file, of such bytes or of the result of an encode; None for anything else."""
     if isinstance(source, bytes):
-        return decode(source, **_trusting(trust))
-    return load_scene(source, **_trusting(trust))
+        return source
+    # Asked by name: what makes an encode's result takes long to import, and is there if there is one.
+    pieces = getattr(source, "pieces", None)
+    return b"".join(pieces) if isinstance(pieces, list) else None
 
 
 def cameras_of(source: CamerasSource | None) -> list[Camera] | None:
@@ -56,6 +75,8 @@ def cameras_of(source: CamerasSource | None) -> list[Camera] | None:
     if source is None:
         return None
     if isinstance(source, (str, os.PathLike)):
+        from potr_cl.formats import load_cameras
+
         return load_cameras(source)
     cameras = list(source)
     if not cameras:
@@ -69,6 +90,8 @@ def device_of(source: DeviceSource) -> Device:
     Raises:
         DeviceError: there is none, or it does not work.
     """
+    from potr_cl.opencl.device import Device
+
     return source if isinstance(source, Device) else Device(source)
 
 
@@ -78,6 +101,8 @@ def colour_of(source: ColourSource) -> Colour:
     Raises:
         UsageError: it is none.
     """
+    from potr_cl.formats.images import parse_colour
+
     text = source if isinstance(source, str) else ",".join(repr(float(part)) for part in source)
     return parse_colour(text)
 
@@ -88,7 +113,9 @@ def rules_of(source: RasterRules | str) -> RasterRules:
     Raises:
         UsageError: there is no rasterizer of this name.
     """
-    if isinstance(source, RasterRules):
+    from potr_cl.raster.rules import RULES
+
+    if not isinstance(source, str):
         return source
     if source not in RULES:
         raise UsageError(f"there are no rules of a rasterizer '{source}': choose {' or '.join(RULES)}")
@@ -97,11 +124,10 @@ def rules_of(source: RasterRules | str) -> RasterRules:
 
 def bytes_of_file(source: SceneSource) -> int | None:
     """Bytes of the file that a scene comes from; None where it comes from none, or whoever reads it will say so."""
-    if isinstance(source, Encoded):
-        return source.nbytes
-    if isinstance(source, bytes):
-        return len(source)
-    if isinstance(source, Scene):
+    data = encoded_bytes(source)
+    if data is not None:
+        return len(data)
+    if not isinstance(source, (str, os.PathLike)):
         return None
     try:
         return os.stat(source).st_size if os.path.isfile(source) else None
@@ -113,7 +139,7 @@ def name_of(source: SceneSource) -> Path:
     """What a scene is called in results: its path, or what it is."""
     if isinstance(source, (str, os.PathLike)):
         return Path(source)
-    return Path("(encoded)" if isinstance(source, (Encoded, bytes)) else "(scene in memory)")
+    return Path("(encoded)" if encoded_bytes(source) is not None else "(scene in memory)")
 
 
 def chosen_views(

@@ -39,7 +39,7 @@ def add_decode(commands: Commands) -> None:
 
 def _info(args: argparse.Namespace) -> None:
     # Imported here: to decode takes less time than to import what this needs.
-    from potr_cl.api.files import info
+    from potr_cl.api.describing import info
 
     found = info(args.file, **trust(args))
     if args.json:
