@@ -45,7 +45,10 @@ from potr_cl.quality.compare import compare as compare_pictures
 from potr_cl.quality.metrics import Lpips
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RULES, RasterRules
-from potr_cl.report.labels import U8, comparison_picture
+from potr_cl.report.labels import U8, comparison_picture, shrunk
+
+#: Pixels that a notebook's picture is wide at most: it is kept in the notebook.
+_SHOWN = 960
 
 
 @dataclass(frozen=True, repr=False)
@@ -128,7 +131,7 @@ class SceneComparison:
         return "\n\n".join([format_sizes(self.a, self.b), format_comparison(self.figures), "\n".join(self.notes)])
 
     def _repr_png_(self) -> bytes:
-        return png_bytes(self.picture)
+        return png_bytes(shrunk(self.picture, _SHOWN))
 
 
 def compare(

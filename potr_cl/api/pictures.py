@@ -32,7 +32,7 @@ from potr_cl.raster.rules import RasterRules
 from potr_cl.report.labels import U8, contact_sheet
 
 #: Pixels along a side of each of a preview's pictures.
-_PREVIEW = 240
+_PREVIEW = 200
 
 
 class Rendering(NamedTuple):

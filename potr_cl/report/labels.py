@@ -121,6 +121,14 @@ def contact_sheet(pictures: Sequence[tuple[U8, Words]], heading: Words = "", row
     return np.concatenate([*([_strip(heading, columns * width, size)] if heading else []), *lines])
 
 
+def shrunk(pixels: U8, width: int) -> U8:
+    """A picture, (H, W, 3) 8-bit, made smaller where it is wider than so many pixels."""
+    if pixels.shape[1] <= width:
+        return pixels
+    height = max(1, round(pixels.shape[0] * width / pixels.shape[1]))
+    return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.LANCZOS))
+
+
 @lru_cache(maxsize=16)
 def _font(size: int) -> Any:
     return ImageFont.load_default(size)
