@@ -16,7 +16,7 @@ from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import add_trust_option, read_scene
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say
-from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
+from potr_cl.cli.views import add_cameras_options, check_frame, given_cameras, virtual_cameras
 from potr_cl.codec.quantize import ac_sparsity
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import parse_colour
@@ -34,6 +34,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
+from potr_cl.stages.pruning.unseen import Unseen
 from potr_cl.stages.refitting.refit import RefitOptions, Refitted, active_coefficients, refit_colours
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
 from potr_cl.stages.stage import Stage, State
@@ -46,6 +47,7 @@ def _prune(args: argparse.Namespace) -> None:
     options = _options(args, Prune)
     cameras = given_cameras(args)
     scene = read_scene(args, args.scene)
+    check_frame(args, scene, cameras)
     with contextlib.ExitStack() as stack:
         order = stack.enter_context(replacing(args.order)) if args.order is not None else None
         state, device = _run(args, scene, cameras, options, Prune)
@@ -57,6 +59,9 @@ def _prune(args: argparse.Namespace) -> None:
         f"{args.output}: kept {pruned.kept} of {len(scene)} splats "
         f"({100 * pruned.kept / len(scene):.1f} %) in {pruned.iterations} iterations on {device.info}"
     )
+    unseen: Unseen = state.learnt["unseen"]
+    if unseen.splats:
+        say(unseen)
 
 
 def _options(args: argparse.Namespace, kind: type[Stage]) -> EncodeOptions:
@@ -107,6 +112,7 @@ def _compact(args: argparse.Namespace) -> None:
         _ = options.parameters
     cameras = given_cameras(args)
     scene = read_scene(args, args.scene)
+    check_frame(args, scene, cameras)
     compacted = _run(args, scene, cameras, options, Compact)[0].scene
     ply.save(args.output, compacted)
     before, after = (100 * ac_sparsity(s.sh, options.parameters.sf_sh) for s in (scene, compacted))
@@ -140,6 +146,7 @@ def _refit(args: argparse.Namespace) -> None:
         assert cameras is not None
         ground_truth = GroundTruth(args.photos, cameras, background)
     scene, reference = read_scene(args, args.scene), read_scene(args, args.reference)
+    check_frame(args, reference, cameras)
     device = Device(args.device)
     with contextlib.closing(Progress()) as progress:
         cameras = cameras or virtual_cameras(args, reference, progress)

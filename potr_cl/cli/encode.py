@@ -46,6 +46,7 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
         memory=as_bytes(args.memory),
         threads=args.threads,
         source_bytes=size_of_file(args.scene),
+        cameras_anyway=args.cameras_anyway,
         **stage_choices(args),
     )
     _ = options.parameters  # a wrong option is told before a gigabyte is read

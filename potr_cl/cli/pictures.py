@@ -19,7 +19,7 @@ from potr_cl.cli.options import CAMERAS_HELP, RULES, Commands, add_rendering_opt
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import add_trust_option, read_scene
 from potr_cl.cli.terminal import note, say, say_document
-from potr_cl.cli.views import read_cameras
+from potr_cl.cli.views import read_cameras, warn_of_frame
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.images import parse_colour, to_8_bits, write_png
 from potr_cl.host.atomic_write import replacing
@@ -62,8 +62,11 @@ def _select(cameras: list[Camera], wanted: list[str] | None, split: str | None) 
     return views or cameras
 
 
-def _rasterizer(args: argparse.Namespace, path: Path, device: Device) -> tuple[SceneFile, Rasterizer]:
+def _rasterizer(
+    args: argparse.Namespace, path: Path, device: Device, views: list[Camera]
+) -> tuple[SceneFile, Rasterizer]:
     scene = read_scene(args, path)
+    warn_of_frame(path, scene, views)
     rasterizer = Rasterizer(device, scene, RULES[args.rules], parse_colour(args.background))
     return SceneFile.of(path, scene), rasterizer
 
@@ -83,7 +86,7 @@ def _render(args: argparse.Namespace) -> None:
         args.output.mkdir(parents=True, exist_ok=True)
     except OSError as error:
         raise UsageError(f"cannot make the folder '{args.output}': {error.strerror}") from None
-    _, rasterizer = _rasterizer(args, args.scene, device)
+    _, rasterizer = _rasterizer(args, args.scene, device, views)
     stage = f"rendering {len(views)} view{'s' if len(views) > 1 else ''}"
     with contextlib.closing(Progress()) as progress:
         progress(stage, 0.0)
@@ -131,8 +134,8 @@ def _compare(args: argparse.Namespace) -> None:
     device = Device(args.device)
     with contextlib.ExitStack() as stack:
         picture = stack.enter_context(replacing(args.output)) if args.output is not None else None
-        a, rasterizer_a = _rasterizer(args, args.a, device)
-        b, rasterizer_b = _rasterizer(args, args.b, device)
+        a, rasterizer_a = _rasterizer(args, args.a, device, views)
+        b, rasterizer_b = _rasterizer(args, args.b, device, views)
         progress = stack.enter_context(contextlib.closing(Progress()))
         comparison = compare(rasterizer_a, rasterizer_b, views, ground_truth, lpips, progress)
         if picture is not None:

@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from pathlib import Path
 
 from potr_cl.cli.guard import ReadCameras, check_photographs
 from potr_cl.cli.options import CAMERAS_HELP
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.terminal import note
 from potr_cl.formats import load_cameras
-from potr_cl.model.camera import Camera
+from potr_cl.model.agreement import judge_cameras, require_agreement
+from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import FEWEST, MOST, describe, place_cameras
 from potr_cl.stages.stage import Progress
@@ -25,6 +28,11 @@ def add_cameras_options(p: argparse.ArgumentParser) -> None:
         type=whole_number,
         metavar="N",
         help=f"to place without --cameras; default {FEWEST} to {MOST}, the fewer the more splats",
+    )
+    p.add_argument(
+        "--cameras-anyway",
+        action="store_true",
+        help="take the cameras even if they do not seem to be in the scene's frame",
     )
 
 
@@ -42,6 +50,23 @@ def read_cameras(args: argparse.Namespace) -> list[Camera]:
     cameras = load_cameras(args.cameras)
     check_photographs(args, cameras)
     return cameras
+
+
+def check_frame(args: argparse.Namespace, scene: Scene, cameras: Sequence[Camera] | None) -> None:
+    """Refuse cameras of a file that are not in the scene's frame, unless the user wants them anyway.
+
+    Raises:
+        UsageError: they are not, or there is no training view among them.
+    """
+    if cameras is not None and not args.cameras_anyway:
+        require_agreement(scene, train_views(cameras))
+
+
+def warn_of_frame(path: Path, scene: Scene, views: Sequence[Camera]) -> None:
+    """Say so if the views of a file do not seem to be in a scene's frame; for commands that throw nothing away."""
+    judged = judge_cameras(scene, views)
+    if judged.suspicious:
+        note(f"warning: {path}: {judged.finding}")
 
 
 def virtual_cameras(args: argparse.Namespace, scene: Scene, progress: Progress) -> list[Camera]:

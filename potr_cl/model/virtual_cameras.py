@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.scene import Scene
+from potr_cl.model.spherical_harmonics import ac_basis
 
 F64 = NDArray[np.float64]
 F32 = NDArray[np.float32]
@@ -413,7 +414,7 @@ def _energy(camera_centre: F64, matter: _Matter) -> F32:
     """
     rays = matter.targets - camera_centre
     towards = rays / np.maximum(np.linalg.norm(rays, axis=1), 1e-300)[:, None]
-    basis = _ac_basis(towards)[:, : matter.colours.shape[1]].astype(np.float32)
+    basis = ac_basis(towards)[:, : matter.colours.shape[1]].astype(np.float32)
     deviation = np.einsum("km,kmc->kc", basis, matter.colours)
     energy: F32 = np.einsum("kc,kc->k", deviation, deviation)
     return energy
@@ -437,32 +438,6 @@ def _remembered(places: F64, shown: list[F32], matter: _Matter) -> F64 | None:
     best = np.quantile(weights @ energy.T / total[:, None], 0.95, axis=1)
     remembered: F64 = own / np.maximum(best, 1e-12)
     return remembered
-
-
-def _ac_basis(d: F64) -> F64:
-    """(n, 15) real spherical harmonics of degree 1 to 3 in unit directions (n, 3), order and signs of 3DGS."""
-    x, y, z = d.T
-    xx, yy, zz = x * x, y * y, z * z
-    return np.stack(
-        [
-            -0.4886025119029199 * y,
-            0.4886025119029199 * z,
-            -0.4886025119029199 * x,
-            1.0925484305920792 * x * y,
-            -1.0925484305920792 * y * z,
-            0.31539156525252005 * (2 * zz - xx - yy),
-            -1.0925484305920792 * x * z,
-            0.5462742152960396 * (xx - yy),
-            -0.5900435899266435 * y * (3 * xx - yy),
-            2.890611442640554 * x * y * z,
-            -0.4570457994644658 * y * (4 * zz - xx - yy),
-            0.3731763325901154 * z * (2 * zz - 3 * xx - 3 * yy),
-            -0.4570457994644658 * x * (4 * zz - xx - yy),
-            1.445305721320277 * z * (xx - yy),
-            -0.5900435899266435 * x * (xx - 3 * yy),
-        ],
-        axis=1,
-    )
 
 
 def _pick(candidates: _Candidates, count: int) -> list[int]:
