@@ -32,6 +32,7 @@ study.rates                where do the bits go, and what do they buy?
 study.compaction_curves    what does the compaction do to sparsity and pictures?
 study.removal_exactness    how far are predicted removal effects from removals in float64?
 study.removal_formulas     back to front or prefix sums: which formula of removal effects?
+study.frames               which cameras in another frame are found, and what do unseen splats cost?
 study.composite_yardstick  the compositing kernel beside a loop in C
 =========================  =============================================================================================
 
