@@ -43,8 +43,8 @@ def wrong(
     yield "another scene's cameras", scene, list(others)
 
 
-def right(scene: Scene, cameras: Sequence[Camera]) -> Iterator[tuple[str, list[Camera]]]:
-    """Cameras that are in the scene's frame, each with what they are."""
+def right(scene: Scene, cameras: Sequence[Camera], others: bool = True) -> Iterator[tuple[str, list[Camera]]]:
+    """Cameras that are in the scene's frame, each with what they are: some of its own and, if wanted, others."""
     count = len(cameras)
     yield "all cameras", list(cameras)
     yield "every other one", list(cameras[::2])
@@ -54,6 +54,8 @@ def right(scene: Scene, cameras: Sequence[Camera]) -> Iterator[tuple[str, list[C
     yield "four others", [cameras[view] for view in np.random.default_rng(1).choice(count, 4, replace=False)]
     for view in np.linspace(0, count - 1, 3).astype(int):
         yield f"number {view} alone", [cameras[view]]
+    if not others:
+        return
     yield "views from inside", from_inside(scene)
     yield "virtual cameras", place_cameras(scene, 40)
 

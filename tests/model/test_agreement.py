@@ -85,12 +85,10 @@ def test_no_right_cameras_of_a_whole_scene_are_refused(name, degree, request):
 @pytest.mark.slow
 @pytest.mark.parametrize("name", CAPTURES)
 def test_no_right_cameras_of_other_kinds_of_scenes_are_refused(name):
-    """But for views from inside matter and virtual ones, which only scenes of captures have to take."""
     whole_scene, cameras = CAPTURES[name]()
     for scene in (whole_scene, without_directions(whole_scene)):
-        for what, views in right(scene, cameras):
-            if what not in ("views from inside", "virtual cameras"):
-                assert not judge_cameras(scene, views).suspicious, (what, scene.sh_degree)
+        for what, views in right(scene, cameras, others=False):
+            assert not judge_cameras(scene, views).suspicious, (what, scene.sh_degree)
 
 
 @pytest.mark.slow

@@ -1,12 +1,13 @@
 """Cameras that are not in the scene's frame: which are found, by which margin, and what keeping unseen splats costs.
 
     python -m tools.study.frames judge SCENE SCENE … [--json FILE]
+    python -m tools.study.frames made [--json FILE]
     python -m tools.study.frames unseen SCENE … [--json FILE] [--device DEVICE] [--preset fast]
 
 ``judge`` takes two scenes or more (point_cloud.ply and cameras.json in each), moves each in the ways in which scenes
-are moved, and gives it the cameras of the next; then come scenes made by rule (:mod:`potr_cl.reference.captures`), for
-kinds of which no real one is at hand. It writes by how much the best motion fits better, and how much is needed: found
-is what has more. Right cameras must have less.
+are moved, and gives it the cameras of the next. It writes by how much the best motion fits better, and how much is
+needed: found is what has more. Right cameras must have less. ``made`` does the same with scenes made by rule
+(:mod:`potr_cl.reference.captures`), for kinds of which no real one is at hand.
 
 ``unseen`` encodes each scene with and without the splats that no training view sees, with all its training views and
 with half of them, those of one side.
@@ -16,7 +17,7 @@ from __future__ import annotations
 
 import argparse
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 
 import numpy as np
@@ -36,50 +37,48 @@ from tools.workloads import pictures, read
 
 
 def judge(args: argparse.Namespace) -> None:
-    """Right and wrong cameras of every scene."""
-    results = Results(None, args.json)
-    scenes = {folder.name: read(folder) for folder in args.scenes}
-    made = {name: capture() for name, capture in CAPTURES.items()}
-    for name, own in (("real", scenes), ("made", made)):
-        heads = (Column("scene"), Column("SH degree"), Column("cameras"))
-        figures = (Column("gain", format="+.2f"), Column("needed", format=".2f"), Column("time", "s", ".2f"))
-        what = "Scenes of captures" if name == "real" else "Scenes made by rule"
-        wrongs = results.table(
-            f"{name}_wrong", f"{what}: cameras in another frame", *heads, *figures, Column("verdict"), Column("said")
-        )
-        rows = list(_rows(own, scenes))
-        for row in rows:
-            if row[3] is not None:
-                _add(wrongs, *row)
-        rights = results.table(
-            f"{name}_right",
-            f"{what}: cameras in the scene's frame",
-            *heads,
-            *figures,
-            Column("verdict"),
-            Column("said"),
-        )
-        for row in rows:
-            if row[3] is None:
-                _add(rights, *row)
+    """Right and wrong cameras of real scenes."""
+    _judge(
+        Results(None, args.json), "real", "Scenes of captures", {folder.name: read(folder) for folder in args.scenes}
+    )
 
 
-Row = tuple[str, str, Scene, "list[Camera] | None", list[Camera]]
+def made(args: argparse.Namespace) -> None:
+    """Right and wrong cameras of scenes made by rule."""
+    _judge(Results(None, args.json), "made", "Scenes made by rule", {name: make() for name, make in CAPTURES.items()})
 
 
-def _rows(own: dict[str, tuple[Scene, list[Camera]]], others: dict[str, tuple[Scene, list[Camera]]]) -> list[Row]:
-    rows: list[Row] = []
-    names = list(others)
-    for name, (whole, cameras) in own.items():
-        other = names[(names.index(name) + 1) % len(names)] if name in names else names[0]
-        views, strange = train_views(cameras), train_views(others[other][1])
-        for scene in (whole, without_directions(whole)):
-            rows += [(name, what, moved, given, given) for what, moved, given in wrong(scene, views, strange)]
-            rows += [(name, what, scene, None, given) for what, given in right(scene, views)]
-    return rows
+def _judge(results: Results, name: str, what: str, scenes: dict[str, tuple[Scene, list[Camera]]]) -> None:
+    columns = (
+        Column("scene"),
+        Column("SH degree"),
+        Column("cameras"),
+        Column("gain", format="+.2f"),
+        Column("needed", format=".2f"),
+        Column("time", "s", ".2f"),
+        Column("verdict"),
+        Column("said"),
+    )
+    views = {folder: train_views(cameras) for folder, (_, cameras) in scenes.items()}
+    names = list(scenes)
+    table = results.table(f"{name}_right", f"{what}: cameras in the scene's frame", *columns)
+    for folder, scene in _of_both_degrees(scenes):
+        for which, cameras in right(scene, views[folder], others=name == "real"):
+            _add(table, folder, which, scene, cameras)
+    table = results.table(f"{name}_wrong", f"{what}: cameras in another frame", *columns)
+    for folder, scene in _of_both_degrees(scenes):
+        other = names[(names.index(folder) + 1) % len(names)]
+        for which, moved, cameras in wrong(scene, views[folder], views[other]):
+            _add(table, folder, which, moved, cameras)
 
 
-def _add(table: Table, name: str, what: str, scene: Scene, _wrong: list[Camera] | None, cameras: list[Camera]) -> None:
+def _of_both_degrees(scenes: dict[str, tuple[Scene, list[Camera]]]) -> Iterator[tuple[str, Scene]]:
+    for folder, (scene, _) in scenes.items():
+        yield folder, scene
+        yield folder, without_directions(scene)
+
+
+def _add(table: Table, name: str, what: str, scene: Scene, cameras: list[Camera]) -> None:
     began = time.process_time()
     judged = judge_cameras(scene, cameras)
     seconds = time.process_time() - began
@@ -135,9 +134,10 @@ def main(argv: Sequence[str] | None = None) -> None:
     """Command line."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     commands = parser.add_subparsers(required=True)
-    for name, work in (("judge", judge), ("unseen", unseen)):
+    for name, work in (("judge", judge), ("made", made), ("unseen", unseen)):
         command = commands.add_parser(name)
-        command.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
+        if work is not made:
+            command.add_argument("scenes", nargs="+", type=Path, metavar="SCENE")
         command.add_argument("--json", type=Path, help="also keep the results here")
         command.set_defaults(run=work)
     command.add_argument("--device", help="as for potr-cl")
