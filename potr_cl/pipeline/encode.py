@@ -71,6 +71,7 @@ def encode(
     options: EncodeOptions | None = None,
     progress: Progress | None = None,
     device: Device | None = None,
+    antialiased: bool | None = None,
 ) -> Encoded:
     """Encode a scene.
 
@@ -82,6 +83,7 @@ def encode(
         progress: called with a stage's name and the part of it that is done.
         device: computes; by default the best one there is. If its memory is too small, less is kept in it, and if that
             is not enough, a CPU does the work. A warning says so.
+        antialiased: whether to take it as an antialiased scene; None: as what it says that it is.
 
     Raises:
         UsageError: options out of range, cameras without a training view, or cameras that are probably not in the
@@ -90,6 +92,7 @@ def encode(
         DeviceError: no device does the work.
     """
     options = options or EncodeOptions()
+    scene = scene.rendered(antialiased)
     watch = Stopwatch(progress)
     cameras = cameras_or_virtual(scene, cameras, options, watch)
     run = Run(options, watch, device)
@@ -166,11 +169,10 @@ class Run:
         return state
 
     def _interludes(self, stage: Stage, state: State) -> tuple[Interlude, ...]:
-        """What other stages want done while this one removes splats, in iterations."""
-        iterations: int | None = getattr(stage, "iterations", None)
-        if iterations is None:
+        """What other stages want done while this one removes splats."""
+        if stage.removes_in is None:
             return ()
-        wanted = [each for other in self._options.stages if other.on for each in other.interludes(iterations)]
+        wanted = [each for other in self._options.stages if other.on for each in other.interludes(stage.removes_in)]
         return tuple(interlude for interlude in wanted if interlude.stage.looks_at(state.source))
 
     def finished(self, state: State) -> Encoded:

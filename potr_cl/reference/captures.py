@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
+from potr_cl.model.placement.colour_memory import ac_basis
 from potr_cl.model.scene import Scene
-from potr_cl.model.spherical_harmonics import ac_basis
 
 F64 = NDArray[np.float64]
 Capture = tuple[Scene, list[Camera]]
@@ -185,5 +185,10 @@ def _sky(rng: np.random.Generator, splats: int, radius: float) -> Scene:
 
 
 def _together(scenes: Sequence[Scene]) -> Scene:
-    names = [field.name for field in dataclasses.fields(Scene)]
-    return Scene(*(np.concatenate([getattr(scene, name) for scene in scenes]) for name in names))
+    return Scene(
+        np.concatenate([scene.means for scene in scenes]),
+        np.concatenate([scene.log_scales for scene in scenes]),
+        np.concatenate([scene.quaternions for scene in scenes]),
+        np.concatenate([scene.opacity_logits for scene in scenes]),
+        np.concatenate([scene.sh for scene in scenes]),
+    )

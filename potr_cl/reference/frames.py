@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera, camera_centres
+from potr_cl.model.placement.colour_memory import ac_basis
 from potr_cl.model.scene import Scene
-from potr_cl.model.spherical_harmonics import ac_basis
 from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.reference.captures import looking
 
@@ -91,12 +91,12 @@ def moved(scene: Scene, axes: F64, scale: float = 1.0, shift: Sequence[float] = 
         towards /= np.linalg.norm(towards, axis=1, keepdims=True)
         before, after = (ac_basis(d)[:, : sh.shape[1] - 1] for d in (towards, towards @ axes.T))
         sh[:, 1:] = np.einsum("mn,knc->kmc", np.linalg.lstsq(after, before, rcond=None)[0], sh[:, 1:])
-    return Scene(
-        (scale * scene.means.astype(np.float64) @ axes.T + np.asarray(shift)).astype(np.float32),
-        scene.log_scales + np.float32(math.log(scale)),
-        _quaternions(turned).astype(np.float32),
-        scene.opacity_logits,
-        sh.astype(np.float32),
+    return dataclasses.replace(
+        scene,
+        means=(scale * scene.means.astype(np.float64) @ axes.T + np.asarray(shift)).astype(np.float32),
+        log_scales=scene.log_scales + np.float32(math.log(scale)),
+        quaternions=_quaternions(turned).astype(np.float32),
+        sh=sh.astype(np.float32),
     )
 
 

@@ -58,6 +58,7 @@ def encode_report(
             "bytes": source_bytes,
             "splats": len(scene),
             "sh_degree": scene.sh_degree,
+            "antialiased": scene.antialiased,
         },
         "file": str(target),
         "bytes": len(file.data),
@@ -148,6 +149,8 @@ def format_encode_report(report: dict[str, Any]) -> str:
     ]
     if report["unseen"] is not None and report["unseen"]["splats"]:
         lines.append(f"           {report['unseen']['said']}")
+    if source["antialiased"]:
+        lines.append("rendered   as an antialiased scene")
     for place, (name, nbytes) in enumerate(report["properties"].items()):
         lines.append(f"{'' if place else 'bytes':<11}{name:<12}{nbytes:>13,}{100 * nbytes / report['bytes']:>7.1f} %")
     quality = report["quality"]

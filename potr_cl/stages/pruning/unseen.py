@@ -8,7 +8,6 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.model.scene import Scene
 from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
 from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.stage import State
@@ -82,9 +81,14 @@ def put_back(split: Split, pruned: State) -> State:
     scene = dataclasses.replace(scene, sh=sh)
     numbers = np.concatenate([pruned.survivors, split.whole.survivors[split.unseen_splats]])
     order = np.argsort(numbers)
-    names = [field.name for field in dataclasses.fields(Scene)]
-    together = Scene(
-        *(np.concatenate([getattr(part, name) for part in (pruned.scene, scene)])[order] for name in names)
+    left = pruned.scene
+    together = dataclasses.replace(
+        left,
+        means=np.concatenate([left.means, scene.means])[order],
+        log_scales=np.concatenate([left.log_scales, scene.log_scales])[order],
+        quaternions=np.concatenate([left.quaternions, scene.quaternions])[order],
+        opacity_logits=np.concatenate([left.opacity_logits, scene.opacity_logits])[order],
+        sh=np.concatenate([left.sh, scene.sh])[order],
     )
     return dataclasses.replace(pruned, scene=together, survivors=numbers[order], geometry=None)
 
