@@ -9,18 +9,20 @@ import math
 
 import numpy as np
 
-from potr_cl.cli.guard import ReadFile, ReadPhotographs, WrittenFile
+from potr_cl.cli.batch import add_to_option
+from potr_cl.cli.guard import ReadPhotographs, read_file
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option, as_bytes
+from potr_cl.cli.outputs import WrittenNumbers, scene_output
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_trust_option, read_scene
+from potr_cl.cli.scenes import add_from_option, add_trust_option, read_scene, write_scene
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
 from potr_cl.codec.quantize import ac_sparsity
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import parse_colour
-from potr_cl.formats.scenes import ply
+from potr_cl.formats.registry import suffixes_read, suffixes_written
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene
@@ -50,7 +52,7 @@ def _prune(args: argparse.Namespace) -> None:
         order = stack.enter_context(replacing(args.order)) if args.order is not None else None
         state, device = _run(args, scene, cameras, options, Prune)
         pruned: Pruned = state.learnt["prune"]
-        ply.save(args.output, state.scene)
+        write_scene(args.output, state.scene, args.to)
         if order is not None:
             np.save(order, pruned.order)
     say(
@@ -81,15 +83,28 @@ def _run(
     return state, run.device or device
 
 
+def _add_output_options(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "-o",
+        "--output",
+        type=scene_output,
+        required=True,
+        metavar="OUT.ply",
+        help=f'{suffixes_written()}, or "-" for standard output',
+    )
+    add_to_option(p)
+    add_from_option(p)
+
+
 def add_prune(commands: Commands) -> None:
     p = commands.add_parser("prune", help="remove the splats that no view misses; nothing else changes")
-    p.add_argument("scene", type=ReadFile, metavar="SCENE", help=".ply or .potr")
+    p.add_argument("scene", type=read_file, metavar="SCENE", help=f'{suffixes_read()}, or "-" for standard input')
     add_cameras_options(p)
-    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
+    _add_output_options(p)
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (fewest splats) to 1; default 0.5")
     p.add_argument(
         "--order",
-        type=WrittenFile,
+        type=WrittenNumbers,
         metavar="FILE.npy",
         help="also write the order of removal: the scene's splat numbers, first removed first, kept ones last",
     )
@@ -108,7 +123,7 @@ def _compact(args: argparse.Namespace) -> None:
     cameras = given_cameras(args)
     scene = read_scene(args, args.scene)
     compacted = _run(args, scene, cameras, options, Compact)[0].scene
-    ply.save(args.output, compacted)
+    write_scene(args.output, compacted, args.to)
     before, after = (100 * ac_sparsity(s.sh, options.parameters.sf_sh) for s in (scene, compacted))
     say(
         f"{args.output}: {len(scene)} splats, {after:.1f} % of the AC coefficients quantise to 0, {before:.1f} % before"
@@ -117,9 +132,9 @@ def _compact(args: argparse.Namespace) -> None:
 
 def add_compact(commands: Commands) -> None:
     p = commands.add_parser("compact", help="make the colours' coefficients sparse; nothing else changes")
-    p.add_argument("scene", type=ReadFile, metavar="SCENE", help=".ply or .potr")
+    p.add_argument("scene", type=read_file, metavar="SCENE", help=f'{suffixes_read()}, or "-" for standard input')
     add_cameras_options(p)
-    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
+    _add_output_options(p)
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (sparsest) to 1; default 0.5")
     add_stage_flags(p, [Compact], without=["on", "at"])
     p.add_argument("--sf-sh", type=float, metavar="SF", help="steps a unit of the quantiser to expect")
@@ -164,7 +179,7 @@ def _refit(args: argparse.Namespace) -> None:
         refitted, device = on_device(device, as_bytes(args.memory), work)
         progress("refit", 1.0)
         result = dataclasses.replace(scene, sh=refitted.sh)
-        ply.save(args.output, result)
+        write_scene(args.output, result, args.to)
         say(f"{args.output}: {len(scene)} splats re-fitted in {refitted.steps} steps on {device.info}")
         before, after = refitted.errors
         say(
@@ -218,13 +233,13 @@ def add_refit(commands: Commands) -> None:
         description="Solve for the colours of all splats together, so that the training views look as those of the "
         "reference (or as the photographs) do; nothing else changes. Coefficients that are 0 stay 0.",
     )
-    p.add_argument("scene", type=ReadFile, metavar="PRUNED", help=".ply or .potr")
-    p.add_argument("--reference", type=ReadFile, required=True, metavar="ORIGINAL", help="the uncompressed scene")
+    p.add_argument("scene", type=read_file, metavar="PRUNED", help=f'{suffixes_read()}, or "-" for standard input')
+    p.add_argument("--reference", type=read_file, required=True, metavar="ORIGINAL", help="the uncompressed scene")
     add_cameras_options(p)
     p.add_argument(
         "--photos", type=ReadPhotographs, metavar="DIR", help="photographs, named after the views, to fit instead"
     )
-    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
+    _add_output_options(p)
     p.add_argument(
         "--steps",
         type=whole_number,

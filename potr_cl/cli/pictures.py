@@ -10,12 +10,12 @@ from potr_cl.cli.guard import (
     ReadCameras,
     ReadFile,
     ReadPhotographs,
-    WrittenFile,
     WrittenFolder,
     check_files,
     check_photographs,
 )
 from potr_cl.cli.options import CAMERAS_HELP, RULES, Commands, add_rendering_options, add_view_options
+from potr_cl.cli.outputs import WrittenPicture
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import add_trust_option, read_scene
 from potr_cl.cli.terminal import note, say, say_document
@@ -166,7 +166,7 @@ def add_compare(commands: Commands) -> None:
     )
     add_view_options(p, "test views if there are any, else all")
     p.add_argument(
-        "-o", "--output", type=WrittenFile, metavar="OUT.png", help="the worst view: A, B, and their difference"
+        "-o", "--output", type=WrittenPicture, metavar="OUT.png", help="the worst view: A, B, and their difference"
     )
     p.add_argument("--json", action="store_true", help="for programs")
     add_trust_option(p)

@@ -6,14 +6,13 @@ Reading, writing, error messages, the help of the command line and docs/formats.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from potr_cl.errors import UsageError
+from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.cameras import cameras_json, colmap, transforms
-from potr_cl.formats.declaration import CameraFormat, SceneFormat, SceneLoader, install_command
+from potr_cl.formats.declaration import CameraFormat, SceneFormat, SceneLoader, SceneSaver, install_command
 from potr_cl.formats.scenes import compressed_ply, ply, potr, sog, spz
-from potr_cl.model.scene import Scene
 
 #: In the order in which people are told of them.
 SCENE_FORMATS: tuple[SceneFormat, ...] = (
@@ -23,6 +22,9 @@ SCENE_FORMATS: tuple[SceneFormat, ...] = (
     spz.FORMAT,
     sog.FORMAT,
 )
+
+#: Bytes that a scene begins with and that may be needed to tell its format.
+START_BYTES = 64
 
 #: In the order in which a folder is searched for them. cameras.json stands before transforms.json, for it lists just
 #: the views that a scene was trained with, as they were.
@@ -50,8 +52,72 @@ def reader_of(path: Path) -> SceneLoader:
     raise UsageError(f"'{path}': unknown kind of scene, expected a {suffixes_read()} file")
 
 
-def writer_of(path: Path) -> Callable[[Path, Scene], None]:
+def suffix_of_content(start: bytes, name: str) -> str:
+    """The suffix of the format that content begins as, for a scene that comes without a name.
+
+    Args:
+        start: its first ``START_BYTES``, fewer if it is shorter.
+        name: of where it comes from, for the message.
+
+    Raises:
+        DataError: no format begins like this.
+    """
+    for entry in SCENE_FORMATS:
+        if start.startswith(entry.starts) and entry.starts:
+            return entry.suffixes[0]
+    raise DataError(
+        f"the {name} begins like no scene that is known; of a format without a mark of its own, give the suffix with "
+        "--from"
+    )
+
+
+def read_suffix(suffix: str) -> str:
+    """A suffix of a format as the command line gives it, ".ply" or "ply", checked.
+
+    Raises:
+        UsageError: no format has it.
+    """
+    wanted = "." + suffix.lower().lstrip(".")
+    if wanted not in _scene_suffixes(SCENE_FORMATS):
+        raise UsageError(f"'{suffix}' is no suffix of a scene: expected {suffixes_read()}")
+    return wanted
+
+
+def written_suffix(suffix: str) -> str:
+    """The same for a format that is to be written.
+
+    Raises:
+        UsageError: no format has it, or it is only read.
+    """
+    wanted = read_suffix(suffix)
+    written_format(Path(f"scene{wanted}"))
+    return wanted
+
+
+def extensions() -> frozenset[str]:
+    """The last parts of all suffixes of scenes, with the point."""
+    return frozenset(extension for entry in SCENE_FORMATS for extension in entry.extensions)
+
+
+def stem_of_scene(path: Path) -> str:
+    """The name of a scene file without the suffix of its format: "a" for "a.compressed.ply"."""
+    fitting = [suffix for suffix in _scene_suffixes(SCENE_FORMATS) if path.name.lower().endswith(suffix)]
+    return path.name[: -len(max(fitting, key=len))] if fitting else path.name
+
+
+def writer_of(path: Path) -> SceneSaver:
     """What writes a scene in the format that the suffixes of the file to be written ask for.
+
+    Raises:
+        UsageError: no format has this suffix, or it is only read.
+    """
+    save = written_format(path).save
+    assert save is not None
+    return save
+
+
+def written_format(path: Path) -> SceneFormat:
+    """The format that the suffixes of a file to be written ask for; it has a ``save``.
 
     Raises:
         UsageError: no format has this suffix, or it is only read.
@@ -66,7 +132,7 @@ def writer_of(path: Path) -> Callable[[Path, Scene], None]:
     _, entry = max(fitting, key=lambda found: found[0])
     if entry.save is None:
         raise UsageError(f"'{path}': {entry.not_written}; {expected}")
-    return entry.save
+    return entry
 
 
 def suffixes_read() -> str:

@@ -125,6 +125,7 @@ FORMAT = SceneFormat(
     "3, binary or ASCII, properties in any order; the original layout is written",
     load=load,
     save=save,
+    starts=(b"ply\n", b"ply\r"),
 )
 
 

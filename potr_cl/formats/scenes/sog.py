@@ -61,6 +61,7 @@ FORMAT = SceneFormat(
     note="of PlayCanvas; version 2 is read",
     load=load,
     not_written="nothing here writes .sog: convert to .ply, and that with splat-transform",
+    starts=(b"PK\x03\x04",),
 )
 
 
