@@ -24,7 +24,7 @@ from potr_cl.errors import UsageError
 from potr_cl.formats.images import parse_colour
 from potr_cl.formats.registry import suffixes_read, suffixes_written
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.camera import Camera, test_views, train_views
+from potr_cl.model.camera import Camera, test_views, train_views, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import Run, Stopwatch
@@ -153,6 +153,7 @@ def _refit(args: argparse.Namespace) -> None:
     ground_truth = None
     if args.photos is not None:
         assert cameras is not None
+        cameras = within_photographs(cameras)
         ground_truth = GroundTruth(args.photos, cameras, background)
     scene, reference = read_scene(args, args.scene), read_scene(args, args.reference)
     device = Device(args.device)

@@ -25,7 +25,7 @@ from potr_cl.formats.images import Colour, parse_colour
 from potr_cl.formats.registry import suffixes_read
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.threads import thread_pool
-from potr_cl.model.camera import Camera, test_views
+from potr_cl.model.camera import Camera, test_views, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import Encoded, Stopwatch, encode
@@ -101,6 +101,7 @@ def _encode(args: argparse.Namespace) -> None:
         cameras = given_cameras(args)
         ground_truth = None
         if refit.ground_truth is not None and cameras is not None:
+            cameras = within_photographs(cameras)
             ground_truth = GroundTruth(refit.ground_truth, cameras, options.background)
         shared = _Shared(target, opened, cameras, ground_truth)
         if opened is not None and len(works) > 1:

@@ -23,7 +23,7 @@ from potr_cl.cli.views import read_cameras
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.images import parse_colour, to_8_bits, write_png
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.camera import Camera, test_views, train_views
+from potr_cl.model.camera import Camera, test_views, train_views, within_photographs
 from potr_cl.opencl.device import Device
 from potr_cl.plain_text import plain
 from potr_cl.quality.compare import (
@@ -122,7 +122,10 @@ def _compare(args: argparse.Namespace) -> None:
         return
     parse_colour(args.background)
     views = _select(read_cameras(args), args.views, args.split)
-    ground_truth = find_ground_truth(args.truth, views) if args.truth is not None else None
+    ground_truth = None
+    if args.truth is not None:
+        views = within_photographs(views)
+        ground_truth = find_ground_truth(args.truth, views)
     lpips, notes = None, []
     try:
         lpips = Lpips()
