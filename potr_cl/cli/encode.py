@@ -40,7 +40,7 @@ from potr_cl.report.summary import encode_report, format_encode_report, quality_
 from potr_cl.stages.refit import Refit
 
 
-def _options(args: argparse.Namespace) -> EncodeOptions:
+def _options(args: argparse.Namespace, source_bytes: int | None = None) -> EncodeOptions:
     if args.threads < 0:
         raise UsageError(f"--threads is {args.threads}, it must be 0 or more")
     options = EncodeOptions.for_preset(
@@ -49,7 +49,7 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
         background=parse_colour(args.background),
         memory=as_bytes(args.memory),
         threads=args.threads,
-        source_bytes=size_of_file(args.scene),
+        source_bytes=source_bytes,
         **stage_choices(args),
     )
     _ = options.parameters  # a wrong option is told before a gigabyte is read
@@ -86,7 +86,6 @@ class _Shared:
 
 
 def _encode(args: argparse.Namespace) -> None:
-    args.scene = args.scenes[0]
     options, target = _options(args), _target(args)
     refit = options.stage(Refit)
     if refit.ground_truth is not None and not (args.cameras and refit.asked_for):
@@ -111,7 +110,8 @@ def _encode(args: argparse.Namespace) -> None:
 
 def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> None:
     began = time.perf_counter()
-    options, target, opened, cameras = _options(args), shared.target, shared.opened, shared.cameras
+    options = _options(args, size_of_file(args.scene))
+    target, opened, cameras = shared.target, shared.opened, shared.cameras
     with contextlib.ExitStack() as stack:
         scene = read_scene(args, args.scene)
         device = opened.result() if opened is not None and options.look_at_views(scene) else None

@@ -75,6 +75,8 @@ def check(args: argparse.Namespace) -> None:
             _check_standard_output(args)
         elif isinstance(path, WrittenFolder):
             _check_folder(path)
+            if "scenes" not in args and path.suffix.lower() == ".png" and not os.path.isdir(path):
+                raise UsageError(f"'{path}': a folder of pictures is written: give it another name than a picture's")
         elif isinstance(path, WrittenFile):
             check_file(path, f"--{name}" if name != "output" else "-o")
 

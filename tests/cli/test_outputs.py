@@ -48,6 +48,7 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
         ("refit a.ply --reference a.ply -o b.png", "written as"),
         ("compare a.ply a.potr --cameras none -o b.jpg", "a name that ends in .png"),
         ("render a.ply --cameras none -o a.potr", "a file of this name"),
+        ("render a.ply --cameras none -o b.png", "a folder of pictures is written"),
         ("convert a.ply b.ply --spz-version 3", "has no versions to choose from"),
         ("encode a.ply -o no/b.potr", "no' does not exist"),
         ("encode a.ply -o b.potr --report no/b.html", "no' does not exist"),

@@ -49,6 +49,7 @@ def piped(folder: Path, call: str, source: str | bytes = "a.ply", code: int = 0)
     return result
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize(
     ("call", "source"),
     [
@@ -142,6 +143,22 @@ def test_an_endless_stream_that_is_no_scene_is_not_read_to_its_end(folder: Path)
     assert b"begins like no scene" in result.stderr
 
 
+def test_a_wrong_option_is_told_before_anything_is_read(folder: Path) -> None:
+    """Nothing comes, and nothing ends, and yet the command does."""
+    with subprocess.Popen([sys.executable, "-c", "import time; time.sleep(100)"], stdout=subprocess.PIPE) as silent:
+        result = subprocess.run(
+            [sys.executable, "-m", "potr_cl", "encode", "-", "-o", str(folder / "b.potr"), "-q", "7"],
+            stdin=silent.stdout,
+            capture_output=True,
+            cwd=ROOT,
+            timeout=60,
+            check=False,
+        )
+        silent.kill()
+    assert result.returncode == 2
+    assert b"quality" in result.stderr
+
+
 def test_what_is_logged_speaks_of_standard_input(folder: Path) -> None:
     scene = random_scene(20)
     scene.means[3] = np.nan
@@ -154,3 +171,15 @@ def test_a_file_that_is_called_minus(folder: Path) -> None:
     (folder / "-").write_bytes((folder / "a.potr").read_bytes())
     piped(folder, "decode ./- -o b.ply", b"")
     assert len(load_scene(folder / "b.ply")) == 100
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs a shell's pipes")
+def test_who_reads_the_result_may_go_early(folder: Path) -> None:
+    script = f"{sys.executable} -m potr_cl decode a.potr -o - | head -c 10; echo; echo ${{PIPESTATUS[0]}}"
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    result = subprocess.run(
+        ["bash", "-c", script], capture_output=True, cwd=folder, env=environment, check=False, timeout=60
+    )
+    assert result.stdout == b"ply\nformat\n0\n"
+    assert b"Traceback" not in result.stderr
+    assert b"rror" not in result.stderr
