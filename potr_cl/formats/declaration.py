@@ -64,6 +64,7 @@ class SceneFormat:
             read what no other recognises.
         starts: what a file may begin with, if that tells the format: for scenes that come without a name. Of formats
             that begin alike one alone says so.
+        gzipped: whether files of the format are gzip files themselves; ``starts`` is what they unpack to then.
         versions: that ``save`` can be asked for by its argument ``version``, the usual one first; none where there is
             only one way to write.
     """
@@ -77,6 +78,7 @@ class SceneFormat:
     extra: str | None = None
     recognises: Callable[[Path], bool] | None = None
     starts: tuple[bytes, ...] = ()
+    gzipped: bool = False
     versions: tuple[int, ...] = ()
 
     @property

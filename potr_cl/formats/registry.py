@@ -6,6 +6,7 @@ Reading, writing, error messages, the help of the command line and docs/formats.
 
 from __future__ import annotations
 
+import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
 
@@ -24,7 +25,8 @@ SCENE_FORMATS: tuple[SceneFormat, ...] = (
 )
 
 #: Bytes that a scene begins with and that may be needed to tell its format.
-START_BYTES = 64
+START_BYTES = 1024
+_GZIP = b"\x1f\x8b"
 
 #: In the order in which a folder is searched for them. cameras.json stands before transforms.json, for it lists just
 #: the views that a scene was trained with, as they were.
@@ -62,13 +64,24 @@ def suffix_of_content(start: bytes, name: str) -> str:
     Raises:
         DataError: no format begins like this.
     """
+    packed = start.startswith(_GZIP)
+    inner = _beginning_of_gzip(start) if packed else start
     for entry in SCENE_FORMATS:
-        if start.startswith(entry.starts) and entry.starts:
-            return entry.suffixes[0]
+        if inner.startswith(entry.starts) and entry.starts:
+            suffix = entry.suffixes[0]
+            return suffix if not packed or entry.gzipped else f"{suffix}.gz"
     raise DataError(
         f"the {name} begins like no scene that is known; of a format without a mark of its own, give the suffix with "
         "--from"
     )
+
+
+def _beginning_of_gzip(start: bytes) -> bytes:
+    """What the first bytes of a gzip file unpack to; nothing if they are damaged."""
+    try:
+        return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(start, 64)
+    except zlib.error:
+        return b""
 
 
 def read_suffix(suffix: str) -> str:
@@ -78,7 +91,7 @@ def read_suffix(suffix: str) -> str:
         UsageError: no format has it.
     """
     wanted = "." + suffix.lower().lstrip(".")
-    if wanted not in _scene_suffixes(SCENE_FORMATS):
+    if wanted.removesuffix(".gz") not in _scene_suffixes(SCENE_FORMATS):
         raise UsageError(f"'{suffix}' is no suffix of a scene: expected {suffixes_read()}")
     return wanted
 

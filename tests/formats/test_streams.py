@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import gzip
 import io
 from pathlib import Path
 
@@ -34,6 +35,16 @@ def test_the_content_tells_the_format(tmp_path: Path, suffix: str, kind: type[io
         scene = load_scene(path)
     assert np.array_equal(scene.means, load_scene(tmp_path / f"a{suffix}").means)
     assert not path.parent.exists()
+
+
+def test_what_a_gzip_stream_unpacks_to_tells_the_format(tmp_path: Path) -> None:
+    for suffix, packed in ((".ply", ".ply.gz"), (".spz", ".spz")):
+        content = written(tmp_path, suffix)
+        start = content if content.startswith(b"\x1f\x8b") else gzip.compress(content)
+        assert registry.suffix_of_content(start[: registry.START_BYTES], "stream") == packed
+    for damaged in (b"\x1f\x8b", b"\x1f\x8b" + bytes(100), gzip.compress(b"no scene")):
+        with pytest.raises(DataError, match="no scene that is known"):
+            registry.suffix_of_content(damaged, "stream")
 
 
 def test_a_stream_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:

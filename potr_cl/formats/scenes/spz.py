@@ -150,7 +150,8 @@ FORMAT = SceneFormat(
     note="of Niantic; versions 1 to 4 are read, 2 to 4 are written: which readers take which stands below",
     load=load,
     save=save,
-    starts=(b"\x1f\x8b", _MAGIC),
+    starts=(_MAGIC,),
+    gzipped=True,
     versions=_VERSIONS,
 )
 
