@@ -34,6 +34,7 @@ study.compaction_curves    what does the compaction do to sparsity and pictures?
 study.removal_exactness    how far are predicted removal effects from removals in float64?
 study.removal_formulas     back to front or prefix sums: which formula of removal effects?
 study.composite_yardstick  the compositing kernel beside a loop in C
+study.lens_field           which pinhole view should stand for a distorted photograph?
 =========================  =============================================================================================
 
 What happens at the limits (``stress``):
