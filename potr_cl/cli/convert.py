@@ -8,7 +8,14 @@ from potr_cl.cli.batch import add_to_option, for_each_scene, jobs
 from potr_cl.cli.guard import StandardOutput, read_file
 from potr_cl.cli.options import Commands
 from potr_cl.cli.outputs import WrittenScene, place
-from potr_cl.cli.scenes import add_from_option, add_trust_option, read_scene, size_of_file, write_scene
+from potr_cl.cli.scenes import (
+    add_antialiased_option,
+    add_from_option,
+    add_trust_option,
+    read_scene,
+    size_of_file,
+    write_scene,
+)
 from potr_cl.cli.terminal import say
 from potr_cl.errors import UsageError
 from potr_cl.formats import scene_writer
@@ -46,7 +53,8 @@ def add_convert(commands: Commands) -> None:
         help="a scene from one format to another, for other tools",
         usage="potr-cl convert IN OUT [options]\n       potr-cl convert IN [IN ...] -o FOLDER --to SUFFIX [options]",
         description=f"Read a scene ({suffixes_read()}) and write it as {suffixes_written()}. Nothing but what the "
-        f"format itself rounds is changed; axes are kept. {extras_needed()}.",
+        f"format itself rounds is changed; axes are kept. {extras_needed()}. All may be gzipped (.ply.gz). SOG is read "
+        "from folders too (meta.json, lod-meta.json), level N of streamed SOG by FOLDER#N.",
     )
     p.add_argument(
         "scenes",
@@ -68,4 +76,5 @@ def add_convert(commands: Commands) -> None:
         f"{versions[-1]}, smaller and for new readers only",
     )
     add_trust_option(p)
+    add_antialiased_option(p)
     p.set_defaults(run=_convert, arrange=_arrange)

@@ -13,6 +13,7 @@ from potr_cl.cli.scenes import add_trust_option, as_file, trust, write_scene
 from potr_cl.cli.terminal import say, say_document
 from potr_cl.codec.decoder import PotrFile, decode
 from potr_cl.formats.registry import suffixes_written
+from potr_cl.model.scene import SH_COEFFICIENTS
 from potr_cl.report.file import file_report, format_report
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def _decode(args: argparse.Namespace) -> None:
 def _decode_one(args: argparse.Namespace) -> None:
     started = time.perf_counter()
     with as_file(args.scene) as file:
-        scene = decode(file, **trust(args))
+        scene = decode(file, **trust(args), sh_degree=args.sh_degree)
     decoded = time.perf_counter()
     write_scene(args.output, scene, args.to)
     written = time.perf_counter()
@@ -50,6 +51,10 @@ def add_decode(commands: Commands) -> None:
         help=f'{suffixes_written()}, a folder, or "-" for standard output',
     )
     add_to_option(p)
+    p.add_argument(
+        "--sh-degree", type=int, choices=range(len(SH_COEFFICIENTS)), metavar="N",
+        help="leave out SH coefficients of degrees above N, 0 to 3, without decoding them; default: none",
+    )  # fmt: skip
     add_trust_option(p)
     p.set_defaults(run=_decode)
 

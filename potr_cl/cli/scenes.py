@@ -13,11 +13,13 @@ from typing import Any
 from potr_cl.cli.guard import StandardInput, StandardOutput
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene, scene_writer
+from potr_cl.formats.scene_size import bytes_of_scene
 from potr_cl.formats.streams import received, send
 from potr_cl.model.scene import Scene
 
 FROM_HELP = 'the format that "-", standard input, brings: .ply, .spz …; default: what its content says'
 TO_HELP = "the format to write where no name says it, .ply, .spz …"
+_ANTIALIASED = {"yes": True, "no": False, "auto": None}
 
 
 def add_trust_option(p: argparse._ActionsContainer) -> None:
@@ -34,6 +36,17 @@ def add_from_option(p: argparse._ActionsContainer) -> None:
     p.add_argument("--from", dest="from_suffix", metavar="SUFFIX", help=FROM_HELP)
 
 
+def add_antialiased_option(p: argparse._ActionsContainer) -> None:
+    """``--antialiased``, for every command that renders, encodes or writes the scenes that it reads."""
+    p.add_argument(
+        "--antialiased",
+        choices=tuple(_ANTIALIASED),
+        default="auto",
+        help="whether the scene was trained with antialiasing (gsplat's antialiased mode, Mip-Splatting) and is to be "
+        "rendered so; default auto: as its file says, which PLY files of gsplat and nerfstudio do not: give yes",
+    )
+
+
 def trust(args: argparse.Namespace) -> dict[str, Any]:
     """What the readers of scenes are told because of ``--trust``."""
     return {"trust": True} if args.trust else {}
@@ -46,7 +59,7 @@ def read_scene(args: argparse.Namespace, path: Path) -> Scene:
         As :func:`potr_cl.formats.load_scene`.
     """
     with as_file(path) as file:
-        return load_scene(file, **trust(args))
+        return load_scene(file, **trust(args), antialiased=_ANTIALIASED[args.antialiased])
 
 
 def write_scene(path: Path, scene: Scene, to: str | None = None, version: int | None = None) -> int:
@@ -72,12 +85,9 @@ def write_scene(path: Path, scene: Scene, to: str | None = None, version: int | 
 
 
 def size_of_file(path: Path) -> int | None:
-    """Bytes of a file; None where there is none, which whoever reads it will say."""
-    try:
-        with as_file(path) as file:
-            return os.stat(file).st_size if os.path.isfile(file) else None
-    except (OSError, ValueError):
-        return None
+    """Bytes of a file, or of a scene's folder; None where there is none, which whoever reads it will say."""
+    with as_file(path) as file:
+        return bytes_of_scene(file)
 
 
 def as_file(path: Path) -> contextlib.AbstractContextManager[Path]:

@@ -67,6 +67,10 @@ class SceneFormat:
         gzipped: whether files of the format are gzip files themselves; ``starts`` is what they unpack to then.
         versions: that ``save`` can be asked for by its argument ``version``, the usual one first; none where there is
             only one way to write.
+        names: of files that tell the format whatever their suffix, in lower case. A folder that holds such a file is
+            read too, and ``load`` takes either, with ``#`` and a number behind if the format has levels of detail.
+        packed: whether files are compressed, so that gzip hardly makes them smaller: then one that is gzipped may
+            unpack to little more than it is.
     """
 
     name: str
@@ -80,6 +84,8 @@ class SceneFormat:
     starts: tuple[bytes, ...] = ()
     gzipped: bool = False
     versions: tuple[int, ...] = ()
+    names: tuple[str, ...] = ()
+    packed: bool = False
 
     @property
     def extensions(self) -> tuple[str, ...]:

@@ -1,13 +1,14 @@
-"""How a scene that was written and read again is compared with itself."""
+"""How a scene that was written and read again is compared with itself; scenes made antialiased."""
 
 from __future__ import annotations
 
+import dataclasses
 import itertools
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import LOW_PASS, Scene
 
 
 def in_order_of(scene: Scene, back: Scene) -> Scene:
@@ -51,3 +52,10 @@ def _matrices(quaternions: NDArray[np.float32]) -> NDArray[np.float64]:
             [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
         ]
     ).transpose(2, 0, 1)
+
+
+def antialiased(scene: Scene, low_pass: float = LOW_PASS, smaller: float = 1.0) -> Scene:
+    """The same as an antialiased scene, its splats e to ``smaller`` times as small, so that the filter matters."""
+    return dataclasses.replace(
+        scene, log_scales=scene.log_scales - np.float32(smaller), antialiased=True, low_pass=low_pass
+    )

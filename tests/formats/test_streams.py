@@ -47,6 +47,12 @@ def test_what_a_gzip_stream_unpacks_to_tells_the_format(tmp_path: Path) -> None:
             registry.suffix_of_content(damaged, "stream")
 
 
+def test_names_of_scenes_without_their_suffixes() -> None:
+    for name in ("a.ply", "b/a.compressed.ply", "a.PLY.gz", "a/meta.json", "a/lod-meta.json#2", "b/a#1"):
+        assert registry.stem_of_scene(Path(name)) == "a"
+    assert registry.stem_of_scene(Path("v1.2.ply")) == "v1.2"
+
+
 def test_a_stream_has_an_end(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     content = written(tmp_path, ".ply")
     monkeypatch.setattr(streams, "MOST_BYTES", len(content) - 1)

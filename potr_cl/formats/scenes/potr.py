@@ -13,4 +13,5 @@ FORMAT = SceneFormat(
     load=decode,
     not_written="a .potr file is made by the command encode, which reads all that convert reads",
     starts=(MAGIC,),
+    packed=True,
 )
