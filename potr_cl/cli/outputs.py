@@ -106,23 +106,12 @@ def check_name(path: WrittenFile, option: str = "-o") -> None:
 
         writer_of(path)
     elif isinstance(path, WrittenPotr):
-        _check_potr(path)
+        from potr_cl.formats.registry import refuse_other_than_potr
+
+        refuse_other_than_potr(path)
     for kind, (suffixes, what) in _SUFFIXES.items():
         if isinstance(path, kind) and path.suffix.lower() not in suffixes:
             raise UsageError(f"'{path}': {option} writes {what}: give it a name that ends in {suffixes[0]}")
-
-
-def _check_potr(path: Path) -> None:
-    if path.suffix.lower() == ".potr":
-        return
-    from potr_cl.formats import registry
-
-    said = "give it a name that ends in .potr"
-    with contextlib.suppress(UsageError):
-        registry.writer_of(path)
-        name = path.with_name(f"{registry.stem_of_scene(path)}.potr")
-        said = f"encode to '{name}', then 'potr-cl decode {name} -o {path}'"
-    raise UsageError(f"'{path}': encode writes .potr files only: {said}")
 
 
 def _check_folder(path: Path) -> None:

@@ -6,6 +6,7 @@ Reading, writing, error messages, the help of the command line and docs/formats.
 
 from __future__ import annotations
 
+import contextlib
 import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -175,6 +176,22 @@ def written_format(path: Path) -> SceneFormat:
     if entry.save is None:
         raise UsageError(f"'{path}': {entry.not_written}; {expected}")
     return entry
+
+
+def refuse_other_than_potr(path: Path) -> None:
+    """Refuse a name for an encoded file that promises another format.
+
+    Raises:
+        UsageError: it does not end in .potr.
+    """
+    if path.suffix.lower() == ".potr":
+        return
+    said = "give it a name that ends in .potr"
+    with contextlib.suppress(UsageError):
+        writer_of(path)
+        name = path.with_name(f"{stem_of_scene(path)}.potr")
+        said = f"encode to '{name}', then 'potr-cl decode {name} -o {path}'"
+    raise UsageError(f"'{path}': encode writes .potr files only: {said}")
 
 
 def suffixes_read() -> str:
