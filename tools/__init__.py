@@ -39,6 +39,7 @@ study.removal_formulas     back to front or prefix sums: which formula of remova
 study.frames               which cameras in another frame are found, and what do unseen splats cost?
 study.decoder_roads        which road to a quick decoder: compiled C or OpenCL kernels? (for bench.decode --part roads)
 study.composite_yardstick  the compositing kernel beside a loop in C
+study.lens_field           which pinhole view should stand for a distorted photograph?
 =========================  =============================================================================================
 
 What happens at the limits (``stress``):

@@ -27,7 +27,7 @@ from potr_cl.api.views import Viewpoints, told
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import Colour, write_png
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.camera import Camera
+from potr_cl.model.camera import Camera, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.plain_text import plain
 from potr_cl.quality.compare import (
@@ -225,6 +225,7 @@ def compare_scenes(
     Raises:
         As :func:`compare`.
     """
+    views = within_photographs(views) if truth is not None else views
     ground_truth = find_ground_truth(truth, views) if truth is not None else None
     lpips, told_of = None, list(notes)
     if a[1].antialiased != b[1].antialiased:

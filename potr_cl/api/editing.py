@@ -30,7 +30,7 @@ from potr_cl.errors import UsageError
 from potr_cl.formats import scene_writer
 from potr_cl.formats.images import Colour
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.camera import Camera, test_views, train_views
+from potr_cl.model.camera import Camera, test_views, train_views, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.amounts import as_bytes
@@ -321,6 +321,8 @@ def refit(
         raise UsageError("--photos needs --cameras, the views that the photographs show")
     write = scene_writer(output) if output is not None else None
     given = cameras_of(cameras)
+    if photos is not None and given is not None:
+        given = within_photographs(given)
     ground_truth = GroundTruth(Path(photos), given, colour) if photos is not None and given is not None else None
     reduced, original = scene_of(scene, trust, antialiased), scene_of(reference, trust, antialiased)
     check_rendered_alike((str(name_of(scene)), reduced), (str(name_of(reference)), original))

@@ -26,6 +26,7 @@ from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.quantize import Preset
 from potr_cl.errors import DataError, PotrError, UsageError
 from potr_cl.formats.images import Colour
+from potr_cl.formats.registry import refuse_other_than_potr
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
@@ -110,6 +111,8 @@ def encode(
         source_bytes=bytes_of_file(scene), cameras_anyway=cameras_anyway,
     )  # fmt: skip
     target = encode_target(q, max_size, min_psnr)
+    if output is not None:
+        refuse_other_than_potr(Path(output))
     check_photographs_have_cameras(settings, cameras is not None)
     if report is None and report_view is not None:
         raise UsageError("report_view needs report, the page that shows it")

@@ -9,19 +9,21 @@ from typing import Any
 import numpy as np
 
 from potr_cl.api.editing import RefittedScene, check_rendered_alike, compact, decibels_of, prune, refit, stage_options
-from potr_cl.cli.guard import ReadFile, ReadPhotographs, WrittenFile
+from potr_cl.cli.batch import add_to_option
+from potr_cl.cli.guard import ReadPhotographs, read_file
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option
+from potr_cl.cli.outputs import WrittenNumbers, scene_output
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene
+from potr_cl.cli.scenes import add_antialiased_option, add_from_option, add_trust_option, read_scene, write_scene
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import parse_colour
-from potr_cl.formats.scenes import ply
+from potr_cl.formats.registry import suffixes_read, suffixes_written
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.camera import Camera
+from potr_cl.model.camera import Camera, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.quality.ground_truth import GroundTruth
@@ -42,7 +44,7 @@ def _prune(args: argparse.Namespace) -> None:
             q=args.quality, memory=args.memory, background=args.background, device=device, progress=progress,
             cameras_anyway=args.cameras_anyway, **choices,
         )  # fmt: skip
-        ply.save(args.output, result.scene)
+        write_scene(args.output, result.scene, args.to)
         if order is not None:
             np.save(order, result.pruned.order)
     say(f"{args.output}: {result.said} on {result.device.info}")
@@ -55,15 +57,28 @@ def _inputs(args: argparse.Namespace) -> tuple[Scene, list[Camera] | None, Devic
     return read_scene(args, args.scene), cameras, Device(args.device)
 
 
+def _add_output_options(p: argparse.ArgumentParser) -> None:
+    p.add_argument(
+        "-o",
+        "--output",
+        type=scene_output,
+        required=True,
+        metavar="OUT.ply",
+        help=f'{suffixes_written()}, or "-" for standard output',
+    )
+    add_to_option(p)
+    add_from_option(p)
+
+
 def add_prune(commands: Commands) -> None:
     p = commands.add_parser("prune", help="remove the splats that no view misses; nothing else changes")
-    p.add_argument("scene", type=ReadFile, metavar="SCENE", help=".ply or .potr")
+    p.add_argument("scene", type=read_file, metavar="SCENE", help=f'{suffixes_read()}, or "-" for standard input')
     add_cameras_options(p)
-    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
+    _add_output_options(p)
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (fewest splats) to 1; default 0.5")
     p.add_argument(
         "--order",
-        type=WrittenFile,
+        type=WrittenNumbers,
         metavar="FILE.npy",
         help="also write the order of removal: the scene's splat numbers, first removed first, kept ones last",
     )
@@ -85,15 +100,15 @@ def _compact(args: argparse.Namespace) -> None:
             q=args.quality, sf_sh=args.sf_sh, memory=args.memory, background=args.background,
             device=device, progress=progress, cameras_anyway=args.cameras_anyway, **choices,
         )  # fmt: skip
-    ply.save(args.output, result.scene)
+    write_scene(args.output, result.scene, args.to)
     say(f"{args.output}: {result.said}")
 
 
 def add_compact(commands: Commands) -> None:
     p = commands.add_parser("compact", help="make the colours' coefficients sparse; nothing else changes")
-    p.add_argument("scene", type=ReadFile, metavar="SCENE", help=".ply or .potr")
+    p.add_argument("scene", type=read_file, metavar="SCENE", help=f'{suffixes_read()}, or "-" for standard input')
     add_cameras_options(p)
-    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
+    _add_output_options(p)
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (sparsest) to 1; default 0.5")
     add_stage_flags(p, [Compact], without=["on", "at"])
     p.add_argument("--sf-sh", type=float, metavar="SF", help="steps a unit of the quantiser to expect")
@@ -112,7 +127,7 @@ def _refit(args: argparse.Namespace) -> None:
         raise UsageError("--photos needs --cameras, the views that the photographs show")
     cameras = given_cameras(args)
     if args.photos is not None and cameras is not None:
-        GroundTruth(args.photos, cameras, background)
+        GroundTruth(args.photos, within_photographs(cameras), background)
     scene, reference = read_scene(args, args.scene), read_scene(args, args.reference)
     check_rendered_alike((str(args.scene), scene), (str(args.reference), reference))
     device = Device(args.device)
@@ -123,7 +138,7 @@ def _refit(args: argparse.Namespace) -> None:
             drop=args.drop, memory=args.memory, background=background, device=device, progress=progress,
             cameras_anyway=args.cameras_anyway,
         )  # fmt: skip
-    ply.save(args.output, result.scene)
+    write_scene(args.output, result.scene, args.to)
     say(f"{args.output}: {len(scene)} splats re-fitted in {result.refitted.steps} steps on {result.device.info}")
     before, after = result.refitted.errors
     say(
@@ -157,13 +172,13 @@ def add_refit(commands: Commands) -> None:
         description="Solve for the colours of all splats together, so that the training views look as those of the "
         "reference (or as the photographs) do; nothing else changes. Coefficients that are 0 stay 0.",
     )
-    p.add_argument("scene", type=ReadFile, metavar="PRUNED", help=".ply or .potr")
-    p.add_argument("--reference", type=ReadFile, required=True, metavar="ORIGINAL", help="the uncompressed scene")
+    p.add_argument("scene", type=read_file, metavar="PRUNED", help=f'{suffixes_read()}, or "-" for standard input')
+    p.add_argument("--reference", type=read_file, required=True, metavar="ORIGINAL", help="the uncompressed scene")
     add_cameras_options(p)
     p.add_argument(
         "--photos", type=ReadPhotographs, metavar="DIR", help="photographs, named after the views, to fit instead"
     )
-    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
+    _add_output_options(p)
     p.add_argument(
         "--steps",
         type=whole_number,

@@ -13,12 +13,12 @@ from potr_cl.cli.guard import (
     ReadCameras,
     ReadFile,
     ReadPhotographs,
-    WrittenFile,
     WrittenFolder,
     check_files,
     check_photographs,
 )
 from potr_cl.cli.options import CAMERAS_HELP, Commands, add_rendering_options, add_view_options
+from potr_cl.cli.outputs import WrittenPicture
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene
@@ -175,7 +175,7 @@ def add_compare(commands: Commands) -> None:
     p.add_argument(
         "-o",
         "--output",
-        type=WrittenFile,
+        type=WrittenPicture,
         metavar="OUT.png",
         help="the worst view: A, B, and their difference, labelled",
     )

@@ -46,24 +46,42 @@ def load_scene(path: str | os.PathLike[str], trust: bool = False, antialiased: b
         return registry.reader_of(path)(path, trust).rendered(antialiased)
 
 
-def scene_writer(path: str | os.PathLike[str]) -> Callable[[Scene], None]:
+def scene_writer(path: str | os.PathLike[str], version: int | None = None) -> Callable[[Scene], None]:
     """What writes a scene to ``path`` in the format that its suffixes tell; nothing is written yet.
 
+    Args:
+        path: of the file to write.
+        version: of the format, where it has several; by default the one that most readers take.
+
     Raises:
-        UsageError: no format that is written has these suffixes (a .potr file is what an encoder makes).
+        UsageError: no format that is written has these suffixes (a .potr file is what an encoder makes), or it has no
+            such version.
     """
     path = Path(path)
-    return partial(registry.writer_of(path), path)
+    if version is None:
+        return partial(registry.writer_of(path), path)
+    entry = registry.written_format(path)
+    if version not in entry.versions:
+        known = registry.listed([str(each) for each in sorted(entry.versions)])
+        has = f"is written in version {known}" if known else "has no versions to choose from"
+        raise UsageError(f"'{path}': {entry.name} {has}, not {version}")
+    save: Callable[..., None] = registry.writer_of(path)
+    return partial(save, path, version=version)
 
 
-def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
+def save_scene(path: str | os.PathLike[str], scene: Scene, version: int | None = None) -> None:
     """Write a scene in the format that the suffixes of ``path`` tell.
+
+    Args:
+        path: of the file to write.
+        scene: to write.
+        version: see :func:`scene_writer`.
 
     Raises:
         UsageError: see :func:`scene_writer`; or ``path`` cannot be written to, or an extra is missing.
         PotrError: the format cannot hold the scene, or the system failed to write.
     """
-    scene_writer(path)(scene)
+    scene_writer(path, version)(scene)
 
 
 def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import DataError, UsageError
+from potr_cl.model.lens import Lens, Pinhole
 
 Split = str  # "train" or "test"
 
@@ -31,6 +32,7 @@ class Camera:
         translation: (3,) float64, world to camera, world units.
         split: "train" (the encoder may look at it) or "test" (for judging only).
         image_path: the photograph, if the camera file names one.
+        lens: how the photograph was bent, if it was; None: the photograph is what the pinhole sees.
     """
 
     name: str
@@ -44,6 +46,7 @@ class Camera:
     translation: NDArray[np.float64]
     split: Split = "train"
     image_path: Path | None = None
+    lens: Lens | None = None
 
     def __post_init__(self) -> None:
         where = f"camera '{self.name}'"
@@ -70,6 +73,11 @@ class Camera:
         return f"Camera('{self.name}', {self.split}, {self.width} x {self.height}, {view:.0f}° wide, at ({at}))"
 
     @property
+    def photograph_size(self) -> tuple[int, int]:
+        """Width and height of the photograph in pixels."""
+        return (self.width, self.height) if self.lens is None else (self.lens.width, self.lens.height)
+
+    @property
     def centre(self) -> NDArray[np.float64]:
         """(3,) position of the camera centre in world units."""
         return -self.rotation.T @ self.translation
@@ -93,6 +101,25 @@ def test_views(cameras: Sequence[Camera]) -> list[Camera]:
 
 
 test_views.__test__ = False  # type: ignore[attr-defined]  # pytest would collect it by its name
+
+
+def within_photographs(cameras: Sequence[Camera]) -> list[Camera]:
+    """The same cameras, each looking at no more than what its photograph shows: for comparing with photographs.
+
+    Only views with a lens are changed: they cover the field of the photograph, and its undistorted picture has gaps
+    there.
+
+    Raises:
+        DataError: no pinhole view lies within a photograph.
+    """
+    views: dict[Lens, Pinhole] = {}
+    for camera in cameras:
+        if camera.lens is not None and camera.lens not in views:
+            try:
+                views[camera.lens] = camera.lens.within()
+            except DataError as error:
+                raise DataError(f"camera '{camera.name}': {error}") from error
+    return [c if c.lens is None else replace(c, **views[c.lens]._asdict()) for c in cameras]
 
 
 def camera_centres(cameras: Sequence[Camera]) -> NDArray[np.float64]:

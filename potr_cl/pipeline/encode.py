@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from potr_cl.codec.encoder import Coded
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.agreement import require_agreement
-from potr_cl.model.camera import Camera, train_views
+from potr_cl.model.camera import Camera, train_views, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import is_virtual, place_cameras
 from potr_cl.opencl.device import Device
@@ -118,6 +118,8 @@ def cameras_or_virtual(
 ) -> Sequence[Camera] | None:
     """The cameras; or virtual ones, if there are none and a stage needs views.
 
+    Where a stage fits to photographs, views with a lens look at no more than theirs show.
+
     Raises:
         UsageError: the training views are probably not in the scene's frame; but with ``options.cameras_anyway``.
     """
@@ -126,6 +128,8 @@ def cameras_or_virtual(
         watch("place cameras", 0.0)
         cameras = place_cameras(scene)
         watch("place cameras", 1.0)
+    if cameras is not None and any(getattr(stage, "ground_truth", None) is not None for stage in options.stages):
+        return within_photographs(cameras)
     return cameras
 
 

@@ -306,8 +306,7 @@ def test_encode_prunes(tmp_path, scene_path, capsys):
 )
 def test_wrong_pruning_options(tmp_path, scene_path, capsys, options, word):
     cameras = cameras_json(tmp_path / "cameras.json")
-    for command in ("prune", "encode"):
-        out = tmp_path / "out"
+    for command, out in (("prune", tmp_path / "out.ply"), ("encode", tmp_path / "out.potr")):
         fails(capsys, [command, scene_path, "--cameras", cameras, "-o", out, *options], 2, word)
         assert not out.exists()
 
@@ -319,8 +318,8 @@ def test_interrupted_pruning_leaves_nothing(tmp_path, scene_path, capsys, monkey
     monkeypatch.setattr("potr_cl.stages.prune.prune_scene", interrupted)
     cameras = cameras_json(tmp_path / "cameras.json")
     before = sorted(tmp_path.iterdir())
-    for command in ("prune", "encode"):
-        fails(capsys, [command, scene_path, "--cameras", cameras, "-o", tmp_path / "out"], 130, "interrupted")
+    for command, out in (("prune", "out.ply"), ("encode", "out.potr")):
+        fails(capsys, [command, scene_path, "--cameras", cameras, "-o", tmp_path / out], 130, "interrupted")
         assert sorted(tmp_path.iterdir()) == before
 
 
@@ -404,13 +403,14 @@ def test_whose_cameras_is_in_the_file(tmp_path, scene_path, capsys):
 
 def test_order_and_output_must_differ(tmp_path, scene_path, capsys):
     cameras = cameras_json(tmp_path / "cameras.json")
-    arguments = ["prune", scene_path, "--cameras", cameras, "-o", tmp_path / "x", "--order", tmp_path / "x"]
+    arguments = ["prune", scene_path, "--cameras", cameras, "-o", tmp_path / "x.ply"]
+    arguments += ["--order", tmp_path / "x.ply"]
     fails(capsys, arguments, 2, "same file")
 
 
 def test_no_such_input(tmp_path, capsys):
-    for command in ("encode", "decode"):
-        fails(capsys, [command, tmp_path / "none.potr", "-o", tmp_path / "out"], 2, "none.potr")
+    for command, out in (("encode", "out.potr"), ("decode", "out.ply")):
+        fails(capsys, [command, tmp_path / "none.potr", "-o", tmp_path / out], 2, "none.potr")
     fails(capsys, ["info", tmp_path / "none.potr"], 2, "none.potr")
     assert list(tmp_path.iterdir()) == []
 
@@ -418,8 +418,8 @@ def test_no_such_input(tmp_path, capsys):
 def test_directories(tmp_path, scene_path, potr_path, capsys):
     fails(capsys, ["decode", tmp_path, "-o", tmp_path / "out.ply"], 2, str(tmp_path))
     fails(capsys, ["info", tmp_path], 2, str(tmp_path))
-    fails(capsys, ["encode", scene_path, "-o", tmp_path], 2, str(tmp_path))
-    fails(capsys, ["decode", potr_path, "-o", tmp_path], 2, str(tmp_path))
+    fails(capsys, ["prune", scene_path, "-o", tmp_path], 2, str(tmp_path))
+    fails(capsys, ["encode", scene_path, "-o", tmp_path / "a.potr", "--report", tmp_path], 2, str(tmp_path))
     fails(capsys, ["encode", scene_path, "-o", tmp_path / "nowhere" / "a.potr"], 2, "nowhere")
 
 
@@ -500,7 +500,8 @@ def test_disk_full(tmp_path, scene_path, potr_path):
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000));"
         "from potr_cl.cli import main; sys.exit(main(sys.argv[1:]))"
     )
-    for arguments in (["encode", scene_path, "-o", tmp_path / "x", *KEEP], ["decode", potr_path, "-o", tmp_path / "x"]):
+    encode = ["encode", scene_path, "-o", tmp_path / "x.potr", *KEEP]
+    for arguments in (encode, ["decode", potr_path, "-o", tmp_path / "x.ply"]):
         result = subprocess.run(
             [sys.executable, "-c", script, *map(str, arguments)], capture_output=True, text=True, check=False
         )

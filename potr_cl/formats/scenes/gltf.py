@@ -64,6 +64,7 @@ FORMAT = SceneFormat(
     "applied, axes kept",
     load=load,
     not_written="nothing here writes glTF: convert to .ply, and that with splat-transform",
+    starts=(b"glTF",),
 )
 
 

@@ -142,6 +142,7 @@ FORMAT = SceneFormat(
     "3 (of 4, what 3 has), binary or ASCII, properties in any order, 2DGS too; the original layout is written",
     load=load,
     save=save,
+    starts=(b"ply\n", b"ply\r"),
 )
 
 

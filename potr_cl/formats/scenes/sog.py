@@ -73,6 +73,7 @@ FORMAT = SceneFormat(
     names=(DESCRIPTION,),
     note="of PlayCanvas; version 2 is read, packed (`.sog`) or as a folder",
     load=load,
+    starts=(b"PK\x03\x04",),
     not_written="nothing here writes SOG: convert to .ply, and that with splat-transform",
     packed=True,
 )

@@ -1,4 +1,4 @@
-"""Scenes as SPZ files (Niantic's .spz): versions 1 to 4 are read, version 3 is written.
+"""Scenes as SPZ files (Niantic's .spz): versions 1 to 4 are read, 2 to 4 are written.
 
 SPZ names axes of its own (right, up, back), but converters, Niantic's included, keep those of the PLY by default, and
 a file rarely says which it holds. So axes are kept as they are, in both directions.
@@ -11,7 +11,7 @@ import logging
 import os
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -19,6 +19,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from potr_cl.codec.logarithm import natural_logarithm
+from potr_cl.codec.quantize import canonical_rotations
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, arranged, cleaned, opened, tell_of_low_pass
@@ -42,6 +43,11 @@ _HALF_FLOATS = 1
 _LARGEST_DEGREE = 4
 #: A file may have extensions behind its splats; no known one comes near.
 _EXTENSION_BYTES = 1 << 20
+
+#: Those that are written, the usual one first.
+_VERSIONS = (2, 3, 4)
+#: Of each stream of version 4.
+_ZSTD_LEVEL = 12
 
 #: Positions are integers of 24 bits with a sign; 12 of them are the fraction in all files that other tools write.
 _POSITION_LIMIT = 2**23 - 1
@@ -113,10 +119,16 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     return cleaned(path, scene)
 
 
-def save(path: str | os.PathLike[str], scene: Scene) -> None:
-    """Write a scene as SPZ, version 3; the file appears under its name only when it is whole.
+def save(path: str | os.PathLike[str], scene: Scene, version: int = _VERSIONS[0]) -> None:
+    """Write a scene as SPZ; the file appears under its name only when it is whole.
 
     Positions are stored in steps of 1/4096 unit, as every tool writes them; in a scene too large for that, coarser.
+
+    Args:
+        path: of the file.
+        scene: of any SH degree.
+        version: 2, rotations in 8 bits a part; 3, rotations in 10 bits; 4, the same content packed by zstd instead of
+            gzip. docs/formats.md has a table of the readers that take them.
 
     Raises:
         UsageError: ``path`` cannot be written to.
@@ -133,18 +145,25 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
         _log.warning("'%s': the scene is large for SPZ: positions are stored in steps of 1/%d unit", path, 2**bits)
     tell_of_low_pass(path, scene)
     flags = _ANTIALIASED if scene.antialiased else 0
-    header = _HEADER.pack(_MAGIC, 3, len(scene), scene.sh_degree, bits, flags, 0)
-    content = b"".join([header, *_packed(arranged(scene), bits)])
+    properties = _packed(_well_conditioned(arranged(scene)) if version == 2 else arranged(scene), bits, version)
+    streams = sum(map(bool, properties)) if version > 3 else 0
+    header = _HEADER.pack(_MAGIC, version, len(scene), scene.sh_degree, bits, flags, streams)
     with replacing(path) as file:
-        _write_gzip(file, content)
+        if version > 3:
+            _write_streams(file, header, properties)
+        else:
+            _write_gzip(file, b"".join([header, *properties]))
 
 
 FORMAT = SceneFormat(
     name="SPZ",
     suffixes=(".spz",),
-    note="of Niantic; versions 1 to 4 are read, version 3, which every reader knows, is written",
+    note="of Niantic; versions 1 to 4 are read, 2 to 4 are written: which readers take which stands below",
     load=load,
     save=save,
+    starts=(_MAGIC,),
+    gzipped=True,
+    versions=_VERSIONS,
     packed=True,
 )
 
@@ -234,6 +253,19 @@ def _write_gzip(file: BinaryIO, content: bytes) -> None:
     file.write(struct.pack("<II", zlib.crc32(content), len(content) & 0xFFFFFFFF))
 
 
+def _write_streams(file: BinaryIO, header: bytes, properties: list[bytes]) -> None:
+    """Version 4: the header up to the table, the table, and a zstd frame for each property that is not empty."""
+    parts = [part for part in properties if part]
+    with thread_pool() as pool:
+        frames = list(pool.map(lambda part: zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(part), parts))
+    start = header + struct.pack("<I", _HEADER_4_BYTES)
+    file.write(start.ljust(_HEADER_4_BYTES, b"\0"))
+    for part, frame in zip(parts, frames, strict=True):
+        file.write(_STREAM.pack(len(frame), len(part)))
+    for frame in frames:
+        file.write(frame)
+
+
 # ---------------------------------------------------------------------------------------------------- values
 
 
@@ -301,7 +333,7 @@ def _xyz(stored: U8) -> FloatArray:
     return np.column_stack([np.sqrt(np.maximum(left, 0)), xyz])
 
 
-def _packed(scene: Scene, fractional_bits: int) -> list[bytes]:
+def _packed(scene: Scene, fractional_bits: int, version: int) -> list[bytes]:
     """The bytes of a scene with unit quaternions, property by property."""
 
     def as_bytes(values: NDArray[Any]) -> bytes:
@@ -315,9 +347,27 @@ def _packed(scene: Scene, fractional_bits: int) -> list[bytes]:
             as_bytes(255 / (1 + np.exp(-scene.opacity_logits))),
             as_bytes(scene.sh[:, 0] * np.float32(_COLOUR_SCALE * 255) + np.float32(127.5)),
             as_bytes((scene.log_scales + np.float32(10)) * np.float32(16)),
-            _packed_rotations(scene.quaternions),
+            _packed_rotations(scene.quaternions) if version > 2 else as_bytes(_first_three(scene.quaternions)),
             as_bytes(scene.sh[:, 1:] * np.float32(128) + np.float32(128)),
         ]
+
+
+def _well_conditioned(scene: Scene) -> Scene:
+    """The same splats with their axes numbered such that w, which version 2 leaves to the reader, is the largest part.
+
+    A reader takes w from the squares of the others: where it is small, their rounding would turn the splat by degrees.
+    """
+    imaginary, log_scales = canonical_rotations(scene.quaternions, scene.log_scales)
+    real = np.sqrt(np.maximum(1 - (imaginary * imaginary).sum(axis=1), 0))
+    quaternions = np.column_stack([real, imaginary]).astype(np.float32)
+    return replace(scene, quaternions=quaternions, log_scales=log_scales)
+
+
+def _first_three(quaternions: FloatArray) -> NDArray[Any]:
+    """x, y and z of unit quaternions with w >= 0, from 0 to 255: a reader takes w from the others."""
+    signs = np.where(quaternions[:, :1] < 0, np.float32(-1), np.float32(1))
+    parts: NDArray[Any] = (quaternions[:, 1:] * signs + np.float32(1)) * np.float32(127.5)
+    return parts
 
 
 def _packed_rotations(quaternions: FloatArray) -> bytes:

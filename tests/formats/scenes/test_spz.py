@@ -6,6 +6,7 @@ import gzip
 import struct
 import time
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,13 +17,14 @@ from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import spz
 from potr_cl.model.claims import FREE_SPLATS
 from potr_cl.reference.scenes import random_scene
-from tests.cases.scenes import in_order_of
+from tests.cases.scenes import in_order_of, turned_by
 
 
+@pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize("degree", range(4))
-def test_spz_keeps_every_property_to_its_step(tmp_path, degree):
+def test_spz_keeps_every_property_to_its_step(tmp_path, degree, version):
     scene = random_scene(300, degree, seed=degree)
-    spz.save(tmp_path / "a.spz", scene)
+    spz.save(tmp_path / "a.spz", scene, version)
     back = in_order_of(scene, spz.load(tmp_path / "a.spz"))
     assert np.abs(back.means - scene.means).max() <= 0.5 / 4096 + 1e-6
     assert np.abs(back.log_scales - np.clip(scene.log_scales, -10, 5.9375)).max() <= 0.5 / 16 + 1e-5
@@ -34,6 +36,19 @@ def test_spz_keeps_every_property_to_its_step(tmp_path, degree):
     if degree:
         ac = np.clip(scene.sh[:, 1:], -1, 127 / 128)
         assert np.abs(back.sh[:, 1:] - ac).max() <= 0.5 / 128 + 1e-5
+
+
+def test_version_2_keeps_every_shape_to_its_step(tmp_path):
+    """Its rotations may be those of another numbering of a splat's axes: the shape is the same, so that is compared."""
+    scene = random_scene(2000, 1)
+    spz.save(tmp_path / "a.spz", scene)  # version 2 is the usual one
+    assert gzip.decompress((tmp_path / "a.spz").read_bytes())[4] == 2
+    back = in_order_of(scene, spz.load(tmp_path / "a.spz"))
+    thick = replace(scene, log_scales=np.clip(scene.log_scales, -10, 5.9375))  # what a byte can say
+    angles, differences = turned_by(thick, back)
+    # Half a step of 1/127.5 in each of three parts, of a quaternion whose real part is at least 0.85.
+    assert angles.max() <= 2 * np.sqrt(3) * 0.5 / 127.5 / 0.85
+    assert np.abs(differences).max() <= 0.5 / 16 + 1e-5
 
 
 def test_a_large_scene_is_stored_more_coarsely(tmp_path, caplog):
@@ -94,7 +109,7 @@ def test_a_scene_has_the_same_bytes_whenever_it_is_written(tmp_path, monkeypatch
             spz.save(tmp_path / f"{day}.spz", scene)
         first, second = ((tmp_path / f"{day}.spz").read_bytes() for day in (1, 2))
         assert first == second
-        assert len(gzip.decompress(first)) == 16 + splats * (16 + 4 + 24)
+        assert len(gzip.decompress(first)) == 16 + splats * (16 + 3 + 24)
 
 
 def test_nothing_is_written_but_beside_the_file(tmp_path, monkeypatch):
@@ -113,13 +128,16 @@ def test_content_and_values_are_those_of_another_program(tmp_path, data):
     from potr_cl.formats.scenes.gsply_arrays import from_scene
 
     scene = random_scene(3000, 3)
-    spz.save(tmp_path / "ours.spz", scene)
+    spz.save(tmp_path / "ours.spz", scene, version=3)
     other.write_spz(tmp_path / "theirs.spz", from_scene(gsply, scene), version=3, fractional_bits=12)
     ours, theirs = (gzip.decompress((tmp_path / name).read_bytes()) for name in ("ours.spz", "theirs.spz"))
     assert len(ours) == len(theirs)
     assert sum(a != b for a, b in zip(ours, theirs, strict=True)) <= 5  # ties that rounding breaks either way
-    for name in ("version_3.spz", "version_4.spz", "degree_1.spz"):
-        expected, got = other.read_spz(data / "foreign" / name), spz.load(data / "foreign" / name)
+    written = [tmp_path / f"{version}.spz" for version in (2, 3, 4)]
+    for version, path in enumerate(written, 2):
+        spz.save(path, scene, version)
+    for path in (*written, *(data / "foreign" / name for name in ("version_3.spz", "version_4.spz", "degree_1.spz"))):
+        expected, got = other.read_spz(path), spz.load(path)
         assert np.array_equal(got.means, expected.means)
         assert np.array_equal(got.log_scales, expected.scales)
         assert np.abs(got.quaternions - expected.quats).max() < 1e-6
