@@ -29,6 +29,8 @@ COMMANDS = ("encode", "prune", "compact", "refit", "decode", "info", "convert", 
 COMMAND_LINE_ONLY = {
     "--help": "Python has its own",
     "--json": "results are objects; SceneComparison.report() and SceneInfo.facts are what it prints",
+    "--from": "for standard input",
+    "--to": "for standard output and folders of scenes",
     "--no-quality": "nothing is judged unless a report is asked for: compare() judges",
 }
 #: Of each option what is typed, and the same in Python; {name} stands for a path of the test's files. What has the
@@ -81,6 +83,7 @@ VALUES: dict[str, tuple[list[str], Any]] = {
     "--trust": ([], True),
     "--antialiased": (["yes"], True),
     "--sh-degree": (["1"], 1),
+    "--spz-version": (["3"], 3),
     "--cameras-anyway": ([], True),
     "--unseen": (["drop"], "drop"),
     "--memory": (["0.25"], 0.25),
@@ -227,14 +230,13 @@ def called(command: str, flags: list[str], files: dict[str, Path], folder: Path,
         here = folder / side
         here.mkdir(parents=True)
         suffix = {"encode": ".potr", "render": "", "compare": ".png"}.get(command, ".ply")
+        suffix = ".spz" if "--spz-version" in flags else suffix
         names = {**files, "output": here / f"out{suffix}", "report": here / "page.html", "order": here / "order.npy"}
         paths = {name: str(path) for name, path in names.items()}
         sources = {"decode": ["potr"], "refit": ["reduced"], "compare": ["scene", "reduced"]}.get(command, ["scene"])
         positional = [paths[name] for name in sources]
         if side == "typed":
             words = [command, *positional]
-            if command == "convert":
-                words.append(paths["output"])
             for flag in flags:
                 values = [value.format(**paths) for value in VALUES[flag][0]]
                 words += [flag + values[0]] if values and values[0].startswith("=") else [flag, *values]
@@ -249,8 +251,6 @@ def called(command: str, flags: list[str], files: dict[str, Path], folder: Path,
             for flag in flags:
                 value = VALUES[flag][1]
                 given[keyword(command, flag)] = value.format(**paths) if isinstance(value, str) else value
-            if command == "convert":
-                given["output"] = paths["output"]
             result = getattr(potr_cl, command)(*positional, **given)
             facts = result.facts if command == "info" else result.report() if command == "compare" else None
             outcomes.append(outcome(here, facts and figures(json.loads(json.dumps(facts)))))
