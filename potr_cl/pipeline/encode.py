@@ -39,6 +39,8 @@ class Encoded:
         device: the device that did the work; not the one that was asked for if that had too little memory. None if no
             stage needed a device.
         seconds: wall time by stage.
+        options: that it was encoded with: those that were given, or that a search for a size or a PSNR has found.
+        source_splats: how many splats the source scene has.
     """
 
     pieces: list[bytes]
@@ -48,6 +50,18 @@ class Encoded:
     refitted: Refitted | None
     device: Device | None
     seconds: dict[str, float]
+    options: EncodeOptions
+    source_splats: int
+
+    def __repr__(self) -> str:
+        q = f"q {self.options.q:.4g} of preset {self.options.preset}"
+        splats = f"{len(self.order):,} of {self.source_splats:,} splats"
+        return f"Encoded({self.nbytes:,} bytes, {splats}, {q}, {sum(self.seconds.values()):.1f} s)"
+
+    @property
+    def data(self) -> bytes:
+        """The whole file."""
+        return b"".join(self.pieces)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the file, whole or not at all.
@@ -175,6 +189,8 @@ class Run:
             refitted=state.learnt.get("refit"),
             device=self.device,
             seconds=self._watch.seconds,
+            options=self._options,
+            source_splats=len(state.source),
         )
 
 
