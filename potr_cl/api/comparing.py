@@ -151,6 +151,7 @@ def compare(
     rules: RasterRules | str = "inria",
     background: ColourSource = "black",
     trust: bool = False,
+    antialiased: bool | None = None,
     progress: Callable[[str, float], None] | None = None,
 ) -> SceneComparison:
     """Render two scenes from the same views and compare, as the command ``compare`` does.
@@ -167,7 +168,7 @@ def compare(
         device: to render on, or what it is called.
         rules: of the rasterizer to follow: inria or gsplat.
         background: R, G, B from 0 to 1, or a colour's name.
-        trust: as of :func:`potr_cl.load_scene`.
+        trust, antialiased: as of :func:`potr_cl.load_scene`.
         progress: called with what is done and the part of it that is done.
 
     Raises:
@@ -182,9 +183,9 @@ def compare(
         points.refuse_with_cameras()
     elif truth is not None:
         raise UsageError("--truth needs --cameras, the views that the photographs show")
-    scene_a = scene_of(a, trust)
+    scene_a = scene_of(a, trust, antialiased)
     there = given or points.placed(scene_a)
-    scene_b = scene_of(b, trust)
+    scene_b = scene_of(b, trust, antialiased)
     comparison = compare_scenes(
         (named(a, scene_a), scene_a),
         (named(b, scene_b), scene_b),
@@ -226,6 +227,12 @@ def compare_scenes(
     """
     ground_truth = find_ground_truth(truth, views) if truth is not None else None
     lpips, told_of = None, list(notes)
+    if a[1].antialiased != b[1].antialiased:
+        ways = " and ".join(
+            f"{name} is rendered {'with' if scene.antialiased else 'without'} antialiasing"
+            for name, scene in (("A", a[1]), ("B", b[1]))
+        )
+        told_of.append(f"warning: {ways}, as the files say: give --antialiased yes or no to render both alike")
     try:
         lpips = Lpips()
     except UsageError as missing:

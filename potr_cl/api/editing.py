@@ -22,6 +22,7 @@ from potr_cl.api.inputs import (
     cameras_of,
     colour_of,
     device_of,
+    name_of,
     scene_of,
 )
 from potr_cl.codec.quantize import ac_sparsity
@@ -151,6 +152,7 @@ def prune(
     background: ColourSource = "black",
     device: DeviceSource = None,
     trust: bool = False,
+    antialiased: bool | None = None,
     progress: Progress | None = None,
     **choices: Any,
 ) -> PrunedScene:
@@ -166,7 +168,7 @@ def prune(
         memory: GiB of device memory to keep views in.
         background: R, G, B from 0 to 1, or a colour's name.
         device: that computes, or what it is called.
-        trust: as of :func:`potr_cl.load_scene`.
+        trust, antialiased: as of :func:`potr_cl.load_scene`.
         progress: called with what is done and the part of it that is done.
         choices: options of the stage by the name of their flag: ``keep=0.5``, ``iterations=16``.
 
@@ -177,7 +179,7 @@ def prune(
     """
     options = stage_options(Prune, q, background, memory, choices)
     write = scene_writer(output) if output is not None else None
-    views, what = cameras_of(cameras), scene_of(scene, trust)
+    views, what = cameras_of(cameras), scene_of(scene, trust, antialiased)
     with contextlib.ExitStack() as stack:
         ranks = stack.enter_context(replacing(order)) if order is not None else None
         state, used = _run(what, views, virtual_views, options, Prune, device, progress)
@@ -201,13 +203,15 @@ def compact(
     background: ColourSource = "black",
     device: DeviceSource = None,
     trust: bool = False,
+    antialiased: bool | None = None,
     progress: Progress | None = None,
     **choices: Any,
 ) -> CompactedScene:
     """Make the colours' coefficients sparse, as the command ``compact`` does; nothing else changes.
 
     Args:
-        scene, cameras, output, virtual_views, memory, background, device, trust, progress: as of :func:`prune`.
+        scene, cameras, output, virtual_views, memory, background, device, trust, antialiased, progress: as of
+            :func:`prune`.
         q: 0 (sparsest) to 1.
         sf_sh: steps a unit of the quantiser to expect.
         choices: options of the stage by the name of their flag: ``lambda_=0.01``, ``one_pass=True``.
@@ -217,7 +221,7 @@ def compact(
     """
     options = stage_options(Compact, q, background, memory, choices, sf_sh)
     write = scene_writer(output) if output is not None else None
-    views, what = cameras_of(cameras), scene_of(scene, trust)
+    views, what = cameras_of(cameras), scene_of(scene, trust, antialiased)
     state, used = _run(what, views, virtual_views, options, Compact, device, progress)
     if write is not None:
         write(state.scene)
@@ -280,6 +284,7 @@ def refit(
     background: ColourSource = "black",
     device: DeviceSource = None,
     trust: bool = False,
+    antialiased: bool | None = None,
     progress: Progress | None = None,
 ) -> RefittedScene:
     """Solve for the colours of all splats of a reduced scene together, as the command ``refit`` does.
@@ -295,7 +300,7 @@ def refit(
         prior: how strongly coefficients are held where they were.
         lambda_: how strongly AC coefficients are pulled to 0.
         drop: give up an AC coefficient where the mean squared error grows by less.
-        cameras, output, virtual_views, memory, background, device, trust, progress: as of :func:`prune`.
+        cameras, output, virtual_views, memory, background, device, trust, antialiased, progress: as of :func:`prune`.
 
     Raises:
         As :func:`prune`; and UsageError if a photograph is missing or there are no cameras for them.
@@ -308,7 +313,8 @@ def refit(
     write = scene_writer(output) if output is not None else None
     given = cameras_of(cameras)
     ground_truth = GroundTruth(Path(photos), given, colour) if photos is not None and given is not None else None
-    reduced, original = scene_of(scene, trust), scene_of(reference, trust)
+    reduced, original = scene_of(scene, trust, antialiased), scene_of(reference, trust, antialiased)
+    check_rendered_alike((str(name_of(scene)), reduced), (str(name_of(reference)), original))
     opened = device_of(device)
     there = views_or_placed(original, given, virtual_views)
     views = train_views(there)
@@ -363,3 +369,20 @@ def _psnr_of_photographs(
 def decibels_of(error: float) -> str:
     """The PSNR of a mean squared error of colours from 0 to 1, for people."""
     return f"{-10 * math.log10(error):.2f} dB" if error > 0 else "infinite"
+
+
+def check_rendered_alike(reduced: tuple[str, Scene], original: tuple[str, Scene]) -> None:
+    """Refuse to fit the pictures of an antialiased scene to those of a classic one, or the other way round.
+
+    Args:
+        reduced, original: what each scene is called, and the scene.
+
+    Raises:
+        UsageError: one is antialiased and the other is not.
+    """
+    if reduced[1].antialiased != original[1].antialiased:
+        yes, no = (reduced, original) if reduced[1].antialiased else (original, reduced)
+        raise UsageError(
+            f"'{yes[0]}' says that it is antialiased and '{no[0]}' does not, so their pictures cannot be alike: "
+            "give --antialiased yes or no for both"
+        )

@@ -64,6 +64,7 @@ def encode(
     memory: float | None = None,
     threads: int | None = None,
     trust: bool = False,
+    antialiased: bool | None = None,
     tell: Callable[[str], None] | None = None,
     **choices: Any,
 ) -> Encoded:
@@ -89,7 +90,7 @@ def encode(
         background: R, G, B from 0 to 1, or a colour's name; black by default.
         memory: GiB of device memory to keep views in; by default half of it, 0.3 of a CPU's.
         threads: on the host; one for each processor by default.
-        trust: as of :func:`potr_cl.load_scene`.
+        trust, antialiased: as of :func:`potr_cl.load_scene`.
         tell: told a line for every step of a search for a size or a PSNR.
         choices: any option of a stage by the name of its flag: ``keep=0.5`` is ``--keep 0.5``, ``prune=False`` is
             ``--no-prune``, ``refit="off"`` is ``--refit off``; ``lambda_`` stands for ``--lambda``, as lambda is a word
@@ -112,7 +113,7 @@ def encode(
         raise UsageError("report_view needs report, the page that shows it")
     opened = None if device is None else device_of(device)
     views = cameras_of(cameras)
-    what = scene_of(scene, trust)
+    what = scene_of(scene, trust, antialiased)
     if views is None and virtual_views is not None and settings.look_at_views(what):
         views = place_cameras(what, virtual_views)
     if views is None and report is not None and settings.look_at_views(what):

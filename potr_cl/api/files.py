@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 from pathlib import Path
-from typing import TYPE_CHECKING
+from typing import TYPE_CHECKING, Any
 
 from potr_cl.api.inputs import SceneSource, encoded_bytes, scene_of
 from potr_cl.codec.decoder import decode as decode_file
@@ -41,13 +41,15 @@ def save(scene: SceneSource, path: str | os.PathLike[str]) -> None:
     write(scene_of(scene))
 
 
-def convert(scene: SceneSource, output: str | os.PathLike[str], *, trust: bool = False) -> Scene:
+def convert(
+    scene: SceneSource, output: str | os.PathLike[str], *, trust: bool = False, antialiased: bool | None = None
+) -> Scene:
     """Read a scene and write it in another format, as the command ``convert`` does.
 
     Args:
         scene: its file, usually.
         output: the file to write; its suffixes tell the format.
-        trust: as of :func:`potr_cl.load_scene`.
+        trust, antialiased: as of :func:`potr_cl.load_scene`.
 
     Returns:
         The scene, as it was read.
@@ -58,23 +60,28 @@ def convert(scene: SceneSource, output: str | os.PathLike[str], *, trust: bool =
     from potr_cl.formats import scene_writer
 
     write = scene_writer(output)
-    read = scene_of(scene, trust)
+    read = scene_of(scene, trust, antialiased)
     write(read)
     return read
 
 
 def decode(
-    file: str | os.PathLike[str] | bytes | Encoded, trust: bool = False, *, output: str | os.PathLike[str] | None = None
+    file: str | os.PathLike[str] | bytes | Encoded,
+    trust: bool = False,
+    sh_degree: int | None = None,
+    *,
+    output: str | os.PathLike[str] | None = None,
 ) -> Scene:
     """Decode a .potr file, as the command ``decode`` does.
 
     Args:
         file: its path, its bytes, or the result of :func:`potr_cl.encode`.
         trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
+        sh_degree: leave out SH coefficients of higher degrees, without decoding them; None: none.
         output: a file to write the scene to as well, usually a .ply.
 
     Raises:
-        UsageError: the path cannot be read, or ``output`` not be written to.
+        UsageError: the path cannot be read, ``output`` not be written to, or there is no such degree.
         DataError: not a .potr file, a damaged one, or too many splats for its size.
     """
     write = None
@@ -83,7 +90,8 @@ def decode(
 
         write = scene_writer(output)
     data = encoded_bytes(file)
-    scene = decode_file(file if data is None else data, **({"trust": True} if trust else {}))  # type: ignore[arg-type]
+    told: dict[str, Any] = ({"trust": True} if trust else {}) | ({} if sh_degree is None else {"sh_degree": sh_degree})
+    scene = decode_file(file if data is None else data, **told)  # type: ignore[arg-type]
     if write is not None:
         write(scene)
     return scene

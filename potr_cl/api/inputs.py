@@ -32,28 +32,28 @@ ColourSource: TypeAlias = "str | Sequence[float]"
 DeviceSource: TypeAlias = "Device | DeviceInfo | str | None"
 
 
-def scene_of(source: SceneSource, trust: bool = False) -> Scene:
+def scene_of(source: SceneSource, trust: bool = False, antialiased: bool | None = None) -> Scene:
     """The scene that a source stands for.
 
     Args:
         source: see :data:`SceneSource`.
-        trust: as of :func:`potr_cl.formats.load_scene`.
+        trust, antialiased: as of :func:`potr_cl.formats.load_scene`.
 
     Raises:
         UsageError, DataError: as :func:`potr_cl.formats.load_scene`.
     """
     if isinstance(source, Scene):
-        return source
+        return source.rendered(antialiased)
     data = encoded_bytes(source)
     if data is not None:
-        return decode(data, **_trusting(trust))
+        return decode(data, **_trusting(trust)).rendered(antialiased)
     scene = getattr(source, "scene", None)
     if isinstance(scene, Scene):
-        return scene
+        return scene.rendered(antialiased)
     if isinstance(source, (str, os.PathLike)):
         from potr_cl.formats import load_scene
 
-        return load_scene(source, **_trusting(trust))
+        return load_scene(source, **_trusting(trust)).rendered(antialiased)
     raise UsageError(f"a scene is wanted, or the path of its file, not {type(source).__name__}")
 
 

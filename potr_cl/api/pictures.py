@@ -137,6 +137,7 @@ def render(
     background: ColourSource = "black",
     *,
     trust: bool = False,
+    antialiased: bool | None = None,
 ) -> Rendering: ...
 @overload
 def render(
@@ -154,6 +155,7 @@ def render(
     size: int | None = None,
     output: str | os.PathLike[str] | None = None,
     trust: bool = False,
+    antialiased: bool | None = None,
 ) -> Renderings: ...
 def render(
     scene: SceneSource,
@@ -170,6 +172,7 @@ def render(
     size: int | None = None,
     output: str | os.PathLike[str] | None = None,
     trust: bool = False,
+    antialiased: bool | None = None,
 ) -> Rendering | Renderings:
     """Render a scene, as the command ``render`` does.
 
@@ -189,7 +192,7 @@ def render(
         up: which way is up in placed views: "x", "y", "z", "-x", "-y", "-z", three numbers; by default a guess.
         size: pixels along a side of the pictures of placed views; 800 by default.
         output: a folder to write the pictures to as well, as PNG files named after their views.
-        trust: as of :func:`potr_cl.load_scene`.
+        trust, antialiased: as of :func:`potr_cl.load_scene`.
 
     Returns:
         A :class:`Rendering`, the image and the transmittance, for one camera; else :class:`Renderings`.
@@ -202,12 +205,12 @@ def render(
     colour, wanted = colour_of(background), rules_of(rules)
     points = Viewpoints(virtual_views, turntable, up, size)
     if isinstance(cameras, Camera):
-        with Rasterizer(device_of(device), scene_of(scene, trust), wanted, colour) as rasterizer:
+        with Rasterizer(device_of(device), scene_of(scene, trust, antialiased), wanted, colour) as rasterizer:
             return Rendering(*rasterizer.render(cameras))
     given = cameras_of(cameras)
     if given is not None:
         points.refuse_with_cameras()
-    what = scene_of(scene, trust)
+    what = scene_of(scene, trust, antialiased)
     there = given or points.placed(what)
     note = "" if given else told(there)
     chosen = chosen_views(there, views, split or (None if views is not None else "all"))

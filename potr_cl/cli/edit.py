@@ -8,12 +8,12 @@ from typing import Any
 
 import numpy as np
 
-from potr_cl.api.editing import RefittedScene, compact, decibels_of, prune, refit, stage_options
+from potr_cl.api.editing import RefittedScene, check_rendered_alike, compact, decibels_of, prune, refit, stage_options
 from potr_cl.cli.guard import ReadFile, ReadPhotographs, WrittenFile
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_trust_option, read_scene
+from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
@@ -66,6 +66,7 @@ def add_prune(commands: Commands) -> None:
     )
     add_stage_flags(p, [Prune], without=["on"])
     add_trust_option(p)
+    add_antialiased_option(p)
     add_memory_option(p)
     add_device_options(p)
     p.set_defaults(run=_prune)
@@ -94,6 +95,7 @@ def add_compact(commands: Commands) -> None:
     add_stage_flags(p, [Compact], without=["on", "at"])
     p.add_argument("--sf-sh", type=float, metavar="SF", help="steps a unit of the quantiser to expect")
     add_trust_option(p)
+    add_antialiased_option(p)
     add_memory_option(p)
     add_device_options(p)
     p.set_defaults(run=_compact)
@@ -109,6 +111,7 @@ def _refit(args: argparse.Namespace) -> None:
     if args.photos is not None and cameras is not None:
         GroundTruth(args.photos, cameras, background)
     scene, reference = read_scene(args, args.scene), read_scene(args, args.reference)
+    check_rendered_alike((str(args.scene), scene), (str(args.reference), reference))
     device = Device(args.device)
     with contextlib.closing(Progress()) as progress:
         result = refit(
@@ -187,6 +190,7 @@ def add_refit(commands: Commands) -> None:
         help="give up an AC coefficient where the mean squared error grows by less; default: none",
     )
     add_trust_option(p)
+    add_antialiased_option(p)
     add_memory_option(p)
     add_device_options(p)
     p.set_defaults(run=_refit)

@@ -21,7 +21,7 @@ from potr_cl.cli.guard import (
 from potr_cl.cli.options import CAMERAS_HELP, Commands, add_rendering_options, add_view_options
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_trust_option, read_scene
+from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene
 from potr_cl.cli.terminal import note, say, say_document
 from potr_cl.cli.views import read_cameras
 from potr_cl.errors import UsageError
@@ -112,6 +112,7 @@ def add_render(commands: Commands) -> None:
     add_view_options(p, "all")
     _add_viewpoints(p)
     add_trust_option(p)
+    add_antialiased_option(p)
     add_rendering_options(p)
     p.set_defaults(run=_render)
 
@@ -176,5 +177,6 @@ def add_compare(commands: Commands) -> None:
     _add_viewpoints(p)
     p.add_argument("--json", action="store_true", help="for programs")
     add_trust_option(p)
+    add_antialiased_option(p)
     add_rendering_options(p)
     p.set_defaults(run=_compare)
