@@ -41,11 +41,11 @@ def scene_report(scene: Scene, mended: Sequence[CleanReport] = ()) -> dict[str, 
         mended: what its reader had to drop or to change.
 
     Returns:
-        ``splats``, ``sh_degree``; ``bounding_box`` of all centres, and ``robust_bounding_box``, which leaves out one
-        in a hundred opaque splats on each side of each axis: lists of the lowest and the highest x, y, z; ``opacity``
-        and ``scale`` (each splat's largest standard deviation), with quantiles and a histogram: ``edges``, one more
-        than there are ``counts``; ``suspicious``: a list of ``what``, ``splats`` (how many it concerns) and ``said``, a
-        line for people.
+        ``splats``, ``sh_degree``; whether it is ``antialiased``; ``bounding_box`` of all centres, and
+        ``robust_bounding_box``, which leaves out one in a hundred opaque splats on each side of each axis: lists of the
+        lowest and the highest x, y, z; ``opacity`` and ``scale`` (each splat's largest standard deviation), with
+        quantiles and a histogram: ``edges``, one more than there are ``counts``; ``suspicious``: a list of ``what``,
+        ``splats`` (how many it concerns) and ``said``, a line for people.
     """
     opacity = scene.opacities.astype(np.float64)
     largest = scene.log_scales.max(axis=1).astype(np.float64) / np.log(10)
@@ -56,6 +56,7 @@ def scene_report(scene: Scene, mended: Sequence[CleanReport] = ()) -> dict[str, 
     return {
         "splats": len(scene),
         "sh_degree": scene.sh_degree,
+        "antialiased": scene.antialiased,
         "bounding_box": [means.min(axis=0).tolist(), means.max(axis=0).tolist()],
         "robust_bounding_box": robust.tolist(),
         "opacity": {"quantiles": _quantiles(opacity), **_histogram(opacity, steps)},
@@ -198,10 +199,12 @@ def _histogram(values: F64, edges: F64, as_power: bool = False) -> dict[str, Any
 
 def format_scene(report: dict[str, Any]) -> str:
     """The facts as lines for people, the histograms as bars."""
+    smoothed = ["antialiased     yes, as the file says"] if report["antialiased"] else []
     coefficients = 3 * SH_COEFFICIENTS[report["sh_degree"]]
     lines = [
         f"splats          {report['splats']:,}",
         f"SH degree       {report['sh_degree']}, {coefficients} coefficients a splat",
+        *smoothed,
         f"bounding box    {_box(report['bounding_box'])}",
         f"robust bounds   {_box(report['robust_bounding_box'])}",
         "",
