@@ -80,6 +80,8 @@ VALUES: dict[str, tuple[list[str], Any]] = {
     "--prior": (["5"], 5),
     "--threads": (["1"], 1),
     "--trust": ([], True),
+    "--cameras-anyway": ([], True),
+    "--unseen": (["drop"], "drop"),
     "--memory": (["0.25"], 0.25),
     "--background": (["0.2,0.4,0.8"], (0.2, 0.4, 0.8)),
     "--device": (["{device}"], "{device}"),
@@ -94,9 +96,9 @@ VALUES: dict[str, tuple[list[str], Any]] = {
 }
 #: What only says how the work is done.
 SAME_RESULT = {"--threads", "--trust", "--memory", "--device", "--output", "--cameras", "--reference", "--report",
-               "--report-view", "--order", "--tolerance"}  # fmt: skip
+               "--report-view", "--order", "--tolerance", "--cameras-anyway", "--unseen"}  # fmt: skip
 #: The compaction weighs views by what they show of a splat, whatever is behind it; no splat of this scene improves the
-#: match by going; and without a number of virtual views so many are placed that it takes long.
+#: match by going; and without a number of virtual views dozens are placed, which takes long.
 NO_DIFFERENCE = {
     ("encode", "--mapping-a"),
     ("prune", "--mapping-a"),
