@@ -49,7 +49,7 @@ from potr_cl.stages.refit import Refit
 def _options(args: argparse.Namespace, source_bytes: int | None = None) -> EncodeOptions:
     return encode_options(
         None, args.preset, stage_choices(args), q=args.quality, background=args.background, memory=args.memory,
-        threads=args.threads, source_bytes=source_bytes,
+        threads=args.threads, source_bytes=source_bytes, cameras_anyway=args.cameras_anyway,
     )  # fmt: skip
 
 
