@@ -112,6 +112,6 @@ def test_versions_of_spz(folder: Path, capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_encode_from_python_writes_no_other_name(folder: Path) -> None:
-    with pytest.raises(UsageError, match="encode to 'b.potr'"):
+    with pytest.raises(UsageError, match=r"encode to 'b\.potr'"):
         encode("a.ply", output="b.spz", prune=False, compact=False, refit="off")
     assert not Path("b.spz").exists()
