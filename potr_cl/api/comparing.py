@@ -13,7 +13,7 @@ from potr_cl.api.inputs import (
     ColourSource,
     DeviceSource,
     SceneSource,
-    bytes_of_file,
+    bytes_of_source,
     cameras_of,
     chosen_views,
     colour_of,
@@ -204,8 +204,9 @@ def compare(
 
 def named(source: SceneSource, scene: Scene) -> SceneFile:
     """The facts of a scene; one that comes from no file counts with the bytes of its arrays."""
-    nbytes = bytes_of_file(source)
-    return SceneFile(name_of(source), scene.nbytes if nbytes is None else nbytes, len(scene), scene.sh_degree)
+    nbytes = bytes_of_source(source)
+    nbytes = scene.nbytes if nbytes is None else nbytes
+    return SceneFile(name_of(source), nbytes, len(scene), scene.sh_degree, scene.antialiased)
 
 
 def compare_scenes(

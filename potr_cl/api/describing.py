@@ -7,10 +7,12 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from potr_cl.api.inputs import SceneSource, bytes_of_file, encoded_bytes, name_of, scene_of
+from potr_cl.api.inputs import SceneSource, bytes_of_source, encoded_bytes, name_of, scene_of
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene, registry
+from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.gzipped import plain
 from potr_cl.formats.scenes.potr import FORMAT as POTR
 from potr_cl.formats.scenes.scene_files import noting_mends
 from potr_cl.model.scene import CleanReport, Scene
@@ -64,7 +66,7 @@ def info(file: SceneSource, trust: bool = False) -> SceneInfo:
     Raises:
         UsageError, DataError: as :func:`potr_cl.load_scene`.
     """
-    own = {"file": str(name_of(file)), "format": None, "bytes": bytes_of_file(file)}
+    own = {"file": str(name_of(file)), "format": None, "bytes": bytes_of_source(file)}
     told = {"trust": True} if trust else {}
     data = encoded_bytes(file)
     if data is not None:
@@ -73,12 +75,14 @@ def info(file: SceneSource, trust: bool = False) -> SceneInfo:
         scene, mended = _as_it_would_be_read(scene_of(file))
         return SceneInfo({**own, **scene_report(scene, mended)})
     else:
-        kind = _format_of(Path(file))
-        if kind is not POTR:
-            with noting_mends() as mends:
-                scene = load_scene(file, **told)
-            return SceneInfo({**own, "format": kind.name, **scene_report(scene, mends)})
-        opened = PotrFile.open(file, **told)
+        # A gzipped file is unpacked once, for both to tell its format and to read it.
+        with plain(Path(file), trust) as path:
+            kind = _format_of(path)
+            if kind is not POTR:
+                with noting_mends() as mends:
+                    scene = load_scene(path, **told)
+                return SceneInfo({**own, "format": kind.name, **scene_report(scene, mends)})
+            opened = PotrFile.open(path, **told)
     # Two reports of one file: what it says itself of counts and bounds is the same as what the scene says.
     return SceneInfo({**own, "format": POTR.name, **file_report(opened), **scene_report(opened.scene())})
 
@@ -89,10 +93,15 @@ def _as_it_would_be_read(scene: Scene) -> tuple[Scene, list[CleanReport]]:
     return clean, [report]
 
 
-def _format_of(path: Path) -> Any:
-    """The format that reads a file; .potr where no suffix says another one, as content tells these."""
+def _format_of(path: Path) -> SceneFormat:
+    """The format that reads a scene; .potr where no suffix of a file says another one, as content tells these.
+
+    Raises:
+        UsageError: a folder, of no format.
+    """
     try:
-        reader = registry.reader_of(path)
+        return registry.format_of(path)
     except UsageError:
+        if path.is_dir():
+            raise
         return POTR
-    return next((entry for entry in registry.SCENE_FORMATS if entry.load is reader), POTR)

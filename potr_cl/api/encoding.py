@@ -15,7 +15,7 @@ from potr_cl.api.inputs import (
     ColourSource,
     DeviceSource,
     SceneSource,
-    bytes_of_file,
+    bytes_of_source,
     cameras_of,
     colour_of,
     device_of,
@@ -108,7 +108,7 @@ def encode(
     began = time.perf_counter()
     settings = encode_options(
         options, preset, choices, q=q, background=background, memory=memory, threads=threads,
-        source_bytes=bytes_of_file(scene), cameras_anyway=cameras_anyway,
+        source_bytes=bytes_of_source(scene), cameras_anyway=cameras_anyway,
     )  # fmt: skip
     target = encode_target(q, max_size, min_psnr)
     if output is not None:
@@ -149,8 +149,6 @@ def encode(
                 quality, pictures = judge(what, candidate, watch, report_view, pictures=True)
             seconds = encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
             source = name_of(scene)
-            if settings.source_bytes is None:  # of a scene in memory, the bytes of its arrays stand for a file's
-                settings = settings.changed(source_bytes=what.nbytes)
             used = encoded.options.changed(source_bytes=settings.source_bytes)
             search = search_report(target, found) if target is not None and found is not None else None
             document = encode_report(

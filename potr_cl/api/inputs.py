@@ -122,17 +122,18 @@ def rules_of(source: RasterRules | str) -> RasterRules:
     return RULES[source]
 
 
-def bytes_of_file(source: SceneSource) -> int | None:
-    """Bytes of the file that a scene comes from; None where it comes from none, or whoever reads it will say so."""
+def bytes_of_source(source: SceneSource) -> int | None:
+    """Bytes of the file that a scene comes from, or of all its files (:mod:`potr_cl.formats.scene_size`); None where it
+    comes from none, or whoever reads it will say so.
+    """
     data = encoded_bytes(source)
     if data is not None:
         return len(data)
     if not isinstance(source, (str, os.PathLike)):
         return None
-    try:
-        return os.stat(source).st_size if os.path.isfile(source) else None
-    except (OSError, ValueError):
-        return None
+    from potr_cl.formats.scene_size import bytes_of_scene
+
+    return bytes_of_scene(source)
 
 
 def name_of(source: SceneSource) -> Path:

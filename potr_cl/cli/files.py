@@ -65,7 +65,7 @@ def _info(args: argparse.Namespace) -> None:
     with as_file(args.file) as file:
         found = info(file, **trust(args))
     if args.json:
-        say_document(found.facts)
+        say_document(found.facts | {"file": str(args.file)})  # standard input is kept in a file of another name
     else:
         say(found)
 

@@ -26,6 +26,7 @@ from potr_cl.cli.terminal import note, say, say_document
 from potr_cl.cli.views import read_cameras, warn_of_frame
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import parse_colour
+from potr_cl.formats.registry import suffixes_read
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
@@ -106,7 +107,7 @@ def _render(args: argparse.Namespace) -> None:
 
 def add_render(commands: Commands) -> None:
     p = commands.add_parser("render", help="pictures (.png) of a scene from its cameras, or from all around")
-    p.add_argument("scene", type=ReadFile, metavar="SCENE", help=".ply or .potr")
+    p.add_argument("scene", type=ReadFile, metavar="SCENE", help=suffixes_read())
     p.add_argument("--cameras", type=ReadCameras, metavar="PATH", help=f"{CAMERAS_HELP}; without, views are placed")
     p.add_argument(
         "-o", "--output", type=WrittenFolder, required=True, metavar="DIR", help="one file a view, named after it"
@@ -165,8 +166,8 @@ def add_compare(commands: Commands) -> None:
         description="Render two scenes from the same views and compare. A PSNR is in decibels, a mean is over views. "
         "In JSON a PSNR of null means identical pictures.",
     )
-    p.add_argument("a", type=ReadFile, metavar="A", help="the uncompressed scene, .ply or .potr")
-    p.add_argument("b", type=ReadFile, metavar="B", help="the one to judge, .ply or .potr")
+    p.add_argument("a", type=ReadFile, metavar="A", help=f"the uncompressed scene: {suffixes_read()}")
+    p.add_argument("b", type=ReadFile, metavar="B", help="the one to judge")
     p.add_argument("--cameras", type=ReadCameras, metavar="PATH", help=f"{CAMERAS_HELP}; without, views are placed")
     p.add_argument(
         "--truth", type=ReadPhotographs, metavar="DIR", help="photographs, named after the views: judge A and B by them"

@@ -37,13 +37,8 @@ def load_scene(path: str | os.PathLike[str], trust: bool = False, antialiased: b
         UsageError: the file cannot be opened, its extension is unknown, or it needs an extra.
         DataError: its content is damaged, or it holds too many splats for its size.
     """
-    path = Path(path)
-    refuse_lfs_pointer(path)
-    with _silent_overflows():
-        if path.suffix.lower() == gzipped.SUFFIX:
-            with gzipped.unpacked(path, trust) as file:
-                return registry.reader_of(file)(file, trust).rendered(antialiased)
-        return registry.reader_of(path)(path, trust).rendered(antialiased)
+    with _silent_overflows(), gzipped.plain(Path(path), trust) as file:
+        return registry.reader_of(file)(file, trust).rendered(antialiased)
 
 
 def scene_writer(path: str | os.PathLike[str], version: int | None = None) -> Callable[[Scene], None]:

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 import contextlib
 import gzip
-import logging
 import os
 import zlib
 from collections.abc import Iterator
@@ -12,6 +11,8 @@ from pathlib import Path
 
 from potr_cl.errors import DataError, PotrError
 from potr_cl.formats import registry
+from potr_cl.formats.called import called
+from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
 from potr_cl.formats.scenes.scene_files import opened
 from potr_cl.host.leftovers import temporary_folder
 
@@ -22,6 +23,26 @@ _MOST_TIMES, _FREE = 16, 1 << 20
 #: The same for formats whose files are compressed, and hold far more splats a byte.
 _MOST_TIMES_PACKED, _FREE_PACKED = 2, 1 << 14
 _PART = 1 << 20
+
+
+@contextlib.contextmanager
+def plain(path: Path, trust: bool = False) -> Iterator[Path]:
+    """A scene as a reader takes it: a gzipped one is unpacked until the block ends, any other is left as it is.
+
+    Args:
+        path: of the scene; it need not exist.
+        trust: as of :func:`unpacked`.
+
+    Raises:
+        As :func:`unpacked`, and:
+        DataError: the file is a Git-LFS pointer.
+    """
+    refuse_lfs_pointer(path)
+    if path.suffix.lower() != SUFFIX:
+        yield path
+        return
+    with unpacked(path, trust) as file:
+        yield file
 
 
 @contextlib.contextmanager
@@ -40,7 +61,7 @@ def unpacked(path: Path, trust: bool = False) -> Iterator[Path]:
         PotrError: there is no room for what it unpacks to.
     """
     inner = path.with_name(path.name[: -len(SUFFIX)])
-    with _called(inner, path):
+    with called(os.fspath(inner), os.fspath(path)):
         packed = registry.format_of(inner).packed
     times, free = (_MOST_TIMES_PACKED, _FREE_PACKED) if packed else (_MOST_TIMES, _FREE)
     with temporary_folder() as folder:
@@ -51,7 +72,7 @@ def unpacked(path: Path, trust: bool = False) -> Iterator[Path]:
                 _unpack(path, gzip.GzipFile(fileobj=stream), file, most)
             except (EOFError, zlib.error, gzip.BadGzipFile) as error:
                 raise DataError(f"'{path}' is damaged or truncated: {error}") from error
-        with _called(file, path):
+        with called(os.fspath(file), os.fspath(path)):
             yield file
 
 
@@ -72,23 +93,3 @@ def _unpack(path: Path, stream: gzip.GzipFile, file: Path, most: int | None) -> 
                     f"cannot unpack '{path}' into '{file.parent}': {error.strerror or error}: make room there, or name "
                     "another folder by the environment variable TMPDIR"
                 ) from error
-
-
-@contextlib.contextmanager
-def _called(file: Path, path: Path) -> Iterator[None]:
-    """Of a block in which a file is called by another name in errors of ours and in the log "potr_cl"."""
-    name, known = os.fspath(file), os.fspath(path)
-
-    class Renamed(logging.Filter):
-        def filter(self, record: logging.LogRecord) -> bool:
-            record.msg, record.args = record.getMessage().replace(name, known), None
-            return True
-
-    log, renamed = logging.getLogger("potr_cl"), Renamed()
-    log.addFilter(renamed)
-    try:
-        yield
-    except PotrError as error:
-        raise type(error)(str(error).replace(name, known)) from error
-    finally:
-        log.removeFilter(renamed)

@@ -3,8 +3,6 @@
 from __future__ import annotations
 
 import contextlib
-import logging
-import os
 import shutil
 from collections.abc import Callable, Iterator
 from pathlib import Path
@@ -12,6 +10,7 @@ from typing import BinaryIO
 
 from potr_cl.errors import DataError, PotrError
 from potr_cl.formats import registry
+from potr_cl.formats.called import called
 from potr_cl.host.leftovers import temporary_folder
 
 #: What a stream is called in messages.
@@ -47,7 +46,7 @@ def received(stream: BinaryIO, suffix: str | None = None, name: str = STANDARD_I
     with temporary_folder() as folder:
         path = Path(folder, f"scene{suffix}")
         _store(stream, start, path, name)
-        with _called(path, name):
+        with called(f"'{path}'", f"the {name}"):
             yield path
 
 
@@ -64,7 +63,7 @@ def send(stream: BinaryIO, suffix: str, save: Callable[[Path], None]) -> int:
     """
     with temporary_folder() as folder:
         path = Path(folder, f"scene{suffix}")
-        with _called(path, "standard output"):
+        with called(f"'{path}'", "the standard output"):
             save(path)
         with path.open("rb") as file:
             shutil.copyfileobj(file, stream, _PART)
@@ -95,25 +94,3 @@ def _store(stream: BinaryIO, start: bytes, path: Path, name: str) -> None:
             f"cannot keep what the {name} brings in '{path.parent}': {error.strerror or error}: make room there, or "
             "name another folder by the environment variable TMPDIR"
         ) from error
-
-
-@contextlib.contextmanager
-def _called(path: Path, name: str) -> Iterator[None]:
-    """Of a block in which a file is called by another name in errors of ours and in the log "potr_cl"."""
-    quoted, known = f"'{os.fspath(path)}'", f"the {name}"
-
-    class Renamed(logging.Filter):
-        def filter(self, record: logging.LogRecord) -> bool:
-            record.msg, record.args = record.getMessage().replace(quoted, known), None
-            return True
-
-    log, renamed = logging.getLogger("potr_cl"), Renamed()
-    log.addFilter(renamed)
-    try:
-        yield
-    except PotrError as error:
-        if quoted not in str(error):
-            raise
-        raise type(error)(str(error).replace(quoted, known)) from error
-    finally:
-        log.removeFilter(renamed)

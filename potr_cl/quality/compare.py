@@ -21,7 +21,7 @@ from potr_cl.formats.cameras.view_files import IMAGE_SUFFIXES, stem
 from potr_cl.formats.images import Colour, image_size, to_8_bits
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.scene import FloatArray
 from potr_cl.quality.metrics import Lpips
 from potr_cl.quality.metrics_device import Similarity, in_batches
 from potr_cl.quality.photographs import read_photograph
@@ -51,19 +51,6 @@ class SceneFile:
     splats: int
     sh_degree: int
     antialiased: bool = False
-
-    @staticmethod
-    def of(path: Path, scene: Scene) -> SceneFile:
-        """The facts of a scene that was read from ``path``.
-
-        Raises:
-            UsageError: the file is gone.
-        """
-        try:
-            size = path.stat().st_size
-        except OSError as error:
-            raise UsageError(f"cannot read '{path}': {error.strerror}") from error
-        return SceneFile(path, size, len(scene), scene.sh_degree, scene.antialiased)
 
 
 @dataclass(frozen=True)

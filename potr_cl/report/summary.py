@@ -44,14 +44,14 @@ def encode_report(
         scene: the uncompressed scene.
         file: what was written to ``target``.
         encoded: how it came about.
-        options: that it was encoded with; they know the size of ``source``.
+        options: that it was encoded with; they know the size of ``source``. Of a scene that comes from no file, the
+            bytes of its arrays stand for it.
         search: of :func:`search_report`, where ``options`` were found by a search.
         quality: of :func:`quality_report`, or why it was not judged.
         seconds: wall time by stage, in order; "total" last.
     """
     contents = file_report(file)
-    # The file itself may be gone by now.
-    source_bytes = source.stat().st_size if options.source_bytes is None else options.source_bytes
+    source_bytes = scene.nbytes if options.source_bytes is None else options.source_bytes
     report: dict[str, Any] = {
         "source": {
             "file": str(source),

@@ -82,6 +82,7 @@ def test_the_same_bytes_as_through_files(folder: Path, call: str, source: str) -
 def test_info_of_standard_input(folder: Path) -> None:
     report = json.loads(piped(folder, "info - --json", "a.potr").stdout)
     assert (report["splats"], report["bytes"]) == (100, (folder / "a.potr").stat().st_size)
+    assert report["file"] == "-"
 
 
 def test_one_command_feeds_another(folder: Path) -> None:

@@ -70,6 +70,23 @@ def test_errors_speak_of_the_stream(tmp_path: Path) -> None:
         pytest.fail("it was taken")
 
 
+def test_warnings_and_errors_over_a_gzipped_scene_speak_of_the_stream(
+    tmp_path: Path, caplog: pytest.LogCaptureFixture
+) -> None:
+    scene = random_scene(10)
+    scene.means[3] = np.nan
+    save_scene(tmp_path / "a.ply", scene)
+    content = (tmp_path / "a.ply").read_bytes()
+    with streams.received(io.BytesIO(gzip.compress(content))) as path:
+        assert len(load_scene(path)) == 9
+    assert [r.getMessage() for r in caplog.records] == ["the standard input: dropped 1 splats with non-finite values"]
+    with (
+        pytest.raises(DataError, match=r"^the standard input is truncated"),
+        streams.received(io.BytesIO(gzip.compress(content[:-9]))) as path,
+    ):
+        load_scene(path)
+
+
 def test_all_or_nothing_is_sent() -> None:
     scene, stream = random_scene(50, 1), io.BytesIO()
     assert streams.send(stream, ".ply", lambda path: ply.save(path, scene)) == len(stream.getvalue())

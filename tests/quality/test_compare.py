@@ -31,7 +31,7 @@ from potr_cl.quality.compare import (
 )
 from potr_cl.quality.metrics import psnr, ssim
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from potr_cl.reference.scenes import ring_of_cameras
 
 BACKGROUND = (0.25, 0.5, 1.0)
 
@@ -230,8 +230,3 @@ def test_ground_truth_of_another_size_or_damaged(tmp_path):
     (tmp_path / "view_0.png").write_bytes(b"\x89PNG damaged")
     with pytest.raises(DataError, match=r"view_0.png' is damaged"):
         find_ground_truth(tmp_path, cameras)
-
-
-def test_a_scene_file_that_is_gone_is_one_line(tmp_path):
-    with pytest.raises(UsageError, match=r"cannot read '.*gone\.ply': No such file"):
-        SceneFile.of(tmp_path / "gone.ply", random_scene(3))
