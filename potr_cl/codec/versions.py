@@ -13,7 +13,7 @@ from __future__ import annotations
 import abc
 from collections.abc import Iterable, Sequence
 from dataclasses import replace
-from typing import ClassVar
+from typing import ClassVar, final
 
 import numpy as np
 from numpy.typing import NDArray
@@ -89,10 +89,13 @@ class FormatVersion(abc.ABC):
     def rotation_factors(self, scales: Sequence[Levels], sf_rotation: float) -> F32:
         """float32 scale factors of rotations: (N,), or (1,) if all are the same; ``scales`` as of the next."""
 
+    @final
     def dequantize_rotations(
         self, levels: Sequence[Levels], scales: Sequence[Levels], sf_rotation: float, out: F32
     ) -> None:
-        """Levels of x, y, z to unit quaternions w, x, y, z in ``out`` (N, 4).
+        """Levels of x, y, z to unit quaternions w, x, y, z in ``out`` (N, 4), by this version's ``rotation_factors``.
+
+        Nothing else about it is a version's to change: the native path asks for the factors alone.
 
         Args:
             levels: (N,) each.
