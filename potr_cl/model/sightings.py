@@ -15,8 +15,10 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera, camera_centres
-from potr_cl.model.placement.colour_memory import ac_basis
+from potr_cl.model.placement.sampling import spiral
+from potr_cl.model.placement.surface import points_on_splats
 from potr_cl.model.scene import Scene
+from potr_cl.model.spherical_harmonics import ac_basis, energy, unit_coefficients
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -51,7 +53,7 @@ class Sample:
         targets: (K, 3) centres of some of them, evenly chosen.
         sizes: (K,) their largest standard deviation.
         colours: (K, M - 1, 3) AC coefficients, of unit norm; zero where there are none to speak of.
-        overall: (D, K) energy of the colours (see :func:`_energy`) in directions all around.
+        overall: (D, K) their energy (:func:`potr_cl.model.spherical_harmonics.energy`) in directions all around.
         informative: (K,) whose colours depend on the direction.
         points: (P, 3) on the scene's surfaces.
         areas: (P,) opacity-weighted area that each stands for.
@@ -144,12 +146,13 @@ def sample(scene: Scene) -> Sample:
     scales = np.exp(np.clip(log_scales - math.log(unit), -30, 3))
 
     chosen = np.unique(np.linspace(0, len(means) - 1, _TARGETS).astype(np.int64))
-    colours = scene.sh[chosen, 1:].astype(np.float64)
-    norm = np.sqrt((colours**2).sum(axis=(1, 2)))
-    colours *= np.where(norm > 1e-4, 1 / np.maximum(norm, 1e-4), 0)[:, None, None]
-    around = ac_basis(on_sphere(_DIRECTIONS))[:, : colours.shape[1]]
+    colours = unit_coefficients(scene.sh[chosen, 1:])
+    around = ac_basis(spiral(_DIRECTIONS))[:, : colours.shape[1]]
     overall = np.einsum("dm,kmc->dkc", around, colours, optimize=True) ** 2
-    points, areas = _surface(means, scales, scene)
+    # Within one standard deviation, on the spiral's directions in an order that is not the splats'.
+    local = spiral(_POINTS)[(np.arange(_POINTS) * 2741) % _POINTS]
+    quaternions, opacities = scene.quaternions.astype(np.float64), scene.opacities.astype(np.float64)
+    points, areas = points_on_splats(means, scales, quaternions, opacities, local)
     return Sample(
         centre,
         unit,
@@ -193,37 +196,11 @@ def look(at: Sample, world: Poses) -> Sights:
         now = now[at.informative[now]]
         if at.remembers and len(now) >= _INFORMATIVE:
             rays = at.targets[now] - camera_centre
-            towards = rays / np.maximum(np.linalg.norm(rays, axis=1), 1e-300)[:, None]
-            own = _energy(towards, at.colours[now])
+            own = energy(rays, at.colours[now])
             known = np.bincount(now, minlength=shape[1])
             best = float(np.quantile(at.overall @ known / len(now), 0.95))
             remembered[view] = float(own.mean()) / max(best, 1e-12)
     return Sights(seen, covered, sizes, remembered)
-
-
-def on_sphere(count: int) -> F64:
-    """(count, 3) unit vectors, evenly spread: Fibonacci's spiral."""
-    step = np.arange(count) + 0.5
-    z = 1 - 2 * step / count
-    turn = math.pi * (1 + math.sqrt(5)) * step
-    side = np.sqrt(1 - z * z)
-    return np.stack([side * np.cos(turn), side * np.sin(turn), z], axis=1)
-
-
-def _surface(means: F64, scales: F64, scene: Scene) -> tuple[F64, F64]:
-    """Points on splats, half of them by number and half by area, and the area that each stands for."""
-    area = 2 * np.pi * np.sort(scales, axis=1)[:, 1:].prod(axis=1) * scene.opacities
-    capped = np.minimum(area, 1000 * area.mean())
-    odds = capped / max(float(capped.sum()), 1e-300) + 1 / len(area)
-    sums = np.cumsum(odds)
-    rows = np.searchsorted(sums, (np.arange(_POINTS) + 0.5) / _POINTS * sums[-1]).clip(0, len(means) - 1)
-    areas = area[rows] * sums[-1] / (odds[rows] * _POINTS)
-    q = scene.quaternions[rows].astype(np.float64)
-    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-30)
-    # Within one standard deviation, on the spiral's directions in an order that is not the splats'.
-    local = on_sphere(_POINTS)[(np.arange(_POINTS) * 2741) % _POINTS] * scales[rows]
-    across = 2 * np.cross(q[:, 1:], local)
-    return means[rows] + local + q[:, :1] * across + np.cross(q[:, 1:], across), areas
 
 
 def _picture(at: Sample, camera_centre: F64, rotation: F64, window: F64, near: float) -> tuple[Mask, F64, float]:
@@ -254,15 +231,3 @@ def _picture(at: Sample, camera_centre: F64, rotation: F64, window: F64, near: f
     seen = np.zeros(len(at.targets), bool)
     seen[shown] = depth[shown] <= _DEEPER * nearest[cell] + _BEHIND
     return seen, depth, covered
-
-
-def _energy(towards: F64, colours: F64) -> F64:
-    """(n,) squared deviation of colours (n, M - 1, 3) from their mean over all directions, each in its own direction.
-
-    Training moves coefficients along the basis functions of its views' directions, so this deviation, averaged over
-    many splats, is large in directions from which they were looked at.
-    """
-    basis = ac_basis(towards)[:, : colours.shape[1]]
-    deviation = np.einsum("km,kmc->kc", basis, colours)
-    energy: F64 = np.einsum("kc,kc->k", deviation, deviation)
-    return energy

@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
-from potr_cl.model.placement.colour_memory import ac_basis
 from potr_cl.model.scene import Scene
+from potr_cl.model.spherical_harmonics import ac_basis
 
 F64 = NDArray[np.float64]
 Capture = tuple[Scene, list[Camera]]

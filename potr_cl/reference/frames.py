@@ -13,8 +13,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera, camera_centres
-from potr_cl.model.placement.colour_memory import ac_basis
 from potr_cl.model.scene import Scene
+from potr_cl.model.spherical_harmonics import ac_basis
 from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.reference.captures import looking
 

@@ -12,9 +12,10 @@ from potr_cl.errors import UsageError
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.model.camera import camera_centres, test_views, train_views
 from potr_cl.model.placement.candidates import places_to_try, views_from
-from potr_cl.model.placement.colour_memory import ac_basis, remembered
+from potr_cl.model.placement.colour_memory import remembered
 from potr_cl.model.placement.matter import CROWDED, frame_of, matter_of, surroundings
 from potr_cl.model.scene import Scene
+from potr_cl.model.spherical_harmonics import ac_basis
 from potr_cl.model.virtual_cameras import FEWEST, MOST, describe, is_virtual, place_cameras, plan, standpoints
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions

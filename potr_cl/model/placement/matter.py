@@ -9,7 +9,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.placement.sampling import F64, low_discrepancy
+from potr_cl.model.placement.surface import points_on_splats
 from potr_cl.model.scene import Scene
+from potr_cl.model.spherical_harmonics import unit_coefficients
 
 F32 = NDArray[np.float32]
 
@@ -95,28 +97,19 @@ def matter_of(scene: Scene, frame: Frame) -> Matter:
     chosen = np.unique(np.linspace(0, len(solid) - 1, _TARGETS).astype(np.int64))
     largest = scales[chosen].max(axis=1)
     relative = np.sqrt(largest / max(float(np.median(largest)), 1e-12))
-    colours = scene.sh[solid[chosen], 1:].astype(np.float64)
-    norm = np.sqrt((colours**2).sum(axis=(1, 2)))
-    colours = np.where(norm > 1e-4, 1 / np.maximum(norm, 1e-4), 0)[:, None, None] * colours
-
-    # Half of the points by number, half by area: a wall may be a few large splats, a small thing thousands.
-    area = 2 * np.pi * np.sort(scales, axis=1)[:, 1:].prod(axis=1) * opacity[solid]
-    capped = np.minimum(area, 1000 * area.mean())
-    odds = capped / max(capped.sum(), 1e-300) + 1 / len(area)
-    sums = np.cumsum(odds)
-    rows = np.searchsorted(sums, (np.arange(_OCCLUDERS) + 0.5) / _OCCLUDERS * sums[-1]).clip(0, len(solid) - 1)
-    areas = area[rows] * sums[-1] / (odds[rows] * _OCCLUDERS)
+    points, areas = points_on_splats(
+        means,
+        scales,
+        scene.quaternions[solid].astype(np.float64),
+        opacity[solid],
+        2 * low_discrepancy(_OCCLUDERS, 3) - 1,
+    )
     # Haze and backdrops: of so wide a splat it means nothing that one of its few points is near.
     areas[areas > _ELBOW_ROOM**2] = 0
-    q = scene.quaternions[solid[rows]].astype(np.float64)
-    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-30)
-    local = (2 * low_discrepancy(_OCCLUDERS, 3) - 1) * scales[rows]
-    across = 2 * np.cross(q[:, 1:], local)
-    points = means[rows] + local + q[:, :1] * across + np.cross(q[:, 1:], across)
     return Matter(
         means[chosen],
         _REACH * relative.clip(0.5, 4),
-        colours.astype(np.float32),
+        unit_coefficients(scene.sh[solid[chosen], 1:]).astype(np.float32),
         points.T.astype(np.float32),
         areas.astype(np.float32),
     )

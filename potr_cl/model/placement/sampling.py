@@ -19,6 +19,12 @@ def low_discrepancy(count: int, dimensions: int) -> F64:
     return (0.5 + np.outer(np.arange(1, count + 1), ratio ** -np.arange(1.0, dimensions + 1))) % 1
 
 
+def spiral(count: int) -> F64:
+    """(count, 3) unit vectors, evenly spread: Fibonacci's spiral."""
+    step = np.arange(count) + 0.5
+    return on_sphere(np.stack([1 - step / count, (1 + np.sqrt(5)) / 2 * step], axis=1))
+
+
 def on_sphere(square: F64) -> F64:
     """(n, 2) in the unit square to (n, 3) unit vectors, areas kept."""
     z = 2 * square[:, 0] - 1
