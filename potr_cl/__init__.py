@@ -37,7 +37,8 @@ if TYPE_CHECKING:
     from potr_cl.model.virtual_cameras import place_cameras
     from potr_cl.pipeline.encode import Encoded
     from potr_cl.pipeline.options import EncodeOptions
-    from potr_cl.pipeline.search import Target, encode_to_target
+    from potr_cl.pipeline.search import encode_to_target
+    from potr_cl.pipeline.target import Target
 
 __version__ = "0.1.0"
 
@@ -99,7 +100,7 @@ _HOMES = {
     "Scene": "model.scene",
     "SceneComparison": "api.comparing",
     "SceneInfo": "api.describing",
-    "Target": "pipeline.search",
+    "Target": "pipeline.target",
     "UnreachableError": "errors",
     "UsageError": "errors",
     "compact": "api.editing",

@@ -38,7 +38,8 @@ from potr_cl.pipeline.encode import encode as run_stages
 from potr_cl.pipeline.keywords import stage_changes
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT
-from potr_cl.pipeline.search import Found, Target, encode_to_target
+from potr_cl.pipeline.search import encode_to_target
+from potr_cl.pipeline.target import Found, Target
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.report.html import PicturePair, html_report, views_to_show
 from potr_cl.report.summary import encode_report, quality_report, search_report

@@ -37,7 +37,8 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import Stopwatch, encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT, PRESETS, PURPOSE
-from potr_cl.pipeline.search import Target, encode_to_target
+from potr_cl.pipeline.search import encode_to_target
+from potr_cl.pipeline.target import Target
 from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer

@@ -23,7 +23,7 @@ def rotated_sh(sh: FloatArray, rotation: NDArray[np.float64]) -> FloatArray:
 
     Args:
         sh: (N, M, 3) float32, M = 1, 4, 9 or 16.
-        rotation: (3, 3) float64, orthonormal, of determinant 1.
+        rotation: (3, 3) float64, orthonormal; of determinant -1 it mirrors.
 
     Returns:
         (N, M, 3) float32; the first coefficient is that of ``sh``.

@@ -31,6 +31,7 @@ from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, cameras_or_virtual
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.growth import FASTEST, SLOWEST, FinenessAxis, Typical, meet, with_colour_steps, with_steps
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.target import KINDS, Found, Target, Try
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.code import Code
 from potr_cl.stages.prune import Prune
@@ -64,110 +65,6 @@ _TRIES = 3
 _QUICK_CODER = {"entropy": "zstd", "zstd_level": 1}
 #: Stands for the infinite PSNR of identical pictures, decibels.
 _IDENTICAL = 200.0
-#: The kinds of tries (:class:`Try`), and what is said of each; to be followed by a value.
-KINDS = {
-    "scout": "quality {}, roughly:",
-    "encode": "quality {}:",
-    "refit": "re-fitted for quality {}:",
-    "steps": "steps of quality {}:",
-    "colours": "quality {}, other steps of colours:",
-}
-
-
-@dataclass(frozen=True)
-class Target:
-    """What to reach: a size or a PSNR.
-
-    Attributes:
-        max_bytes: the file shall have at most so many bytes, and at least 98 % of them.
-        min_psnr: the mean PSNR in decibels over the judging views, against the uncompressed scene's renders, shall be
-            this at least, and at most 0.1 more.
-
-    Raises:
-        UsageError: both or neither are given, or the value is out of range.
-    """
-
-    max_bytes: int | None = None
-    min_psnr: float | None = None
-
-    def __post_init__(self) -> None:
-        if (self.max_bytes is None) == (self.min_psnr is None):
-            raise UsageError("give either a size or a PSNR to reach")
-        if self.max_bytes is not None and self.max_bytes < 1:
-            raise UsageError(f"a file of at most {self.max_bytes} bytes: at least 1 is needed")
-        if self.min_psnr is not None and not 0 < self.min_psnr < math.inf:
-            raise UsageError(f"a PSNR of at least {self.min_psnr:g} dB: it must be a positive number")
-
-    @property
-    def window(self) -> tuple[float, float]:
-        """The values with which the search is content: logarithms of sizes, or decibels."""
-        if self.max_bytes is not None:
-            return math.log(0.98 * self.max_bytes), math.log(self.max_bytes)
-        assert self.min_psnr is not None
-        return self.min_psnr, self.min_psnr + 0.1
-
-    @property
-    def aim(self) -> float:
-        """The value to aim at: the middle of the window."""
-        return sum(self.window) / 2
-
-    def met(self, value: float) -> bool:
-        """Whether a value keeps the promise, if not by how little."""
-        low, high = self.window
-        return value <= high if self.max_bytes is not None else value >= low
-
-    def inside(self, value: float) -> bool:
-        """Whether the search is content with a value."""
-        low, high = self.window
-        return low <= value <= high
-
-    def plain(self, value: float) -> float:
-        """A value as bytes or decibels."""
-        return round(math.exp(value)) if self.max_bytes is not None else value
-
-    def describe(self, value: float) -> str:
-        """A value for people."""
-        return f"{self.plain(value):,} bytes" if self.max_bytes is not None else f"{value:.2f} dB"
-
-    def __str__(self) -> str:
-        return f"at most {self.max_bytes:,} bytes" if self.max_bytes is not None else f"at least {self.min_psnr:g} dB"
-
-
-@dataclass(frozen=True)
-class Try:
-    """One step of a search.
-
-    Attributes:
-        kind: "scout" (a rough encode), "encode" (in full), "refit" (the splats of the last full encode, re-fitted and
-            quantised for another q), "steps" (other quantiser steps alone), or "colours" (of colours alone).
-        q: of the encode, the re-fit or the steps.
-        value: see :meth:`Target.plain`.
-    """
-
-    kind: str
-    q: float
-    value: float
-
-
-@dataclass(frozen=True)
-class Found:
-    """What a search found.
-
-    Attributes:
-        encoded: the file that meets the target.
-        options: that it was encoded with: q, and parameters of their own where they differ from that q's. Without
-            compaction :func:`potr_cl.pipeline.encode.encode` makes the same file of them.
-        value: that was reached; see :meth:`Target.plain`.
-        tries: all steps, in order.
-    """
-
-    encoded: Encoded
-    options: EncodeOptions
-    value: float
-    tries: list[Try]
-
-    def __repr__(self) -> str:
-        return f"Found({self.encoded!r} after {len(self.tries)} tries)"
 
 
 def encode_to_target(

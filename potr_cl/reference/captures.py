@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.model.spherical_harmonics import ac_basis
+from potr_cl.reference.surfaces import facing, points_on_box, together
 
 F64 = NDArray[np.float64]
 Capture = tuple[Scene, list[Camera]]
@@ -60,7 +61,7 @@ def room() -> Capture:
     things = [_box(rng, 1500, (0.5, 0.4, 0.4), 0.03, (x, y, -1.1)) for x, y in ((-3, 1.8), (2.5, -1.6), (0.5, 1.9))]
     spots = rng.uniform(-1, 1, (60, 3)) * (2.5, 1.2, 0.4)
     aims = rng.normal(size=(60, 3)) * (1, 1, 0.3)
-    return _capture(_together([walls, *things]), [(spot, spot + aim) for spot, aim in zip(spots, aims, strict=True)])
+    return _capture(together(walls, *things), [(spot, spot + aim) for spot, aim in zip(spots, aims, strict=True)])
 
 
 def building() -> Capture:
@@ -69,7 +70,7 @@ def building() -> Capture:
     rooms = [_box(rng, 4000, (2.4, 2.4, 1.5), 0.06, (5 * number, 0, 0)) for number in range(12)]
     spots = np.array([(5 * (number % 12), 0, 0) + rng.uniform(-1, 1, 3) * (1.2, 1.2, 0.4) for number in range(120)])
     aims = rng.normal(size=(120, 3)) * (1, 1, 0.2)
-    return _capture(_together(rooms), [(spot, spot + aim) for spot, aim in zip(spots, aims, strict=True)])
+    return _capture(together(*rooms), [(spot, spot + aim) for spot, aim in zip(spots, aims, strict=True)])
 
 
 def street() -> Capture:
@@ -85,7 +86,7 @@ def street() -> Capture:
     rays = np.stack([np.ones(90), rng.normal(size=90) * 0.7, rng.normal(size=90) * 0.1], axis=1)
     spots = np.stack([places, rng.uniform(-2, 2, 90), np.full(90, 1.7)], axis=1)
     views = [(spot, spot + ray) for spot, ray in zip(spots, rays, strict=True)]
-    return _capture(_together([*houses, ground, _sky(rng, 6000, 400)]), views)
+    return _capture(together(*houses, ground, _sky(rng, 6000, 400)), views)
 
 
 def garden() -> Capture:
@@ -102,7 +103,7 @@ def garden() -> Capture:
     heights = np.repeat([0.8, 1.6, 2.4], 30)
     spots = np.stack([3 * np.cos(turns), 3 * np.sin(turns), heights], axis=1)
     return _capture(
-        _together([thing, lawn, land, *trees, _sky(rng, 6000, 300)]),
+        together(thing, lawn, land, *trees, _sky(rng, 6000, 300)),
         [(spot, np.array([0, 0, 0.6]) + 0.3 * rng.normal(size=3)) for spot in spots],
     )
 
@@ -114,7 +115,7 @@ def terrain() -> Capture:
     houses = [_box(rng, 150, (3, 3, 3), 0.4, (*rng.uniform(-90, 90, 2), 2)) for _ in range(60)]
     spots = [np.array([x, y, 45.0]) for x in np.linspace(-90, 90, 9) for y in np.linspace(-90, 90, 9)]
     views = [(spot, spot + np.append(0.25 * rng.normal(size=2), -1)) for spot in spots]
-    return _capture(_together([land, *houses]), views)
+    return _capture(together(land, *houses), views)
 
 
 def facade() -> Capture:
@@ -124,7 +125,7 @@ def facade() -> Capture:
     road = _sheet(rng, 5000, (10, 8), 0.1)
     spots = np.stack([rng.uniform(-7, 7, 40), rng.uniform(-9, -6, 40), rng.uniform(1, 3, 40)], axis=1)
     views = [(spot, np.array([rng.uniform(-4, 4), 0, rng.uniform(1, 6)])) for spot in spots]
-    return _capture(_together([front, road]), views)
+    return _capture(together(front, road), views)
 
 
 #: All of them by name.
@@ -145,8 +146,7 @@ def _capture(scene: Scene, views: Sequence[tuple[F64, F64]]) -> Capture:
 
 def _discs(points: F64, normals: F64, size: float, rng: np.random.Generator) -> Scene:
     """Flat opaque splats of about one size."""
-    quaternions = np.stack([1 + normals[:, 2], -normals[:, 1], normals[:, 0], np.zeros(len(normals))], axis=1)
-    quaternions[np.linalg.norm(quaternions, axis=1) < 1e-6] = (0, 1, 0, 0)
+    quaternions = facing(normals)
     scales = size * np.exp(0.4 * rng.normal(size=(len(points), 3))) * (1, 1, 0.1)
     sh = np.zeros((len(points), 1, 3), np.float32)
     logits = rng.normal(2.5, 1.5, len(points)).astype(np.float32)
@@ -158,14 +158,7 @@ def _discs(points: F64, normals: F64, size: float, rng: np.random.Generator) -> 
 def _box(
     rng: np.random.Generator, splats: int, half: Sequence[float], size: float, centre: Sequence[float] = (0, 0, 0)
 ) -> Scene:
-    sides = np.asarray(half, np.float64)
-    areas = np.repeat([sides[1] * sides[2], sides[0] * sides[2], sides[0] * sides[1]], 2)
-    side = rng.choice(6, splats, p=areas / areas.sum())
-    rows = np.arange(splats)
-    normals = np.zeros((splats, 3))
-    normals[rows, side // 2] = np.where(side % 2, 1.0, -1.0)
-    points = rng.uniform(-1, 1, (splats, 3)) * sides
-    points[rows, side // 2] = sides[side // 2] * normals[rows, side // 2]
+    points, normals = points_on_box(rng, splats, half)
     return _discs(points + np.asarray(centre), normals, size, rng)
 
 
@@ -182,13 +175,3 @@ def _sky(rng: np.random.Generator, splats: int, radius: float) -> Scene:
     towards[:, 2] = np.abs(towards[:, 2])
     towards /= np.linalg.norm(towards, axis=1, keepdims=True)
     return _discs(radius * rng.uniform(0.7, 1.3, (splats, 1)) * towards, -towards, radius * 0.02, rng)
-
-
-def _together(scenes: Sequence[Scene]) -> Scene:
-    return Scene(
-        np.concatenate([scene.means for scene in scenes]),
-        np.concatenate([scene.log_scales for scene in scenes]),
-        np.concatenate([scene.quaternions for scene in scenes]),
-        np.concatenate([scene.opacity_logits for scene in scenes]),
-        np.concatenate([scene.sh for scene in scenes]),
-    )

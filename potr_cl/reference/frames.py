@@ -13,10 +13,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera, camera_centres
+from potr_cl.model.quaternions import quaternions_of
 from potr_cl.model.scene import Scene
-from potr_cl.model.spherical_harmonics import ac_basis
+from potr_cl.model.sh_rotation import rotated_sh
 from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.reference.captures import looking
+from potr_cl.reference.raster import rotation_matrices
 
 F64 = NDArray[np.float64]
 
@@ -81,45 +83,14 @@ def moved(scene: Scene, axes: F64, scale: float = 1.0, shift: Sequence[float] = 
         axes: (3, 3) orthogonal; with a determinant of -1 it mirrors.
     """
     axes = np.asarray(axes, np.float64)
-    own = _matrices(scene.quaternions.astype(np.float64))
+    own = rotation_matrices(scene.quaternions.astype(np.float64))
     turned = axes @ own
     # A Gaussian is its own mirror image along each of its axes: one of them makes a rotation of it again.
     turned[..., 2] *= np.sign(np.linalg.det(axes))
-    sh = scene.sh.astype(np.float64)
-    if sh.shape[1] > 1:
-        towards = np.random.default_rng(0).normal(size=(200, 3))
-        towards /= np.linalg.norm(towards, axis=1, keepdims=True)
-        before, after = (ac_basis(d)[:, : sh.shape[1] - 1] for d in (towards, towards @ axes.T))
-        sh[:, 1:] = np.einsum("mn,knc->kmc", np.linalg.lstsq(after, before, rcond=None)[0], sh[:, 1:])
     return dataclasses.replace(
         scene,
         means=(scale * scene.means.astype(np.float64) @ axes.T + np.asarray(shift)).astype(np.float32),
         log_scales=scene.log_scales + np.float32(math.log(scale)),
-        quaternions=_quaternions(turned).astype(np.float32),
-        sh=sh.astype(np.float32),
+        quaternions=quaternions_of(turned).astype(np.float32),
+        sh=rotated_sh(scene.sh, axes),
     )
-
-
-def _matrices(q: F64) -> F64:
-    """(n, 3, 3) rotations of quaternions (n, 4), w first."""
-    w, x, y, z = (q / np.linalg.norm(q, axis=1, keepdims=True)).T
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def _quaternions(m: F64) -> F64:
-    """(n, 4) quaternions of rotations (n, 3, 3): the eigenvector of Bar-Itzhack's symmetric matrix."""
-    k = np.empty((len(m), 4, 4))
-    diagonal = m[:, 0, 0], m[:, 1, 1], m[:, 2, 2]
-    k[:, 0, 0] = diagonal[0] + diagonal[1] + diagonal[2]
-    for i in range(3):
-        j, o = (i + 1) % 3, (i + 2) % 3
-        k[:, 1 + i, 1 + i] = diagonal[i] - diagonal[j] - diagonal[o]
-        k[:, 0, 1 + i] = k[:, 1 + i, 0] = m[:, o, j] - m[:, j, o]
-        k[:, 1 + i, 1 + j] = k[:, 1 + j, 1 + i] = m[:, i, j] + m[:, j, i]
-    q: F64 = np.linalg.eigh(k)[1][:, :, -1]
-    return q

@@ -14,7 +14,7 @@ from potr_cl.codec.decoder import PotrFile
 from potr_cl.model.scene import Scene
 from potr_cl.pipeline.encode import Encoded
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.search import Found, Target
+from potr_cl.pipeline.target import Found, Target
 from potr_cl.plain_text import plain_document
 from potr_cl.quality.compare import Comparison, Figures, mean_view
 from potr_cl.quality.evaluator import EvaluationViews

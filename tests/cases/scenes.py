@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.scene import LOW_PASS, Scene
+from potr_cl.reference.raster import rotation_matrices
 
 
 def in_order_of(scene: Scene, back: Scene) -> Scene:
@@ -28,7 +29,7 @@ def turned_by(scene: Scene, back: Scene) -> tuple[NDArray[np.float64], NDArray[n
     Returns:
         (N,) angles in radians, the smallest of all numberings, and (N, 3) differences of log scales with that one.
     """
-    wanted, found = _matrices(scene.quaternions), _matrices(back.quaternions)
+    wanted, found = (rotation_matrices(of.quaternions.astype(np.float64)) for of in (scene, back))
     forms = [
         np.eye(3)[:, list(order)] * signs
         for order in itertools.permutations(range(3))
@@ -40,18 +41,6 @@ def turned_by(scene: Scene, back: Scene) -> tuple[NDArray[np.float64], NDArray[n
     orders = np.array([np.abs(form).argmax(axis=0) for form in forms])[best]
     differences = np.take_along_axis(back.log_scales, orders, axis=1) - scene.log_scales
     return np.arccos(((traces.max(axis=0) - 1) / 2).clip(-1, 1)), differences
-
-
-def _matrices(quaternions: NDArray[np.float32]) -> NDArray[np.float64]:
-    """(N, 3, 3) float64 rotations."""
-    w, x, y, z = (quaternions / np.linalg.norm(quaternions, axis=1, keepdims=True)).astype(np.float64).T
-    return np.array(
-        [
-            [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-            [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-            [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-        ]
-    ).transpose(2, 0, 1)
 
 
 def antialiased(scene: Scene, low_pass: float = LOW_PASS, smaller: float = 1.0) -> Scene:

@@ -15,7 +15,8 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.viewpoints import AXES, guess_up, look_around, turntable
 from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.reference.scenes import random_scene
-from tests.cases.surfaces import flat_splats, together
+from potr_cl.reference.surfaces import together
+from tests.cases.surfaces import flat_splats
 
 
 def rotated(scene: Scene, rotation: np.ndarray) -> Scene:

@@ -22,7 +22,8 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rules import INRIA
 from potr_cl.reference.raster import sh_basis
 from potr_cl.reference.scenes import random_scene
-from tests.cases.surfaces import box, flat_splats, sphere, together
+from potr_cl.reference.surfaces import together
+from tests.cases.surfaces import box, flat_splats, sphere
 
 BALL = sphere(8000, 1.0, 0.03)
 ROOM = box(12000, (3, 4, 1.5), 0.08)

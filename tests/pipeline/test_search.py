@@ -18,7 +18,8 @@ from potr_cl.formats.images import to_8_bits, write_png
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.search import KINDS, Target, encode_to_target
+from potr_cl.pipeline.search import encode_to_target
+from potr_cl.pipeline.target import KINDS, Target
 from potr_cl.quality.compare import compare, mean_view
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.scenes import random_scene, ring_of_cameras

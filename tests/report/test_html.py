@@ -13,7 +13,7 @@ import pytest
 from PIL import Image
 
 from potr_cl.formats.images import to_8_bits
-from potr_cl.pipeline.search import KINDS
+from potr_cl.pipeline.target import KINDS
 from potr_cl.report.html import PicturePair, html_report, views_to_show
 
 HOSTILE = "<script>alert('1')</script>&\"${title}$"

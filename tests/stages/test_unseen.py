@@ -9,7 +9,7 @@ import pytest
 
 from potr_cl import EncodeOptions, Scene, UsageError, decode, encode
 from potr_cl.opencl.device import Device
-from tests.cases.surfaces import together
+from potr_cl.reference.surfaces import together
 from tests.devices import FAMILIES, open_device
 
 FEW = {"iterations": 3}

@@ -26,7 +26,8 @@ from potr_cl.errors import UnreachableError
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import Encoded, encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.pipeline.search import Target, encode_to_target
+from potr_cl.pipeline.search import encode_to_target
+from potr_cl.pipeline.target import Target
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from tools.results import Column, Results
 from tools.workloads import read, scene_parser

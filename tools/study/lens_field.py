@@ -48,7 +48,7 @@ def main() -> None:
         encoded = encode(scene, looked, EncodeOptions.for_preset(args.preset), device=device)
         decoded = PotrFile.from_bytes(b"".join(encoded.pieces)).scene()
         found = _pictures(device, decoded, tests)
-        cells = [f"{_psnr(wanted, found, where):.2f}" for where in (shown, middle, shown & ~middle)]
+        cells = [_psnr(wanted, found, where) for where in (shown, middle, shown & ~middle)]
         print(f"| {name} | {view.width} x {view.height} | {encoded.nbytes:,} | {' | '.join(cells)} |", flush=True)
 
 
@@ -87,10 +87,12 @@ def _pictures(device: Device, scene: Scene, cameras: list[Camera]) -> list[NDArr
         return [np.clip(rasterizer.render(camera)[0], 0, 1) for camera in cameras]
 
 
-def _psnr(wanted: list[NDArray[np.float32]], found: list[NDArray[np.float32]], where: NDArray[np.bool_]) -> float:
-    """Mean over the pictures, in some pixels of each."""
-    errors = [((a - b)[where].astype(np.float64) ** 2).mean() for a, b in zip(wanted, found, strict=True)]
-    return float(np.mean(-10 * np.log10(errors)))
+def _psnr(wanted: list[NDArray[np.float32]], found: list[NDArray[np.float32]], where: NDArray[np.bool_]) -> str:
+    """Mean over the pictures that differ in some pixels of each; what there is to say where none does."""
+    if not where.any():
+        return "-"
+    errors = np.array([((a - b)[where].astype(np.float64) ** 2).mean() for a, b in zip(wanted, found, strict=True)])
+    return f"{np.mean(-10 * np.log10(errors[errors > 0])):.2f}" if errors.any() else "identical"
 
 
 if __name__ == "__main__":

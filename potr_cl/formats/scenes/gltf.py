@@ -23,6 +23,7 @@ from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.gltf_file import Asset
 from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, cleaned, joined, log_of_scales, reading, shown
 from potr_cl.model.claims import check_claim
+from potr_cl.model.quaternions import quaternions_of, rotation_matrices
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 from potr_cl.model.sh_rotation import rotated_sh
 
@@ -154,7 +155,7 @@ def _matrix(asset: Asset, node: dict[str, Any]) -> Matrix:
     length = np.linalg.norm(rotation)
     if not length > 0:
         raise asset.damaged("a node's rotation has the length zero")
-    matrix[:3, :3] = _rotation_matrix(rotation[[3, 0, 1, 2]] / length) * scale
+    matrix[:3, :3] = rotation_matrices(rotation[[3, 0, 1, 2]] / length) * scale
     matrix[:3, 3] = _numbers(asset, node, "translation", [0.0, 0.0, 0.0])
     return matrix
 
@@ -266,7 +267,7 @@ def _placed(path: str | os.PathLike[str], scene: Scene, matrix: Matrix) -> Scene
         return _stretched(scene, linear)
     logarithms = scene.log_scales + np.float32(np.log(lengths.mean()))
     return dataclasses.replace(
-        scene, log_scales=logarithms, quaternions=_turned(scene.quaternions, _quaternions(rotation[None])[0])
+        scene, log_scales=logarithms, quaternions=_turned(scene.quaternions, quaternions_of(rotation[None])[0])
     )
 
 
@@ -278,43 +279,15 @@ def _stretched(scene: Scene, linear: Matrix) -> Scene:
         rows = slice(start, start + block)
         unit = scene.quaternions[rows].astype(np.float64)
         unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-30)
-        axes = _rotation_matrix(unit) * np.exp(scene.log_scales[rows].astype(np.float64))[:, None, :]
+        axes = rotation_matrices(unit) * np.exp(scene.log_scales[rows].astype(np.float64))[:, None, :]
         good = np.isfinite(axes.reshape(len(axes), 9)).all(axis=1)
         axes[~good] = np.eye(3)
         vectors, values, _ = np.linalg.svd(linear @ axes)
         vectors[np.linalg.det(vectors) < 0, :, 2] *= -1
         log_scales[rows] = log_of_scales(values.astype(np.float32))
         log_scales[rows][~good] = np.nan
-        quaternions[rows] = _quaternions(vectors)
+        quaternions[rows] = quaternions_of(vectors)
     return dataclasses.replace(scene, log_scales=log_scales, quaternions=quaternions)
-
-
-def _rotation_matrix(quaternions: Matrix) -> Matrix:
-    """(…, 3, 3) from unit quaternions (…, 4), w first."""
-    w, x, y, z = np.moveaxis(quaternions, -1, 0)
-    rows = [
-        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
-        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
-        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
-    ]
-    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
-
-
-def _quaternions(rotations: Matrix) -> Matrix:
-    """(n, 4) unit quaternions, w first, of rotation matrices (n, 3, 3), each by its largest part."""
-    products = np.empty((len(rotations), 4, 4))
-    products[:, 1:, 1:] = rotations + rotations.transpose(0, 2, 1)
-    for k in range(3):
-        a, b = (k + 1) % 3, (k + 2) % 3
-        products[:, 0, k + 1] = products[:, k + 1, 0] = rotations[:, b, a] - rotations[:, a, b]
-    trace = np.einsum("nii->n", rotations)
-    products[:, 0, 0] = 1 + trace
-    for k in range(3):
-        products[:, k + 1, k + 1] = 1 + 2 * rotations[:, k, k] - trace
-    largest = np.einsum("nii->ni", products).argmax(axis=1)
-    rows = products[np.arange(len(rotations)), largest]
-    quaternions: Matrix = rows / np.linalg.norm(rows, axis=1, keepdims=True)
-    return quaternions
 
 
 def _turned(quaternions: FloatArray, by: Matrix) -> FloatArray:
