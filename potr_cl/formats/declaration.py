@@ -69,6 +69,8 @@ class SceneFormat:
             only one way to write.
         names: of files that tell the format whatever their suffix, in lower case. A folder that holds such a file is
             read too, and ``load`` takes either, with ``#`` and a number behind if the format has levels of detail.
+        files: all files of a scene, from a path that ``load`` takes too, without its level; None where a scene is the
+            one file. Raises what ``load`` raises.
         packed: whether files are compressed, so that gzip hardly makes them smaller: then one that is gzipped may
             unpack to little more than it is.
     """
@@ -85,6 +87,7 @@ class SceneFormat:
     gzipped: bool = False
     versions: tuple[int, ...] = ()
     names: tuple[str, ...] = ()
+    files: Callable[[Path], list[Path]] | None = None
     packed: bool = False
 
     @property

@@ -12,6 +12,7 @@ from __future__ import annotations
 import dataclasses
 import logging
 import os
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -58,6 +59,16 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
         return cleaned(path, _scene(path, asset, trust))
 
 
+def files(path: Path) -> list[Path]:
+    """A .glb file; a .gltf file and those that its buffers are in.
+
+    Raises:
+        UsageError: it cannot be opened, or a buffer is elsewhere.
+        DataError: it is damaged.
+    """
+    return [path] if path.suffix.lower() == ".glb" else Asset(path).files()
+
+
 FORMAT = SceneFormat(
     name="glTF",
     suffixes=(".glb", ".gltf"),
@@ -66,6 +77,7 @@ FORMAT = SceneFormat(
     load=load,
     not_written="nothing here writes glTF: convert to .ply, and that with splat-transform",
     starts=(b"glTF",),
+    files=files,
 )
 
 

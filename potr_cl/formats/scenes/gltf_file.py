@@ -69,6 +69,20 @@ class Asset:
             raise DataError(f"'{path}' is a glTF file of version {shown(version)}, only 2 can be read")
         self.description: dict[str, Any] = description
 
+    def files(self) -> list[Path]:
+        """The file, and those beside it that its buffers are in.
+
+        Raises:
+            UsageError: a buffer is elsewhere.
+            DataError: a buffer is described wrongly.
+        """
+        buffers = self.description.get("buffers", [])
+        if not isinstance(buffers, list):
+            raise self.damaged("its buffers are no list")
+        uris = [self.entry("buffers", number).get("uri") for number in range(len(buffers))]
+        beside = [self._where(uri) for uri in uris if isinstance(uri, str) and not uri.startswith("data:")]
+        return list(dict.fromkeys([Path(self._path), *beside]))
+
     def entry(self, kind: str, index: Any) -> dict[str, Any]:
         """One of the objects of a list of the description.
 
@@ -204,10 +218,13 @@ class Asset:
         except (binascii.Error, ValueError) as error:
             raise self.damaged(f"a buffer in it is no base64: {error}") from None
 
-    def _beside(self, uri: str) -> memoryview:
+    def _where(self, uri: str) -> Path:
         if "://" in uri:
             raise UsageError(f"'{self._path}' has a buffer elsewhere, {shown(uri)}: download it, and name it there")
-        file = related(Path(self._path), urllib.parse.unquote(uri))
+        return related(Path(self._path), urllib.parse.unquote(uri))
+
+    def _beside(self, uri: str) -> memoryview:
+        file = self._where(uri)
         if file not in self._files:
             with opened(file) as (stream, size):
                 self._files[file] = memoryview(stream.read())

@@ -67,10 +67,24 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     return cleaned(path, scene)
 
 
+def files(path: Path) -> list[Path]:
+    """A packed file; of a folder the description and the images that it names.
+
+    Raises:
+        UsageError: the description cannot be opened.
+        DataError: it is damaged, or names a file outside of the folder.
+    """
+    description = file_in_folder(path, DESCRIPTION)
+    if description is None:
+        return [path]
+    return [description, *(related(description, name) for name in _described(description)[1])]
+
+
 FORMAT = SceneFormat(
     name="SOG",
     suffixes=(".sog",),
     names=(DESCRIPTION,),
+    files=files,
     note="of PlayCanvas; version 2 is read, packed (`.sog`) or as a folder",
     load=load,
     starts=(b"PK\x03\x04",),
@@ -95,13 +109,9 @@ class Folder:
 
     def __init__(self, path: Path) -> None:
         self._path = path
-        with opened(path) as (file, size):
-            if size > _DESCRIPTION_BYTES:
-                raise DataError(f"'{path}' is no description of a SOG scene: it has {size} bytes")
-            self._description = file.read()
-            names = _names_of_images(json.loads(self._description))
+        self._description, names = _described(path)
         self._images = {name: self._read(name) for name in names}
-        self.size = size + sum(map(len, self._images.values()))
+        self.size = len(self._description) + sum(map(len, self._images.values()))
 
     def description(self) -> bytes:
         """The bytes of meta.json."""
@@ -115,6 +125,15 @@ class Folder:
         with opened(related(self._path, name)) as (file, _):
             content: bytes = file.read()
         return content
+
+
+def _described(path: Path) -> tuple[bytes, list[str]]:
+    """The bytes of a description, and the names of images in it."""
+    with opened(path) as (file, size):
+        if size > _DESCRIPTION_BYTES:
+            raise DataError(f"'{path}' is no description of a SOG scene: it has {size} bytes")
+        content: bytes = file.read()
+        return content, _names_of_images(json.loads(content))
 
 
 def _names_of_images(meta: Any) -> list[str]:

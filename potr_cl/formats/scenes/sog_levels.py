@@ -17,6 +17,7 @@ import numpy as np
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.levels import path_and_level
+from potr_cl.formats.scenes import sog
 from potr_cl.formats.scenes.scene_files import (
     MOST_A_BYTE,
     cleaned,
@@ -80,10 +81,25 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     return cleaned(path, joined(scenes))
 
 
+def files(path: Path) -> list[Path]:
+    """The description, and those of the levels that are there and of the environment, with the images that they name.
+
+    Raises:
+        UsageError: a description cannot be opened.
+        DataError: a description is damaged.
+    """
+    description = file_in_folder(path, DESCRIPTION) or path
+    with opened(description) as (file, _):
+        meta = _Meta(description, json.load(file))
+    parts = meta.files if meta.environment is None else [*meta.files, meta.environment]
+    return [description, *(file for part in dict.fromkeys(parts) if part.is_file() for file in sog.files(part))]
+
+
 FORMAT = SceneFormat(
     name="streamed SOG",
     suffixes=(),
     names=(DESCRIPTION,),
+    files=files,
     note="of PlayCanvas; a folder of levels of detail: the finest is read, with the environment, or the level N of "
     "`FOLDER/lod-meta.json#N`",
     load=load,
