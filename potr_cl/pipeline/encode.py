@@ -22,6 +22,7 @@ from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
+from potr_cl.stages.refitting.photographs import PhotographChoice
 from potr_cl.stages.refitting.refit import Refitted
 from potr_cl.stages.stage import Interlude, Progress, Stage, State, Workbench
 
@@ -36,6 +37,7 @@ class Encoded:
         order: (N,) index in the source scene of each splat of the file.
         pruned: what pruning did; None if it was left out.
         refitted: what the re-fit of the colours did; None if it was left out.
+        photographs: what held-out photographs say of a fit to photographs; None if none were given.
         device: the device that did the work; not the one that was asked for if that had too little memory. None if no
             stage needed a device.
         seconds: wall time by stage.
@@ -46,6 +48,7 @@ class Encoded:
     order: NDArray[np.int64]
     pruned: Pruned | None
     refitted: Refitted | None
+    photographs: PhotographChoice | None
     device: Device | None
     seconds: dict[str, float]
 
@@ -170,6 +173,7 @@ class Run:
             order=state.survivors[coded.order],
             pruned=state.learnt.get("prune"),
             refitted=state.learnt.get("refit"),
+            photographs=state.learnt.get("photographs"),
             device=self.device,
             seconds=self._watch.seconds,
         )

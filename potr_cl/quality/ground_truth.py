@@ -10,27 +10,36 @@ import numpy as np
 from potr_cl.formats.images import Colour, read_ground_truth
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
-from potr_cl.quality.compare import find_ground_truth
+from potr_cl.quality.compare import find_ground_truth, missing_photographs
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
 
 
 class GroundTruth:
-    """The photographs of some views, read and decoded one at a time.
+    """The photographs of some views, read and decoded one at a time. Views without a photograph are left out.
 
     Args:
         folder: holds them, named after the views.
         cameras: the views.
         background: behind those with alpha.
 
+    Attributes:
+        missing: one line that says which views have no photograph; None if each has one.
+
     Raises:
-        UsageError: there is no such folder, a view has no photograph or several, or one is not of the camera's size.
+        UsageError: there is no such folder, no view has a photograph, one has several, or one is not of the camera's
+            size.
         DataError: a photograph is damaged.
     """
 
     def __init__(self, folder: Path, cameras: Sequence[Camera], background: Colour = (0.0, 0.0, 0.0)) -> None:
         self._paths = find_ground_truth(folder, cameras)
         self._background = background
+        self.missing = missing_photographs(self._paths, cameras)
+
+    def of(self, cameras: Sequence[Camera]) -> list[Camera]:
+        """Those of some views that have a photograph."""
+        return [camera for camera in cameras if camera.name in self._paths]
 
     def picture(self, camera: Camera) -> FloatArray:
         """(H, W, 3) float32, the photograph of a view.
@@ -41,11 +50,15 @@ class GroundTruth:
         """
         return read_ground_truth(self._paths[camera.name], self._background)
 
-    def psnr(self, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> float:
-        """Mean over views of the PSNR of a scene's pictures against the photographs, in decibels.
+    def psnrs(self, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> list[float]:
+        """PSNR of a scene's picture of each view against the photograph, in decibels.
 
         Raises:
             UsageError, DataError: a photograph cannot be read.
             DeviceError: a view does not fit the device.
         """
-        return float(np.mean([psnr(rasterizer.render(camera)[0], self.picture(camera)) for camera in cameras]))
+        return [psnr(rasterizer.render(camera)[0], self.picture(camera)) for camera in cameras]
+
+    def psnr(self, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> float:
+        """Mean of :meth:`psnrs`."""
+        return float(np.mean(self.psnrs(rasterizer, cameras)))
