@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
 
 from potr_cl.formats.images import Colour
-from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray
+from potr_cl.model.camera import Camera, test_views, train_views
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.opencl.device import Device
 from potr_cl.quality.compare import find_ground_truth, missing_photographs
 from potr_cl.quality.metrics import psnr
 from potr_cl.quality.photographs import read_photograph
@@ -64,3 +66,54 @@ class GroundTruth:
     def psnr(self, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> float:
         """Mean of :meth:`psnrs`."""
         return float(np.mean(self.psnrs(rasterizer, cameras)))
+
+
+@dataclass(frozen=True)
+class PhotographFigures:
+    """What an uncompressed scene and its file come to against photographs.
+
+    Attributes:
+        views: names of the views.
+        kind: "test", views that no stage has looked at, or "train".
+        uncompressed, file: PSNR of each view against its photograph, decibels.
+    """
+
+    views: list[str]
+    kind: str
+    uncompressed: list[float]
+    file: list[float]
+
+    @property
+    def means(self) -> tuple[float, float]:
+        """Mean over the views, of the uncompressed scene and of the file."""
+        return float(np.mean(self.uncompressed)), float(np.mean(self.file))
+
+
+def judge_by_photographs(
+    ground_truth: GroundTruth,
+    cameras: Sequence[Camera],
+    scenes: tuple[Scene, Scene],
+    device: Device,
+    background: Colour = (0.0, 0.0, 0.0),
+) -> PhotographFigures:
+    """Judge a scene and its file by photographs of test views; where no test view has one, of training views.
+
+    Args:
+        ground_truth: the photographs.
+        cameras: all of the scene's.
+        scenes: uncompressed, and as a decoder sees the file.
+        device: to render on.
+        background: behind both.
+
+    Raises:
+        UsageError, DataError: a photograph cannot be read.
+        DeviceError: a view does not fit the device.
+    """
+    views, kind = ground_truth.of(test_views(cameras)), "test"
+    if not views:
+        views, kind = ground_truth.of(train_views(cameras)), "train"
+    psnrs = []
+    for scene in scenes:
+        with Rasterizer(device, scene, background=background) as rasterizer:
+            psnrs.append(ground_truth.psnrs(rasterizer, views))
+    return PhotographFigures([camera.name for camera in views], kind, psnrs[0], psnrs[1])
