@@ -100,7 +100,15 @@ def test_virtual_views_are_bounded(
 def test_devices_that_there_are_not(
     tmp_path: Path, scene_path: Path, capsys: pytest.CaptureFixture[str], data: Path, device: str
 ) -> None:
-    render = ["render", scene_path, "--cameras", data / "lego_cameras.json", "-o", tmp_path / "d", f"--device={device}"]
+    render = [
+        "render",
+        scene_path,
+        "--cameras",
+        data / "plush_excerpt_cameras.json",
+        "-o",
+        tmp_path / "d",
+        f"--device={device}",
+    ]
     code, _, err = outcome(capsys, render)
     assert code == 1
     assert "no OpenCL device fits" in err
@@ -116,7 +124,7 @@ def test_a_forgotten_option_is_one_line(capsys: pytest.CaptureFixture[str]) -> N
 
 def calls(name: str, good: str) -> list[list[str]]:
     """A name in every place of every command that takes one, beside good ones."""
-    cameras = str(ROOT / "tests" / "data" / "lego_cameras.json")
+    cameras = str(ROOT / "tests" / "data" / "plush_excerpt_cameras.json")
     return [
         ["encode", name, "-o", "new"],
         ["encode", good, "-o", name, *KEEP],
@@ -371,7 +379,7 @@ def test_trust_reaches_the_readers(
 
     for reader in ("scenes.load_scene", "files.decode", "files.PotrFile.open"):
         monkeypatch.setattr(f"potr_cl.cli.{reader}", ask)
-    cameras = str(ROOT / "tests" / "data" / "lego_cameras.json")
+    cameras = str(ROOT / "tests" / "data" / "plush_excerpt_cameras.json")
     scene, out = str(scene_path), str(tmp_path / "out.ply")
     for command in (
         ["encode", scene, "-o", out, *KEEP],

@@ -119,7 +119,7 @@ def test_content_decides_between_formats_of_one_extension(data: Path, tmp_path: 
         next(entry for entry in SCENE_FORMATS if suffix in entry.suffixes) for suffix in (".ply", ".compressed.ply")
     )
     for name in ("a.ply", "a.compressed.ply"):
-        shutil.copy(data / "lego_excerpt.ply", tmp_path / name)
+        shutil.copy(data / "plush_excerpt.ply", tmp_path / name)
         assert registry.reader_of(tmp_path / name) is plain.load
         shutil.copy(data / "foreign" / "degree_0.compressed.ply", tmp_path / name)
         assert registry.reader_of(tmp_path / name) is compressed.load
@@ -192,11 +192,11 @@ def test_a_missing_extra_is_named(entry: SceneFormat | CameraFormat, tmp_path: P
 
 
 @pytest.mark.usefixtures("no_extras")
-def test_a_missing_library_is_named(tmp_path: Path, data: Path, lego_excerpt: Scene) -> None:
+def test_a_missing_library_is_named(tmp_path: Path, data: Path, plush_excerpt: Scene) -> None:
     with pytest.raises(UsageError, match=r"potr-cl\[convert\]"):
         load_scene(data / "foreign" / "degree_3.compressed.ply")
     with pytest.raises(UsageError, match=r"potr-cl\[convert\]"):
-        scene_writer(tmp_path / "x.compressed.ply")(lego_excerpt)
+        scene_writer(tmp_path / "x.compressed.ply")(plush_excerpt)
     assert not list(tmp_path.iterdir())
 
 
