@@ -15,6 +15,8 @@ bench.compact_at       when within the pruning schedule to compact?
 bench.codec            speed, memory and size of the codec alone
 bench.search           what does encoding to a size or a PSNR cost, against one plain encode?
 bench.virtual_cameras  what does encoding without cameras cost?
+bench.forecast         how far off is what an encode says beforehand of its time and memory?
+bench.install          what does an installation take, and where are there wheels?
 bench.needs            what is a scene charged for splats, views and tiles that nobody needs?
 bench.busy             how busy is the device during an encode, stage by stage?
 bench.kernels          processor time of each kernel, on machines that do other work too

@@ -7,7 +7,7 @@ import argparse
 from potr_cl.cli.guard import ReadFile, WrittenFile
 from potr_cl.cli.options import Commands
 from potr_cl.cli.scenes import add_trust_option, read_scene, size_of_file
-from potr_cl.cli.terminal import say
+from potr_cl.cli.terminal import say_done
 from potr_cl.formats import scene_writer
 from potr_cl.formats.registry import extras_needed, suffixes_read, suffixes_written
 
@@ -18,7 +18,9 @@ def _convert(args: argparse.Namespace) -> None:
     scene = read_scene(args, args.scene)
     write(scene)
     after = size_of_file(args.output)
-    say(f"{args.output}: {len(scene)} splats of SH degree {scene.sh_degree}, {after} bytes; {args.scene} has {before}")
+    say_done(
+        f"{args.output}: {len(scene)} splats of SH degree {scene.sh_degree}, {after} bytes; {args.scene} has {before}"
+    )
 
 
 def add_convert(commands: Commands) -> None:
@@ -28,7 +30,7 @@ def add_convert(commands: Commands) -> None:
         description=f"Read a scene ({suffixes_read()}) and write it as {suffixes_written()}. Nothing but what the "
         f"format itself rounds is changed; axes are kept. {extras_needed()}.",
     )
-    p.add_argument("scene", type=ReadFile, metavar="IN")
-    p.add_argument("output", type=WrittenFile, metavar="OUT")
+    p.add_argument("scene", type=ReadFile, metavar="IN", help="the scene to read")
+    p.add_argument("output", type=WrittenFile, metavar="OUT", help="the file to write; its suffix says the format")
     add_trust_option(p)
     p.set_defaults(run=_convert)

@@ -9,13 +9,14 @@ import math
 
 import numpy as np
 
+from potr_cl.cli.forecasts import tell_what_is_ahead
 from potr_cl.cli.guard import ReadFile, ReadPhotographs, WrittenFile
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option, as_bytes
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import add_trust_option, read_scene
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
-from potr_cl.cli.terminal import note, say
+from potr_cl.cli.terminal import note, say_done
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
 from potr_cl.codec.quantize import ac_sparsity
 from potr_cl.errors import UsageError
@@ -53,7 +54,7 @@ def _prune(args: argparse.Namespace) -> None:
         ply.save(args.output, state.scene)
         if order is not None:
             np.save(order, pruned.order)
-    say(
+    say_done(
         f"{args.output}: kept {pruned.kept} of {len(scene)} splats "
         f"({100 * pruned.kept / len(scene):.1f} %) in {pruned.iterations} iterations on {device.info}"
     )
@@ -76,6 +77,7 @@ def _run(
     with contextlib.closing(Progress()) as progress:
         watch = Stopwatch(progress)
         cameras = cameras or virtual_cameras(args, scene, watch)
+        tell_what_is_ahead(device, scene, cameras, options)
         run = Run(options, watch, device)
         state = run.stages(State.of(scene, train_views(cameras)), [kind])
     return state, run.device or device
@@ -83,9 +85,9 @@ def _run(
 
 def add_prune(commands: Commands) -> None:
     p = commands.add_parser("prune", help="remove the splats that no view misses; nothing else changes")
-    p.add_argument("scene", type=ReadFile, metavar="SCENE", help=".ply or .potr")
+    p.add_argument("scene", type=ReadFile, metavar="SCENE", help="the trained scene, .ply or .potr")
     add_cameras_options(p)
-    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
+    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply", help="the scene to write")
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (fewest splats) to 1; default 0.5")
     p.add_argument(
         "--order",
@@ -110,16 +112,16 @@ def _compact(args: argparse.Namespace) -> None:
     compacted = _run(args, scene, cameras, options, Compact)[0].scene
     ply.save(args.output, compacted)
     before, after = (100 * ac_sparsity(s.sh, options.parameters.sf_sh) for s in (scene, compacted))
-    say(
+    say_done(
         f"{args.output}: {len(scene)} splats, {after:.1f} % of the AC coefficients quantise to 0, {before:.1f} % before"
     )
 
 
 def add_compact(commands: Commands) -> None:
     p = commands.add_parser("compact", help="make the colours' coefficients sparse; nothing else changes")
-    p.add_argument("scene", type=ReadFile, metavar="SCENE", help=".ply or .potr")
+    p.add_argument("scene", type=ReadFile, metavar="SCENE", help="the trained scene, .ply or .potr")
     add_cameras_options(p)
-    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
+    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply", help="the scene to write")
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (sparsest) to 1; default 0.5")
     add_stage_flags(p, [Compact], without=["on", "at"])
     p.add_argument("--sf-sh", type=float, metavar="SF", help="steps a unit of the quantiser to expect")
@@ -144,6 +146,7 @@ def _refit(args: argparse.Namespace) -> None:
     with contextlib.closing(Progress()) as progress:
         cameras = cameras or virtual_cameras(args, reference, progress)
         views = train_views(cameras)
+        tell_what_is_ahead(device, scene, views, _refit_alone(args))
 
         def work(device: Device, memory: int | None) -> Refitted:
             how = dataclasses.replace(options, memory=memory)
@@ -165,9 +168,9 @@ def _refit(args: argparse.Namespace) -> None:
         progress("refit", 1.0)
         result = dataclasses.replace(scene, sh=refitted.sh)
         ply.save(args.output, result)
-        say(f"{args.output}: {len(scene)} splats re-fitted in {refitted.steps} steps on {device.info}")
+        say_done(f"{args.output}: {len(scene)} splats re-fitted in {refitted.steps} steps on {device.info}")
         before, after = refitted.errors
-        say(
+        say_done(
             f"{len(views)} training views: mean squared error {before:.3g} before, {after:.3g} after, "
             f"PSNR {_decibels(before)} before, {_decibels(after)} after"
         )
@@ -177,7 +180,12 @@ def _refit(args: argparse.Namespace) -> None:
         elif held_out:
             with Evaluator(device, reference, EvaluationViews.of(held_out), background) as evaluator:
                 psnrs = [evaluator.psnr(candidate) for candidate in (scene, result)]
-            say(f"{evaluator.views}: PSNR {psnrs[0]:.2f} dB before, {psnrs[1]:.2f} dB after, mean over views")
+            say_done(f"{evaluator.views}: PSNR {psnrs[0]:.2f} dB before, {psnrs[1]:.2f} dB after, mean over views")
+
+
+def _refit_alone(args: argparse.Namespace) -> EncodeOptions:
+    """Options of an encode that does what ``refit`` does, and nothing else that takes long."""
+    return EncodeOptions(memory=as_bytes(args.memory)).changed(prune=False, refit={"steps": args.steps})
 
 
 def _decibels(error: float) -> str:
@@ -193,14 +201,17 @@ def _tell_of_ground_truth(
 ) -> None:
     """What the reference, the scene before and the scene after come to on photographs that the re-fit did not see."""
     if not held_out:
-        note("warning: no view is held out, so nobody knows whether the colours fit the photographs too closely")
+        note(
+            "warning: no view is held out, so nobody knows whether the colours fit the photographs too closely",
+            "warning",
+        )
         return
     psnrs = []
     for scene in scenes:
         with Rasterizer(device, scene, background=background) as rasterizer:
             psnrs.append(ground_truth.psnr(rasterizer, held_out))
     reference, before, after = psnrs
-    say(
+    say_done(
         f"{len(held_out)} held-out photographs: PSNR {before:.2f} dB before, {after:.2f} dB after, "
         f"{reference:.2f} dB of the reference, mean over views"
     )
@@ -208,6 +219,7 @@ def _tell_of_ground_truth(
         note(
             f"warning: on held-out photographs the result is {reference - after:.2f} dB worse than the reference: "
             "the training photographs are fitted too closely (more --prior, fewer --steps), or too much is gone",
+            "warning",
         )
 
 
@@ -218,13 +230,13 @@ def add_refit(commands: Commands) -> None:
         description="Solve for the colours of all splats together, so that the training views look as those of the "
         "reference (or as the photographs) do; nothing else changes. Coefficients that are 0 stay 0.",
     )
-    p.add_argument("scene", type=ReadFile, metavar="PRUNED", help=".ply or .potr")
+    p.add_argument("scene", type=ReadFile, metavar="PRUNED", help="the reduced scene, .ply or .potr")
     p.add_argument("--reference", type=ReadFile, required=True, metavar="ORIGINAL", help="the uncompressed scene")
     add_cameras_options(p)
     p.add_argument(
         "--photos", type=ReadPhotographs, metavar="DIR", help="photographs, named after the views, to fit instead"
     )
-    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
+    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply", help="the scene to write")
     p.add_argument(
         "--steps",
         type=whole_number,

@@ -8,13 +8,14 @@ import time
 from concurrent.futures import Future
 from typing import Any
 
+from potr_cl.cli.forecasts import tell_what_is_ahead
 from potr_cl.cli.guard import ReadFile, WrittenFile
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option, as_bytes, size_in_bytes
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import add_trust_option, read_scene, size_of_file, trust
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
-from potr_cl.cli.terminal import note, say, say_document
+from potr_cl.cli.terminal import note, say_document, say_done
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.errors import DataError, DeviceError, PotrError, UsageError
@@ -88,6 +89,8 @@ def _encode(args: argparse.Namespace) -> None:
         with replacing(args.output) as file:
             if cameras is None and device is not None:
                 cameras = virtual_cameras(args, scene, placing)
+            if device is not None and cameras is not None:
+                tell_what_is_ahead(device, scene, cameras, options, target is not None)
             views = EvaluationViews.of(cameras) if cameras is not None and not args.no_quality else None
             if args.report_view is not None:
                 _ = views and views.named(args.report_view)  # an unknown name is told before the work
@@ -115,7 +118,7 @@ def _encode(args: argparse.Namespace) -> None:
     if args.json:
         say_document(report)
     else:
-        say(format_encode_report(report))
+        say_done(format_encode_report(report))
 
 
 def _proved(args: argparse.Namespace, encoded: Encoded) -> tuple[PotrFile, Scene]:
@@ -180,13 +183,16 @@ def _evaluate_by_ground_truth(
             before, after = after, ground_truth.psnr(rasterizer, views)
     note(f"{len(views)} held-out photographs: uncompressed {before:.2f} dB, file {after:.2f} dB")
     if after < before:
-        note(f"warning: on held-out photographs the file is {before - after:.2f} dB worse than the uncompressed scene")
+        note(
+            f"warning: on held-out photographs the file is {before - after:.2f} dB worse than the uncompressed scene",
+            "warning",
+        )
 
 
 def add_encode(commands: Commands) -> None:
     p = commands.add_parser("encode", help="a scene (.ply) to a .potr file")
-    p.add_argument("scene", type=ReadFile, metavar="SCENE.ply")
-    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.potr")
+    p.add_argument("scene", type=ReadFile, metavar="SCENE.ply", help="the trained scene")
+    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.potr", help="the file to write")
     goal = p.add_mutually_exclusive_group()
     goal.add_argument(
         "-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (smallest) to 1 (best); default 0.5"

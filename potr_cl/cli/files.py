@@ -8,7 +8,7 @@ from typing import TYPE_CHECKING
 
 from potr_cl.cli.guard import ReadFile, WrittenFile
 from potr_cl.cli.scenes import add_trust_option, trust
-from potr_cl.cli.terminal import say, say_document
+from potr_cl.cli.terminal import say, say_document, say_done
 from potr_cl.codec.decoder import PotrFile, decode
 from potr_cl.formats.scenes import ply
 from potr_cl.report.file import file_report, format_report
@@ -23,7 +23,7 @@ def _decode(args: argparse.Namespace) -> None:
     decoded = time.perf_counter()
     ply.save(args.output, scene)
     written = time.perf_counter()
-    say(
+    say_done(
         f"{args.output}: {len(scene)} splats, decoded in {decoded - started:.2f} s, "
         f"written in {written - decoded:.2f} s"
     )
@@ -31,8 +31,8 @@ def _decode(args: argparse.Namespace) -> None:
 
 def add_decode(commands: Commands) -> None:
     p = commands.add_parser("decode", help="a .potr file to a .ply that every viewer opens")
-    p.add_argument("file", type=ReadFile, metavar="IN.potr")
-    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
+    p.add_argument("file", type=ReadFile, metavar="IN.potr", help="the compressed scene")
+    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply", help="the scene to write")
     add_trust_option(p)
     p.set_defaults(run=_decode)
 
@@ -47,7 +47,7 @@ def _info(args: argparse.Namespace) -> None:
 
 def add_info(commands: Commands) -> None:
     p = commands.add_parser("info", help="what a .potr file holds, and where its bytes are")
-    p.add_argument("file", type=ReadFile, metavar="IN.potr")
+    p.add_argument("file", type=ReadFile, metavar="IN.potr", help="the compressed scene")
     p.add_argument("--json", action="store_true", help="for programs")
     add_trust_option(p)
     p.set_defaults(run=_info)

@@ -18,7 +18,7 @@ from potr_cl.cli.guard import (
 from potr_cl.cli.options import CAMERAS_HELP, RULES, Commands, add_rendering_options, add_view_options
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import add_trust_option, read_scene
-from potr_cl.cli.terminal import note, say, say_document
+from potr_cl.cli.terminal import note, say, say_document, say_done
 from potr_cl.cli.views import read_cameras
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.images import parse_colour, to_8_bits, write_png
@@ -92,12 +92,12 @@ def _render(args: argparse.Namespace) -> None:
             with replacing(args.output / name) as file:
                 write_png(file, to_8_bits(image))
             progress(stage, done / len(files))
-    say(f"{args.output}: {len(files)} image{'s' if len(files) > 1 else ''}, rendered on {device.info}")
+    say_done(f"{args.output}: {len(files)} image{'s' if len(files) > 1 else ''}, rendered on {device.info}")
 
 
 def add_render(commands: Commands) -> None:
     p = commands.add_parser("render", help="pictures (.png) of a scene from its cameras")
-    p.add_argument("scene", type=ReadFile, metavar="SCENE", help=".ply or .potr")
+    p.add_argument("scene", type=ReadFile, metavar="SCENE", help="the scene to look at, .ply or .potr")
     p.add_argument("--cameras", type=ReadCameras, required=True, metavar="PATH", help=CAMERAS_HELP)
     p.add_argument(
         "-o", "--output", type=WrittenFolder, required=True, metavar="DIR", help="one file a view, named after it"

@@ -9,5 +9,5 @@ Every result of the OpenCL kernels is compared with these, by the tests and by t
 - :mod:`potr_cl.reference.refit_cases`: the device's re-fit beside that map;
 - :mod:`potr_cl.reference.scenes`: small scenes and cameras to compare on.
 
-Nothing else in the package imports them. The two solvers need scipy, which ``pip install potr-cl[test]`` brings.
+Nothing else in the package imports them. The two solvers need scipy, which the extra ``test`` brings.
 """

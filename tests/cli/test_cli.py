@@ -197,7 +197,7 @@ def test_encode_report_page(tmp_path, excerpt, capsys):
     encode = [*excerpt, "-o", tmp_path / "a.potr"]
     run(capsys, *encode, "--report", page, "--report-view", "20240212_003919")
     text = page.read_text()
-    assert "worst view: 20240212_004053" in text
+    assert "worst view: 20240212_004138" in text
     assert "chosen view: 20240212_003919" in text
     assert text.count("<img") == 9
     run(capsys, *encode, "--report", page, "--no-quality")

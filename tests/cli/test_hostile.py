@@ -118,7 +118,7 @@ def test_a_forgotten_option_is_one_line(capsys: pytest.CaptureFixture[str]) -> N
     assert outcome(capsys, ["encode", "i.ply"]) == (
         2,
         "",
-        "potr-cl encode: the following arguments are required: -o/--output (see potr-cl encode --help)\n",
+        "potr-cl encode: -o OUT.potr (the file to write) is missing (see potr-cl encode --help)\n",
     )
 
 
