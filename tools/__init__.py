@@ -20,6 +20,7 @@ bench.install          what does an installation take, and where are there wheel
 bench.needs            what is a scene charged for splats, views and tiles that nobody needs?
 bench.busy             how busy is the device during an encode, stage by stage?
 bench.kernels          processor time of each kernel, on machines that do other work too
+bench.paired           are whole encodes faster or slower than those of another checkout?
 bench.memory           host memory of one encode, stage by stage
 bench.memory_growth    peak memory against splats and views, and whether --memory is obeyed
 =====================  =================================================================================================
