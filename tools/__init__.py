@@ -52,6 +52,7 @@ What tests and pages are made of (``make``):
 make.large_scene      a scene of any size with the statistics of a real one
 make.test_data        the excerpts in tests/data
 make.foreign_files    the excerpt in other tools' formats
+make.release          a wheel and an sdist that are ready for a package index
 make.readme_picture   the picture at the top of the README
 make.golden_files     files that every later decoder must read to the same values
 make.docs             the pages and tables of README and docs that are made from the code (see CONTRIBUTING.md)
