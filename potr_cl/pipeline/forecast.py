@@ -51,12 +51,15 @@ class Forecast:
 
 @dataclass(frozen=True)
 class Units:
-    """What stages take, as multiples of the time of one picture of the uncompressed scene, for each training view.
+    """What stages take.
 
     Attributes:
-        prepare, prune, compact, refit: once a view.
-        iteration, step: a pruning iteration and a step of the re-fit, besides.
-        splat: seconds to quantise and code a splat that is left.
+        prepare, prune, compact, refit: once for each training view, as multiples of the time of one picture of the
+            uncompressed scene.
+        iteration, step: a pruning iteration and a step of the re-fit, for each view, besides.
+        once: pictures' times that the re-fit takes besides, whatever the number of views.
+        compact_splat, refit_splat, code_splat: seconds that compaction, the re-fit and the coding take besides, for
+            each splat of the uncompressed scene.
     """
 
     prepare: float
@@ -65,13 +68,16 @@ class Units:
     compact: float
     refit: float
     step: float
-    splat: float
+    once: float
+    compact_splat: float
+    refit_splat: float
+    code_splat: float
 
 
-#: Measured by tools.bench.forecast.
+#: From tools.bench.forecast for CPUs, and from docs/benchmarks/encode.md for GPUs, where the host does a good part.
 UNITS: dict[Family, Units] = {
-    "cpu": Units(prepare=1.1, prune=2.0, iteration=0.12, compact=2.0, refit=1.0, step=0.65, splat=4e-6),
-    "gpu": Units(prepare=0.8, prune=2.0, iteration=0.04, compact=6.0, refit=2.5, step=1.2, splat=3e-6),
+    "cpu": Units(1.0, 3.0, 0.035, 2.0, 4.7, 0.33, 20, 0, 0, 4e-6),
+    "gpu": Units(0.9, 2.0, 0.042, 0, 0, 0.45, 0, 3.5e-6, 1.45e-6, 1.5e-6),
 }
 
 
@@ -91,14 +97,16 @@ def forecast(
     seconds, nbytes = _view(scene, cameras, options, device)
     parts = {stage.name: stage for stage in options.stages if stage.asked_for and stage.looks_at(scene)}
     units = UNITS[device.family]
-    of_a_view = units.prepare
+    pictures, of_a_splat = len(cameras) * units.prepare, units.code_splat
     if isinstance(prune := parts.get(Prune.name), Prune):
-        of_a_view += units.prune + units.iteration * prune.iterations
+        pictures += len(cameras) * (units.prune + units.iteration * prune.iterations)
     if Compact.name in parts:
-        of_a_view += units.compact
+        pictures += len(cameras) * units.compact
+        of_a_splat += units.compact_splat
     if isinstance(refit := parts.get(Refit.name), Refit):
-        of_a_view += units.refit + units.step * refit.steps
-    work = len(cameras) * seconds * of_a_view + len(scene) * units.splat
+        pictures += units.once + len(cameras) * (units.refit + units.step * refit.steps)
+        of_a_splat += units.refit_splat
+    work = pictures * seconds + len(scene) * of_a_splat
     budget = default_memory(device) if options.memory is None else options.memory
     memory = len(scene) * _DEVICE_SPLAT + min(len(cameras) * nbytes * _VIEWS, budget)
     if device.info.kind == "cpu":
