@@ -3,7 +3,7 @@
 Nearly all of the time goes into projecting, sorting and compositing splats, view by view. So a few views are rendered,
 and their mean time, as a unit, is multiplied by what each stage was measured to take in such units. This sees the
 device, the scene and the size of the pictures, and whatever else the machine is doing.
-``python -m tools.bench.forecast`` measures the units, and how far off a forecast is.
+``python -m tools.bench.forecast`` measures the units, and how far off a forecast is (docs/benchmarks/forecast.md).
 """
 
 from __future__ import annotations
@@ -41,12 +41,14 @@ class Forecast:
     Attributes:
         seconds: from the first stage to the last; reading, judging and writing come on top.
         memory: bytes at the peak: the whole process's on a CPU, the device's on a GPU.
-        sampled: seconds of a view, as measured.
+        sampled: seconds of a picture, as measured.
+        pictures: how many pictures' times the stages up to the re-fit are expected to take.
     """
 
     seconds: float
     memory: float
     sampled: float
+    pictures: float
 
 
 @dataclass(frozen=True)
@@ -111,7 +113,7 @@ def forecast(
     memory = len(scene) * _DEVICE_SPLAT + min(len(cameras) * nbytes * _VIEWS, budget)
     if device.info.kind == "cpu":
         memory += _PROCESS + len(scene) * _HOST_SPLAT
-    return Forecast(work * (_SEARCH if search else 1), memory, seconds)
+    return Forecast(work * (_SEARCH if search else 1), memory, seconds, pictures)
 
 
 def _view(scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, device: Device) -> tuple[float, float]:

@@ -51,8 +51,9 @@ def main() -> None:
     results = Results(choose_device(args.device), args.json)
     ahead = results.table(
         "errors", "What was forecast, and what it took", Column("scene"), Column("preset"), Column("views", "", "d"),
-        Column("pixels", "", ",d"), Column("forecast", "s", ".1f"), Column("took", "s", ".1f"),
-        Column("took / forecast", "", ".2f"), Column("forecast", "GB", ".2f"), Column("peak", "GB", ".2f"),
+        Column("pixels", "", ",d"), Column("time, forecast", "s", ".1f"), Column("time", "s", ".1f"),
+        Column("work, forecast", "pictures' times", ".0f"), Column("work", "pictures' times", ".0f"),
+        Column("memory, forecast", "GB", ".2f"), Column("memory", "GB", ".2f"),
     )  # fmt: skip
     found = []
     for scene in args.scenes:
@@ -65,7 +66,7 @@ def main() -> None:
             found.append(one)
             ahead.add(
                 one["scene"], preset, one["views"], one["pixels"], one["seconds"], one["took"],
-                one["took"] / one["seconds"], one["memory"] / 1e9, one["peak"] / 1e9,
+                one["pictures"], sum(one["units"]) * one["views"], one["memory"] / 1e9, one["peak"] / 1e9,
             )  # fmt: skip
     units = results.table(
         "units", "Stages in units of the time of one picture, once a view", Column("scene"), Column("preset"),
@@ -112,7 +113,8 @@ def _one(args: argparse.Namespace) -> dict[str, Any]:
     host = resource.getrusage(resource.RUSAGE_SELF).ru_maxrss * 1024
     return {
         "scene": folder.name, "preset": preset, "views": len(views), "pixels": views[0].width * views[0].height,
-        "seconds": ahead.seconds, "took": took, "memory": ahead.memory, "peak": host if on_cpu else most,
+        "seconds": ahead.seconds, "took": took, "pictures": ahead.pictures,
+        "memory": ahead.memory, "peak": host if on_cpu else most,
         "units": [spent[stage] / picture / len(views) for stage in _STAGES],
         "rest": 1e6 * spent[""] / len(encoded.order),
     }  # fmt: skip

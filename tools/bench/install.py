@@ -31,7 +31,6 @@ PLATFORMS = {
     "macOS 11, Apple silicon": ["macosx_11_0_arm64"],
     "macOS 14, Intel": ["macosx_14_0_x86_64", "macosx_10_15_x86_64", "macosx_10_13_x86_64", "macosx_10_9_x86_64"],
     "Windows x86-64": ["win_amd64"],
-    "Windows ARM": ["win_arm64"],
 }
 
 
