@@ -10,9 +10,10 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from potr_cl import __version__
-from potr_cl.cli import guard
+from potr_cl.cli import guard, outputs
 from potr_cl.cli.completion import SHELLS, PrintCompletion
 from potr_cl.cli.parser import CommandParser
+from potr_cl.cli.scenes import standard_input
 from potr_cl.cli.terminal import note, speak
 from potr_cl.errors import PotrError
 from potr_cl.host.signals import unwinding
@@ -70,8 +71,11 @@ def _run(argv: Sequence[str]) -> None:
         in_background(import_module("potr_cl.opencl.discovery").list_devices)
     args = command_parser(argv).parse_args(argv)
     speak(args.loudness)
+    if "arrange" in args:
+        args.arrange(args)
     guard.check(args)
-    with unwinding():
+    outputs.check(args)
+    with unwinding(), standard_input(args), outputs.standard_output(args):
         args.run(args)
 
 

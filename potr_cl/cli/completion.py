@@ -6,7 +6,8 @@ import argparse
 from collections.abc import Iterator
 from typing import Any
 
-from potr_cl.cli.guard import ReadCameras, ReadFile, ReadPhotographs, WrittenFile, WrittenFolder
+from potr_cl.cli.guard import ReadCameras, ReadFile, ReadPhotographs, WrittenFile, WrittenFolder, read_file
+from potr_cl.cli.outputs import place, scene_output
 from potr_cl.cli.terminal import say
 from potr_cl.errors import UsageError
 from potr_cl.host.installation import install_command
@@ -30,7 +31,9 @@ class PrintCompletion(argparse.Action):
         for action in _all_actions(parser):
             if action.type in (ReadPhotographs, WrittenFolder):
                 action.complete = shtab.DIRECTORY  # type: ignore[attr-defined]
-            elif action.type in (ReadFile, ReadCameras, WrittenFile):
+            elif action.type in (read_file, scene_output, place) or (
+                isinstance(action.type, type) and issubclass(action.type, (ReadFile, ReadCameras, WrittenFile))
+            ):
                 action.complete = shtab.FILE  # type: ignore[attr-defined]
         say(shtab.complete(parser, value))
         parser.exit()

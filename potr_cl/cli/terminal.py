@@ -60,14 +60,7 @@ def say(text: object) -> None:
         BrokenPipeError: whoever read it has gone.
         PotrError: it cannot be written to.
     """
-    try:
-        _print(sys.stdout, text)
-    except BrokenPipeError:
-        abandon(sys.stdout)
-        raise
-    except OSError as error:
-        abandon(sys.stdout)
-        raise PotrError(f"cannot write to the standard output: {error.strerror or error}") from error
+    _say(plain_lines(text))
 
 
 def say_done(text: object) -> None:
@@ -85,14 +78,30 @@ def say_document(document: Any) -> None:
     say(json.dumps(plain_document(document), indent=1, allow_nan=False))
 
 
+def say_line(document: Any) -> None:
+    """The same in one line, however long, for one of several documents."""
+    _say(json.dumps(plain_document(document), allow_nan=False))  # escapes all that is not ASCII
+
+
 def note(text: object, kind: Kind = "news") -> None:
     """Print lines on standard error, if lines of this kind are shown."""
     if kind not in _shown:
         return
     try:
-        _print(sys.stderr, text, _COLOURS.get(kind))
+        _print(sys.stderr, plain_lines(text), _COLOURS.get(kind))
     except OSError:
         abandon(sys.stderr)
+
+
+def _say(text: str) -> None:
+    try:
+        _print(sys.stdout, text)
+    except BrokenPipeError:
+        abandon(sys.stdout)
+        raise
+    except OSError as error:
+        abandon(sys.stdout)
+        raise PotrError(f"cannot write to the standard output: {error.strerror or error}") from error
 
 
 def is_terminal(stream: TextIO | None) -> bool:
@@ -128,12 +137,12 @@ def _takes_colours(stream: TextIO) -> bool:
     return os.name != "nt" or "WT_SESSION" in os.environ
 
 
-def _print(stream: TextIO | None, text: object, colour: str | None = None) -> None:
+def _print(stream: TextIO | None, text: str, colour: str | None = None) -> None:
     if stream is None:  # closed by whoever started the process
         return
     # A terminal of another alphabet shows escapes rather than nothing.
     alphabet = stream.encoding or "utf-8"
-    line = plain_lines(text).encode(alphabet, "backslashreplace").decode(alphabet)
+    line = text.encode(alphabet, "backslashreplace").decode(alphabet)
     if colour is not None and _takes_colours(stream):
         head, colon, rest = line.partition(":")
         line = f"{colour}{head}{colon}{_PLAIN_AGAIN}{rest}" if colon else f"{colour}{line}{_PLAIN_AGAIN}"
