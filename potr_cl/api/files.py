@@ -42,13 +42,19 @@ def save(scene: SceneSource, path: str | os.PathLike[str]) -> None:
 
 
 def convert(
-    scene: SceneSource, output: str | os.PathLike[str], *, trust: bool = False, antialiased: bool | None = None
+    scene: SceneSource,
+    output: str | os.PathLike[str],
+    *,
+    spz_version: int | None = None,
+    trust: bool = False,
+    antialiased: bool | None = None,
 ) -> Scene:
     """Read a scene and write it in another format, as the command ``convert`` does.
 
     Args:
         scene: its file, usually.
         output: the file to write; its suffixes tell the format.
+        spz_version: of an .spz file, 2, 3 or 4; by default the one that all readers that were tried take.
         trust, antialiased: as of :func:`potr_cl.load_scene`.
 
     Returns:
@@ -59,7 +65,7 @@ def convert(
     """
     from potr_cl.formats import scene_writer
 
-    write = scene_writer(output)
+    write = scene_writer(output, spz_version)
     read = scene_of(scene, trust, antialiased)
     write(read)
     return read

@@ -35,7 +35,7 @@ _VIEWS, _FEW, _CHOSEN = 16, 4, 3
 #: A fit of this or more cannot be surpassed by much: nothing else is tried.
 _FINE = -0.9
 #: A motion must fit at least so well to be believed in.
-_PLAUSIBLE = -2.25
+_PLAUSIBLE = -2.1
 #: By how much a motion must fit better: with many views, if people know its size, and if it was fitted to the cameras;
 #: and what one view needs on top, which falls with this power of their number. (One view may look at a bare wall.)
 _BETTER, _FITTED = 0.42, 1.2

@@ -109,7 +109,8 @@ def file_report(file: PotrFile) -> dict[str, Any]:
     }
 
 
-def _antialiasing(report: dict[str, Any]) -> str:
+def antialiasing(report: dict[str, Any]) -> str:
+    """How a scene is to be rendered, for people, from a report's ``antialiased`` and ``low_pass``."""
     return f"yes, low-pass filter of {report['low_pass']:g} square pixels" if report["antialiased"] else "no"
 
 
@@ -119,7 +120,7 @@ def format_report(report: dict[str, Any]) -> str:
     lines = [
         f"splats          {report['splats']}",
         f"SH degree       {report['sh_degree']}",
-        f"antialiased     {_antialiasing(report)}",
+        f"antialiased     {antialiasing(report)}",
         f"quality q       {'unknown' if report['q'] is None else report['q']}",
         f"cameras         {report['cameras'] or 'unknown or none'}",
         "bounding box    " + " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(low, high, strict=True)),

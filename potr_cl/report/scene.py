@@ -9,6 +9,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.model.scene import SH_COEFFICIENTS, CleanReport, Scene
+from potr_cl.report.file import antialiasing
 
 F64 = NDArray[np.float64]
 
@@ -41,11 +42,11 @@ def scene_report(scene: Scene, mended: Sequence[CleanReport] = ()) -> dict[str, 
         mended: what its reader had to drop or to change.
 
     Returns:
-        ``splats``, ``sh_degree``; ``bounding_box`` of all centres, and ``robust_bounding_box``, which leaves out one
-        in a hundred opaque splats on each side of each axis: lists of the lowest and the highest x, y, z; ``opacity``
-        and ``scale`` (each splat's largest standard deviation), with quantiles and a histogram: ``edges``, one more
-        than there are ``counts``; ``suspicious``: a list of ``what``, ``splats`` (how many it concerns) and ``said``, a
-        line for people.
+        ``splats``, ``sh_degree``, ``antialiased``, ``low_pass``; ``bounding_box`` of all centres, and
+        ``robust_bounding_box``, which leaves out one in a hundred opaque splats on each side of each axis: lists of
+        the lowest and the highest x, y, z; ``opacity`` and ``scale`` (each splat's largest standard deviation), with
+        quantiles and a histogram: ``edges``, one more than there are ``counts``; ``suspicious``: a list of ``what``,
+        ``splats`` (how many it concerns) and ``said``, a line for people.
     """
     opacity = scene.opacities.astype(np.float64)
     largest = scene.log_scales.max(axis=1).astype(np.float64) / np.log(10)
@@ -56,6 +57,8 @@ def scene_report(scene: Scene, mended: Sequence[CleanReport] = ()) -> dict[str, 
     return {
         "splats": len(scene),
         "sh_degree": scene.sh_degree,
+        "antialiased": scene.antialiased,
+        "low_pass": scene.low_pass,
         "bounding_box": [means.min(axis=0).tolist(), means.max(axis=0).tolist()],
         "robust_bounding_box": robust.tolist(),
         "opacity": {"quantiles": _quantiles(opacity), **_histogram(opacity, steps)},
@@ -202,6 +205,7 @@ def format_scene(report: dict[str, Any]) -> str:
     lines = [
         f"splats          {report['splats']:,}",
         f"SH degree       {report['sh_degree']}, {coefficients} coefficients a splat",
+        f"antialiased     {antialiasing(report)}",
         f"bounding box    {_box(report['bounding_box'])}",
         f"robust bounds   {_box(report['robust_bounding_box'])}",
         "",

@@ -18,6 +18,7 @@ import pytest
 
 import potr_cl
 from potr_cl import cli
+from potr_cl.api.encoding import encode_options
 from potr_cl.cli import command_parser
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import list_devices
@@ -29,6 +30,8 @@ COMMANDS = ("encode", "prune", "compact", "refit", "decode", "info", "convert", 
 COMMAND_LINE_ONLY = {
     "--help": "Python has its own",
     "--json": "results are objects; SceneComparison.report() and SceneInfo.facts are what it prints",
+    "--from": "for standard input",
+    "--to": "for standard output and folders of scenes",
     "--no-quality": "nothing is judged unless a report is asked for: compare() judges",
 }
 #: Of each option what is typed, and the same in Python; {name} stands for a path of the test's files. What has the
@@ -81,6 +84,7 @@ VALUES: dict[str, tuple[list[str], Any]] = {
     "--trust": ([], True),
     "--antialiased": (["yes"], True),
     "--sh-degree": (["1"], 1),
+    "--spz-version": (["3"], 3),
     "--cameras-anyway": ([], True),
     "--unseen": (["drop"], "drop"),
     "--memory": (["0.25"], 0.25),
@@ -96,9 +100,11 @@ VALUES: dict[str, tuple[list[str], Any]] = {
 #: What only says how the work is done.
 SAME_RESULT = {"--threads", "--trust", "--memory", "--device", "--output", "--cameras", "--reference", "--report",
                "--report-view", "--order", "--tolerance", "--cameras-anyway", "--unseen"}  # fmt: skip
-#: The compaction weighs views by what they show of a splat, whatever is behind it. And without a number of virtual
-#: views dozens are placed, which takes long.
+#: The compaction weighs views by what they show of a splat, whatever is behind it; no splat of this scene improves the
+#: match by going; and without a number of virtual views dozens are placed, which takes long.
 NO_DIFFERENCE = {
+    ("encode", "--mapping-a"),
+    ("prune", "--mapping-a"),
     ("compact", "--background"),
     *((command, "--virtual-views") for command in ("encode", "prune", "compact", "refit")),
 }
@@ -227,14 +233,13 @@ def called(command: str, flags: list[str], files: dict[str, Path], folder: Path,
         here = folder / side
         here.mkdir(parents=True)
         suffix = {"encode": ".potr", "render": "", "compare": ".png"}.get(command, ".ply")
+        suffix = ".spz" if "--spz-version" in flags else suffix
         names = {**files, "output": here / f"out{suffix}", "report": here / "page.html", "order": here / "order.npy"}
         paths = {name: str(path) for name, path in names.items()}
         sources = {"decode": ["potr"], "refit": ["reduced"], "compare": ["scene", "reduced"]}.get(command, ["scene"])
         positional = [paths[name] for name in sources]
         if side == "typed":
             words = [command, *positional]
-            if command == "convert":
-                words.append(paths["output"])
             for flag in flags:
                 values = [value.format(**paths) for value in VALUES[flag][0]]
                 words += [flag + values[0]] if values and values[0].startswith("=") else [flag, *values]
@@ -249,8 +254,6 @@ def called(command: str, flags: list[str], files: dict[str, Path], folder: Path,
             for flag in flags:
                 value = VALUES[flag][1]
                 given[keyword(command, flag)] = value.format(**paths) if isinstance(value, str) else value
-            if command == "convert":
-                given["output"] = paths["output"]
             result = getattr(potr_cl, command)(*positional, **given)
             facts = result.facts if command == "info" else result.report() if command == "compare" else None
             outcomes.append(outcome(here, facts and figures(json.loads(json.dumps(facts)))))
@@ -277,9 +280,34 @@ def test_and_means_the_same(command, flag, files, known, tmp_path, capsys):
     typed, python = called(command, [*base, flag], files, tmp_path / "with", capsys)
     assert typed, "nothing came out"
     assert typed == python
-    if flag in SAME_RESULT or command in ("decode", "info", "convert") or (command, flag) in NO_DIFFERENCE:
+    if flag in SAME_RESULT or command in ("info", "convert") or (command, flag) in NO_DIFFERENCE:
         return
     key = (command, *base)
     if key not in known:
         known[key], _ = called(command, base, files, tmp_path / "without", capsys)
     assert typed != known[key], f"{flag} changes nothing here: the test does not see what it means"
+
+
+def test_choices_of_stages_by_name() -> None:
+    options = encode_options(None, "paper", {"mapping_a": 4, "one_pass": True, "prune": {"iterations": 7}, "refit": 3})
+    assert (options.prune.mapping_a, options.prune.iterations) == (4, 7)
+    assert (options.compact.two_pass, options.refit.steps) == (False, 3)
+    assert not encode_options(None, "best", {"refit": False}).refit.on
+    assert not encode_options(None, "best", {"prune": False}).prune.on
+    assert encode_options(None, "best", {"refit": "auto"}).refit.steps == 8
+
+
+@pytest.mark.parametrize(
+    ("choices", "said"),
+    [
+        ({"iteration": 3}, "did you mean 'iterations'"),
+        ({"xyzzy": 3}, "there is no option 'xyzzy'"),
+        ({"entropy": "gzip"}, "choose one of"),
+        ({"one_pass": 1}, "True or False"),
+        ({"keep": "half"}, "no value"),
+        ({"keep": 1.5}, "at most 1"),
+    ],
+)
+def test_wrong_choices(choices, said) -> None:
+    with pytest.raises(potr_cl.UsageError, match=said):
+        potr_cl.encode("no such file", **choices)

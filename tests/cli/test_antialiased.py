@@ -83,6 +83,8 @@ def test_info_shows_it(tmp_path, paths, capsys):
         assert said in capsys.readouterr().out
         run("info", tmp_path / "a.potr", "--json")
         assert json.loads(capsys.readouterr().out)["antialiased"] is ("yes" in said)
+        run("info", scene)
+        assert said in capsys.readouterr().out
 
 
 def test_encode_is_judged_as_the_scene_is_rendered(tmp_path, paths, capsys):

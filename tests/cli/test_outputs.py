@@ -6,7 +6,7 @@ from pathlib import Path
 
 import pytest
 
-from potr_cl import cli
+from potr_cl import UsageError, cli, encode
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply
 from potr_cl.reference.scenes import random_scene
@@ -109,3 +109,9 @@ def test_versions_of_spz(folder: Path, capsys: pytest.CaptureFixture[str]) -> No
     assert len(load_scene("a.spz")) == 100
     with pytest.raises(SystemExit):
         cli.main(["convert", "a.ply", "a.spz", "--spz-version", "1"])
+
+
+def test_encode_from_python_writes_no_other_name(folder: Path) -> None:
+    with pytest.raises(UsageError, match=r"encode to 'b\.potr'"):
+        encode("a.ply", output="b.spz", prune=False, compact=False, refit="off")
+    assert not Path("b.spz").exists()

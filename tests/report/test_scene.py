@@ -222,4 +222,11 @@ def test_every_format_that_is_read_is_told(tmp_path, data, scene):
         assert info["scale"]["quantiles"]["median"] == pytest.approx(0.0198, rel=0.1), path
         assert np.allclose(info["robust_bounding_box"], scene_report(scene)["robust_bounding_box"], atol=5e-3), path
         told.add(info["format"])
+    for path in (data / "other_tools").rglob("*"):  # of another scene
+        kinds = [entry for entry in registry.SCENE_FORMATS if path.name.lower().endswith(entry.suffixes)]
+        if (path.is_file() and kinds) or path.name in ("splat-transform_lod", "splat-transform_sog"):
+            info = potr_cl.info(path)
+            assert info["splats"] == len(potr_cl.read_scene(path)), path
+            assert sum(info["opacity"]["counts"]) == info["splats"]
+            told.add(info["format"])
     assert told == {entry.name for entry in registry.SCENE_FORMATS}

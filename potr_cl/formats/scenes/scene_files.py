@@ -115,6 +115,8 @@ def shown(value: object) -> str:
 def joined(scenes: list[Scene]) -> Scene:
     """Scenes as one; those of a lower SH degree get coefficients of zero.
 
+    It is antialiased if all are, alike; as in splat-transform, it is classic where they differ.
+
     Args:
         scenes: at least one.
     """
@@ -126,8 +128,9 @@ def joined(scenes: list[Scene]) -> Scene:
     for scene in scenes:
         sh[start : start + len(scene), : scene.sh.shape[1]] = scene.sh
         start += len(scene)
+    alike = len({(scene.antialiased, scene.low_pass) for scene in scenes}) == 1
     return replace(
-        scenes[0],
+        scenes[0].rendered(None if alike else False),
         means=np.concatenate([scene.means for scene in scenes]),
         log_scales=np.concatenate([scene.log_scales for scene in scenes]),
         quaternions=np.concatenate([scene.quaternions for scene in scenes]),

@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import json
+import shutil
 import zipfile
 
 import numpy as np
@@ -12,6 +14,7 @@ import pytest
 from potr_cl.errors import DataError
 from potr_cl.formats import load_scene, save_scene
 from potr_cl.formats.scenes import ply
+from potr_cl.formats.scenes.scene_files import joined
 from potr_cl.model.scene import LOW_PASS, MIP_SPLATTING_LOW_PASS, Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
@@ -203,6 +206,38 @@ def test_the_model_of_sog(tmp_path, data, model, expected):
                 content = json.dumps({**json.loads(content), "model": model}).encode()
             new.writestr(entry.filename, content)
     assert load_scene(tmp_path / "a.sog").antialiased is expected
+
+
+def test_the_model_of_streamed_sog(tmp_path, data):
+    """All of its parts must say it: a scene is rendered in one way."""
+    folder = tmp_path / "lod"
+    shutil.copytree(data / "other_tools" / "splat-transform_lod", folder)
+    parts = sorted(folder.rglob("meta.json"))
+    assert len(parts) > 1
+    for number, part in enumerate(parts):
+        assert load_scene(folder).antialiased is False, number
+        part.write_text(json.dumps({**json.loads(part.read_text()), "model": "antialiased"}))
+    assert load_scene(folder).antialiased is True
+
+
+@pytest.mark.parametrize(
+    ("first", "second", "expected"),
+    [
+        ((True, LOW_PASS), (True, LOW_PASS), (True, LOW_PASS)),
+        ((True, MIP_SPLATTING_LOW_PASS), (True, MIP_SPLATTING_LOW_PASS), (True, MIP_SPLATTING_LOW_PASS)),
+        ((True, LOW_PASS), (True, MIP_SPLATTING_LOW_PASS), (False, LOW_PASS)),
+        ((True, LOW_PASS), (False, LOW_PASS), (False, LOW_PASS)),
+        ((False, LOW_PASS), (True, LOW_PASS), (False, LOW_PASS)),
+    ],
+)
+def test_scenes_that_are_joined(first, second, expected):
+    scenes = [
+        dataclasses.replace(random_scene(3, 1), antialiased=kind, low_pass=low_pass)
+        for kind, low_pass in (first, second)
+    ]
+    whole = joined(scenes)
+    assert (whole.antialiased, whole.low_pass) == expected
+    assert len(whole) == 6
 
 
 @pytest.mark.parametrize("low_pass", [LOW_PASS, MIP_SPLATTING_LOW_PASS])
