@@ -119,7 +119,8 @@ def test_a_forgotten_option_is_one_line(capsys: pytest.CaptureFixture[str]) -> N
     assert outcome(capsys, ["encode", "i.ply"]) == (
         2,
         "",
-        'potr-cl encode: -o OUT.potr (.potr, a folder, or "-" for standard output) is missing (see potr-cl encode --help)\n',
+        'potr-cl encode: -o OUT.potr (.potr, a folder, or "-" for standard output) is missing '
+        "(see potr-cl encode --help)\n",
     )
 
 
