@@ -4,8 +4,8 @@
 #     docker run --rm -v "$PWD:/data" potr-cl encode scene.ply -o scene.potr --cameras cameras.json
 
 FROM debian:trixie-slim AS build
-RUN apt-get update && apt-get install -y --no-install-recommends python3-venv
-COPY pyproject.toml README.md LICENSE MANIFEST.in /source/
+RUN apt-get update && apt-get install -y --no-install-recommends python3-venv python3-dev gcc libc6-dev
+COPY pyproject.toml setup.py README.md LICENSE MANIFEST.in /source/
 COPY potr_cl /source/potr_cl
 # pip is needed no more once everything is installed.
 RUN python3 -m venv /opt/potr-cl && /opt/potr-cl/bin/pip install --no-cache-dir --no-compile /source \

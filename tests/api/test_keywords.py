@@ -30,6 +30,8 @@ COMMANDS = ("encode", "prune", "compact", "refit", "decode", "info", "convert", 
 COMMAND_LINE_ONLY = {
     "--help": "Python has its own",
     "--json": "results are objects; SceneComparison.report() and SceneInfo.facts are what it prints",
+    "--quiet": "what a program is told it asks for by progress; warnings are log messages",
+    "--verbose": "as --quiet",
     "--from": "for standard input",
     "--to": "for standard output and folders of scenes",
     "--no-quality": "nothing is judged unless a report is asked for: compare() judges",

@@ -42,7 +42,9 @@ def main() -> None:
         project.write_text(with_urls(project.read_text("utf-8"), args.url), "utf-8")
         _run("build", "--outdir", str(args.output.resolve()), str(copy))
     stem = f"potr_cl-{__version__}"
-    wheel, sdist = args.output / f"{stem}-py3-none-any.whl", args.output / f"{stem}.tar.gz"
+    # Its name says for which machine the compiled part of the decoder is.
+    wheel = max(args.output.glob(f"{stem}-*.whl"), key=lambda path: path.stat().st_mtime)
+    sdist = args.output / f"{stem}.tar.gz"
     _run("twine", "check", "--strict", str(wheel), str(sdist))
     _run("check_wheel_contents", str(wheel))
     with zipfile.ZipFile(wheel) as contents, tarfile.open(sdist) as source:
