@@ -17,8 +17,8 @@ from potr_cl.report.scene import format_scene, scene_report
 
 
 @pytest.fixture
-def scene(lego_excerpt) -> Scene:
-    return lego_excerpt
+def scene(plush_excerpt) -> Scene:
+    return plush_excerpt
 
 
 def found(scene: Scene) -> dict[str, int]:
