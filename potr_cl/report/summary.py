@@ -149,10 +149,11 @@ def photographs_report(encoded: Encoded, missing: str | None, figures: Photograp
         figures: of the scene and the file.
     """
     uncompressed, file = figures.means
+    choice, held_out = encoded.photographs, None
+    if choice is not None:
+        held_out = {**dataclasses.asdict(choice), "kept": choice.kept, "said": str(choice)}
     return {
-        "held_out": None
-        if choice is None
-        else {**dataclasses.asdict(choice), "kept": choice.kept, "said": str(choice)},
+        "held_out": held_out,
         "missing": missing,
         "kind": figures.kind,
         "uncompressed": uncompressed,
