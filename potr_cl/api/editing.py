@@ -34,7 +34,7 @@ from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.amounts import as_bytes
-from potr_cl.pipeline.encode import Run, Stopwatch
+from potr_cl.pipeline.encode import Run, Stopwatch, check_frame
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
@@ -43,6 +43,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
+from potr_cl.stages.pruning.unseen import Unseen
 from potr_cl.stages.refitting.refit import RefitOptions, Refitted, active_coefficients, refit_colours
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
 from potr_cl.stages.stage import Progress, Stage, State
@@ -87,9 +88,11 @@ class PrunedScene(Edited):
 
     Attributes:
         pruned: which splats went, in which order; see :class:`potr_cl.stages.pruning.schedule.Pruned`.
+        unseen: the splats that no training view sees.
     """
 
     pruned: Pruned
+    unseen: Unseen
 
     @property
     def said(self) -> str:
@@ -153,6 +156,7 @@ def prune(
     device: DeviceSource = None,
     trust: bool = False,
     antialiased: bool | None = None,
+    cameras_anyway: bool = False,
     progress: Progress | None = None,
     **choices: Any,
 ) -> PrunedScene:
@@ -169,6 +173,7 @@ def prune(
         background: R, G, B from 0 to 1, or a colour's name.
         device: that computes, or what it is called.
         trust, antialiased: as of :func:`potr_cl.load_scene`.
+        cameras_anyway: take the cameras even if they do not seem to be in the scene's frame.
         progress: called with what is done and the part of it that is done.
         choices: options of the stage by the name of their flag: ``keep=0.5``, ``iterations=16``.
 
@@ -177,7 +182,7 @@ def prune(
         DataError: a file is damaged.
         DeviceError: no device does the work.
     """
-    options = stage_options(Prune, q, background, memory, choices)
+    options = stage_options(Prune, q, background, memory, choices).changed(cameras_anyway=cameras_anyway)
     write = scene_writer(output) if output is not None else None
     views, what = cameras_of(cameras), scene_of(scene, trust, antialiased)
     with contextlib.ExitStack() as stack:
@@ -188,7 +193,7 @@ def prune(
             write(state.scene)
         if ranks is not None:
             np.save(ranks, pruned.order)
-    return PrunedScene(state.scene, len(what), used, pruned)
+    return PrunedScene(state.scene, len(what), used, pruned, state.learnt["unseen"])
 
 
 def compact(
@@ -204,14 +209,15 @@ def compact(
     device: DeviceSource = None,
     trust: bool = False,
     antialiased: bool | None = None,
+    cameras_anyway: bool = False,
     progress: Progress | None = None,
     **choices: Any,
 ) -> CompactedScene:
     """Make the colours' coefficients sparse, as the command ``compact`` does; nothing else changes.
 
     Args:
-        scene, cameras, output, virtual_views, memory, background, device, trust, antialiased, progress: as of
-            :func:`prune`.
+        scene, cameras, output, virtual_views, memory, background, device, trust, antialiased, cameras_anyway,
+            progress: as of :func:`prune`.
         q: 0 (sparsest) to 1.
         sf_sh: steps a unit of the quantiser to expect.
         choices: options of the stage by the name of their flag: ``lambda_=0.01``, ``one_pass=True``.
@@ -219,7 +225,7 @@ def compact(
     Raises:
         As :func:`prune`.
     """
-    options = stage_options(Compact, q, background, memory, choices, sf_sh)
+    options = stage_options(Compact, q, background, memory, choices, sf_sh).changed(cameras_anyway=cameras_anyway)
     write = scene_writer(output) if output is not None else None
     views, what = cameras_of(cameras), scene_of(scene, trust, antialiased)
     state, used = _run(what, views, virtual_views, options, Compact, device, progress)
@@ -261,6 +267,7 @@ def _run(
     progress: Progress | None,
 ) -> tuple[State, Device]:
     """What a stage alone makes of a scene, and the device that it was done on."""
+    check_frame(scene, cameras, options.cameras_anyway)
     opened = device_of(device)
     views = train_views(views_or_placed(scene, cameras, count))
     run = Run(options, Stopwatch(progress), opened)
@@ -285,6 +292,7 @@ def refit(
     device: DeviceSource = None,
     trust: bool = False,
     antialiased: bool | None = None,
+    cameras_anyway: bool = False,
     progress: Progress | None = None,
 ) -> RefittedScene:
     """Solve for the colours of all splats of a reduced scene together, as the command ``refit`` does.
@@ -300,7 +308,8 @@ def refit(
         prior: how strongly coefficients are held where they were.
         lambda_: how strongly AC coefficients are pulled to 0.
         drop: give up an AC coefficient where the mean squared error grows by less.
-        cameras, output, virtual_views, memory, background, device, trust, antialiased, progress: as of :func:`prune`.
+        cameras, output, virtual_views, memory, background, device, trust, antialiased, cameras_anyway,
+            progress: as of :func:`prune`.
 
     Raises:
         As :func:`prune`; and UsageError if a photograph is missing or there are no cameras for them.
@@ -315,6 +324,7 @@ def refit(
     ground_truth = GroundTruth(Path(photos), given, colour) if photos is not None and given is not None else None
     reduced, original = scene_of(scene, trust, antialiased), scene_of(reference, trust, antialiased)
     check_rendered_alike((str(name_of(scene)), reduced), (str(name_of(reference)), original))
+    check_frame(original, given, cameras_anyway)
     opened = device_of(device)
     there = views_or_placed(original, given, virtual_views)
     views = train_views(there)

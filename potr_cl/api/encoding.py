@@ -65,6 +65,7 @@ def encode(
     threads: int | None = None,
     trust: bool = False,
     antialiased: bool | None = None,
+    cameras_anyway: bool | None = None,
     tell: Callable[[str], None] | None = None,
     **choices: Any,
 ) -> Encoded:
@@ -91,6 +92,7 @@ def encode(
         memory: GiB of device memory to keep views in; by default half of it, 0.3 of a CPU's.
         threads: on the host; one for each processor by default.
         trust, antialiased: as of :func:`potr_cl.load_scene`.
+        cameras_anyway: take the cameras even if they do not seem to be in the scene's frame.
         tell: told a line for every step of a search for a size or a PSNR.
         choices: any option of a stage by the name of its flag: ``keep=0.5`` is ``--keep 0.5``, ``prune=False`` is
             ``--no-prune``, ``refit="off"`` is ``--refit off``; ``lambda_`` stands for ``--lambda``, as lambda is a word
@@ -105,7 +107,7 @@ def encode(
     began = time.perf_counter()
     settings = encode_options(
         options, preset, choices, q=q, background=background, memory=memory, threads=threads,
-        source_bytes=bytes_of_file(scene),
+        source_bytes=bytes_of_file(scene), cameras_anyway=cameras_anyway,
     )  # fmt: skip
     target = encode_target(q, max_size, min_psnr)
     check_photographs_have_cameras(settings, cameras is not None)
@@ -165,6 +167,7 @@ def encode_options(
     memory: float | None = None,
     threads: int | None = None,
     source_bytes: int | None = None,
+    cameras_anyway: bool | None = None,
     stages: Collection[type[Stage]] | None = None,
 ) -> EncodeOptions:
     """The options that keywords ask for, checked.
@@ -186,6 +189,7 @@ def encode_options(
         "memory": as_bytes(memory),
         "threads": threads,
         "source_bytes": source_bytes,
+        "cameras_anyway": cameras_anyway,
     }
     changes = {name: value for name, value in changes.items() if value is not None} | stage_changes(choices, stages)
     if options is None:

@@ -39,12 +39,15 @@ def _prune(args: argparse.Namespace) -> None:
         progress = stack.enter_context(contextlib.closing(Progress()))
         result = prune(
             scene, cameras or virtual_cameras(args, scene, progress),
-            q=args.quality, memory=args.memory, background=args.background, device=device, progress=progress, **choices,
+            q=args.quality, memory=args.memory, background=args.background, device=device, progress=progress,
+            cameras_anyway=args.cameras_anyway, **choices,
         )  # fmt: skip
         ply.save(args.output, result.scene)
         if order is not None:
             np.save(order, result.pruned.order)
     say(f"{args.output}: {result.said} on {result.device.info}")
+    if result.unseen.splats:
+        say(result.unseen)
 
 
 def _inputs(args: argparse.Namespace) -> tuple[Scene, list[Camera] | None, Device]:
@@ -80,7 +83,7 @@ def _compact(args: argparse.Namespace) -> None:
         result = compact(
             scene, cameras or virtual_cameras(args, scene, progress),
             q=args.quality, sf_sh=args.sf_sh, memory=args.memory, background=args.background,
-            device=device, progress=progress, **choices,
+            device=device, progress=progress, cameras_anyway=args.cameras_anyway, **choices,
         )  # fmt: skip
     ply.save(args.output, result.scene)
     say(f"{args.output}: {result.said}")
@@ -118,6 +121,7 @@ def _refit(args: argparse.Namespace) -> None:
             scene, reference, cameras or virtual_cameras(args, reference, progress),
             photos=args.photos, steps=args.steps, prior=args.prior, lambda_=args.lam,
             drop=args.drop, memory=args.memory, background=background, device=device, progress=progress,
+            cameras_anyway=args.cameras_anyway,
         )  # fmt: skip
     ply.save(args.output, result.scene)
     say(f"{args.output}: {len(scene)} splats re-fitted in {result.refitted.steps} steps on {result.device.info}")

@@ -39,7 +39,7 @@ from potr_cl.stages.refit import Refit
 def _options(args: argparse.Namespace) -> EncodeOptions:
     return encode_options(
         None, args.preset, stage_choices(args), q=args.quality, background=args.background, memory=args.memory,
-        threads=args.threads, source_bytes=size_of_file(args.scene),
+        threads=args.threads, source_bytes=size_of_file(args.scene), cameras_anyway=args.cameras_anyway,
     )  # fmt: skip
 
 

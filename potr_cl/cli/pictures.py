@@ -23,7 +23,7 @@ from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene
 from potr_cl.cli.terminal import note, say, say_document
-from potr_cl.cli.views import read_cameras
+from potr_cl.cli.views import read_cameras, warn_of_frame
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import parse_colour
 from potr_cl.host.atomic_write import replacing
@@ -91,6 +91,8 @@ def _render(args: argparse.Namespace) -> None:
     device = Device(args.device)
     make_folder(args.output)
     scene = scene or read_scene(args, args.scene)
+    if args.cameras is not None:
+        warn_of_frame(args.scene, scene, views)
     stage = f"rendering {len(views)} view{'s' if len(views) > 1 else ''}"
     with (
         Rasterizer(device, scene, RULES[args.rules], background) as rasterizer,
@@ -133,6 +135,9 @@ def _compare(args: argparse.Namespace) -> None:
         return
     cameras = cameras or _cameras(args, points, a)
     views = chosen_views(cameras, args.views, args.split)
+    if args.cameras is not None:
+        for path, scene in ((args.a, a), (args.b, b)):
+            warn_of_frame(path, scene, views)
     with contextlib.ExitStack() as stack:
         picture = stack.enter_context(replacing(args.output)) if args.output is not None else None
         progress = stack.enter_context(contextlib.closing(Progress()))

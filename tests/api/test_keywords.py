@@ -81,6 +81,8 @@ VALUES: dict[str, tuple[list[str], Any]] = {
     "--trust": ([], True),
     "--antialiased": (["yes"], True),
     "--sh-degree": (["1"], 1),
+    "--cameras-anyway": ([], True),
+    "--unseen": (["drop"], "drop"),
     "--memory": (["0.25"], 0.25),
     "--background": (["0.2,0.4,0.8"], (0.2, 0.4, 0.8)),
     "--device": (["{device}"], "{device}"),
@@ -93,7 +95,7 @@ VALUES: dict[str, tuple[list[str], Any]] = {
 }
 #: What only says how the work is done.
 SAME_RESULT = {"--threads", "--trust", "--memory", "--device", "--output", "--cameras", "--reference", "--report",
-               "--report-view", "--order", "--tolerance"}  # fmt: skip
+               "--report-view", "--order", "--tolerance", "--cameras-anyway", "--unseen"}  # fmt: skip
 #: The compaction weighs views by what they show of a splat, whatever is behind it. And without a number of virtual
 #: views dozens are placed, which takes long.
 NO_DIFFERENCE = {

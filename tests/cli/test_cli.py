@@ -275,7 +275,7 @@ def test_prune(tmp_path, scene_path, capsys):
     assert cli.main([str(a) for a in [*arguments, "--keep", "0.5"]]) == 0
     assert len(ply.load(out)) == 100
     for limit, kept in (("0", 200), ("1e9", 1)):
-        assert cli.main([str(a) for a in [*arguments, "--delta-mse-max", limit]]) == 0
+        assert cli.main([str(a) for a in [*arguments, "--unseen", "drop", "--delta-mse-max", limit]]) == 0
         assert len(ply.load(out)) <= kept
     capsys.readouterr()
 
