@@ -14,7 +14,7 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.refit import RefitOptions, active_coefficients, refit_colours
-from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
+from potr_cl.stages.refitting.targets import GroundTruthTargets, PartlyPhotographed, RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 
@@ -117,13 +117,7 @@ class Refit(Stage):
         active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
         with ExitStack() as stack:
             stack.callback(bench.progress, "refit", 1.0)
-            targets: RenderedTargets | GroundTruthTargets
-            if self.ground_truth is None:
-                rasterizer = stack.enter_context(Rasterizer(bench.opened, state.source, background=bench.background))
-                targets = RenderedTargets(rasterizer, state.views)
-            else:
-                ground_truth = GroundTruth(self.ground_truth, state.views, bench.background)
-                targets = GroundTruthTargets(bench.opened, ground_truth, state.views)
+            targets = _targets(self.ground_truth, state, bench, stack)
             refitted = refit_colours(
                 bench.opened,
                 decoded,
@@ -135,6 +129,21 @@ class Refit(Stage):
                 lambda done, steps: bench.progress("refit", done / steps),
             )
         return replace(state.recoloured(refitted.sh), geometry=geometry).having_learnt(self.name, refitted)
+
+
+def _targets(folder: Path | None, state: State, bench: Workbench, stack: ExitStack) -> Targets:
+    """The pictures that the views of a state should show; what they need is closed with the stack."""
+    given = len(state.views) - state.added
+    photographs = None
+    if folder is not None:
+        ground_truth = GroundTruth(folder, state.views[:given], bench.background)
+        photographs = GroundTruthTargets(bench.opened, ground_truth, state.views)
+        if not state.added:
+            return photographs
+    rasterizer = stack.enter_context(Rasterizer(bench.opened, state.source, background=bench.background))
+    rendered = RenderedTargets(rasterizer, state.views)
+    # Nobody photographed the views that were added.
+    return rendered if photographs is None else PartlyPhotographed(photographs, given, rendered)
 
 
 @dataclass(frozen=True)
