@@ -1,9 +1,9 @@
 """How many views between the training views does a scene need? A trial with some of them held out.
 
-A few training views are held out, the rest are made small, and splats are removed down to a fixed number by what the
-rest shows, without and with views between them. Since the number is fixed, whatever the held-out views lose less with
-added views is won at equal size. It is enough if they lose no more than the views that were looked at; and where more
-views no longer help, fewer do.
+A few training views are held out, the rest are made small, and splats are removed by what the rest shows, without and
+with views between them: each time down to the number that is left without. Since the number is the same, whatever the
+held-out views lose less with added views is won at equal size. It is enough if they lose no more than the views that
+were looked at; and where more views no longer help, fewer do.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from potr_cl.stages.stage import State, Workbench
 ROUNDS = (1, 3)
 #: Every so many-th view is held out; with fewer views than the least there is nothing to learn from holding out some.
 _EVERY, _LEAST = 8, 6
-#: Width and height of the trial's views, at most; part of the splats that stay; iterations and steps.
+#: Width and height of the trial's views, at most; iterations and steps.
 _SIDE = 256
-_KEEP, _ITERATIONS, _STEPS = 0.5, 6, 2
+_ITERATIONS, _STEPS = 6, 2
 #: A round has to bring so many decibels on the held-out views; below so many between them and the others the gap is
 #: closed.
 _GAIN, _CLOSED = 0.15, 0.3
@@ -73,11 +73,12 @@ def try_views(state: State, bench: Workbench, spread: float, most: int) -> Trial
     wanted = _pictures(state.source, judges, bench)
     of_held: list[float] = []
     of_rest: list[float] = []
-    best = 0
+    best, count = 0, None
     for number, each in enumerate([0, *rounds]):
         bench.progress("views between", number / (len(rounds) + 1))
         looked_at = (*rest, *views_between(state.source, rest, each, spread))
-        reduced = _reduced(dataclasses.replace(state, views=looked_at), quiet)
+        reduced = _reduced(dataclasses.replace(state, views=looked_at), quiet, count)
+        count = len(reduced)
         got = _pictures(reduced, judges, bench)
         errors = [psnr(a, b) for a, b in zip(wanted, got, strict=True)]
         of_held.append(float(np.mean(errors[: len(held)])))
@@ -90,9 +91,9 @@ def try_views(state: State, bench: Workbench, spread: float, most: int) -> Trial
     return Trial(best, tuple(of_held), tuple(of_rest))
 
 
-def _reduced(state: State, bench: Workbench) -> Scene:
-    """A part of the splats, with their colours re-fitted, as a quick encode would leave them."""
-    pruned = Prune(keep=_KEEP, iterations=_ITERATIONS).run(state, bench)
+def _reduced(state: State, bench: Workbench, count: int | None) -> Scene:
+    """So many splats, or as many as q leaves, with their colours re-fitted, as a quick encode would leave them."""
+    pruned = Prune(count=count, iterations=_ITERATIONS).run(state, bench)
     return Refit(steps=_STEPS).run(pruned, bench).scene
 
 
