@@ -17,7 +17,6 @@ ROOT = Path(__file__).parents[1]
 def test_every_name_is_there():
     for name in potr_cl.__all__:
         assert getattr(potr_cl, name) is not None
-    assert set(potr_cl._HOMES) == set(potr_cl.__all__) - {"__version__"}
     assert dir(potr_cl) == sorted(potr_cl.__all__)
     with pytest.raises(AttributeError, match="no attribute 'enocde'"):
         _ = potr_cl.enocde

@@ -18,6 +18,7 @@ bench.virtual_cameras  what does encoding without cameras cost?
 bench.needs            what is a scene charged for splats, views and tiles that nobody needs?
 bench.busy             how busy is the device during an encode, stage by stage?
 bench.kernels          processor time of each kernel, on machines that do other work too
+bench.paired           are whole encodes faster or slower than those of another checkout?
 bench.memory           host memory of one encode, stage by stage
 bench.memory_growth    peak memory against splats and views, and whether --memory is obeyed
 =====================  =================================================================================================
@@ -28,6 +29,7 @@ What a choice costs or brings, against the alternatives (``study``):
 study.rate_distortion      size against quality: the curves that other studies compare with
 study.ablation             what does each part of the codec contribute?
 study.compare_formats      what would people use instead?
+study.virtual_views        how many virtual views, how large, how wide, at what time and memory?
 study.rates                where do the bits go, and what do they buy?
 study.compaction_curves    what does the compaction do to sparsity and pictures?
 study.removal_exactness    how far are predicted removal effects from removals in float64?

@@ -20,7 +20,7 @@ from potr_cl.host.threads import in_background
 from potr_cl.plain_text import plain
 
 #: The commands, and who adds them, in the order of the help.
-_COMMANDS = {
+COMMANDS = {
     "encode": "encode",
     "prune": "edit",
     "compact": "edit",
@@ -82,8 +82,8 @@ def command_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
     parser.add_argument("--version", action="version", version=f"potr-cl {__version__}")
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     # To decode takes less time than to import what other commands need.
-    for command in [argv[0]] if argv and argv[0] in _COMMANDS else _COMMANDS:
-        getattr(import_module(f"potr_cl.cli.{_COMMANDS[command]}"), f"add_{command}")(commands)
+    for command in [argv[0]] if argv and argv[0] in COMMANDS else COMMANDS:
+        getattr(import_module(f"potr_cl.cli.{COMMANDS[command]}"), f"add_{command}")(commands)
     return parser
 
 

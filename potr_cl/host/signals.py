@@ -22,7 +22,7 @@ _SAID = {
     "SIGHUP": b"potr-cl: the terminal was closed; no file is left half written\n",
 }
 #: Seconds that the work is given to let go of what it holds.
-_PATIENCE = 5.0
+PATIENCE = 5.0
 
 _received: int | None = None
 _unwinds = False
@@ -68,7 +68,7 @@ def _handle(number: int, _frame: FrameType | None) -> None:
 
 
 def _end_late(number: int) -> None:
-    time.sleep(_PATIENCE)
+    time.sleep(PATIENCE)
     _end(number)
 
 

@@ -29,13 +29,16 @@ from potr_cl.model.scene import Scene
 
 F32 = NDArray[np.float32]
 
-#: Training views that are placed unless told otherwise. Many small ones leave fewer gaps than few large ones of as many
-#: pixels; but each costs time and memory for every splat, so that large scenes get fewer.
-FEWEST, MOST = 100, 300
-_SPLATS_TIMES_VIEWS = 150_000_000
+#: Training views that are placed unless told otherwise. Each costs time and memory for every splat, hardly less if it
+#: is small: so they are few and wide, and large scenes get fewer.
+FEWEST, MOST = 64, 96
+_SPLATS_TIMES_VIEWS = 50_000_000
 #: Pixels of all of them together, and along a side of each.
-_PIXELS = 108_000_000
-_SMALLEST, _LARGEST = 500, 1000
+_PIXELS = 47_000_000
+_SMALLEST, _LARGEST = 500, 860
+#: Degrees from side to side. A wide view shows a splat together with more of the others, so that fewer views show each
+#: splat from as many directions.
+FIELD = 80.0
 #: What may be asked for: no more views than places are tried, no wider ones than are rendered.
 _MOST_ASKED, _WIDEST_ASKED = 4000, 16384
 #: What the names of virtual cameras begin with.
@@ -47,14 +50,17 @@ _SOME = 3000
 _AROUND = 0.35
 
 
-def place_cameras(scene: Scene, count: int | None = None, size: int | None = None) -> list[Camera]:
+def place_cameras(
+    scene: Scene, count: int | None = None, size: int | None = None, field: float = FIELD
+) -> list[Camera]:
     """Views that cover what someone would look at.
 
     Args:
         scene: clean, at least one splat.
-        count: training views; by default 100 to 300, the fewer the more splats there are. An eighth as many test views,
+        count: training views; by default 64 to 96, the fewer the more splats there are. An eighth as many test views,
             which lie among them, come on top.
-        size: of their square images, in pixels; by default 500 to 1000, the smaller the more views there are.
+        size: of their square images, in pixels; by default 700 to 860, the smaller the more views there are.
+        field: of view from side to side, in degrees; less where the renderer's near plane would cut a small scene off.
 
     Returns:
         Cameras "virtual_000" and so on, in the order in which they were picked.
@@ -65,7 +71,7 @@ def place_cameras(scene: Scene, count: int | None = None, size: int | None = Non
     planned = plan(len(scene), count, size)
     frame = frame_of(scene)
     matter = matter_of(scene, frame)
-    candidates = candidates_of(frame, matter)
+    candidates = candidates_of(frame, matter, math.tan(math.radians(field / 2)))
     tests, views = planned.test, planned.training + planned.test
     picked = pick(candidates, views)
     every = views // tests if tests else 0

@@ -19,7 +19,7 @@ os.environ.setdefault("PYOPENCL_CACHE_FAILURE_FATAL", "")
 
 #: Processes hold the lock while they read or write a program, which takes milliseconds. Seconds after which one that
 #: is still the same is nobody's; and the age at which nobody needs to wait for that.
-_PATIENCE, _OLD = 5.0, 60.0
+PATIENCE, OLD = 5.0, 60.0
 
 
 def folder() -> str | bool:
@@ -50,7 +50,7 @@ def _remove_left_lock(lock: str) -> None:
     first = _identity(lock)
     if first is None:
         return
-    end = time.monotonic() + (0 if time.time() - first[1] > _OLD else _PATIENCE)
+    end = time.monotonic() + (0 if time.time() - first[1] > OLD else PATIENCE)
     while time.monotonic() < end:
         time.sleep(0.05)
         if _identity(lock) != first:

@@ -157,11 +157,10 @@ class Run:
         return state
 
     def _interludes(self, stage: Stage, state: State) -> tuple[Interlude, ...]:
-        """What other stages want done while this one removes splats, in iterations."""
-        iterations: int | None = getattr(stage, "iterations", None)
-        if iterations is None:
+        """What other stages want done while this one removes splats."""
+        if stage.removes_in is None:
             return ()
-        wanted = [each for other in self._options.stages if other.on for each in other.interludes(iterations)]
+        wanted = [each for other in self._options.stages if other.on for each in other.interludes(stage.removes_in)]
         return tuple(interlude for interlude in wanted if interlude.stage.looks_at(state.source))
 
     def finished(self, state: State) -> Encoded:

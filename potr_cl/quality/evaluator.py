@@ -25,7 +25,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 #: So many training views, spread evenly, stand for all of them where there are no test views.
 _MOST_TRAINING_VIEWS = 32
 #: Bytes of the uncompressed scene's pictures that are kept from one candidate to the next; others are rendered again.
-_CACHED_PICTURES = 1 << 30
+CACHED_PICTURES = 1 << 30
 
 
 @dataclass(frozen=True)
@@ -96,7 +96,7 @@ class Evaluator(Owner):
         self._similarity = Similarity(device)
         self._pictures: dict[str, Picture] = {}
         self._kept = ExitStack()
-        self._room = min(_CACHED_PICTURES, device.info.memory // 16)
+        self._room = min(CACHED_PICTURES, device.info.memory // 16)
 
     def psnr(self, candidate: Scene, most: int | None = None) -> float:
         """Mean over the views of the PSNR against the uncompressed scene's pictures, in decibels.

@@ -90,6 +90,10 @@ class Prune(Stage):
             raise UsageError("give either the part or the number of splats to keep")
         _ = self._sweep_options(None), self._schedule(0.0, 1)  # refuse what is out of range at once
 
+    @property
+    def removes_in(self) -> int:
+        return self.iterations
+
     def _sweep_options(self, memory: int | None) -> SweepOptions:
         return SweepOptions(
             tolerance=self.tolerance,

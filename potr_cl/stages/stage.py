@@ -168,6 +168,11 @@ class Stage(ABC):
         """Whether there is anything in this scene for which the stage has to look at views."""
         return self.asked_for and self.needs_views
 
+    @property
+    def removes_in(self) -> int | None:
+        """In how many iterations the stage removes splats; None: there are none for other stages to come between."""
+        return None
+
     def interludes(self, iterations: int) -> Sequence[Interlude]:
         """What the stage wants done while splats are being removed in so many iterations."""
         return ()

@@ -556,7 +556,7 @@ def test_every_command_has_its_help(capsys):
         cli.main(["--help"])
     assert left.value.code == 0
     listed = capsys.readouterr().out
-    for command in cli._COMMANDS:
+    for command in cli.COMMANDS:
         with pytest.raises(SystemExit) as left:
             cli.main([command, "--help"])
         assert left.value.code == 0

@@ -110,7 +110,7 @@ def test_paths_of_no_known_kind(tmp_path: Path, monkeypatch: pytest.MonkeyPatch)
     refused(tmp_path / "notes.txt", "unknown kind of cameras", UsageError)
     (tmp_path / "a.json").mkdir()
     refused(tmp_path / "a.json", "holds no cameras", UsageError)
-    monkeypatch.setattr(view_files, "_MAX_JSON_BYTES", 10)
+    monkeypatch.setattr(view_files, "MAX_JSON_BYTES", 10)
     refused(write_json(tmp_path / "b.json", [view()]), "too large for a camera file")
 
 

@@ -30,7 +30,7 @@ from pathlib import Path
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.leftovers import temporary_folder
 from potr_cl.host import signals
-signals._PATIENCE = float(sys.argv[3])
+signals.PATIENCE = float(sys.argv[3])
 signals.end_cleanly_on_signals()
 number = getattr(signal, sys.argv[1])
 with signals.unwinding(), replacing(sys.argv[2]) as file, temporary_folder() as folder:

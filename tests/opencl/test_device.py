@@ -59,7 +59,8 @@ def machine(monkeypatch: pytest.MonkeyPatch, faults: dict[str, str]) -> list[Dev
         invented(6, "RTX", "gpu", "NVIDIA CUDA"),
         invented(7, "RTX", "gpu", "NVIDIA CUDA"),
     ]
-    monkeypatch.setattr(discovery, "_devices", devices)
+    for module in ("opencl.discovery", "report.devices"):
+        monkeypatch.setattr(f"potr_cl.{module}.list_devices", lambda: list(devices))
     monkeypatch.delenv("POTR_CL_DEVICE", raising=False)
     return devices
 
@@ -70,7 +71,6 @@ def test_preference(machine: list[DeviceInfo]) -> None:
     while machine:
         order.append(choose_device().index)
         machine.remove(choose_device())
-        discovery._devices = machine
     assert order == [6, 7, 5, 4, 3, 2, 1, 0]
 
 
@@ -95,7 +95,7 @@ def test_specification_that_fits_nothing(machine: list[DeviceInfo], spec: str) -
     ("architecture", "advice"), [("x86_64", "`pip install intel"), ("AMD64", "`pip install intel"), ("aarch64", "PoCL")]
 )
 def test_no_device_at_all(monkeypatch: pytest.MonkeyPatch, architecture: str, advice: str) -> None:
-    monkeypatch.setattr(discovery, "_devices", [])
+    monkeypatch.setattr(discovery, "list_devices", list)
     monkeypatch.setattr(discovery, "machine", lambda: architecture)
     monkeypatch.setattr("sys.platform", "linux")
     with pytest.raises(DeviceError, match=f"or a CPU runtime by .*{advice}"):
@@ -305,19 +305,19 @@ def test_registering_a_runtime_keeps_the_others(tmp_path: Path, monkeypatch: pyt
     monkeypatch.setattr(loader.importlib.metadata, "files", lambda package: [Installed()])
     monkeypatch.setattr(loader, "place_for_temporary_files", lambda: str(tmp_path))
     monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))
-    loader._register_intel_runtime()
+    loader.register_runtimes()
     made = Path(os.environ["OCL_ICD_VENDORS"])
     assert made.parent == tmp_path
     assert {p.name: p.read_text() for p in made.iterdir()} == {
         "other.icd": "libother.so\n",
         "potr_cl_intel_cpu.icd": f"{library}\n",
     }
-    loader._register_intel_runtime()  # what is there already is left alone
+    loader.register_runtimes()  # what is there already is left alone
     assert os.environ["OCL_ICD_VENDORS"] == str(made)
 
     library.unlink()
     monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))
-    loader._register_intel_runtime()
+    loader.register_runtimes()
     assert os.environ["OCL_ICD_VENDORS"] == str(vendors)
 
 
@@ -333,11 +333,12 @@ def test_registering_a_runtime_on_windows(tmp_path: Path, monkeypatch: pytest.Mo
 
     monkeypatch.setattr(loader.importlib.metadata, "files", lambda package: [Installed()])
     monkeypatch.setenv("OCL_ICD_FILENAMES", known)
-    loader._register_intel_runtime_on_windows()
+    monkeypatch.delattr(os, "getuid")  # which Windows has not
+    loader.register_runtimes()
     assert os.environ["OCL_ICD_FILENAMES"] == known  # it is not there
     library.touch()
     for _ in range(2):  # the second time it is known
-        loader._register_intel_runtime_on_windows()
+        loader.register_runtimes()
         assert os.environ["OCL_ICD_FILENAMES"].split(os.pathsep) == [*filter(None, [known]), str(library)]
 
 

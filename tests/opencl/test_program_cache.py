@@ -42,7 +42,7 @@ def test_an_old_lock_is_removed_at_once(cache):
 
 
 def test_a_lock_that_stays_the_same_is_removed(cache, monkeypatch):
-    monkeypatch.setattr(program_cache, "_PATIENCE", 0.3)
+    monkeypatch.setattr(program_cache, "PATIENCE", 0.3)
     (cache / "lock").touch()
     program_cache.folder()
     assert not (cache / "lock").exists()

@@ -70,7 +70,7 @@ def test_figures_are_those_of_the_pictures(evaluator):
 
 def test_pictures_that_are_not_kept_are_the_same(evaluator, monkeypatch):
     kept = evaluator.psnr(WORSE), evaluator.psnr(WORSE)
-    monkeypatch.setattr("potr_cl.quality.evaluator._CACHED_PICTURES", 0)
+    monkeypatch.setattr("potr_cl.quality.evaluator.CACHED_PICTURES", 0)
     with Evaluator(Device(), SCENE, evaluator.views, (0.2, 0.0, 0.0)) as other:
         assert (other.psnr(WORSE), other.psnr(WORSE)) == kept
 

@@ -1,12 +1,13 @@
-"""How many virtual views, and how large? What each choice costs in bytes, time and memory.
+"""How many virtual views, how large, how wide? What each choice costs in bytes, time and memory.
 
-    python -m tools.study.virtual_views SCENE … [--views 48x600 128x500 …] [--json FILE]
+    python -m tools.study.virtual_views SCENE … [--views 96x700@80 300x600@50 …] [--json FILE]
 
 A SCENE is a folder with point_cloud.ply and cameras.json. It is encoded with its training cameras at the qualities of
---qualities, and then with virtual views of each number and size at two of them. PSNR is the mean over the true test
-views, against the uncompressed scene's renders. Bytes are compared at the PSNR that the true cameras reach at q = 0.5,
-interpolated in the logarithm of the bytes; time is that of the encodes at the first quality, as a multiple of the true
-cameras'; memory is the most that the device had given away whenever the encode reported how far it was.
+--qualities, and then with virtual views of each number, size and field of view (NUMBERxPIXELS@DEGREES). PSNR is the
+mean over the true test views, against the uncompressed scene's renders. Bytes are compared at the PSNR that the true
+cameras reach at the first quality, interpolated in the logarithm of the bytes; time is that of the encodes at the first
+quality, as a multiple of the true cameras'; memory is the most that the device had given away whenever the encode
+reported how far it was.
 
 --fraction F takes all pictures smaller, and --iterations N prunes in fewer iterations: enough to compare placements on
 a CPU, not for publication.
@@ -16,6 +17,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
+import re
 import sys
 import time
 from collections.abc import Callable, Sequence
@@ -35,8 +37,11 @@ from potr_cl.quality.metrics import psnr
 from tools.results import Column, Results
 from tools.workloads import pictures, read, scaled, scene_parser
 
-#: Number and size that are tried unless told otherwise.
-VIEWS = ("48x600", "64x600", "96x400", "96x500", "96x600", "128x400", "128x500", "128x600", "192x500", "300x600")
+#: Number, size and field that are tried unless told otherwise; the first were the default while views were narrow.
+VIEWS = (
+    "300x600@50", "128x500@50", "48x700@90", "64x600@80", "64x700@90", "96x500@80", "96x600@65", "96x700@80",
+    "96x800@90", "128x600@65", "128x600@80", "192x500@65",
+)  # fmt: skip
 QUALITIES = (0.5, 0.6)
 
 
@@ -107,7 +112,7 @@ class Judge:
 def main() -> None:
     """Command line."""
     parser = scene_parser(__doc__)
-    parser.add_argument("--views", nargs="+", default=VIEWS, metavar="NxSIZE", help="number and size of the views")
+    parser.add_argument("--views", nargs="+", default=VIEWS, metavar="NxSIZE@DEGREES", help="what to try")
     parser.add_argument("--qualities", nargs="+", type=float, default=QUALITIES)
     parser.add_argument("--fraction", type=float, default=1.0, help="of the width and height of all views")
     parser.add_argument("--iterations", type=int, help="of pruning; default: the preset's")
@@ -118,10 +123,11 @@ def main() -> None:
         options = options.changed(prune={"iterations": args.iterations})
     table = Results(device.info, args.json).table(
         "study",
-        "Virtual views by number and size: bytes at the PSNR that the true cameras reach at q = 0.5, time and memory",
+        "Virtual views by number, size and field: bytes at the true cameras' PSNR, time and memory",
         Column("scene"),
         Column("views"),
         Column("width and height", "pixels"),
+        Column("field", "degrees"),
         Column("pixels", "million", ".0f"),
         Column("bytes", "%", "+.1f"),
         Column("PSNR at q = 0.5", "dB", ".2f"),
@@ -155,13 +161,14 @@ def measure(
         folder.name, f"{len(own)} true", sizes, megapixels, 0.0, true.psnr[0], true.seconds, 1.0, true.memory / 1e6, 1.0
     )
     for text in views:
-        count, size = (int(number) for number in text.split("x"))
-        placed = [scaled(c, fraction) for c in train_views(place_cameras(scene, count, size))]
+        count, size, degrees = (int(number) for number in re.split("[x@]", text))
+        placed = [scaled(c, fraction) for c in train_views(place_cameras(scene, count, size, degrees))]
         got = judge.outcome(placed)
         add(
             folder.name,
             f"{count}",
             f"{placed[0].width} x {placed[0].height}",
+            f"{degrees}",
             sum(c.width * c.height for c in placed) / 1e6,
             100 * (got.bytes_at(true.psnr[0]) / true.nbytes[0] - 1),
             got.psnr[0],

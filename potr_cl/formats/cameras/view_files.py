@@ -17,7 +17,7 @@ from potr_cl.model.camera import Camera
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".exr", ".heic"})
 
-_MAX_JSON_BYTES = 256 << 20  # some 400 000 views
+MAX_JSON_BYTES = 256 << 20  # some 400 000 views
 _MAX_SIDE = 1 << 16
 
 
@@ -44,8 +44,8 @@ def read_json(path: Path) -> Any:
         size = path.stat().st_size
     except (OSError, ValueError) as error:
         raise UsageError(f"cannot read '{path}': {getattr(error, 'strerror', None) or error}") from error
-    if size > _MAX_JSON_BYTES:
-        raise DataError(f"'{path}' is too large for a camera file: {size} bytes, at most {_MAX_JSON_BYTES} are read")
+    if size > MAX_JSON_BYTES:
+        raise DataError(f"'{path}' is too large for a camera file: {size} bytes, at most {MAX_JSON_BYTES} are read")
     try:
         return json.loads(read_bytes(path))
     except RecursionError as error:

@@ -179,7 +179,7 @@ class _Archive:
             raise self._damaged(f"'{name}' has {width} x {height} {what} for {self._count} splats")
 
     def _size(self, name: str, index: int) -> tuple[int, int]:
-        size = _webp_size(self._stored(name, index))
+        size = webp_size(self._stored(name, index))
         if size is None:
             raise self._damaged(f"an image of '{name}' is no WebP image")
         return size
@@ -190,7 +190,7 @@ class _Archive:
 
         stored = self._stored(name, index)
         with opened_image(io.BytesIO(stored), ("WEBP",)) as image:
-            if image.size != _webp_size(stored):
+            if image.size != webp_size(stored):
                 raise self._damaged(f"an image of '{name}' has two sizes")
             pixels: U8 = np.asarray(image.convert("RGBA")).reshape(-1, 4)
             return pixels
@@ -202,7 +202,7 @@ class _Archive:
         return DataError(f"'{self._path}' is damaged: {what}")
 
 
-def _webp_size(data: bytes) -> tuple[int, int] | None:
+def webp_size(data: bytes) -> tuple[int, int] | None:
     """Width and height that a WebP file begins with, for which Pillow would take memory; None if it is none."""
     head, kind = data[:30], data[12:16]
     if len(head) < 30 or head[:4] != b"RIFF" or head[8:12] != b"WEBP":

@@ -16,8 +16,6 @@ F32 = NDArray[np.float32]
 
 #: Directions from which seeing a splat counts as new.
 BINS = 32
-#: Half the field of view: tan of 25 degrees, both ways.
-HALF_VIEW = math.tan(math.radians(25))
 #: Places to stand that are tried, and views at each.
 _PLACES = 800
 _AIMS = 6
@@ -55,13 +53,21 @@ class Candidates:
     trained: bool
 
 
-def candidates_of(frame: Frame, matter: Matter) -> Candidates:
-    """All views from all places that are free; from the freest tenth if too few are."""
-    places, tangents = places_to_try(frame)
+def candidates_of(frame: Frame, matter: Matter, half_view: float) -> Candidates:
+    """All views from all places that are free; from the freest tenth if too few are.
+
+    Args:
+        frame, matter: of the scene.
+        half_view: tan of half the field of view, both ways.
+    """
+    places, tangents = places_to_try(frame, half_view)
     horizons, blocked = zip(*[surroundings(camera_centre, matter) for camera_centre in places], strict=True)
     crowd = np.array(blocked)
     free = np.flatnonzero(crowd <= max(CROWDED, float(np.quantile(crowd, 0.1))))
-    views = [views_from(places[place], tangents[place], horizons[place], frame, matter) for place in free]
+    views = [
+        views_from(places[place], tangents[place], tangents[place] / half_view, horizons[place], frame, matter)
+        for place in free
+    ]
     worths = [worth for _, worth, _ in views]
     memory = remembered(places[free], [np.maximum.reduce(worth) for worth in worths], matter)
     if memory is not None:
@@ -79,7 +85,7 @@ def candidates_of(frame: Frame, matter: Matter) -> Candidates:
     )
 
 
-def places_to_try(frame: Frame) -> tuple[F64, F64]:
+def places_to_try(frame: Frame, half_view: float) -> tuple[F64, F64]:
     """Positions to try, and the tangent of half the field of view there.
 
     Evenly in direction and in the logarithm of the distance. Where the near plane would cut off a small scene, the
@@ -88,19 +94,26 @@ def places_to_try(frame: Frame) -> tuple[F64, F64]:
     spread = low_discrepancy(_PLACES, 3)
     distance = _NEAREST * (_FARTHEST / _NEAREST) ** spread[:, 2]
     away = np.maximum(distance, frame.near + 1.5) if frame.near > 0.5 else distance
-    return on_sphere(spread[:, :2]) * away[:, None], HALF_VIEW * distance / away
+    return on_sphere(spread[:, :2]) * away[:, None], half_view * distance / away
 
 
 def views_from(
-    camera_centre: F64, tangent: float, horizon: F32, frame: Frame, matter: Matter
+    camera_centre: F64, tangent: float, zoom: float, horizon: F32, frame: Frame, matter: Matter
 ) -> tuple[F64, F32, NDArray[np.uint8]]:
-    """Some directions to look in from one place, what each view shows of every target, and from which direction bin."""
+    """Some directions to look in from one place, what each view shows of every target, and from which direction bin.
+
+    Args:
+        camera_centre: (3,) the place.
+        tangent: of half the field of view.
+        zoom: the tangent as a part of what it is where no lens had to be longer.
+        horizon: of the place, as :func:`potr_cl.model.placement.matter.surroundings` gives it.
+        frame, matter: of the scene.
+    """
     rays = matter.targets - camera_centre
     distance = np.linalg.norm(rays, axis=1)
     towards = rays / np.maximum(distance, 1e-300)[:, None]
     # A cell is wide: what is a little behind its nearest point may be the same surface.
     visible = (distance <= 1.1 * horizon[cell_of(rays.T.astype(np.float32))] + 0.02) & (distance > frame.near)
-    zoom = tangent / HALF_VIEW
     shown = np.where(visible, np.minimum(1, (matter.reach / np.maximum(distance * zoom, 1e-12)) ** 2), 0)
     seen = np.flatnonzero(visible)
     if len(seen) == 0:

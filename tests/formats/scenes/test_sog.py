@@ -119,9 +119,9 @@ def test_sizes_of_webp_images(options):
     for mode in ("RGB", "RGBA"):
         file = io.BytesIO()
         Image.new(mode, (300, 77), 9).save(file, "WEBP", **options)
-        assert sog._webp_size(file.getvalue()) == (300, 77)
-    assert sog._webp_size(b"RIFF") is None
-    assert sog._webp_size(file.getvalue()[:12] + b"ABCD" + file.getvalue()[16:]) is None
+        assert sog.webp_size(file.getvalue()) == (300, 77)
+    assert sog.webp_size(b"RIFF") is None
+    assert sog.webp_size(file.getvalue()[:12] + b"ABCD" + file.getvalue()[16:]) is None
 
 
 @pytest.mark.parametrize("method", [zipfile.ZIP_LZMA, zipfile.ZIP_BZIP2])
