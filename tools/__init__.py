@@ -15,6 +15,7 @@ bench.compact_at       when within the pruning schedule to compact?
 bench.codec            speed, memory and size of the codec alone
 bench.search           what does encoding to a size or a PSNR cost, against one plain encode?
 bench.virtual_cameras  what does encoding without cameras cost?
+bench.views_between    what do views between the training views bring, and what do they take?
 bench.needs            what is a scene charged for splats, views and tiles that nobody needs?
 bench.busy             how busy is the device during an encode, stage by stage?
 bench.kernels          processor time of each kernel, on machines that do other work too

@@ -54,7 +54,7 @@ def _options(args: argparse.Namespace) -> EncodeOptions:
 
 def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
     """Whether anything may be rendered: to encode, or to judge what was encoded."""
-    wanted = any(stage.asked_for and stage.needs_views for stage in options.stages)
+    wanted = any(s.asked_for and s.needs_views and not s.serves_others for s in options.stages)
     return wanted or not (args.cameras is None or args.no_quality)
 
 

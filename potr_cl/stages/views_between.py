@@ -11,9 +11,9 @@ from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.stages.between.trial import Trial, try_views
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
-#: The most views that are added for each training view if the scene decides: on GPUs, and on CPUs, where each takes
-#: nearly as long as a training view.
-_MOST, _MOST_ON_CPU = 3, 1
+#: The most views that are added for each training view if the scene decides. On CPUs, where each takes nearly as long
+#: as a training view, every second training view gets one.
+_MOST, _MOST_ON_CPU, _EVERY_ON_CPU = 2, 1, 2
 _MOST_ASKED = 100
 
 
@@ -73,8 +73,13 @@ class Between(Stage):
         if is_virtual(state.views) or len(state.views) < 2 or state.added:
             return state
         bench.progress("views between", 0.0)
-        most = _MOST_ON_CPU if bench.opened.info.kind == "cpu" else _MOST
-        trial = try_views(state, bench, self.spread, most) if self.views is None else Trial(self.views)
+        slow = bench.opened.info.kind == "cpu"
+        if self.views is None:
+            trial = try_views(state, bench, self.spread, _MOST_ON_CPU if slow else _MOST)
+        else:
+            trial = Trial(self.views)
         added = views_between(state.source, state.views, trial.each, self.spread)
+        if slow and self.views is None:
+            added = added[::_EVERY_ON_CPU]
         bench.progress("views between", 1.0)
         return replace(state, views=(*state.views, *added), added=len(added)).having_learnt(self.name, trial)

@@ -1,9 +1,9 @@
 """How many views between the training views does a scene need? A trial with some of them held out.
 
-A few training views are held out, the rest are made small, and splats are removed by what the rest shows, without and
-with views between them: each time down to the number that is left without. Since the number is the same, whatever the
-held-out views lose less with added views is won at equal size. It is enough if they lose no more than the views that
-were looked at; and where more views no longer help, fewer do.
+Some training views that stand close together are made small, a few of them are held out, and splats are removed by what
+the rest shows, without and with views between them: each time down to the number that is left without. Since the number
+is the same, whatever the held-out views lose less with added views is won at equal size. It is enough if they lose no
+more than the views that were looked at; and where more views no longer help, fewer do.
 """
 
 from __future__ import annotations
@@ -13,8 +13,9 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
-from potr_cl.model.camera import Camera
+from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.views_between import views_between
 from potr_cl.quality.metrics import psnr
@@ -24,9 +25,10 @@ from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import State, Workbench
 
 #: Views that are added for each training view in the rounds of a trial, one round after the other.
-ROUNDS = (1, 3)
-#: Every so many-th view is held out; with fewer views than the least there is nothing to learn from holding out some.
-_EVERY, _LEAST = 8, 6
+ROUNDS = (1, 2)
+#: The trial looks at so many views that stand close together: as close to their neighbours as all of them. Among the
+#: inner half of them every so many-th is held out. With fewer views than the least there is nothing to learn from that.
+_VIEWS, _EVERY, _LEAST = 32, 4, 6
 #: Width and height of the trial's views, at most; iterations and steps.
 _SIDE = 256
 _ITERATIONS, _STEPS = 6, 2
@@ -65,10 +67,10 @@ def try_views(state: State, bench: Workbench, spread: float, most: int) -> Trial
     rounds = sorted({min(each, most) for each in ROUNDS} - {0})
     if len(state.views) < _LEAST or not rounds:
         return Trial(max(rounds, default=0))
-    views = [_small(camera) for camera in state.views]
-    held = views[_EVERY // 2 :: _EVERY]
-    rest = [view for number, view in enumerate(views) if number % _EVERY != _EVERY // 2]
-    judges = [*held, *rest[:: max(len(rest) // len(held), 1)]]
+    near = [_small(state.views[number]) for number in _cluster(camera_centres(state.views))]
+    held = near[1 : max(len(near) // 2, 2) : _EVERY]
+    rest = [view for view in near if not any(view is other for other in held)]
+    judges = [*held, *rest[: len(near) // 2 : 2]]
     quiet = dataclasses.replace(bench, interludes=(), progress=lambda what, done: None)
     wanted = _pictures(state.source, judges, bench)
     of_held: list[float] = []
@@ -89,6 +91,13 @@ def try_views(state: State, bench: Workbench, spread: float, most: int) -> Trial
         if of_rest[-1] < of_held[-1] + _CLOSED:
             break
     return Trial(best, tuple(of_held), tuple(of_rest))
+
+
+def _cluster(centres: NDArray[np.float64]) -> NDArray[np.int64]:
+    """Numbers of some cameras around the one that the others are nearest to, by their distance from it."""
+    distance = np.linalg.norm(centres[:, None] - centres, axis=2)
+    middle = int(np.median(distance, axis=1).argmin())
+    return np.argsort(distance[middle], kind="stable")[:_VIEWS]
 
 
 def _reduced(state: State, bench: Workbench, count: int | None) -> Scene:
