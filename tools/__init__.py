@@ -12,6 +12,7 @@ bench.pruning          what does pruning keep, against other pruners, and what m
 bench.refit            what does the re-fit of the colours bring, and what does it take?
 bench.compaction       speed of the compaction, and its error against float64
 bench.compact_at       when within the pruning schedule to compact?
+bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
 bench.codec            speed, memory and size of the codec alone
 bench.search           what does encoding to a size or a PSNR cost, against one plain encode?
 bench.virtual_cameras  what does encoding without cameras cost?
@@ -32,9 +33,11 @@ study.ablation             what does each part of the codec contribute?
 study.compare_formats      what would people use instead?
 study.virtual_views        how many virtual views, how large, how wide, at what time and memory?
 study.rates                where do the bits go, and what do they buy?
+study.antialiasing         what is lost if an antialiased scene is encoded as a classic one?
 study.compaction_curves    what does the compaction do to sparsity and pictures?
 study.removal_exactness    how far are predicted removal effects from removals in float64?
 study.removal_formulas     back to front or prefix sums: which formula of removal effects?
+study.decoder_roads        which road to a quick decoder: compiled C or OpenCL kernels? (for bench.decode --part roads)
 study.composite_yardstick  the compositing kernel beside a loop in C
 =========================  =============================================================================================
 
@@ -44,6 +47,7 @@ What happens at the limits (``stress``):
 stress.run         every kernel against float64 on the worst inputs: what error is the kernel's own?
 stress.platforms   the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
 stress.fuzz        does any changed file do more than be refused or decode to finite numbers?
+stress.native      does the compiled decoder touch memory that is not its own, or differ from NumPy's, on changed files?
 =================  =====================================================================================================
 
 What tests and pages are made of (``make``):
@@ -51,8 +55,10 @@ What tests and pages are made of (``make``):
 ====================  ==================================================================================================
 make.large_scene      a scene of any size with the statistics of a real one
 make.test_data        the excerpts in tests/data
-make.foreign_files    the excerpt in other tools' formats
+make.foreign_files    the excerpt in splat-transform's formats
+make.other_tools      some splats in the formats of six tools, and how splat-transform reads them
 make.golden_files     files that every later decoder must read to the same values
+make.native           the compiled part of the decoder, in the checkout
 make.docs             the pages and tables of README and docs that are made from the code (see CONTRIBUTING.md)
 make.benchmark_pages  the tables and plots of docs/benchmarks, from the results beside them
 ====================  ==================================================================================================

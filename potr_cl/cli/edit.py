@@ -13,7 +13,7 @@ from potr_cl.cli.guard import ReadFile, ReadPhotographs, WrittenFile
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option, as_bytes
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_trust_option, read_scene
+from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
@@ -95,6 +95,7 @@ def add_prune(commands: Commands) -> None:
     )
     add_stage_flags(p, [Prune], without=["on"])
     add_trust_option(p)
+    add_antialiased_option(p)
     add_memory_option(p)
     add_device_options(p)
     p.set_defaults(run=_prune)
@@ -124,6 +125,7 @@ def add_compact(commands: Commands) -> None:
     add_stage_flags(p, [Compact], without=["on", "at"])
     p.add_argument("--sf-sh", type=float, metavar="SF", help="steps a unit of the quantiser to expect")
     add_trust_option(p)
+    add_antialiased_option(p)
     add_memory_option(p)
     add_device_options(p)
     p.set_defaults(run=_compact)
@@ -140,6 +142,12 @@ def _refit(args: argparse.Namespace) -> None:
         assert cameras is not None
         ground_truth = GroundTruth(args.photos, cameras, background)
     scene, reference = read_scene(args, args.scene), read_scene(args, args.reference)
+    if scene.antialiased != reference.antialiased:
+        names = (args.scene, args.reference) if scene.antialiased else (args.reference, args.scene)
+        raise UsageError(
+            f"'{names[0]}' says that it is antialiased and '{names[1]}' does not, so their pictures cannot be alike: "
+            "give --antialiased yes or no for both"
+        )
     device = Device(args.device)
     with contextlib.closing(Progress()) as progress:
         cameras = cameras or virtual_cameras(args, reference, progress)
@@ -255,6 +263,7 @@ def add_refit(commands: Commands) -> None:
         help="give up an AC coefficient where the mean squared error grows by less; default: none",
     )
     add_trust_option(p)
+    add_antialiased_option(p)
     add_memory_option(p)
     add_device_options(p)
     p.set_defaults(run=_refit)

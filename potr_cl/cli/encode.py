@@ -12,7 +12,7 @@ from potr_cl.cli.guard import ReadFile, WrittenFile
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option, as_bytes, size_in_bytes
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_trust_option, read_scene, size_of_file, trust
+from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene, size_of_file, trust
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say, say_document
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
@@ -220,6 +220,7 @@ def add_encode(commands: Commands) -> None:
     add_stage_flags(p)
     p.add_argument("--threads", type=whole_number, default=0, metavar="T", help="default: one a processor")
     add_trust_option(p)
+    add_antialiased_option(p)
     add_memory_option(p)
     add_device_options(p)
     p.set_defaults(run=_encode)

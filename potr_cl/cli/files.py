@@ -11,6 +11,7 @@ from potr_cl.cli.scenes import add_trust_option, trust
 from potr_cl.cli.terminal import say, say_document
 from potr_cl.codec.decoder import PotrFile, decode
 from potr_cl.formats.scenes import ply
+from potr_cl.model.scene import SH_COEFFICIENTS
 from potr_cl.report.file import file_report, format_report
 
 if TYPE_CHECKING:
@@ -19,7 +20,7 @@ if TYPE_CHECKING:
 
 def _decode(args: argparse.Namespace) -> None:
     started = time.perf_counter()
-    scene = decode(args.file, **trust(args))
+    scene = decode(args.file, **trust(args), sh_degree=args.sh_degree)
     decoded = time.perf_counter()
     ply.save(args.output, scene)
     written = time.perf_counter()
@@ -33,6 +34,10 @@ def add_decode(commands: Commands) -> None:
     p = commands.add_parser("decode", help="a .potr file to a .ply that every viewer opens")
     p.add_argument("file", type=ReadFile, metavar="IN.potr")
     p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
+    p.add_argument(
+        "--sh-degree", type=int, choices=range(len(SH_COEFFICIENTS)), metavar="N",
+        help="leave out SH coefficients of degrees above N, 0 to 3, without decoding them; default: none",
+    )  # fmt: skip
     add_trust_option(p)
     p.set_defaults(run=_decode)
 

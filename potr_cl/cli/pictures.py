@@ -17,7 +17,7 @@ from potr_cl.cli.guard import (
 )
 from potr_cl.cli.options import CAMERAS_HELP, RULES, Commands, add_rendering_options, add_view_options
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_trust_option, read_scene
+from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene
 from potr_cl.cli.terminal import note, say, say_document
 from potr_cl.cli.views import read_cameras
 from potr_cl.errors import DataError, UsageError
@@ -104,6 +104,7 @@ def add_render(commands: Commands) -> None:
     )
     add_view_options(p, "all")
     add_trust_option(p)
+    add_antialiased_option(p)
     add_rendering_options(p)
     p.set_defaults(run=_render)
 
@@ -133,6 +134,12 @@ def _compare(args: argparse.Namespace) -> None:
         picture = stack.enter_context(replacing(args.output)) if args.output is not None else None
         a, rasterizer_a = _rasterizer(args, args.a, device)
         b, rasterizer_b = _rasterizer(args, args.b, device)
+        if a.antialiased != b.antialiased:
+            ways = " and ".join(
+                f"{name} is rendered {'with' if each.antialiased else 'without'} antialiasing"
+                for name, each in (("A", a), ("B", b))
+            )
+            notes.append(f"warning: {ways}, as the files say: give --antialiased yes or no to render both alike")
         progress = stack.enter_context(contextlib.closing(Progress()))
         comparison = compare(rasterizer_a, rasterizer_b, views, ground_truth, lpips, progress)
         if picture is not None:
@@ -170,5 +177,6 @@ def add_compare(commands: Commands) -> None:
     )
     p.add_argument("--json", action="store_true", help="for programs")
     add_trust_option(p)
+    add_antialiased_option(p)
     add_rendering_options(p)
     p.set_defaults(run=_compare)

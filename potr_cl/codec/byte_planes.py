@@ -2,8 +2,14 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+from functools import cached_property
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
+
+from potr_cl.codec.native.library import native
 
 
 def pack_integers(values: NDArray[np.integer], signed: bool) -> tuple[bytes, int]:
@@ -40,3 +46,36 @@ def unpack_integers(raw: NDArray[np.uint8], planes: int, signed: bool, start: in
     np.subtract(mapped.dtype.type(0), sign, out=sign)
     half ^= sign
     return half.view(half.dtype.str.replace("u", "i"))
+
+
+@dataclass(frozen=True)
+class PlaneStream:
+    """Integers of byte planes, as long as nobody needs them.
+
+    Attributes:
+        raw: (planes · count,) uint8; of no planes if all integers are 0.
+        planes: number of planes.
+        signed: whether the integers were mapped.
+        count: number of integers.
+    """
+
+    raw: NDArray[np.uint8]
+    planes: int
+    signed: bool
+    count: int
+
+    def part(self, start: int, stop: int) -> NDArray[np.integer]:
+        """Those from one place to another."""
+        return unpack_integers(self.raw, self.planes, self.signed, start, stop)
+
+    @cached_property
+    def joined(self) -> NDArray[Any]:
+        """All of them: uint8, mapped to unsigned, where they are that small; else 32 or 64 bits each."""
+        if self.planes == 0:
+            return np.zeros(self.count, np.uint8)
+        if self.planes == 1:
+            return self.raw
+        functions = native()
+        if functions is not None:
+            return functions.join_planes(self.raw, self.planes, self.signed)
+        return self.part(0, self.count).astype(np.int64 if self.signed else np.uint64)

@@ -18,21 +18,23 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import container, metadata, octree, sections
-from potr_cl.codec.byte_planes import unpack_integers
+from potr_cl.codec.byte_planes import PlaneStream, unpack_integers
 from potr_cl.codec.container import Header
 from potr_cl.codec.context.decoder import Reader, Stream
 from potr_cl.codec.context.lanes import Lanes
 from potr_cl.codec.context.model import Sizes
+from potr_cl.codec.dequantizer import Dequantizer, IntegerStream
+from potr_cl.codec.native.library import native
 from potr_cl.codec.sections import Coder, Property, Section
 from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 
-#: Splats dequantised at a time: few enough that temporaries stay in a cache, many enough that threads seldom wait.
-_BLOCK = 1 << 15
 #: More threads would find nothing to do.
 _MOST_THREADS = 16
+#: Coefficients and other properties whose integers may wait for a thread to make values of them.
+_MOST_WAITING = 6
 
 _EMPTY = np.empty(0, np.uint8)
 
@@ -127,14 +129,14 @@ class PotrFile:
     def log_scales(self) -> NDArray[np.float32]:
         """(N, 3) float32 natural logarithms of standard deviations. Raises DataError if damaged."""
         out = np.empty((self.header.splats, 3), np.float32)
-        self._dequantize_scales(self._streams(Property.SCALE), out)
+        self._dequantizer.scales(self._streams(Property.SCALE), out)
         return out
 
     def quaternions(self) -> NDArray[np.float32]:
         """(N, 4) float32 unit quaternions w, x, y, z. Raises DataError if damaged."""
         out = np.empty((self.header.splats, 4), np.float32)
         scales = self._streams(Property.SCALE) if self._version.rotations_need_scales else []
-        self._dequantize_rotations(self._streams(Property.ROTATION), scales, out)
+        self._dequantizer.rotations(self._streams(Property.ROTATION), scales, out)
         return out
 
     def opacity_logits(self) -> NDArray[np.float32]:
@@ -143,26 +145,36 @@ class PotrFile:
         self._decode_opacities(out, _now)
         return out
 
-    def sh(self) -> NDArray[np.float32]:
-        """(N, M, 3) float32 SH coefficients, each contiguous in memory. Raises DataError if damaged."""
-        planar = self._empty_sh()
+    def sh(self, degree: int | None = None) -> NDArray[np.float32]:
+        """(N, M, 3) float32 SH coefficients, each contiguous in memory.
+
+        Args:
+            degree: those up to this degree, 0 for the DC alone; sections of others are not looked at. None: all.
+
+        Raises:
+            UsageError: there is no such degree.
+            DataError: damaged.
+        """
+        planar = self._empty_sh(degree)
         for _, job in self._sh_jobs(planar):
             job(_now)
         return planar.transpose(2, 0, 1)
 
-    def scene(self, threads: int = 0) -> Scene:
-        """Decode everything.
+    def scene(self, threads: int = 0, sh_degree: int | None = None) -> Scene:
+        """Decode everything, or all but some SH coefficients.
 
         Args:
             threads: 0: one a processor.
+            sh_degree: as ``degree`` of :meth:`sh`.
 
         Raises:
+            UsageError: there is no such degree.
             DataError: damaged.
         """
         header = self.header
         _ = self.metadata  # it takes no part in the scene, but damage anywhere is damage
         try:
-            planar = self._empty_sh()
+            planar = self._empty_sh(sh_degree)
             log_scales = np.empty((header.splats, 3), np.float32)
             quaternions = np.empty((header.splats, 4), np.float32)
             opacity_logits = np.empty(header.splats, np.float32)
@@ -176,31 +188,39 @@ class PotrFile:
             ]
             means = self._run(jobs, threads or min(os.cpu_count() or 1, _MOST_THREADS))
         except MemoryError:
-            needed = header.splats * (11 + 3 * SH_COEFFICIENTS[header.sh_degree]) * 4
+            needed = header.splats * (11 + 3 * self._coefficients(sh_degree)) * 4
             raise DataError(f"the scene needs {needed / 1e9:.1f} GB of memory, more than there is") from None
-        return Scene(means, log_scales, quaternions, opacity_logits, planar.transpose(2, 0, 1))
+        sh = planar.transpose(2, 0, 1)
+        return Scene(means, log_scales, quaternions, opacity_logits, sh, header.antialiased, header.low_pass)
 
     def _run(self, jobs: list[tuple[bool, _Job]], threads: int) -> NDArray[np.float32]:
         """Do some jobs, each with whether it takes the context coder, and decode the centres.
 
-        The context coder makes many short calls, in which threads would only wait for each other: one makes them all,
-        and leaves what else is to be done with the integers to others.
+        By NumPy the context coder makes many short calls, in which threads would only wait for each other: one makes
+        them all, and leaves what else is to be done with the integers to others.
         """
+        alone = native() is None
         left: list[Future[None]] = []
 
         def leave(work: Callable[[], None]) -> None:
-            left.append(pool.submit(work))
+            # What waits holds memory; where much does, threads are not what is missing.
+            if sum(not future.done() for future in left) < _MOST_WAITING:
+                left.append(pool.submit(work))
+            else:
+                work()
 
-        def one_by_one() -> None:
-            for contextual, job in jobs:
-                if contextual:
-                    job(_now if threads == 1 else leave)
+        submit: _Submit = _now if threads == 1 else leave
 
+        def in_turn(some: list[_Job]) -> None:
+            for job in some:
+                job(submit)
+
+        contextual = [job for takes_coder, job in jobs if takes_coder]
         with thread_pool(threads) as pool:
-            coded = pool.submit(one_by_one)
+            coded = [pool.submit(in_turn, some) for some in ([contextual] if alone else [[job] for job in contextual])]
             means = pool.submit(self.means)
-            others = [pool.submit(job, _now) for contextual, job in jobs if not contextual]
-            first: list[Future[Any]] = [coded, means, *others]
+            others = [pool.submit(job, _now) for takes_coder, job in jobs if not takes_coder]
+            first: list[Future[Any]] = [*coded, means, *others]
             for futures in (first, left):
                 wait(futures, return_when=FIRST_EXCEPTION)
                 for future in futures:
@@ -238,58 +258,43 @@ class PotrFile:
             section.name,
         )
 
-    def _streams(self, prop: Property, indices: range | None = None) -> list[_Stream]:
+    def _streams(self, prop: Property, indices: range | None = None) -> list[IntegerStream]:
         """Some streams of one integer a splat, all of a property's by default."""
         indices = range(sections.stream_count(prop)) if indices is None else indices
         section = self.header.find(prop, indices[0])
         if section is not None and section.coder == Coder.CONTEXT:
-            return [stream.part for stream in self._context_streams(section)]
-        signed = sections.is_signed(prop)
-        return [
-            partial(unpack_integers, self._raw(prop, index), self._planes(prop, index), signed) for index in indices
-        ]
+            return list(self._context_streams(section))
+        signed, splats = sections.is_signed(prop), self.header.splats
+        return [PlaneStream(self._raw(prop, index), self._planes(prop, index), signed, splats) for index in indices]
 
-    def _blocks(self, streams: list[_Stream]) -> Iterator[tuple[slice, list[NDArray[np.integer]]]]:
-        """The integers of some streams side by side, block by block."""
-        for start in range(0, self.header.splats, _BLOCK):
-            stop = min(start + _BLOCK, self.header.splats)
-            yield slice(start, stop), [stream(start, stop) for stream in streams]
+    @property
+    def _dequantizer(self) -> Dequantizer:
+        return Dequantizer(self.header, self._version)
 
     def _decode_shapes(
         self, log_scales: NDArray[np.float32], quaternions: NDArray[np.float32], submit: _Submit
     ) -> None:
         scales = self._streams(Property.SCALE)
-        submit(partial(self._dequantize_scales, scales, log_scales))
-        submit(partial(self._dequantize_rotations, self._streams(Property.ROTATION), scales, quaternions))
+        submit(partial(self._dequantizer.scales, scales, log_scales))
+        submit(partial(self._dequantizer.rotations, self._streams(Property.ROTATION), scales, quaternions))
 
     def _decode_opacities(self, out: NDArray[np.float32], submit: _Submit) -> None:
-        version = self._version
+        submit(partial(self._dequantizer.opacities, self._streams(Property.OPACITY)[0], out))
 
-        def finish(streams: list[_Stream]) -> None:
-            for block, levels in self._blocks(streams):
-                out[block] = version.dequantize_opacities(levels[0], self.header.sf_opacity)
+    def _coefficients(self, degree: int | None) -> int:
+        """How many there are up to a degree, which need not be in the file."""
+        if degree is not None and not 0 <= degree < len(SH_COEFFICIENTS):
+            raise UsageError(f"SH degree {degree} is unknown: choose 0 to {len(SH_COEFFICIENTS) - 1}")
+        return SH_COEFFICIENTS[self.header.sh_degree if degree is None else min(degree, self.header.sh_degree)]
 
-        submit(partial(finish, self._streams(Property.OPACITY)))
-
-    def _dequantize_scales(self, streams: list[_Stream], out: NDArray[np.float32]) -> None:
-        version = self._version
-        for axis, stream in enumerate(streams):
-            for block, levels in self._blocks([stream]):
-                out[block, axis] = version.dequantize_scales(levels[0], self.header.sf_scale)
-
-    def _dequantize_rotations(self, streams: list[_Stream], scales: list[_Stream], out: NDArray[np.float32]) -> None:
-        """Quaternions; ``scales`` are looked at where the version's rotations need them."""
-        version = self._version
-        needed = scales if version.rotations_need_scales else []
-        for block, levels in self._blocks([*streams, *needed]):
-            version.dequantize_rotations(levels[:3], levels[3:], self.header.sf_rotation, out[block])
-
-    def _empty_sh(self) -> NDArray[np.float32]:
-        return np.empty((SH_COEFFICIENTS[self.header.sh_degree], 3, self.header.splats), np.float32)
+    def _empty_sh(self, degree: int | None) -> NDArray[np.float32]:
+        return np.empty((self._coefficients(degree), 3, self.header.splats), np.float32)
 
     def _sh_jobs(self, planar: NDArray[np.float32]) -> list[tuple[bool, _Job]]:
-        """What decodes all SH coefficients into ``planar`` (M, 3, N), and whether it takes the context coder."""
-        chained = [s for s in self.header.sections if s.kind == Property.SH and s.coder == Coder.CONTEXT and s.index]
+        """What decodes M SH coefficients into ``planar`` (M, 3, N), and whether it takes the context coder."""
+        stop = 3 * len(planar)
+        contextual = [s for s in self.header.sections if s.kind == Property.SH and s.coder == Coder.CONTEXT]
+        chained = [s for s in contextual if 0 < s.index < stop]
         in_chain = {s.index // 3 + m for s in chained for m in range(s.streams // 3)}
         alone = [m for m in range(len(planar)) if m not in in_chain]
         jobs: list[tuple[bool, _Job]] = [(True, partial(self._decode_chain, chained, planar))] if chained else []
@@ -303,30 +308,15 @@ class PotrFile:
         for section in sorted(chain, key=lambda s: s.index):
             streams = self._context_streams(section, history)
             for m, channels in enumerate(zip(streams, streams, streams, strict=True), start=section.index // 3):
-                submit(partial(self._finish_coefficient, [s.part for s in channels], m, False, planar[m]))
+                submit(partial(self._dequantizer.colours, channels, m, False, planar[m]))
 
     def _decode_coefficient(self, m: int, out: NDArray[np.float32], submit: _Submit) -> None:
         """One SH coefficient into ``out`` (3, N): R, G, B."""
         streams = self._streams(Property.SH, range(3 * m, 3 * m + 3))
         differences = m == 0 and not self._contextual(Property.SH)
-        submit(partial(self._finish_coefficient, streams, m, differences, out))
-
-    def _finish_coefficient(self, streams: list[_Stream], m: int, differences: bool, out: NDArray[np.float32]) -> None:
-        last = [0, 0, 0]
-        for block, levels in self._blocks(streams):
-            if differences:
-                channels = [level.astype(np.int64) for level in levels]
-                for c, channel in enumerate(channels):
-                    channel[:1] += last[c]  # an array: unlike a number it wraps round without a warning
-                    np.cumsum(channel, out=channel)
-                    last[c] = channel[-1]
-            else:
-                channels = _wider(levels)
-            _to_rgb(channels, self.header.sf_dc if m == 0 else self.header.sf_ac, out[:, block])
+        submit(partial(self._dequantizer.colours, streams, m, differences, out))
 
 
-#: Gives the integers from one splat to another of a stream.
-_Stream = Callable[[int, int], NDArray[np.integer]]
 #: Takes what needs no more than what is at hand, to be done now or by another thread.
 _Submit = Callable[[Callable[[], None]], None]
 #: Decodes some of a file.
@@ -337,39 +327,23 @@ def _now(work: Callable[[], None]) -> None:
     work()
 
 
-def _wider(levels: list[NDArray[np.integer]]) -> list[NDArray[Any]]:
-    """Levels of a type that holds the sums of three of them."""
-    most = max(level.dtype.itemsize for level in levels)
-    dtype: type[np.signedinteger] = np.int16 if most == 1 else np.int32 if most == 2 else np.int64
-    return [level.astype(dtype) for level in levels]
-
-
-def _to_rgb(channels: list[NDArray[Any]], factor: float, out: NDArray[np.float32]) -> None:
-    """Levels of Y, Co, Cg to R, G, B in ``out`` (3, n)."""
-    divisor = np.float32(factor)
-    y, co, cg = channels
-    r = y - cg
-    np.divide(r + co, divisor, out=out[0], dtype=np.float32, casting="unsafe")
-    np.divide(y + cg, divisor, out=out[1], dtype=np.float32, casting="unsafe")
-    np.divide(r - co, divisor, out=out[2], dtype=np.float32, casting="unsafe")
-
-
-def decode(source: bytes | str | os.PathLike[str], trust: bool = False) -> Scene:
+def decode(source: bytes | str | os.PathLike[str], trust: bool = False, sh_degree: int | None = None) -> Scene:
     """Decode a .potr file, given as bytes or as a path.
 
     Args:
         source: the file.
         trust: whether it may hold more splats a byte than a real scene has. Without, the memory taken is in proportion
             to the size of the file.
+        sh_degree: leave out SH coefficients of higher degrees; None: none.
 
     Raises:
-        UsageError: the path cannot be read.
+        UsageError: the path cannot be read, or there is no such degree.
         DataError: damaged, or too many splats for its size.
     """
     if isinstance(source, bytes):
-        return PotrFile.from_bytes(source, trust).scene()
+        return PotrFile.from_bytes(source, trust).scene(sh_degree=sh_degree)
     try:
-        return PotrFile.open(source, trust).scene()
+        return PotrFile.open(source, trust).scene(sh_degree=sh_degree)
     except DataError as error:
         where = os.fspath(source)
         raise error if where in str(error) else DataError(f"'{where}': {error}") from None

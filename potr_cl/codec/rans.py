@@ -292,7 +292,7 @@ class Decoder:
                 taken = words[read : read + count]
                 read += count
                 if len(taken) < count:
-                    raise DataError(f"section '{self._what}' ends too early")
+                    raise no_words_left(self._what)
                 # States below 2^16 have nothing in their higher half: it takes the lower one, which takes a word.
                 high[at] = low[at]
                 low[at] = taken
@@ -305,5 +305,19 @@ class Decoder:
         Raises:
             DataError: they are not.
         """
-        if self._read != len(self._words) or (self._pairs[0::2] != LOWEST).any():
-            raise DataError(f"section '{self._what}' does not end where its last token does")
+        check_end(self._read == len(self._words), self._pairs[0::2], self._what)
+
+
+def no_words_left(what: str) -> DataError:
+    """What to raise where a lane needs a word and there is none; ``what`` is the section, for the message."""
+    return DataError(f"section '{what}' ends too early")
+
+
+def check_end(all_words: bool, states: NDArray[np.unsignedinteger], what: str) -> None:
+    """Check that all words were taken and every lane is back where its encoder began.
+
+    Raises:
+        DataError: they are not.
+    """
+    if not all_words or (states != LOWEST).any():
+        raise DataError(f"section '{what}' does not end where its last token does")

@@ -27,6 +27,9 @@ from potr_cl.model.scene import Scene
 
 Levels = NDArray[np.integer]
 
+#: How many times as many steps the scales of antialiased scenes have, in version 2 and after.
+ANTIALIASED_SCALE_STEPS = 2
+
 
 class FormatVersion(abc.ABC):
     """What sets a version of the format apart. Defaults are what all versions have in common so far.
@@ -83,6 +86,9 @@ class FormatVersion(abc.ABC):
         """(N, 3) imaginary parts of unit quaternions to levels of x, y and z, (N,) each; ``scales`` as quantised."""
 
     @abc.abstractmethod
+    def rotation_factors(self, scales: Sequence[Levels], sf_rotation: float) -> F32:
+        """float32 scale factors of rotations: (N,), or (1,) if all are the same; ``scales`` as of the next."""
+
     def dequantize_rotations(
         self, levels: Sequence[Levels], scales: Sequence[Levels], sf_rotation: float, out: F32
     ) -> None:
@@ -94,6 +100,7 @@ class FormatVersion(abc.ABC):
             sf_rotation: scale factor.
             out: float32.
         """
+        quantize.dequantize_rotations(levels, self.rotation_factors(scales, sf_rotation), out)
 
     @abc.abstractmethod
     def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
@@ -121,10 +128,8 @@ class Version1(FormatVersion):
     ) -> Iterable[Integers]:
         return run(lambda part: quantize.quantize_rotations(part, sf_rotation), imaginary.T)
 
-    def dequantize_rotations(
-        self, levels: Sequence[Levels], scales: Sequence[Levels], sf_rotation: float, out: F32
-    ) -> None:
-        quantize.dequantize_rotations(levels, sf_rotation, out)
+    def rotation_factors(self, scales: Sequence[Levels], sf_rotation: float) -> F32:
+        return np.full(1, sf_rotation, np.float32)
 
     def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
         return quantize.quantize_opacities(logits, sf_opacity)
@@ -147,10 +152,14 @@ class Version2(FormatVersion):
 
         A splat's size is its largest standard deviation, the typical one their median; seen from the views, the median
         of size over distance.
+
+        Scales of antialiased scenes have finer steps: their splats' opacity follows the area on screen, so that an
+        error in a thin splat's width is seen as one in its opacity.
         """
         sizes = np.exp(np.clip(scene.log_scales.max(axis=1).astype(np.float64), -60, 60))
         size = float(np.median(sizes))
-        sf_scale = min(max(parameters.sf_scale / size, 1e-3), 1e9)
+        finer = ANTIALIASED_SCALE_STEPS if scene.antialiased else 1
+        sf_scale = min(max(finer * parameters.sf_scale / size, 1e-3), 1e9)
         seen = nearest > 0
         if seen.any():
             beta = parameters.beta * float(np.median(sizes[seen] / nearest[seen]))
@@ -165,10 +174,8 @@ class Version2(FormatVersion):
         ball = (scales[0] == scales[1]) & (scales[1] == scales[2])
         return run(lambda part: np.where(ball, 0, quantize.quantize_rotations(part, factors)), imaginary.T)
 
-    def dequantize_rotations(
-        self, levels: Sequence[Levels], scales: Sequence[Levels], sf_rotation: float, out: F32
-    ) -> None:
-        quantize.dequantize_rotations(levels, quantize.rotation_factors(scales, sf_rotation), out)
+    def rotation_factors(self, scales: Sequence[Levels], sf_rotation: float) -> F32:
+        return quantize.rotation_factors(scales, sf_rotation)
 
     def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:
         return quantize.quantize_logits(logits, sf_opacity)

@@ -12,29 +12,38 @@ from typing import Any
 import numpy as np
 
 from potr_cl.errors import DataError, UsageError
-from potr_cl.formats import registry
+from potr_cl.formats import gzipped, registry
 from potr_cl.formats.cameras.view_files import read_json
+from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 
 __all__ = ["load_cameras", "load_scene", "save_scene", "scene_writer"]
 
 
-def load_scene(path: str | os.PathLike[str], trust: bool = False) -> Scene:
-    """Read a trained scene; the extension tells the format, the content where formats share an extension.
+def load_scene(path: str | os.PathLike[str], trust: bool = False, antialiased: bool | None = None) -> Scene:
+    """Read a trained scene; its name tells the format, the content where formats share an extension.
 
     Args:
-        path: of a file in one of ``registry.SCENE_FORMATS``. A .potr file is decoded.
+        path: of a file in one of ``registry.SCENE_FORMATS``, or one that is gzipped (".ply.gz"), or of a folder that
+            holds a scene in several files (SOG). A .potr file is decoded. Where a scene has levels of detail, the
+            finest is read, or the one whose number stands behind the path: "scene/lod-meta.json#1".
         trust: whether the file may hold more splats a byte than a real scene has. Without, memory and time are in
             proportion to its size.
+        antialiased: whether the scene was trained with antialiasing and is to be rendered so; None: as the file says,
+            which those of gsplat and nerfstudio do not.
 
     Raises:
         UsageError: the file cannot be opened, its extension is unknown, or it needs an extra.
         DataError: its content is damaged, or it holds too many splats for its size.
     """
     path = Path(path)
+    refuse_lfs_pointer(path)
     with _silent_overflows():
-        return registry.reader_of(path)(path, trust)
+        if path.suffix.lower() == gzipped.SUFFIX:
+            with gzipped.unpacked(path, trust) as file:
+                return registry.reader_of(file)(file, trust).rendered(antialiased)
+        return registry.reader_of(path)(path, trust).rendered(antialiased)
 
 
 def scene_writer(path: str | os.PathLike[str]) -> Callable[[Scene], None]:
@@ -72,6 +81,7 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
         DataError: its content is damaged.
     """
     path = Path(path)
+    refuse_lfs_pointer(path)
     try:
         with _silent_overflows():
             return _from_folder(path) if path.is_dir() else _from_file(path)

@@ -45,6 +45,10 @@ class SceneFormat:
         recognises: whether the content of a file is of this format; False for a file that cannot be read. For formats
             that share the last part of a suffix: it decides which of them reads a file, and one of them has none, to
             read what no other recognises.
+        names: of files that tell the format whatever their suffix, in lower case. A folder that holds such a file is
+            read too, and ``load`` takes either, with ``#`` and a number behind if the format has levels of detail.
+        packed: whether files are compressed, so that gzip hardly makes them smaller: then one that is gzipped may
+            unpack to little more than it is.
     """
 
     name: str
@@ -55,6 +59,8 @@ class SceneFormat:
     not_written: str = ""
     extra: str | None = None
     recognises: Callable[[Path], bool] | None = None
+    names: tuple[str, ...] = ()
+    packed: bool = False
 
     @property
     def extensions(self) -> tuple[str, ...]:

@@ -12,7 +12,8 @@ from pathlib import Path
 from potr_cl.errors import UsageError
 from potr_cl.formats.cameras import cameras_json, colmap, transforms
 from potr_cl.formats.declaration import CameraFormat, SceneFormat, SceneLoader, install_command
-from potr_cl.formats.scenes import compressed_ply, ply, potr, sog, spz
+from potr_cl.formats.levels import without_level
+from potr_cl.formats.scenes import compressed_ply, gltf, ksplat, ply, potr, sog, sog_levels, splat, spz
 from potr_cl.model.scene import Scene
 
 #: In the order in which people are told of them.
@@ -22,6 +23,10 @@ SCENE_FORMATS: tuple[SceneFormat, ...] = (
     compressed_ply.FORMAT,
     spz.FORMAT,
     sog.FORMAT,
+    sog_levels.FORMAT,
+    gltf.FORMAT,
+    splat.FORMAT,
+    ksplat.FORMAT,
 )
 
 #: In the order in which a folder is searched for them. cameras.json stands before transforms.json, for it lists just
@@ -34,20 +39,39 @@ CAMERA_FORMATS: tuple[CameraFormat, ...] = (
 
 
 def reader_of(path: Path) -> SceneLoader:
-    """What reads a scene file. Its format is told by its extension, and by its content where formats share that.
+    """What reads a scene; see :func:`format_of`.
 
     Raises:
         UsageError: no format has this extension.
     """
+    return format_of(path).load
+
+
+def format_of(path: Path) -> SceneFormat:
+    """The format of a scene that is read. Names and extensions tell it, and the content where formats share those.
+
+    Args:
+        path: of a file, or of a folder that holds a file whose name tells the format.
+
+    Raises:
+        UsageError: no format has this name or extension.
+    """
+    plain = without_level(path)
+    for entry in SCENE_FORMATS:
+        if any(plain.name.lower() == name or (plain / name).is_file() for name in entry.names):
+            return entry
     extension = path.suffix.lower()
     having_it = [entry for entry in SCENE_FORMATS if extension in entry.extensions]
     for entry in having_it:
         if entry.recognises is not None and entry.recognises(path):
-            return entry.load
+            return entry
     for entry in having_it:
         if entry.recognises is None:
-            return entry.load
-    raise UsageError(f"'{path}': unknown kind of scene, expected a {suffixes_read()} file")
+            return entry
+    names = listed([name for entry in SCENE_FORMATS for name in entry.names])
+    if path.is_dir():
+        raise UsageError(f"the folder '{path}' holds no scene that can be read as a folder: it has no {names}")
+    raise UsageError(f"'{path}': unknown kind of scene, expected a {suffixes_read()} file, or a folder with {names}")
 
 
 def writer_of(path: Path) -> Callable[[Path, Scene], None]:
@@ -60,6 +84,7 @@ def writer_of(path: Path) -> Callable[[Path, Scene], None]:
     fitting = [
         (len(suffix), entry) for entry in SCENE_FORMATS for suffix in entry.suffixes if suffixes.endswith(suffix)
     ]
+    fitting += [(len(path.name), entry) for entry in SCENE_FORMATS if path.name.lower() in entry.names]
     expected = f"scenes are written as {suffixes_written()}"
     if not fitting:
         raise UsageError(f"'{path}': {expected}")
@@ -102,7 +127,7 @@ def formats_table() -> str:
     """All formats as Markdown, for docs/formats.md: a table of scenes and one of cameras."""
     scenes = [
         [
-            f"{entry.name} ({', '.join(f'`{suffix}`' for suffix in entry.suffixes)})",
+            f"{entry.name} ({', '.join(f'`{name}`' for name in (*entry.suffixes, *entry.names))})",
             "yes",
             "no" if entry.save is None else "yes",
             _needs(entry.extra),

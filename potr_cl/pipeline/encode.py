@@ -67,6 +67,7 @@ def encode(
     options: EncodeOptions | None = None,
     progress: Progress | None = None,
     device: Device | None = None,
+    antialiased: bool | None = None,
 ) -> Encoded:
     """Encode a scene.
 
@@ -78,6 +79,7 @@ def encode(
         progress: called with a stage's name and the part of it that is done.
         device: computes; by default the best one there is. If its memory is too small, less is kept in it, and if that
             is not enough, a CPU does the work. A warning says so.
+        antialiased: whether to take it as an antialiased scene; None: as what it says that it is.
 
     Raises:
         UsageError: options out of range, or cameras without a training view.
@@ -85,6 +87,7 @@ def encode(
         DeviceError: no device does the work.
     """
     options = options or EncodeOptions()
+    scene = scene.rendered(antialiased)
     watch = Stopwatch(progress)
     cameras = cameras_or_virtual(scene, cameras, options, watch)
     run = Run(options, watch, device)

@@ -49,6 +49,7 @@ class SceneFile:
     nbytes: int
     splats: int
     sh_degree: int
+    antialiased: bool = False
 
     @staticmethod
     def of(path: Path, scene: Scene) -> SceneFile:
@@ -61,7 +62,7 @@ class SceneFile:
             size = path.stat().st_size
         except OSError as error:
             raise UsageError(f"cannot read '{path}': {error.strerror}") from error
-        return SceneFile(path, size, len(scene), scene.sh_degree)
+        return SceneFile(path, size, len(scene), scene.sh_degree, scene.antialiased)
 
 
 @dataclass(frozen=True)
@@ -258,6 +259,7 @@ def size_report(a: SceneFile, b: SceneFile) -> dict[str, Any]:
             "bytes": scene.nbytes,
             "splats": scene.splats,
             "sh_degree": scene.sh_degree,
+            "antialiased": scene.antialiased,
         }
 
     return {"a": entry(a), "b": entry(b), "size_ratio": a.nbytes / b.nbytes}

@@ -58,6 +58,7 @@ def encode_report(
             "bytes": source_bytes,
             "splats": len(scene),
             "sh_degree": scene.sh_degree,
+            "antialiased": scene.antialiased,
         },
         "file": str(target),
         "bytes": len(file.data),
@@ -143,6 +144,8 @@ def format_encode_report(report: dict[str, Any]) -> str:
         f"{report['file']}: {report['bytes']:,} bytes, {change} than {source['file']} ({source['bytes']:,} bytes)",
         f"splats     {report['splats']:,} of {source['splats']:,}, {report['bytes_a_splat']:.2f} bytes each",
     ]
+    if source["antialiased"]:
+        lines.append("rendered   as an antialiased scene")
     for place, (name, nbytes) in enumerate(report["properties"].items()):
         lines.append(f"{'' if place else 'bytes':<11}{name:<12}{nbytes:>13,}{100 * nbytes / report['bytes']:>7.1f} %")
     quality = report["quality"]

@@ -60,12 +60,13 @@ def test_declarations_are_complete() -> None:
     extras = re.findall(r"^([a-z-]+) = \[", (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
     for entry in (*SCENE_FORMATS, *CAMERA_FORMATS):
         assert all(re.fullmatch(r"(\.[a-z0-9]+)+", suffix) for suffix in entry.suffixes), entry.name
-        assert entry.suffixes, entry.name
+        assert entry.suffixes or getattr(entry, "names", ()), entry.name
         assert entry.note, entry.name
         assert not {"\n", "|"} & set(entry.name + entry.note), "it would break the documentation's table"
         assert entry.extra is None or entry.extra in extras, entry.name
     for entry in SCENE_FORMATS:
         assert bool(entry.not_written) == (entry.save is None), entry.name
+        assert all(re.fullmatch(r"[a-z0-9-]+\.[a-z0-9]+", each) for each in entry.names), entry.name
     for each in CAMERA_FORMATS:
         assert bool(each.json_mark) == (".json" in each.suffixes), each.name
 
@@ -142,7 +143,7 @@ def test_formats_that_are_not_written_say_what_to_do(tmp_path: Path) -> None:
     for entry in SCENE_FORMATS:
         if entry.save is None:
             with pytest.raises(UsageError, match=re.escape(entry.not_written)):
-                save_scene(tmp_path / f"a{entry.suffixes[0]}", random_scene(3))
+                save_scene(tmp_path / (f"a{entry.suffixes[0]}" if entry.suffixes else entry.names[0]), random_scene(3))
 
 
 @pytest.mark.parametrize("suffix", [suffix for entry in SCENE_FORMATS for suffix in entry.suffixes])

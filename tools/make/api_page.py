@@ -95,7 +95,10 @@ def _index() -> Iterator[tuple[str, str]]:
         if found.name.endswith("__main__"):
             continue
         path = Path(potr_cl.__file__).parent.joinpath(*found.name.split(".")[1:])
-        source = (path / "__init__.py" if found.ispkg else path.with_suffix(".py")).read_text("utf-8")
+        file = path / "__init__.py" if found.ispkg else path.with_suffix(".py")
+        if not file.exists():  # compiled: its Python neighbours say what it is
+            continue
+        source = file.read_text("utf-8")
         docstring = ast.get_docstring(ast.parse(source)) or ""
         first = " ".join(docstring.split("\n\n")[0].split())
         yield found.name, _inline(re.split(r"(?<=[.?!])(?<!et al\.)\s", first)[0])

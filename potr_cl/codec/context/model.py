@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import zstandard
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from potr_cl.codec import rans
 from potr_cl.codec.context.lanes import Lanes
 from potr_cl.codec.context.tokens import ALPHABET
+from potr_cl.codec.native.library import native
 from potr_cl.errors import DataError
 
 I32 = NDArray[np.int32]
@@ -46,20 +48,28 @@ class Sizes:
 
     def __init__(self, lanes: Lanes) -> None:
         shape = (lanes.steps, lanes.number)
-        self._sums = [np.zeros(shape, np.int32) for _ in range(CHANNELS)]
-        self._same: list[I32] = []  # of the channels before, of the same coefficient
+        # The sums of 15 coefficients' sizes fit 16 bits, which the native path takes; NumPy is faster with 32.
+        dtype: type[np.signedinteger] = np.int32 if native() is None else np.int16
+        self._sums = [np.zeros(shape, dtype) for _ in range(CHANNELS)]
+        self._same = [np.empty(shape, dtype) for _ in range(CHANNELS)]
+        self._channels = 0
 
-    def known(self) -> list[I32]:
+    def known(self) -> list[Any]:
         """The terms of the next stream's expectation, in the order of their weights, but recent ones and constant."""
-        return [*self._sums, *self._same]
+        return [*self._sums, *self._same[: self._channels]]
 
-    def add(self, sizes: I32) -> None:
-        """Take in the next stream."""
-        self._same.append(sizes)
-        if len(self._same) == CHANNELS:
+    @property
+    def next(self) -> NDArray[Any]:
+        """(steps, lanes): where the next stream's sizes go, before :meth:`added`."""
+        return self._same[self._channels]
+
+    def added(self) -> None:
+        """Take in the next stream, whose sizes stand in :attr:`next`."""
+        self._channels += 1
+        if self._channels == CHANNELS:
             for total, part in zip(self._sums, self._same, strict=True):
                 total += part
-            self._same = []
+            self._channels = 0
 
 
 @dataclass(frozen=True)

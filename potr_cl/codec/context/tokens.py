@@ -78,9 +78,18 @@ def detokenise(tokens: U8, bits: Bits, signed: bool) -> I64:
     return (mapped >> 1) ^ -(mapped & 1) if signed else mapped
 
 
-def bits_beside(tokens: U8) -> int:
-    """How many bits stand beside some tokens, at least one."""
-    return int(_extra_bits(tokens[tokens >= _DIRECT]).sum()) if int(tokens.max()) >= _DIRECT else 0
+def bits_beside(tokens: U8) -> tuple[int, int]:
+    """How many bits stand beside some tokens, at least one, and the largest token."""
+    largest = int(tokens.max())
+    return (int(_extra_bits(tokens[tokens >= _DIRECT]).sum()) if largest >= _DIRECT else 0), largest
+
+
+def largest_integer(token: int) -> int:
+    """The largest of the integers, mapped to unsigned ones, that a token stands for."""
+    if token < _DIRECT:
+        return token
+    above = token - _DIRECT
+    return ((5 + above % 4) << (_DIRECT_BITS - 2 + above // 4)) - 1
 
 
 def _extra_bits(large: U8) -> I64:

@@ -11,4 +11,5 @@ FORMAT = SceneFormat(
     note="this package's own: what `encode` makes of a scene in any of these formats; files of every version are read",
     load=decode,
     not_written="a .potr file is made by the command encode, which reads all that convert reads",
+    packed=True,
 )

@@ -21,7 +21,7 @@ from numpy.typing import NDArray
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, arranged, cleaned, opened
+from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, arranged, cleaned, opened, tell_of_low_pass
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.claims import check_claim
@@ -35,6 +35,11 @@ _HEADER = struct.Struct("<4sIIBBBB")
 _HEADER_4_BYTES = 32
 _STREAM = struct.Struct("<QQ")
 _ANTIALIASED, _EXTENSIONS = 1, 2
+#: Versions that are one stream, usually gzipped.
+_LEGACY = range(1, 4)
+#: The version whose positions are half floats.
+_HALF_FLOATS = 1
+_LARGEST_DEGREE = 4
 #: A file may have extensions behind its splats; no known one comes near.
 _EXTENSION_BYTES = 1 << 20
 
@@ -71,12 +76,14 @@ class _Header:
     @property
     def sizes(self) -> list[int]:
         """Bytes of positions, opacities, colours, scales, rotations and SH, in this order."""
-        rotation = 3 if self.version < 3 else 4
-        return [self.splats * size for size in (9, 1, 3, 3, rotation, 3 * (SH_COEFFICIENTS[self.degree] - 1))]
+        position, rotation = 6 if self.version == _HALF_FLOATS else 9, 3 if self.version < 3 else 4
+        return [self.splats * size for size in (position, 1, 3, 3, rotation, 3 * ((self.degree + 1) ** 2 - 1))]
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
-    """Read a scene from an SPZ file of version 1 to 4 and SH degree 0 to 3.
+    """Read a scene from an SPZ file of version 1 to 4; versions 1 to 3 may be gzipped or not.
+
+    Of SH degree 4, the coefficients of degree 4 are dropped.
 
     Args:
         path: of the file.
@@ -93,12 +100,14 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
         start = file.read(_HEADER_4_BYTES)
         file.seek(0)
         if start[:2] == b"\x1f\x8b":
+            header, properties = _read_gzip(path, gzip.GzipFile(fileobj=file), size, trust)
+        elif int.from_bytes(start[4:8], "little") in _LEGACY:
             header, properties = _read_gzip(path, file, size, trust)
         else:
             header, properties = _read_streams(path, file.read(), trust)
-        scene = _unpacked(header, properties)
-    if header.flags & _ANTIALIASED:
-        _log.warning("'%s' was trained for a rasterizer with antialiasing: it is rendered without", path)
+        scene = _unpacked(header, properties).rendered(bool(header.flags & _ANTIALIASED))
+    if header.degree >= len(SH_COEFFICIENTS):
+        _log.warning("'%s': SH degree 4 is left out: only degrees 0 to 3 are kept", path)
     if header.flags & _EXTENSIONS:
         _log.warning("'%s' has extensions: they are left out, and axes are kept as they are", path)
     return cleaned(path, scene)
@@ -122,7 +131,9 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
         raise DataError(f"'{path}': SPZ cannot hold a splat {largest:.3g} units from the origin")
     if bits < _FRACTIONAL_BITS:
         _log.warning("'%s': the scene is large for SPZ: positions are stored in steps of 1/%d unit", path, 2**bits)
-    header = _HEADER.pack(_MAGIC, 3, len(scene), scene.sh_degree, bits, 0, 0)
+    tell_of_low_pass(path, scene)
+    flags = _ANTIALIASED if scene.antialiased else 0
+    header = _HEADER.pack(_MAGIC, 3, len(scene), scene.sh_degree, bits, flags, 0)
     content = b"".join([header, *_packed(arranged(scene), bits)])
     with replacing(path) as file:
         _write_gzip(file, content)
@@ -134,6 +145,7 @@ FORMAT = SceneFormat(
     note="of Niantic; versions 1 to 4 are read, version 3, which every reader knows, is written",
     load=load,
     save=save,
+    packed=True,
 )
 
 
@@ -141,12 +153,11 @@ FORMAT = SceneFormat(
 
 
 def _read_gzip(
-    path: str | os.PathLike[str], file: BinaryIO, size: int, trust: bool
+    path: str | os.PathLike[str], stream: gzip.GzipFile | BinaryIO, size: int, trust: bool
 ) -> tuple[_Header, list[bytes | memoryview]]:
     """Versions 1 to 3: one stream, of which no more is unpacked than its header tells of."""
     try:
-        stream = gzip.GzipFile(fileobj=file)
-        header = _header(path, stream.read(_HEADER.size), range(1, 4), size, trust)
+        header = _header(path, stream.read(_HEADER.size), _LEGACY, size, trust)
         properties: list[bytes | memoryview] = [stream.read(wanted) for wanted in header.sizes]
         beyond = _EXTENSION_BYTES if header.flags & _EXTENSIONS else 0
         if len(stream.read(beyond + 1)) > beyond:  # to the end, where gzip has its checksum
@@ -192,11 +203,11 @@ def _header(path: str | os.PathLike[str], start: bytes, versions: range, size: i
     _, version, splats, degree, bits, flags, streams = _HEADER.unpack_from(start)
     if version not in versions:
         raise DataError(f"'{path}' is an SPZ file of version {version}, which is not known or not packed like this")
-    if degree >= len(SH_COEFFICIENTS):
+    if degree > _LARGEST_DEGREE:
         raise DataError(f"'{path}' has SH degree {degree}: export at most 3 bands")
     if splats == 0:
         raise DataError(f"'{path}' holds no splat")
-    if not 1 <= bits <= _MOST_FRACTIONAL_BITS:
+    if version != _HALF_FLOATS and not 1 <= bits <= _MOST_FRACTIONAL_BITS:
         raise DataError(f"'{path}' is damaged: positions with {bits} fractional bits")
     try:
         check_claim(splats, size, MOST_A_BYTE, trust)
@@ -228,7 +239,7 @@ def _write_gzip(file: BinaryIO, content: bytes) -> None:
 
 def _unpacked(header: _Header, properties: list[bytes | memoryview]) -> Scene:
     """The values of a file's bytes, block by block."""
-    count, coefficients = header.splats, SH_COEFFICIENTS[header.degree]
+    count, coefficients = header.splats, SH_COEFFICIENTS[min(header.degree, len(SH_COEFFICIENTS) - 1)]
     positions, opacities, colours, scales, rotations, rest = (
         np.frombuffer(part, np.uint8).reshape(count, -1) for part in properties
     )
@@ -246,21 +257,24 @@ def _unpacked(header: _Header, properties: list[bytes | memoryview]) -> Scene:
     dc = (byte / np.float32(255) - np.float32(0.5)) / np.float32(_COLOUR_SCALE)
     for start in range(0, count, _BLOCK):
         block = slice(start, start + _BLOCK)
-        scene.means[block] = _positions(positions[block], header.fractional_bits)
+        scene.means[block] = _positions(positions[block], header)
         scene.log_scales[block] = (byte / 16 - 10).take(scales[block])
         scene.quaternions[block] = _smallest_three(rotations[block]) if header.version > 2 else _xyz(rotations[block])
         scene.opacity_logits[block] = logits.take(opacities[block, 0])
         scene.sh[block, 0] = dc.take(colours[block])
         if coefficients > 1:
-            scene.sh[block, 1:] = ((byte - 128) / 128).take(rest[block]).reshape(-1, coefficients - 1, 3)
+            stored = rest[block, : 3 * (coefficients - 1)]
+            scene.sh[block, 1:] = ((byte - 128) / 128).take(stored).reshape(-1, coefficients - 1, 3)
     return scene
 
 
-def _positions(stored: U8, fractional_bits: int) -> FloatArray:
+def _positions(stored: U8, header: _Header) -> FloatArray:
+    if header.version == _HALF_FLOATS:
+        return np.ascontiguousarray(stored).view("<f2").astype(np.float32)
     parts = stored.reshape(-1, 3, 3).astype(np.int32)
     values = parts[..., 0] | parts[..., 1] << 8 | parts[..., 2] << 16
     values = (values ^ 0x800000) - 0x800000
-    positions: FloatArray = values.astype(np.float32) * np.float32(2.0**-fractional_bits)
+    positions: FloatArray = values.astype(np.float32) * np.float32(2.0**-header.fractional_bits)
     return positions
 
 

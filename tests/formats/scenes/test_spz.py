@@ -49,14 +49,13 @@ def test_a_large_scene_is_stored_more_coarsely(tmp_path, caplog):
     assert not (tmp_path / "b.spz").exists()
 
 
-@pytest.mark.parametrize(("flag", "said"), [(1, "antialiasing"), (2, "extensions")])
-def test_flags_that_matter_are_said(tmp_path, data, caplog, flag, said):
+def test_extensions_are_said(tmp_path, data, caplog):
     content = bytearray(gzip.decompress((data / "foreign" / "version_3.spz").read_bytes()))
-    content[14] |= flag
+    content[14] |= 2
     path = tmp_path / "a.spz"
     path.write_bytes(gzip.compress(bytes(content)))
     assert len(load_scene(path)) == 1500
-    assert said in caplog.text
+    assert "extensions" in caplog.text
 
 
 def spz_header(splats, version=3, degree=3):
@@ -72,7 +71,7 @@ def spz_header(splats, version=3, degree=3):
         (gzip.compress(spz_header(4_000_000_000)), "--trust"),
         (gzip.compress(spz_header(10)), "truncated"),
         (gzip.compress(spz_header(0)), "no splat"),
-        (gzip.compress(spz_header(10, degree=4)), "SH degree 4"),
+        (gzip.compress(spz_header(10, degree=5)), "SH degree 5"),
         (gzip.compress(spz_header(1000) + bytes(3_000_000)), "more than the splats"),
         (gzip.compress(spz_header(10, version=9) + bytes(650)), "version 9"),
         (spz_header(4_000_000_000, version=4) + bytes(100), "--trust"),
@@ -131,7 +130,7 @@ def test_content_and_values_are_those_of_another_program(tmp_path, data):
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_rotations_of_old_versions(tmp_path, version):
-    body = bytes(9) + bytes([255, 0, 0, 0]) + bytes(3) + bytes([255, 128, 127])
+    body = bytes(6 if version == 1 else 9) + bytes([255, 0, 0, 0]) + bytes(3) + bytes([255, 128, 127])
     (tmp_path / "a.spz").write_bytes(gzip.compress(spz_header(1, version, 0) + body))
     w, x, y, z = load_scene(tmp_path / "a.spz").quaternions[0]
     assert (w, x) == (0, 1)
@@ -199,3 +198,55 @@ def test_values_beyond_bytes_give_no_warning(tmp_path, recwarn):
     spz.save(tmp_path / "a.spz", scene)
     assert len(spz.load(tmp_path / "a.spz")) == 20
     assert not recwarn.list
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_coefficients_of_degree_4_are_left_out(tmp_path, caplog, version):
+    count, rng = 40, np.random.default_rng(version)
+    sizes = (9, 1, 3, 3, 3 if version < 3 else 4)
+    parts = [rng.integers(0, 256, (count, size), np.uint8) for size in sizes]
+    rest = rng.integers(0, 256, (count, 24, 3), np.uint8)
+    scenes = []
+    for degree, kept in ((3, 15), (4, 24)):
+        content = [part.tobytes() for part in (*parts, rest[:, :kept])]
+        path = tmp_path / f"{degree}.spz"
+        if version < 4:
+            path.write_bytes(gzip.compress(spz_header(count, version, degree) + b"".join(content)))
+        else:
+            table = [(len(zstandard.compress(part)), len(part)) for part in content]
+            path.write_bytes(version_4(count, [zstandard.compress(part) for part in content], degree, table))
+        scenes.append(load_scene(path))
+    assert np.array_equal(scenes[0].sh, scenes[1].sh)
+    assert np.array_equal(scenes[0].quaternions, scenes[1].quaternions)
+    assert [r.getMessage() for r in caplog.records] == [
+        f"'{path}': SH degree 4 is left out: only degrees 0 to 3 are kept"
+    ]
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_content_that_is_not_gzipped(tmp_path, version):
+    content = spz_header(100, version, 1) + np.random.default_rng(0).bytes(100 * ((16, 19, 20)[version - 1] + 9))
+    (tmp_path / "packed.spz").write_bytes(gzip.compress(content))
+    (tmp_path / "raw.spz").write_bytes(content)
+    packed, raw = load_scene(tmp_path / "packed.spz"), load_scene(tmp_path / "raw.spz")
+    assert np.array_equal(packed.means, raw.means)
+    assert np.array_equal(packed.sh, raw.sh)
+    for bad, said in ((content[:-1], "truncated"), (content + b"0", "more than the splats"), (content[:20], "trunc")):
+        (tmp_path / "raw.spz").write_bytes(bad)
+        with pytest.raises(DataError, match=said):
+            load_scene(tmp_path / "raw.spz")
+    (tmp_path / "raw.spz").write_bytes(spz_header(4_000_000_000, version, 1) + bytes(1000))
+    with pytest.raises(DataError, match="--trust"):
+        load_scene(tmp_path / "raw.spz")
+
+
+def test_positions_of_version_1_are_half_floats(tmp_path):
+    """As Niantic's library reads them, and gaussforge and spz-js with it."""
+    rng = np.random.default_rng(0)
+    positions = rng.normal(size=(70, 3)).astype("<f2")
+    body = positions.tobytes() + rng.bytes(70 * 10)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 1, 70, 0, 0, 0, 0) + body))
+    scene = load_scene(tmp_path / "a.spz")
+    assert np.array_equal(scene.means, positions.astype(np.float32))
+    rows = np.frombuffer(body[420:], np.uint8)
+    assert np.array_equal(scene.log_scales, rows[280:490].reshape(70, 3) / np.float32(16) - 10)

@@ -1,0 +1,158 @@
+"""Streams of integers to a scene's values, for whole files: :class:`Dequantizer`.
+
+What a value is made of is up to the file's version; here it is done for many splats: block by block with NumPy, or by
+the native path, which gives the same bits.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from typing import Any, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.container import Header
+from potr_cl.codec.native.functions import Functions
+from potr_cl.codec.native.library import native
+from potr_cl.codec.versions import FormatVersion
+
+F32 = NDArray[np.float32]
+
+#: Splats worked on at a time: few enough that temporaries stay in a cache, many enough that threads seldom wait.
+_BLOCK = 1 << 15
+#: Levels whose values the native path looks up: small tables for levels of one byte, larger ones for others.
+_SMALL_TABLE, _LARGE_TABLE = 1 << 8, 1 << 16
+
+
+class IntegerStream(Protocol):
+    """The integers of a stream, one a splat."""
+
+    def part(self, start: int, stop: int) -> NDArray[np.integer]:
+        """Those from one splat to another."""
+
+    @property
+    def joined(self) -> NDArray[Any]:
+        """All of them: uint8, mapped to unsigned, where they are that small; else 32 or 64 bits each."""
+
+
+@dataclass(frozen=True)
+class Dequantizer:
+    """Makes values of the integers of one file.
+
+    Attributes:
+        header: has the scale factors.
+        version: the rules of the file's version.
+    """
+
+    header: Header
+    version: FormatVersion
+
+    def scales(self, streams: Sequence[IntegerStream], out: F32) -> None:
+        """Levels of each axis to natural logarithms of standard deviations in ``out`` (N, 3)."""
+        factor = self.header.sf_scale
+        functions = native()
+        for axis, stream in enumerate(streams):
+            if functions is not None:
+                self._look_up(functions, self.version.dequantize_scales, stream, factor, out, axis)
+                continue
+            for block, levels in self._blocks([stream]):
+                out[block, axis] = self.version.dequantize_scales(levels[0], factor)
+
+    def opacities(self, stream: IntegerStream, out: F32) -> None:
+        """Levels to logits in ``out`` (N,)."""
+        factor = self.header.sf_opacity
+        functions = native()
+        if functions is not None:
+            self._look_up(functions, self.version.dequantize_opacities, stream, factor, out[:, None], 0)
+            return
+        for block, levels in self._blocks([stream]):
+            out[block] = self.version.dequantize_opacities(levels[0], factor)
+
+    def rotations(self, streams: Sequence[IntegerStream], scales: Sequence[IntegerStream], out: F32) -> None:
+        """Levels of x, y, z to unit quaternions w, x, y, z in ``out`` (N, 4).
+
+        ``scales`` are looked at where the version's rotations need them.
+        """
+        version, factor = self.version, self.header.sf_rotation
+        needed = scales if version.rotations_need_scales else []
+        functions = native()
+        if functions is not None:
+            x, y, z = (stream.joined for stream in streams)
+            sizes = [stream.joined for stream in needed]
+            for start in range(0, len(out), _BLOCK):
+                block = slice(start, start + _BLOCK)
+                factors = version.rotation_factors([size[block] for size in sizes], factor)
+                functions.rotations([x[block], y[block], z[block]], np.atleast_1d(factors), out[block])
+            return
+        for block, levels in self._blocks([*streams, *needed]):
+            version.dequantize_rotations(levels[:3], levels[3:], factor, out[block])
+
+    def colours(self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, out: F32) -> None:
+        """Levels of Y, Co, Cg of an SH coefficient to R, G, B in ``out`` (3, N).
+
+        Args:
+            streams: three.
+            coefficient: 0 for DC.
+            differences: whether integers are the differences of levels of splats that follow each other.
+            out: float32.
+        """
+        factor = self.header.sf_dc if coefficient == 0 else self.header.sf_ac
+        functions = native()
+        if functions is not None:
+            levels = [stream.joined for stream in streams]
+            if differences:
+                levels = [_summed(functions, level) for level in levels]
+            functions.colours(levels, float(np.float32(factor)), out)
+            return
+        last = [0, 0, 0]
+        for block, parts in self._blocks(streams):
+            if differences:
+                channels = [part.astype(np.int64) for part in parts]
+                for c, channel in enumerate(channels):
+                    channel[:1] += last[c]  # an array: unlike a number it wraps round without a warning
+                    np.cumsum(channel, out=channel)
+                    last[c] = channel[-1]
+            else:
+                channels = _wider(parts)
+            _to_rgb(channels, factor, out[:, block])
+
+    def _blocks(self, streams: Sequence[IntegerStream]) -> Iterator[tuple[slice, list[NDArray[np.integer]]]]:
+        """The integers of some streams side by side, block by block."""
+        for start in range(0, self.header.splats, _BLOCK):
+            stop = min(start + _BLOCK, self.header.splats)
+            yield slice(start, stop), [stream.part(start, stop) for stream in streams]
+
+    def _look_up(
+        self, functions: Functions, dequantize: Any, stream: IntegerStream, factor: float, out: F32, column: int
+    ) -> None:
+        """Values of unsigned levels from a table of what ``dequantize`` makes of the first ones."""
+        levels = stream.joined
+        small = levels.dtype == np.uint8
+        table = dequantize(np.arange(_SMALL_TABLE if small else _LARGE_TABLE), factor)
+        if functions.look_up(levels, table, out, column):
+            beyond = np.flatnonzero(levels >= len(table))
+            out[beyond, column] = dequantize(levels[beyond], factor)
+
+
+def _summed(functions: Functions, levels: NDArray[Any]) -> NDArray[np.int64]:
+    differences = functions.widened(levels, True) if levels.dtype == np.uint8 else levels
+    return np.cumsum(differences, dtype=np.int64)
+
+
+def _wider(levels: list[NDArray[np.integer]]) -> list[NDArray[Any]]:
+    """Levels of a type that holds the sums of three of them."""
+    most = max(level.dtype.itemsize for level in levels)
+    dtype: type[np.signedinteger] = np.int16 if most == 1 else np.int32 if most == 2 else np.int64
+    return [level.astype(dtype) for level in levels]
+
+
+def _to_rgb(channels: list[NDArray[Any]], factor: float, out: F32) -> None:
+    """Levels of Y, Co, Cg to R, G, B in ``out`` (3, n)."""
+    divisor = np.float32(factor)
+    y, co, cg = channels
+    r = y - cg
+    np.divide(r + co, divisor, out=out[0], dtype=np.float32, casting="unsafe")
+    np.divide(y + cg, divisor, out=out[1], dtype=np.float32, casting="unsafe")
+    np.divide(r - co, divisor, out=out[2], dtype=np.float32, casting="unsafe")

@@ -1,0 +1,58 @@
+"""Which path a decoder takes (:func:`native`): the compiled library if there is one, unless the user says otherwise."""
+
+from __future__ import annotations
+
+import ctypes
+import importlib.machinery
+import os
+import sys
+from functools import lru_cache
+from pathlib import Path
+
+from potr_cl.codec.native.functions import Functions
+from potr_cl.errors import UsageError
+
+#: The environment variable: "0" takes NumPy always, "1" refuses to go on without the library.
+VARIABLE = "POTR_CL_NATIVE"
+#: Another library than the one that was built with the package, such as one with a sanitizer.
+LIBRARY_VARIABLE = "POTR_CL_NATIVE_LIBRARY"
+
+
+def native() -> Functions | None:
+    """The library's functions; None where NumPy is to be taken.
+
+    Raises:
+        UsageError: ``POTR_CL_NATIVE`` asks for a library that is not there, or is not 0 or 1.
+    """
+    asked = os.environ.get(VARIABLE, "")
+    if asked not in ("", "0", "1"):
+        raise UsageError(
+            f"{VARIABLE} is '{asked}': set it to 0 for NumPy, to 1 for the compiled library, or not at all"
+        )
+    if asked == "0":
+        return None
+    functions = _loaded(os.environ.get(LIBRARY_VARIABLE) or _built())
+    if functions is None and asked == "1":
+        raise UsageError(
+            f"{VARIABLE} is 1, but the compiled library is missing: unset it, or install potr_cl with a C compiler"
+        )
+    return functions
+
+
+def _built() -> str | None:
+    """The library beside this file."""
+    for suffix in importlib.machinery.EXTENSION_SUFFIXES:
+        path = Path(__file__).with_name(f"_library{suffix}")
+        if path.is_file():
+            return str(path)
+    return None
+
+
+@lru_cache(maxsize=4)
+def _loaded(path: str | None) -> Functions | None:
+    if path is None or sys.byteorder != "little":
+        return None
+    try:
+        return Functions(ctypes.CDLL(path))
+    except (OSError, AttributeError):  # for another machine, or of another version of the package
+        return None

@@ -1,0 +1,16 @@
+/* The module potr_cl.codec.native._library: empty for Python, which only builds and finds it. Its functions are those
+ * of the other sources, and are called through ctypes. So it needs next to nothing of Python's C interface, and one
+ * library serves all versions of Python. */
+
+#define Py_LIMITED_API 0x030A0000
+#include <Python.h>
+
+static struct PyModuleDef definition = {
+    PyModuleDef_HEAD_INIT, "_library", "Native parts of the decoder; see potr_cl.codec.native.", 0, NULL, NULL, NULL,
+    NULL, NULL
+};
+
+PyMODINIT_FUNC PyInit__library(void)
+{
+    return PyModule_Create(&definition);
+}

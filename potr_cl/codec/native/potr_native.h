@@ -1,0 +1,41 @@
+/* What the native path's sources share. docs/format.md is the normative description of all that they compute, and the
+ * NumPy modules beside this folder are the reference: both give the same integers and floats, bit for bit.
+ *
+ * Rules: nothing that comes from a file is trusted; every function is told how long its arrays are, and the Python
+ * that calls it (binding.py) has checked that they are as long as it says. No function allocates memory, keeps state
+ * between calls, or knows of Python: binding.py calls them through ctypes, which leaves the interpreter free meanwhile.
+ */
+
+#ifndef POTR_NATIVE_H
+#define POTR_NATIVE_H
+
+#include <stddef.h>
+#include <stdint.h>
+
+#if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
+#error "the native path is for little-endian machines; without it the package works all the same"
+#endif
+
+#if defined(_MSC_VER)
+#define INLINE __forceinline
+#else
+#define INLINE inline __attribute__((always_inline))
+#endif
+
+#if defined(_WIN32)
+#define POTR_EXPORT __declspec(dllexport)
+#else
+#define POTR_EXPORT __attribute__((visibility("default")))
+#endif
+
+/* Loops over integers whose vectors profit from wider registers than every processor has: compiled for several, and
+ * chosen when the library is loaded. Only for integers: a wider version could fuse multiplications and additions of
+ * floats. */
+#if defined(__x86_64__) && defined(__linux__) && defined(__GLIBC__) && !defined(POTR_SANITIZED) \
+    && (defined(__clang__) ? __clang_major__ >= 14 : defined(__GNUC__))
+#define POTR_WIDE_INTEGERS __attribute__((target_clones("default", "avx2")))
+#else
+#define POTR_WIDE_INTEGERS
+#endif
+
+#endif

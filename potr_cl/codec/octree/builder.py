@@ -1,0 +1,232 @@
+"""Centres to an octree's streams: :func:`build`."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, U64, OctreeStreams
+
+#: Splats worked on at a time where each stands for itself: the temporaries of a block stay in the cache.
+_BLOCK = 1 << 15
+#: Levels whose octants fit a 64-bit Morton word.
+_LEVELS_A_WORD = 21
+
+F64 = NDArray[np.float64]
+
+
+def build(
+    means: NDArray[np.float32], tolerance: F64 | float, absolute: bool = False
+) -> tuple[OctreeStreams, NDArray[np.int64]]:
+    """Build and serialise the octree of a scene's centres.
+
+    Args:
+        means: (N, 3) float32 centres, world units, finite, N >= 1.
+        tolerance: the largest allowed distance of a centre to its leaf's centre, world units, > 0: (N,) or one for all.
+            Never taken finer than float32 can hold the coordinates themselves.
+        absolute: leaves lie at the first level at which no point of a cell is farther than that from its centre, which
+            the level of leaves nearby foretells; without, at the first whose centre happens to be near enough.
+
+    Returns:
+        The streams, and ``order`` (N,): the splats' indices in the order of the leaves.
+    """
+    n = len(means)
+    axes = [means[:, a].astype(np.float64) for a in range(3)]
+    low = [float(a.min()) for a in axes]
+    side = max(float(a.max()) - lo for a, lo in zip(axes, low, strict=True))
+
+    resolution = np.maximum(np.maximum(np.abs(axes[0]), np.abs(axes[1])), np.abs(axes[2])) * 2.0**-23
+    limit: F64 = np.maximum(tolerance, resolution)
+    depth = _depth_for(side, float(limit.min()))
+
+    # Coordinates in units of the deepest cells; the centre test below works with real distances, so that a rounding
+    # into the neighbouring cell cannot break the criterion.
+    cells = 2.0**depth
+    grid = [
+        np.minimum((axis - lo) * (cells / side if side > 0 else 0.0), cells - 1).astype(np.uint64)
+        for axis, lo in zip(axes, low, strict=True)
+    ]
+
+    words = _morton_words(grid, depth)
+    order = np.argsort(words[0], kind="stable") if len(words) == 1 else np.lexsort(words[::-1])
+    grid = [g[order] for g in grid]
+    common = _common_levels([w[order] for w in words], depth)
+    del words
+
+    # A splat is alone from the level below the last one that it shares with a neighbour in the order.
+    alone = np.maximum(common[:-1], common[1:]) + 1
+    single = alone <= depth
+
+    occupancy, several, starts = _serialise_tree(grid, common, alone, depth)
+    multiplicities = np.diff(np.append(starts, n))[~single[starts]] if not single.all() else np.empty(0, np.int64)
+
+    if absolute:
+        wanted = _levels_for(side, limit, depth)[order]
+        leaf_level = np.maximum(wanted, alone)
+    else:
+        leaf_level = np.empty(n, np.int8)
+        for start in range(0, n, _BLOCK):
+            block = slice(start, start + _BLOCK)
+            rows = order[block]
+            leaf_level[block] = _leaf_levels(
+                [a[rows] for a in axes], low, side, [g[block] for g in grid], alone[block], depth, limit[rows]
+            )
+    lengths = (leaf_level[single] - alone[single]).astype(np.uint8)
+    tails = _serialise_tails([g[single] for g in grid] if len(multiplicities) else grid, lengths, alone[single], depth)
+    streams = OctreeStreams(
+        origin=(low[0], low[1], low[2]),
+        side=side,
+        depth=depth,
+        occupancy=occupancy,
+        several=several,
+        multiplicities=multiplicities.astype(np.uint64),
+        tail_lengths=wanted[single].astype(np.uint8) if absolute else lengths,
+        tails=tails,
+        absolute=absolute,
+    )
+    return streams, order
+
+
+def _depth_for(side: float, tolerance: float) -> int:
+    """The first level whose cells' half diagonal is below the tolerance (with a margin for rounding)."""
+    half_diagonal = side * (np.sqrt(3) / 2)
+    if half_diagonal == 0 or half_diagonal < tolerance:
+        return 0
+    return min(DEEPEST_LEVEL, int(np.floor(np.log2(half_diagonal / tolerance) + 1e-6)) + 1)
+
+
+def _levels_for(side: float, tolerance: F64, depth: int) -> NDArray[np.int8]:
+    """:func:`_depth_for` of each tolerance."""
+    half_diagonal = side * (np.sqrt(3) / 2)
+    if half_diagonal == 0:
+        return np.zeros(len(tolerance), np.int8)
+    levels = np.floor(np.log2(half_diagonal / tolerance) + 1e-6) + 1
+    clipped: NDArray[np.int8] = np.clip(levels, 0, depth).astype(np.int8)
+    return clipped
+
+
+def _morton_words(grid: list[U64], depth: int) -> list[U64]:
+    """Interleaved coordinates, most significant word first, 21 levels a word, left-aligned."""
+    n = len(grid[0])
+    words = [np.empty(n, np.uint64) for _ in range(0, max(depth, 1), _LEVELS_A_WORD)]
+    for start in range(0, n, _BLOCK):
+        block = slice(start, start + _BLOCK)
+        for number, word in enumerate(words):
+            shift = depth - (number + 1) * _LEVELS_A_WORD
+            bits = np.zeros(len(word[block]), np.uint64)
+            for axis, g in enumerate(grid):
+                part = g[block] >> np.uint64(shift) if shift >= 0 else g[block] << np.uint64(-shift)
+                bits |= _spread(part & np.uint64(0x1FFFFF)) << np.uint64(axis)
+            word[block] = bits
+    return words
+
+
+def _spread(x: U64) -> U64:
+    """Move bit i to bit 3 i, for 21 bits."""
+    for shift, mask in (
+        (32, 0x1F00000000FFFF),
+        (16, 0x1F0000FF0000FF),
+        (8, 0x100F00F00F00F00F),
+        (4, 0x10C30C30C30C30C3),
+        (2, 0x1249249249249249),
+    ):
+        x = (x | (x << np.uint64(shift))) & np.uint64(mask)
+    return x
+
+
+def _common_levels(words: list[U64], depth: int) -> NDArray[np.int8]:
+    """(N + 1,) levels that splat i - 1 and splat i of the order share; -1 at both ends, which have one neighbour."""
+    n = len(words[0])
+    common = np.full(n + 1, -1, np.int8)
+    inner = np.full(n - 1, depth, np.int8)
+    undecided = np.ones(n - 1, bool)
+    for k, word in enumerate(words):
+        differs = word[1:] ^ word[:-1]
+        here = undecided & (differs != 0)
+        # Only the top bit counts; clearing the one below it keeps the conversion to float from rounding it up.
+        top = differs[here]
+        top &= ~(top >> np.uint64(1))
+        exponent = np.frexp(top.astype(np.float64))[1] - 1
+        inner[here] = _LEVELS_A_WORD * k + (3 * _LEVELS_A_WORD - 1 - exponent) // 3
+        undecided &= ~here
+    common[1:-1] = inner
+    return common
+
+
+def _octants(grid: list[U64], index: NDArray[np.int64], shift: int) -> U8:
+    bits: list[U8] = [((g[index] >> np.uint64(shift)) & np.uint64(1)).astype(np.uint8) for g in grid]
+    numbers: U8 = bits[0] | bits[1] << np.uint8(1) | bits[2] << np.uint8(2)
+    return numbers
+
+
+def _serialise_tree(
+    grid: list[U64], common: NDArray[np.int8], alone: NDArray[np.int8], depth: int
+) -> tuple[U8, U8, NDArray[np.int64]]:
+    """Occupancy and several-flags breadth first, and the first splat of each leaf in Morton order."""
+    occupancy: list[U8] = []
+    flags: list[NDArray[np.bool_]] = []
+    # Splats that still share their node with others; a run of them with common > level - 1 is a node of that level.
+    crowd = np.flatnonzero(alone > 0)
+    for level in range(depth):
+        if len(crowd) == 0:
+            break
+        shared = common[crowd]
+        child_starts = crowd[shared <= level]
+        node_starts = np.flatnonzero(common[child_starts] < level)
+        octants = _octants(grid, child_starts, depth - 1 - level)
+        occupancy.append(np.add.reduceat(np.left_shift(np.uint8(1), octants), node_starts, dtype=np.uint8))
+        flags.append(alone[child_starts] > level + 1)
+        crowd = crowd[alone[crowd] > level + 1]
+    # What is still crowded at the deepest level shares a leaf with the splat before it where all levels are common.
+    first = common[:-1] < depth
+    if depth == 0:
+        first[1:] = False
+    packed = np.packbits(np.concatenate(flags), bitorder="little") if flags else np.empty(0, np.uint8)
+    occupied = np.concatenate(occupancy) if occupancy else np.empty(0, np.uint8)
+    return occupied, packed, np.flatnonzero(first)
+
+
+def _leaf_levels(
+    axes: list[F64],
+    low: list[float],
+    side: float,
+    grid: list[U64],
+    alone: NDArray[np.int8],
+    depth: int,
+    limit: F64,
+) -> NDArray[np.int8]:
+    """The first level from ``alone`` on whose cell centre lies within the limit; ``depth`` at the latest."""
+    level_of = np.full(len(alone), depth, np.int8)
+    pending = np.flatnonzero(alone <= depth)
+    squared = limit * limit
+    for level in range(depth):
+        ready = alone[pending] <= level
+        here = pending[ready]
+        if len(here) == 0:
+            continue
+        distance = np.zeros(len(here))
+        cell = side * 2.0**-level
+        for axis, lo, g in zip(axes, low, grid, strict=True):
+            centre = lo + ((g[here] >> np.uint64(depth - level)).astype(np.float64) + 0.5) * cell
+            centre -= axis[here]
+            distance += centre * centre
+        done = distance < squared[here]
+        level_of[here[done]] = level
+        ready[ready] = done
+        pending = pending[~ready]
+    return level_of
+
+
+def _serialise_tails(grid: list[U64], lengths: U8, alone: NDArray[np.int8], depth: int) -> U8:
+    longest_first = np.argsort(np.uint8(255) - lengths, kind="stable")
+    reach = np.cumsum(np.bincount(lengths, minlength=1)[::-1])[::-1]  # leaves whose tail has at least this length
+    shift = (depth - 1 - alone).astype(np.int16)[longest_first]
+    sorted_grid = [g[longest_first] for g in grid]
+    planes: list[U8] = []
+    for level in range(1, len(reach)):
+        k = reach[level]
+        down = (shift[:k] - (level - 1)).astype(np.uint64)
+        planes.extend(
+            np.packbits(((g[:k] >> down) & np.uint64(1)).astype(np.uint8), bitorder="little") for g in sorted_grid
+        )
+    return np.concatenate(planes) if planes else np.empty(0, np.uint8)

@@ -1,0 +1,44 @@
+"""What an octree is stored as: :class:`OctreeStreams`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+#: Levels that float64 arithmetic on the root cube can tell apart.
+DEEPEST_LEVEL = 52
+
+U8 = NDArray[np.uint8]
+U64 = NDArray[np.uint64]
+
+
+@dataclass(frozen=True)
+class OctreeStreams:
+    """A serialised octree.
+
+    Attributes:
+        origin: corner of the root cube with the smallest coordinates, world units.
+        side: edge of the root cube, world units; 0 if all centres coincide.
+        depth: deepest level of any leaf, 0 to 52.
+        occupancy: uint8, one a node that holds several splats and lies above ``depth``, breadth first; bit
+            ``x + 2 y + 4 z`` is set if the child octant at (x, y, z) holds a splat.
+        several: uint8, bits packed with the first in the lowest bit: one a child in the order of ``occupancy``, set if
+            the child holds several splats.
+        multiplicities: uint64, number of splats of each leaf at ``depth`` that holds several, in Morton order.
+        tail_lengths: uint8, one a leaf with a single splat, in Morton order: levels below the one where it is alone; if
+            ``absolute``, the level itself, which is not reached where the splat is still in company there.
+        tails: uint8, bit planes: for level 1, 2, … of the tails and axis x, y, z one plane, padded to whole bytes
+            (first bit lowest), of the leaves whose tail reaches that level, longest tail first, then Morton order.
+    """
+
+    origin: tuple[float, float, float]
+    side: float
+    depth: int
+    occupancy: U8
+    several: U8
+    multiplicities: U64
+    tail_lengths: U8
+    tails: U8
+    absolute: bool = False

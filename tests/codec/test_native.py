@@ -1,0 +1,292 @@
+"""The native path: the same bits as NumPy's, the same refusals, and never beyond its buffers."""
+
+from __future__ import annotations
+
+import random
+import struct
+import zlib
+from pathlib import Path
+from unittest.mock import patch
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from potr_cl.codec import encoder, octree
+from potr_cl.codec.container import EntropyCoder
+from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.codec.encoder import code_scene
+from potr_cl.codec.native.functions import Functions, Tree
+from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, native
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.errors import DataError, UsageError
+from potr_cl.model.scene import Scene
+from potr_cl.reference.scenes import random_scene
+
+GOLDEN = sorted((Path(__file__).parents[1] / "data").glob("golden_v*.potr"))
+ATTRIBUTES = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
+TREE = ("occupancy", "several", "multiplicities", "tail_lengths", "tails")
+PATHS = {"numpy": "0", "native": "1"}
+#: A path is chosen by the environment: hypothesis need not undo it between its examples, as each sets it anew.
+SETTINGS = settings(
+    max_examples=60, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture, HealthCheck.too_slow]
+)
+
+
+@pytest.fixture
+def choose(monkeypatch):
+    """Chooses a path by name; skips where there is no compiled library."""
+    monkeypatch.delenv(VARIABLE, raising=False)
+    if native() is None:
+        pytest.skip("the compiled library is not there: python -m tools.make.native, or pip install -e .")
+    return lambda path: monkeypatch.setenv(VARIABLE, PATHS[path])
+
+
+def outcome(data: bytes, threads: int = 1) -> Scene | str:
+    try:
+        return PotrFile.from_bytes(data).scene(threads)
+    except DataError as error:
+        return str(error)
+
+
+def bits(scene: Scene) -> dict[str, np.ndarray]:
+    return {name: np.ascontiguousarray(getattr(scene, name)).view(np.uint32) for name in ATTRIBUTES}
+
+
+def assert_alike(data: bytes, choose, threads: int = 1) -> bool:
+    """That both paths read a file to the same bits or refuse it for the same reason. Returns whether they read it."""
+    outcomes = {}
+    for path in PATHS:
+        choose(path)
+        outcomes[path] = outcome(data, threads)
+    if isinstance(outcomes["numpy"], str) or isinstance(outcomes["native"], str):
+        assert outcomes["native"] == outcomes["numpy"]
+        return False
+    ours, wanted = (bits(outcomes[path]) for path in ("native", "numpy"))
+    for name in ATTRIBUTES:
+        assert np.array_equal(ours[name], wanted[name]), name
+    return True
+
+
+def coded(scene: Scene, preset="best", q=0.5, entropy="context") -> bytes:
+    with patch.object(encoder, "_FEW", 0):  # the context coder for few splats, too
+        return b"".join(
+            code_scene(scene, HyperParameters.from_quality(q, preset), entropy=EntropyCoder(entropy, 1)).pieces
+        )
+
+
+# The same bits --------------------------------------------------------------------------------------------------------
+
+
+@pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
+@pytest.mark.parametrize("threads", [1, 3])
+def test_golden_files(path, threads, choose):
+    assert assert_alike(path.read_bytes(), choose, threads)
+
+
+@pytest.mark.parametrize("entropy", ["context", "zstd", "npz"])
+@pytest.mark.parametrize("q", [0.1, 0.5, 1.0])
+def test_a_real_scene(lego_excerpt, q, entropy, choose):
+    assert assert_alike(coded(lego_excerpt, q=q, entropy=entropy), choose, 2)
+
+
+@given(
+    splats=st.sampled_from([1, 2, 3, 7, 127, 128, 129, 255, 256, 257, 511, 513, 1500]),
+    degree=st.integers(0, 3),
+    seed=st.integers(0, 2**16),
+    preset=st.sampled_from(["paper", "fast", "best"]),
+    entropy=st.sampled_from(["context", "zstd"]),
+    q=st.floats(0, 1),
+    spread=st.sampled_from([1e-3, 1.0, 30.0]),
+    copies=st.integers(1, 4),
+)
+@SETTINGS
+def test_any_scene(splats, degree, seed, preset, entropy, q, spread, copies, choose):
+    """Small and large integers of every property, whole lanes and odd ones, splats in one place."""
+    scene = random_scene(splats, degree, seed=seed)
+    scene = scene.subset(np.repeat(np.arange(splats), np.arange(splats) % copies + 1))
+    scene = Scene(
+        scene.means,
+        scene.log_scales + np.float32(np.log(spread)),
+        scene.quaternions,
+        scene.opacity_logits,
+        scene.sh * np.float32(spread),
+    )
+    assert assert_alike(coded(scene, preset, q, entropy), choose, 2)
+
+
+def test_more_lanes_than_a_group_and_lanes_of_many_steps(choose):
+    """Steps in which only some lanes have a splat; groups of lanes that are cut short."""
+    for splats in (256 * 130 + 1, 8192 * 257 + 3):
+        scene = random_scene(400, 0, seed=splats).subset(np.arange(splats) % 400)
+        data = coded(scene)
+        for path in PATHS:
+            choose(path)
+            found = PotrFile.from_bytes(data, trust=True).scene(2)
+            assert len(found) == splats
+            if path == "numpy":
+                wanted = bits(found)
+        ours = bits(found)
+        assert all(np.array_equal(ours[name], wanted[name]) for name in ATTRIBUTES)
+
+
+@pytest.mark.parametrize("name", ["means", "log_scales", "quaternions", "opacity_logits", "sh"])
+def test_properties_one_by_one(lego_excerpt, name, choose):
+    data = coded(lego_excerpt)
+    found = {}
+    for path in PATHS:
+        choose(path)
+        found[path] = np.ascontiguousarray(getattr(PotrFile.from_bytes(data), name)())
+    assert np.array_equal(found["native"].view(np.uint32), found["numpy"].view(np.uint32))
+
+
+# The same refusals ----------------------------------------------------------------------------------------------------
+
+
+def resealed(data: bytearray) -> bytes:
+    """A file whose checksums are right again."""
+    count = struct.unpack_from("<H", data, 34)[0]
+    at = 124 + 24 * count
+    for entry in range(120, 120 + 24 * count, 24):
+        (size,) = struct.unpack_from("<Q", data, entry + 16)
+        struct.pack_into("<I", data, entry + 4, zlib.crc32(data[at : at + size]))
+        at += size
+    struct.pack_into("<I", data, 120 + 24 * count, zlib.crc32(data[: 120 + 24 * count]))
+    return bytes(data)
+
+
+def files_to_change() -> list[bytes]:
+    scenes = [random_scene(300, 1, seed=1), random_scene(40, 3, seed=2).subset(np.r_[np.arange(40), [5, 5, 6]])]
+    made = [coded(scene) for scene in scenes] + [coded(scenes[1], "paper", entropy="npz"), coded(scenes[0], "fast")]
+    return made + [path.read_bytes() for path in GOLDEN if path.stat().st_size < 6000]
+
+
+def test_changed_files(choose):
+    """Bytes changed anywhere behind the magic, checksums made right: read alike or refused for the same reason."""
+    rng = random.Random(7)
+    originals = files_to_change()
+    read = 0
+    for number in range(1000):
+        data = bytearray(originals[number % len(originals)])
+        for _ in range(rng.choice([1, 1, 1, 2, 8])):
+            data[rng.randrange(10 if rng.random() < 0.1 else 124, len(data))] = rng.choice(
+                [0, 1, 127, 128, 255, rng.getrandbits(8)]
+            )
+        read += assert_alike(resealed(data), choose)
+    assert 100 < read < 900  # both must occur for this to mean anything
+
+
+def test_changed_octrees(choose):
+    rng = np.random.default_rng(3)
+    means = rng.normal(size=(200, 3)).astype(np.float32)
+    means = np.concatenate([means, means[:20], means[:5]])
+    reasons = set()
+    for number in range(1500):
+        tree, _ = octree.build(means, 1e-3, absolute=bool(number % 2))
+        fields = {
+            name: np.array(getattr(tree, name))
+            for name in ("occupancy", "several", "multiplicities", "tail_lengths", "tails")
+        }
+        name = rng.choice(list(fields))
+        values = fields[name]
+        if rng.random() < 0.3:
+            values = values[: rng.integers(0, len(values) + 1)] if rng.random() < 0.5 else np.append(values, values[:1])
+        else:
+            values[rng.integers(len(values))] = rng.choice([0, 1, 2, 3, 60, 255])
+        fields[name] = np.ascontiguousarray(values)
+        changed = octree.OctreeStreams(tree.origin, tree.side, tree.depth, **fields, absolute=tree.absolute)
+        found = []
+        for path in PATHS:
+            choose(path)
+            try:
+                found.append(octree.parse(changed, len(means)).tobytes())
+            except DataError as error:
+                found.append(str(error))
+                reasons.add(str(error)[:30])
+        assert found[0] == found[1], name
+    assert len(reasons) >= 5
+
+
+def test_the_end_of_the_words_is_seen(choose):
+    """A section whose last words are missing, in steps of every width."""
+    data = coded(random_scene(700, 0, seed=4))
+    file = PotrFile.from_bytes(data)
+    refused = 0
+    for section in file.header.sections:
+        if section.streams > 1 or section.kind.name == "OPACITY":
+            for cut in (2, 4, 20, 60):
+                short = bytearray(data)
+                del short[section.offset + section.stored_bytes - cut : section.offset + section.stored_bytes]
+                entry = 120 + 24 * file.header.sections.index(section)
+                struct.pack_into("<Q", short, entry + 16, section.stored_bytes - cut)
+                struct.pack_into("<Q", short, 16, len(short))
+                refused += not assert_alike(resealed(short), choose)
+    assert refused >= 12
+
+
+# The choice -----------------------------------------------------------------------------------------------------------
+
+
+def test_another_word_than_0_and_1_is_refused(monkeypatch):
+    monkeypatch.setenv(VARIABLE, "yes")
+    with pytest.raises(UsageError, match=f"{VARIABLE} is 'yes'"):
+        decode(GOLDEN[0])
+
+
+def test_without_the_library(monkeypatch, tmp_path):
+    """NumPy decodes, unless the user insists."""
+    monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path / "nowhere.so"))
+    monkeypatch.delenv(VARIABLE, raising=False)
+    assert native() is None
+    assert len(decode(GOLDEN[0]))
+    monkeypatch.setenv(VARIABLE, "1")
+    with pytest.raises(UsageError, match="compiled library is missing"):
+        decode(GOLDEN[0])
+
+
+def test_a_library_that_is_none(monkeypatch, tmp_path):
+    (tmp_path / "text.so").write_text("this is not machine code")
+    monkeypatch.setenv(LIBRARY_VARIABLE, str(tmp_path / "text.so"))
+    monkeypatch.delenv(VARIABLE, raising=False)
+    assert native() is None
+
+
+# Sizes are checked before C sees them ---------------------------------------------------------------------------------
+
+
+@pytest.fixture
+def functions(choose) -> Functions:
+    choose("native")
+    found = native()
+    assert found is not None
+    return found
+
+
+def test_arrays_of_other_sizes_are_refused(functions):
+    out = np.empty((3, 10), np.float32)
+    short, right = np.zeros(9, np.uint8), np.zeros(10, np.uint8)
+    with pytest.raises(TypeError, match="takes 10 of uint8"):
+        functions.colours([right, short, right], 1.0, out)
+    with pytest.raises(TypeError, match="takes 10 of uint8"):
+        functions.look_up(short, np.zeros(256, np.float32), out.T.copy(), 0)
+    with pytest.raises(TypeError, match="too small"):
+        functions.look_up(right, np.zeros(255, np.float32), out.T.copy(), 0)
+    with pytest.raises(TypeError, match="float32"):
+        functions.rotations([right] * 3, np.ones(10), np.empty((10, 4), np.float32))
+    out.flags.writeable = False
+    with pytest.raises(TypeError, match="read-only"):
+        functions.colours([right] * 3, 1.0, out)
+
+
+def test_tails_and_bits_that_are_too_short_are_refused(functions):
+    with pytest.raises(TypeError, match="fewer bits"):
+        functions.integers_of_tokens(np.full((2, 2), 200, np.uint8), np.zeros(3, np.uint8), 0, 1 << 30, True, False)
+    tree = Tree(np.zeros(108, np.uint64), 4, 0)
+    counts = np.zeros(53, np.uint64)
+    counts[3] = 4
+    with pytest.raises(TypeError, match="tails of another size"):
+        functions.octree_centres(
+            np.zeros(1, np.uint8), np.zeros(1, np.uint8), 3, tree, np.zeros(4, np.uint8), True, counts,
+            np.zeros(0, np.uint64), np.zeros(2, np.uint8), np.zeros(4), np.zeros(3), np.zeros((4, 3), np.float32),
+        )  # fmt: skip
