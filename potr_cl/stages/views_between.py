@@ -75,7 +75,7 @@ class Between(Stage):
         bench.progress("views between", 0.0)
         slow = bench.opened.info.kind == "cpu"
         if self.views is None:
-            trial = try_views(state, bench, self.spread, _MOST_ON_CPU if slow else _MOST)
+            trial = try_views(state, bench, self.spread, _MOST_ON_CPU if slow else _MOST, brief=slow)
         else:
             trial = Trial(self.views)
         added = views_between(state.source, state.views, trial.each, self.spread)

@@ -35,6 +35,8 @@ _ITERATIONS, _STEPS = 6, 2
 #: A round has to bring so many decibels on the held-out views; below so many between them and the others the gap is
 #: closed.
 _GAIN, _CLOSED = 0.15, 0.3
+#: A gap of so many decibels is closed by added views without their being tried first, where trying is dear.
+_CLEAR = 1.0
 
 
 @dataclass(frozen=True)
@@ -52,7 +54,7 @@ class Trial:
     looked_at: tuple[float, ...] = ()
 
 
-def try_views(state: State, bench: Workbench, spread: float, most: int) -> Trial:
+def try_views(state: State, bench: Workbench, spread: float, most: int, brief: bool) -> Trial:
     """How many views to add.
 
     Args:
@@ -60,13 +62,14 @@ def try_views(state: State, bench: Workbench, spread: float, most: int) -> Trial
         bench: of the stage that asks.
         spread: of the views, as :func:`potr_cl.model.views_between.views_between` takes it.
         most: the most that may be added for each view.
+        brief: do not try what added views bring: let the gap without them decide.
 
     Raises:
         DeviceError: the device fails, or has too little memory.
     """
     rounds = sorted({min(each, most) for each in ROUNDS} - {0})
     if len(state.views) < _LEAST or not rounds:
-        return Trial(max(rounds, default=0))
+        return Trial(0)
     near = [_small(state.views[number]) for number in _cluster(camera_centres(state.views))]
     held = near[1 : max(len(near) // 2, 2) : _EVERY]
     rest = [view for view in near if not any(view is other for other in held)]
@@ -85,6 +88,9 @@ def try_views(state: State, bench: Workbench, spread: float, most: int) -> Trial
         errors = [psnr(a, b) for a, b in zip(wanted, got, strict=True)]
         of_held.append(float(np.mean(errors[: len(held)])))
         of_rest.append(float(np.mean(errors[len(held) :])))
+        if brief:
+            gap = of_rest[0] - of_held[0]
+            return Trial(rounds[0] if gap > _CLEAR else 0, tuple(of_held), tuple(of_rest))
         if number and of_held[-1] < of_held[-2] + _GAIN:
             break
         best = each
