@@ -37,6 +37,7 @@ study.antialiasing         what is lost if an antialiased scene is encoded as a 
 study.compaction_curves    what does the compaction do to sparsity and pictures?
 study.removal_exactness    how far are predicted removal effects from removals in float64?
 study.removal_formulas     back to front or prefix sums: which formula of removal effects?
+study.frames               which cameras in another frame are found, and what do unseen splats cost?
 study.decoder_roads        which road to a quick decoder: compiled C or OpenCL kernels? (for bench.decode --part roads)
 study.composite_yardstick  the compositing kernel beside a loop in C
 =========================  =============================================================================================

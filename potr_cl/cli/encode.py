@@ -8,48 +8,39 @@ import time
 from concurrent.futures import Future
 from typing import Any
 
+from potr_cl.api.encoding import Judge, check_photographs_have_cameras, encode_options, encode_target, proved
 from potr_cl.cli.guard import ReadFile, WrittenFile
-from potr_cl.cli.options import Commands, add_device_options, add_memory_option, as_bytes, size_in_bytes
+from potr_cl.cli.options import Commands, add_device_options, add_memory_option
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene, size_of_file, trust
+from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene, size_of_file
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say, say_document
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
-from potr_cl.codec.decoder import PotrFile
-from potr_cl.errors import DataError, DeviceError, PotrError, UsageError
+from potr_cl.errors import DeviceError, UsageError
 from potr_cl.formats.images import Colour, parse_colour
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, test_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, Stopwatch, encode
+from potr_cl.pipeline.encode import Stopwatch, encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT, PRESETS, PURPOSE
-from potr_cl.pipeline.search import Target, encode_to_target
-from potr_cl.quality.evaluator import EvaluationViews, Evaluator
+from potr_cl.pipeline.search import encode_to_target
+from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.report.html import PicturePair, html_report, views_to_show
-from potr_cl.report.summary import encode_report, format_encode_report, quality_report, search_report
+from potr_cl.report.html import PicturePair, html_report
+from potr_cl.report.summary import encode_report, format_encode_report, search_report
 from potr_cl.stages.refit import Refit
 
 
 def _options(args: argparse.Namespace) -> EncodeOptions:
-    if args.threads < 0:
-        raise UsageError(f"--threads is {args.threads}, it must be 0 or more")
-    options = EncodeOptions.for_preset(
-        args.preset,
-        q=args.quality,
-        background=parse_colour(args.background),
-        memory=as_bytes(args.memory),
-        threads=args.threads,
-        source_bytes=size_of_file(args.scene),
-        **stage_choices(args),
-    )
-    _ = options.parameters  # a wrong option is told before a gigabyte is read
-    return options
+    return encode_options(
+        None, args.preset, stage_choices(args), q=args.quality, background=args.background, memory=args.memory,
+        threads=args.threads, source_bytes=size_of_file(args.scene), cameras_anyway=args.cameras_anyway,
+    )  # fmt: skip
 
 
 def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
@@ -58,18 +49,11 @@ def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
     return wanted or not (args.cameras is None or args.no_quality)
 
 
-def _target(args: argparse.Namespace) -> Target | None:
-    if args.max_size is not None:
-        return Target(max_bytes=size_in_bytes(args.max_size))
-    return None if args.min_psnr is None else Target(min_psnr=args.min_psnr)
-
-
 def _encode(args: argparse.Namespace) -> None:
     began = time.perf_counter()
-    options, target = _options(args), _target(args)
+    options, target = _options(args), encode_target(None, args.max_size, args.min_psnr)
     refit = options.stage(Refit)
-    if refit.ground_truth is not None and not (args.cameras and refit.asked_for):
-        raise UsageError("--photos needs --cameras, the views that the photographs show, and a re-fit")
+    check_photographs_have_cameras(options, args.cameras is not None)
     if args.report is None and args.report_view is not None:
         raise UsageError("--report-view needs --report, the page that shows it")
     with contextlib.ExitStack() as stack:
@@ -96,7 +80,7 @@ def _encode(args: argparse.Namespace) -> None:
             else:
                 found = encode_to_target(scene, cameras, target, options, progress, device, progress.tell)
                 encoded, options, search = found.encoded, found.options, search_report(target, found)
-            written, candidate = _proved(args, encoded)  # what cannot be decoded must not replace what can
+            written, candidate = proved(encoded, args.trust)  # what cannot be decoded must not replace what can
             file.write(written.data)
         watch = Stopwatch(progress)
         pictures: list[PicturePair] = []
@@ -118,22 +102,6 @@ def _encode(args: argparse.Namespace) -> None:
         say(format_encode_report(report))
 
 
-def _proved(args: argparse.Namespace, encoded: Encoded) -> tuple[PotrFile, Scene]:
-    """The file that was made and the scene that a decoder makes of it.
-
-    Raises:
-        PotrError: no decoder takes it.
-    """
-    try:
-        file = PotrFile.from_bytes(b"".join(encoded.pieces), **trust(args))
-        return file, file.scene()
-    except DataError as error:
-        raise PotrError(
-            f"the encoded file cannot be decoded ({error}): nothing was written. If the scene has splats that are very "
-            "far away or very large, leave them out"
-        ) from error
-
-
 def _evaluate(
     args: argparse.Namespace,
     scene: Scene,
@@ -149,16 +117,12 @@ def _evaluate(
     """
     watch("evaluate", 0.0)
     try:
-        device = device or (Device(args.device) if opened is None else opened.result())
-        with Evaluator(device, scene, views, parse_colour(args.background)) as evaluator:
-            quality = quality_report(views, evaluator.compare(candidate, lambda _, done: watch("evaluate", done)))
-            shown = views_to_show(quality, args.report_view) if args.report is not None else []
-            pairs = evaluator.pictures(candidate, [view["name"] for _, view in shown])
+        judge = Judge(
+            views, device or (Device(args.device) if opened is None else opened.result()), parse_colour(args.background)
+        )
+        return judge(scene, candidate, watch, args.report_view, pictures=args.report is not None)
     except DeviceError as error:
         return f"not judged: {error}", []
-    return quality, [
-        PicturePair(title, view["name"], view["psnr"], *pair) for (title, view), pair in zip(shown, pairs, strict=True)
-    ]
 
 
 def _evaluate_by_ground_truth(

@@ -1,4 +1,4 @@
-"""The commands about .potr files: decode, info."""
+"""The commands about files: decode, info."""
 
 from __future__ import annotations
 
@@ -9,10 +9,10 @@ from typing import TYPE_CHECKING
 from potr_cl.cli.guard import ReadFile, WrittenFile
 from potr_cl.cli.scenes import add_trust_option, trust
 from potr_cl.cli.terminal import say, say_document
-from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.codec.decoder import decode
+from potr_cl.formats.registry import suffixes_read
 from potr_cl.formats.scenes import ply
 from potr_cl.model.scene import SH_COEFFICIENTS
-from potr_cl.report.file import file_report, format_report
 
 if TYPE_CHECKING:
     from potr_cl.cli.options import Commands
@@ -43,16 +43,24 @@ def add_decode(commands: Commands) -> None:
 
 
 def _info(args: argparse.Namespace) -> None:
-    report = file_report(PotrFile.open(args.file, **trust(args)))
+    # Imported here: to decode takes less time than to import what this needs.
+    from potr_cl.api.describing import info
+
+    found = info(args.file, **trust(args))
     if args.json:
-        say_document(report)
+        say_document(found.facts)
     else:
-        say(format_report(report))
+        say(found)
 
 
 def add_info(commands: Commands) -> None:
-    p = commands.add_parser("info", help="what a .potr file holds, and where its bytes are")
-    p.add_argument("file", type=ReadFile, metavar="IN.potr")
+    p = commands.add_parser(
+        "info",
+        help="what a scene holds and what looks wrong with it; of a .potr file also where its bytes are",
+        description=f"Reads every kind of scene: {suffixes_read()}. Says how many splats it has, how large it is, how "
+        "its opacities and scales are spread, and what looks suspicious.",
+    )
+    p.add_argument("file", type=ReadFile, metavar="SCENE", help="a scene of any kind that is read")
     p.add_argument("--json", action="store_true", help="for programs")
     add_trust_option(p)
     p.set_defaults(run=_info)

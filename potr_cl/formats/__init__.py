@@ -18,7 +18,7 @@ from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 
-__all__ = ["load_cameras", "load_scene", "save_scene", "scene_writer"]
+__all__ = ["load_cameras", "load_scene", "read_cameras", "read_scene", "save_scene", "scene_writer"]
 
 
 def load_scene(path: str | os.PathLike[str], trust: bool = False, antialiased: bool | None = None) -> Scene:
@@ -117,3 +117,7 @@ def _from_folder(folder: Path) -> list[Camera]:
             if entry.is_in(folder / subfolder):
                 return entry.load_folder(folder / subfolder)
     raise UsageError(f"the folder '{folder}' holds no cameras, expected {registry.cameras_read()}")
+
+
+#: The same under the names that go with what the readers' messages say; neither name is better than the other.
+read_scene, read_cameras = load_scene, load_cameras

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -63,6 +64,11 @@ class Camera:
         if self.split not in ("train", "test"):
             raise DataError(f"{where}: split '{self.split}' is neither 'train' nor 'test'")
 
+    def __repr__(self) -> str:
+        at = ", ".join(f"{x:.3g}" for x in self.centre)
+        view = 2 * math.degrees(math.atan(self.width / 2 / self.fx))
+        return f"Camera('{self.name}', {self.split}, {self.width} x {self.height}, {view:.0f}° wide, at ({at}))"
+
     @property
     def centre(self) -> NDArray[np.float64]:
         """(3,) position of the camera centre in world units."""
@@ -92,3 +98,12 @@ test_views.__test__ = False  # type: ignore[attr-defined]  # pytest would collec
 def camera_centres(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     """(S, 3) positions of the camera centres in world units."""
     return np.array([c.centre for c in cameras], dtype=np.float64).reshape(-1, 3)
+
+
+def focus(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    """(3,) the point in world units that the lines of sight of some cameras come nearest to, by least squares."""
+    across = np.eye(3) - np.stack([np.outer(c.rotation[2], c.rotation[2]) for c in cameras])
+    point: NDArray[np.float64] = np.linalg.lstsq(
+        across.sum(axis=0), np.einsum("nij,nj->i", across, camera_centres(cameras)), rcond=1e-9
+    )[0]
+    return point

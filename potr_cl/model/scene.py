@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -125,6 +126,28 @@ class Scene:
         # exp of a non-positive number only: a logit of -100 must not overflow.
         e = np.exp(-np.abs(logits))
         return np.where(logits >= 0, 1 / (1 + e), e / (1 + e)).astype(np.float32)
+
+    def __repr__(self) -> str:
+        low, high = (self.means.min(axis=0), self.means.max(axis=0)) if len(self) else (np.zeros(3), np.zeros(3))
+        box = " x ".join(f"[{a:.3g}, {b:.3g}]" for a, b in zip(low, high, strict=True))
+        return f"Scene({len(self):,} splats, SH degree {self.sh_degree}, {box}, {self.nbytes / 1e6:.1f} MB)"
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the scene in the format that the suffixes of ``path`` tell, as :func:`potr_cl.save` does.
+
+        Raises:
+            As :func:`potr_cl.save`.
+        """
+        # Arrays know nothing of files: which formats there are the package knows, and is asked when it is needed.
+        import potr_cl
+
+        potr_cl.save(self, path)
+
+    def _repr_png_(self) -> bytes | None:
+        """For notebooks: the scene from four sides, or nothing where no device renders it."""
+        import potr_cl
+
+        return potr_cl.preview(self)
 
     def subset(self, index: NDArray[np.generic]) -> Scene:
         """The splats that ``index`` (integers or a boolean mask) selects, in its order."""

@@ -166,6 +166,9 @@ class Found:
     value: float
     tries: list[Try]
 
+    def __repr__(self) -> str:
+        return f"Found({self.encoded!r} after {len(self.tries)} tries)"
+
 
 def encode_to_target(
     scene: Scene,

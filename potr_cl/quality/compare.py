@@ -106,6 +106,14 @@ class Comparison:
     views: list[ViewFigures]
     worst: int
 
+    def __repr__(self) -> str:
+        mean, worst = mean_view(self.views).figures["b_against_a"], self.views[self.worst]
+        views = f"{len(self.views)} view{'s' if len(self.views) > 1 else ''}"
+        return (
+            f"Comparison({views}, PSNR {mean.psnr:.2f} dB, SSIM {mean.ssim:.4f}, "
+            f"worst {worst.figures['b_against_a'].psnr:.2f} dB in '{worst.name}')"
+        )
+
 
 def find_ground_truth(folder: Path, cameras: Sequence[Camera]) -> dict[str, Path]:
     """The photograph of each view: the image in ``folder`` that is named after it.

@@ -55,3 +55,6 @@ LEAST_COMPENSATION = 0.005
 INRIA = RasterRules()
 #: gsplat's rasterizer, with the original's near plane instead of its own default of 0.01.
 GSPLAT = RasterRules(alpha_cap=0.999, square_extent=False, threshold_included=True)
+
+#: By the names that people know them by.
+RULES = {"inria": INRIA, "gsplat": GSPLAT}

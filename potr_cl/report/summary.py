@@ -68,6 +68,7 @@ def encode_report(
         "properties": _properties(contents["sections"]),
         "quality": quality,
         "pruning": None,
+        "unseen": None,
         "search": search,
         "options": options.as_dict(),
         "parameters": dataclasses.asdict(options.parameters),
@@ -81,6 +82,8 @@ def encode_report(
             "iterations": encoded.pruned.iterations,
             "history": [dataclasses.asdict(entry) for entry in encoded.pruned.history],
         }
+    if encoded.unseen is not None:
+        report["unseen"] = {**dataclasses.asdict(encoded.unseen), "said": str(encoded.unseen)}
     if encoded.device is not None:
         info = encoded.device.info
         report["device"] = {"name": info.name, "platform": info.platform, "version": info.version}
@@ -144,6 +147,8 @@ def format_encode_report(report: dict[str, Any]) -> str:
         f"{report['file']}: {report['bytes']:,} bytes, {change} than {source['file']} ({source['bytes']:,} bytes)",
         f"splats     {report['splats']:,} of {source['splats']:,}, {report['bytes_a_splat']:.2f} bytes each",
     ]
+    if report["unseen"] is not None and report["unseen"]["splats"]:
+        lines.append(f"           {report['unseen']['said']}")
     if source["antialiased"]:
         lines.append("rendered   as an antialiased scene")
     for place, (name, nbytes) in enumerate(report["properties"].items()):

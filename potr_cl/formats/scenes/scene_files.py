@@ -7,6 +7,7 @@ import logging
 import os
 import stat
 from collections.abc import Iterator
+from contextvars import ContextVar
 from dataclasses import replace
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
@@ -17,7 +18,10 @@ from potr_cl.codec import octree
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError, PotrError, UsageError
 from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
-from potr_cl.model.scene import LOW_PASS, FloatArray, Scene
+from potr_cl.model.scene import LOW_PASS, CleanReport, FloatArray, Scene
+
+#: Where somebody wants to know what was mended in files that are read.
+_MENDED: ContextVar[list[CleanReport] | None] = ContextVar("mended", default=None)
 
 _log = logging.getLogger("potr_cl")
 
@@ -147,6 +151,17 @@ def log_of_scales(scales: FloatArray) -> FloatArray:
     return np.where(scales >= 0, natural_logarithm(flat).reshape(scales.shape), np.float32(np.nan))
 
 
+@contextlib.contextmanager
+def noting_mends() -> Iterator[list[CleanReport]]:
+    """Of all scenes that are read within the block, what had to be mended; the log is not told of it then."""
+    mended: list[CleanReport] = []
+    token = _MENDED.set(mended)
+    try:
+        yield mended
+    finally:
+        _MENDED.reset(token)
+
+
 def cleaned(path: str | os.PathLike[str], scene: Scene) -> Scene:
     """A scene that was read, finite throughout; what had to be dropped or mended is reported to the log "potr_cl".
 
@@ -157,6 +172,10 @@ def cleaned(path: str | os.PathLike[str], scene: Scene) -> Scene:
         scene, report = scene.cleaned()
     except DataError as error:
         raise DataError(f"'{path}': {error}") from error
+    noted = _MENDED.get()
+    if noted is not None:
+        noted.append(report)
+        return scene
     if report.non_finite:
         _log.warning("'%s': dropped %d splats with non-finite values", path, report.non_finite)
     if report.infinite_opacities:

@@ -3,32 +3,26 @@
 from __future__ import annotations
 
 import gzip
-import io
 import json
 import struct
 import zipfile
 import zlib
 from collections.abc import Callable
-from functools import cache
-from random import Random
 from typing import Any
 
 import numpy as np
 import zstandard
-from PIL import Image
 
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.reference.scenes import random_scene
 from tools.stress.hostile import (
     camera_files,
-    gltf_files,
     picture_files,
     ply_files,
     potr_files,
+    scene_bomb_files,
     sog_files,
-    sog_folder_files,
-    splat_files,
     spz_files,
 )
 from tools.stress.hostile.formats import Files
@@ -186,21 +180,8 @@ def _spz_streams(splats: int, said: int | None = None) -> Files:
     return {"a.spz": spz_files.streamed(said or splats, 3, streams, sizes)}
 
 
-@cache
-def _webp(side: int) -> bytes:
-    out = io.BytesIO()
-    Image.new("RGBA", (side, side), (1, 2, 3, 255)).save(out, "WEBP", lossless=True, method=0)
-    return out.getvalue()
-
-
 def _sog_pictures(side: int, splats: int) -> Files:
-    files = sog_files.parts(4, 0)
-    large = _webp(side)
-    files = {name: data if name == "meta.json" else large for name, data in files.items()}
-    meta = json.loads(files["meta.json"])
-    meta["count"] = splats
-    files["meta.json"] = json.dumps(meta).encode()
-    return {"a.sog": sog_files.archive(files)}
+    return {"a.sog": sog_files.archive(sog_files.equal_splats(side, splats))}
 
 
 def _sog_member(name: str, content: bytes) -> Files:
@@ -226,87 +207,6 @@ def _sog_meta(**changes: Any) -> Files:
     files = sog_files.parts(4, 0)
     meta = json.loads(files["meta.json"]) | changes
     return {"a.sog": sog_files.archive(files | {"meta.json": json.dumps(meta).encode()}, zipfile.ZIP_DEFLATED)}
-
-
-# Scenes of several files, glTF, .splat and .ksplat -------------------------------------------------------------------
-
-
-def _sog_folder(side: int, splats: int) -> Files:
-    with zipfile.ZipFile(io.BytesIO(_sog_pictures(side, splats)["a.sog"])) as archive:
-        names = sorted(archive.namelist(), key=lambda name: name != "meta.json")
-        return {name: archive.read(name) for name in names}
-
-
-def _sog_names(name: str) -> Files:
-    files = dict(sog_folder_files.originals()[0])
-    meta = json.loads(files["meta.json"])
-    meta["sh0"]["files"] = [name]
-    return files | {"meta.json": json.dumps(meta).encode()}
-
-
-def _levels(folders: int) -> Files:
-    meta = json.loads(sog_folder_files.originals()[0]["meta.json"])
-    small = json.dumps(meta | {"count": 65_536, "scales": {}, "sh0": {}}).encode()
-    leaves = [{"lods": {"0": {"file": k, "offset": 0, "count": 65_536}}} for k in range(folders)]
-    names = [f"{k}.json" for k in range(folders)]
-    tree = {"lodLevels": 1, "filenames": names, "tree": {"children": leaves}}
-    return {"lod-meta.json": json.dumps(tree).encode()} | dict.fromkeys(names, small)
-
-
-def _leaves(ranges: list[tuple[int, int]]) -> Files:
-    leaves = [{"lods": {"0": {"file": 0, "offset": first, "count": count}}} for first, count in ranges]
-    meta = {"lodLevels": 1, "filenames": ["0/meta.json"], "tree": {"children": leaves}}
-    return sog_folder_files.streamed(meta, {"0": (5, 0)})
-
-
-def _nodes(number: int, splats: int = 100) -> Files:
-    description, content = gltf_files.asset(splats, 0, False, Random(0))
-    description |= {"nodes": [{"mesh": 0}] * number, "scenes": [{"nodes": list(range(number))}]}
-    return gltf_files.described_bomb(description, content)
-
-
-def _accessors(count: int, view: int | None = 0, stride: int | None = None) -> Files:
-    description, content = gltf_files.asset(5, 0, False, Random(0))
-    for accessor in description["accessors"]:
-        accessor["count"] = count
-        if view is None:
-            del accessor["bufferView"]
-    for each in description["bufferViews"]:
-        each["byteStride"] = each["byteStride"] if stride is None else stride
-    return gltf_files.described_bomb(description, content)
-
-
-def _empty_nodes(number: int) -> Files:
-    description, content = gltf_files.asset(5, 0, False, Random(0))
-    description |= {"nodes": [{}] * number, "scenes": [{"nodes": list(range(number))}]}
-    return {"a.gltf": gltf_files.gltf(description, content, None)}
-
-
-def _chain(number: int) -> Files:
-    description, content = gltf_files.asset(5, 0, False, Random(0))
-    nodes = [{"children": [k + 1], "scale": [2, 2, 2]} for k in range(number)]
-    description |= {"nodes": [*nodes, {"mesh": 0}]}
-    return {"a.gltf": gltf_files.gltf(description, content, None)}
-
-
-def _base64(text: bytes) -> Files:
-    description, content = gltf_files.asset(5, 0, False, Random(0))
-    return {"a.gltf": gltf_files.gltf(description, content, "data:;base64," + text.decode())}
-
-
-def _ksplat(at: int, size: int, value: int) -> Files:
-    data = bytearray(splat_files.ksplat_originals()[8])
-    data[at : at + size] = value.to_bytes(size, "little")
-    return {"a.ksplat": bytes(data)}
-
-
-def _gzipped_zeros() -> Files:
-    names = ["x", "y", "z", *(f"f_dc_{i}" for i in range(3)), "opacity", *(f"scale_{i}" for i in range(3))]
-    names += [f"rot_{i}" for i in range(4)]
-    splats = (1 << 24) // (4 * len(names))
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {splats}"]
-    header += [*(f"property float {name}" for name in names), "end_header", ""]
-    return {"a.ply.gz": gzip.compress("\n".join(header).encode() + bytes(4 * len(names) * splats), 9, mtime=0)}
 
 
 # Cameras --------------------------------------------------------------------------------------------------------------
@@ -422,46 +322,7 @@ BOMBS: dict[str, dict[str, Callable[[], Files]]] = {
         "48 GB by 3,000 names for one member": _sog_overlapping,
         "a codebook of a million": lambda: _sog_meta(sh0={"codebook": [0] * 1_000_000, "files": ["sh0.webp"]}),
     },
-    "sog-folder": {
-        "pictures of 4,000², all splats claimed": lambda: _sog_folder(4000, 16_000_000),
-        "pictures of 4,000², one splat claimed": lambda: _sog_folder(4000, 1),
-        "64 MB of brackets as description": lambda: {"meta.json": b"[" * _LONG},
-        "a device as a picture": lambda: _sog_names("/dev/zero"),
-    },
-    "sog-levels": {
-        "1,000 folders of 65,536 splats claimed": lambda: _levels(1000),
-        "one splat in 100,000 leaves": lambda: _leaves([(0, 1)] * 100_000),
-        "2⁶⁰ splats claimed in a leaf": lambda: _leaves([(0, 1 << 60)]),
-        "100,000 nested nodes": lambda: {"lod-meta.json": b'{"tree":' + b'{"children":[' * 100_000},
-    },
-    "glb": {
-        "65,536 nodes with one mesh": lambda: _nodes(65_536),
-        "65,536 nodes with one splat": lambda: _nodes(65_536, 1),
-        "4,096 nodes with one splat": lambda: _nodes(4096, 1),
-        "2³¹ splats claimed": lambda: _accessors(count=(1 << 31) - 1),
-        "16 million splats claimed in nothing": lambda: _accessors(count=1 << 24, view=None),
-        "a stride of nothing": lambda: _accessors(count=1 << 24, stride=0),
-        "4 GB claimed in the header": lambda: {"a.glb": b"glTF\2\0\0\0" + b"\xff" * 4 + b"\xf0\xff\xff\xffJSON{}"},
-        "100,000 nested objects": lambda: {"a.glb": gltf_files.glb(b'{"asset":' * 100_000, b"")},
-    },
-    "gltf": {
-        "500,000 empty nodes": lambda: _empty_nodes(500_000),
-        "a chain of 20,000 nodes": lambda: _chain(20_000),
-        "64 MB in base64 that is none": lambda: _base64(b"!" * (_LONG // 4)),
-    },
-    "splat": {"empty": lambda: {"a.splat": b""}},
-    "ksplat": {
-        "2³² sections claimed": lambda: _ksplat(4, 4, 0xFFFFFFFF),
-        "2³² splats claimed": lambda: _ksplat(4100, 4, 0xFFFFFFFF),
-        "2³² buckets of 2³² claimed": lambda: _ksplat(4104, 4, 0xFFFFFFFF),
-        "2³² other buckets claimed": lambda: _ksplat(4132, 4, 0xFFFFFFFF),
-        "a bucket of 2³² splats": lambda: _ksplat(5120, 4, 0xFFFFFFFF),
-    },
-    "ply.gz": {
-        "64 MB of blanks": lambda: {"a.ply.gz": gzip.compress(b" " * _LONG, 9, mtime=0)},
-        "16 MB of splats in zeros": _gzipped_zeros,
-        "64 MB in members without content": lambda: {"a.ply.gz": gzip.compress(b"", mtime=0) * 100_000},
-    },
+    **scene_bomb_files.BOMBS,
     "cameras.json": {
         "100,000 brackets": _json("cameras.json", b"[" * 100_000),
         "100,000 nested objects": _json("cameras.json", b'{"a":' * 100_000),
@@ -505,6 +366,6 @@ BOMBS: dict[str, dict[str, Callable[[], Files]]] = {
             "a.webp": b"RIFF" + struct.pack("<I", 22) + b"WEBPVP8L" + struct.pack("<I", 10)
             + b"\x2f" + struct.pack("<I", 16382 | 16382 << 14) + bytes(5)
         },
-        "2,000² equal pixels": lambda: {"a.webp": _webp(2000)},
+        "2,000² equal pixels": lambda: {"a.webp": sog_files.one_colour(2000)},
     },
 }  # fmt: skip
