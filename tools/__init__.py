@@ -18,6 +18,7 @@ bench.search           what does encoding to a size or a PSNR cost, against one 
 bench.virtual_cameras  what does encoding without cameras cost?
 bench.forecast         how far off is what an encode says beforehand of its time and memory?
 bench.install          what does an installation take, and where are there wheels?
+bench.views_between    what do views between the training views bring, and what do they take?
 bench.needs            what is a scene charged for splats, views and tiles that nobody needs?
 bench.busy             how busy is the device during an encode, stage by stage?
 bench.kernels          processor time of each kernel, on machines that do other work too

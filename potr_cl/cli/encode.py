@@ -62,7 +62,7 @@ def _options(args: argparse.Namespace, source_bytes: int | None = None) -> Encod
 
 def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
     """Whether anything may be rendered: to encode, or to judge what was encoded."""
-    wanted = any(stage.asked_for and stage.needs_views for stage in options.stages)
+    wanted = any(s.asked_for and s.needs_views and not s.serves_others for s in options.stages)
     return wanted or not (args.cameras is None or args.no_quality)
 
 
