@@ -89,6 +89,7 @@ VALUES: dict[str, tuple[list[str], Any]] = {
     "--spz-version": (["3"], 3),
     "--cameras-anyway": ([], True),
     "--unseen": (["drop"], "drop"),
+    "--views-between": (["1"], 1),
     "--memory": (["0.25"], 0.25),
     "--background": (["0.2,0.4,0.8"], (0.2, 0.4, 0.8)),
     "--device": (["{device}"], "{device}"),
