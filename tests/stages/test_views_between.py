@@ -76,7 +76,7 @@ def test_it_is_left_out_where_nothing_else_looks_at_views(plush_excerpt, plush_e
     assert encode(plush_excerpt, plush_excerpt_cameras, chosen).device is None
 
 
-@pytest.mark.parametrize("numbers", [range(0, 3), range(2, 6), range(6, 9)])
+@pytest.mark.parametrize("numbers", [range(0, 3), range(2, 6), range(5, 7)])
 def test_photographs_are_targets_of_the_views_that_have_them(
     device, plush_excerpt, plush_excerpt_cameras, tmp_path, numbers
 ):
