@@ -156,7 +156,9 @@ def _encode_natively(functions: Functions, section: Tokens) -> tuple[NDArray[np.
     states = np.full(section.cells[0].shape[1], LOWEST, np.uint32)
     words = []
     for cells, model in zip(reversed(section.cells), reversed(section.models), strict=True):
-        words.append(functions.encode_stream(cells, intervals[bases[0][model] : ends[model]], states))
+        words.append(
+            functions.encode_stream(np.ascontiguousarray(cells), intervals[bases[0][model] : ends[model]], states)
+        )
     return states, b"".join(part.astype("<u2", copy=False).tobytes() for part in reversed(words))
 
 
