@@ -1,12 +1,14 @@
 """potr_cl: post-training compression of 3D Gaussian Splatting scenes with OpenCL.
 
-The public interface in short; everything else has its module:
+The public interface in short; everything else has its module. What the command line does, functions of the same names
+do with the same options (docs/python.md has examples):
 
-- :func:`load_scene`, :func:`load_cameras`: from the files of :mod:`potr_cl.formats`;
-- :func:`encode` with :class:`EncodeOptions`, or :func:`encode_to_target` with a :class:`Target`, a size or a PSNR;
-- :func:`place_cameras`: views for a scene that comes without any; the two above place them themselves;
-- :func:`decode`: back from a .potr file;
-- :func:`render`: a picture of a scene;
+- :func:`encode`, :func:`decode`: to a .potr file and back; :class:`EncodeOptions`, all options of an encode at once;
+- :func:`prune`, :func:`compact`, :func:`refit`: one stage alone, from a scene to a scene;
+- :func:`render`, :func:`compare`: pictures of a scene, and one scene judged by another's;
+- :func:`read_scene`, :func:`read_cameras`, :func:`save`, :func:`convert`, :func:`info`: files, of all formats;
+- :func:`place_cameras`, :func:`look_around`, :func:`turntable`: views for a scene that comes without any;
+- :func:`encode_to_target` with a :class:`Target`: what a search for a size or a PSNR has tried;
 - :class:`Scene`, :class:`Camera`: what they work on;
 - :class:`PotrError` and its subclasses: what they raise.
 """
@@ -21,61 +23,104 @@ TYPE_CHECKING = False
 if TYPE_CHECKING:
     from typing import Any
 
-    from potr_cl.codec.decoder import decode
+    from potr_cl.api.comparing import SceneComparison, compare
+    from potr_cl.api.describing import SceneInfo, info
+    from potr_cl.api.editing import CompactedScene, PrunedScene, RefittedScene, compact, prune, refit
+    from potr_cl.api.encoding import encode
+    from potr_cl.api.files import convert, decode, save
+    from potr_cl.api.pictures import Rendering, Renderings, preview, render
     from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, PotrError, UnreachableError, UsageError
-    from potr_cl.formats import load_cameras, load_scene
+    from potr_cl.formats import load_cameras, load_scene, read_cameras, read_scene
     from potr_cl.model.camera import Camera
     from potr_cl.model.scene import Scene
+    from potr_cl.model.viewpoints import look_around, turntable
     from potr_cl.model.virtual_cameras import place_cameras
-    from potr_cl.pipeline.encode import Encoded, encode
+    from potr_cl.pipeline.encode import Encoded
     from potr_cl.pipeline.options import EncodeOptions
     from potr_cl.pipeline.search import Target, encode_to_target
-    from potr_cl.raster.rasterizer import render
 
 __version__ = "0.1.0"
 
 __all__ = [
     "Camera",
+    "CompactedScene",
     "DataError",
     "DeviceError",
     "DeviceMemoryError",
     "EncodeOptions",
     "Encoded",
     "PotrError",
+    "PrunedScene",
+    "RefittedScene",
+    "Rendering",
+    "Renderings",
     "Scene",
+    "SceneComparison",
+    "SceneInfo",
     "Target",
     "UnreachableError",
     "UsageError",
     "__version__",
+    "compact",
+    "compare",
+    "convert",
     "decode",
     "encode",
     "encode_to_target",
+    "info",
     "load_cameras",
     "load_scene",
+    "look_around",
     "place_cameras",
+    "preview",
+    "prune",
+    "read_cameras",
+    "read_scene",
+    "refit",
     "render",
+    "save",
+    "turntable",
 ]
 
 #: Imported on first use: the OpenCL loader and NumPy are not everybody's who asks for the version.
 _HOMES = {
     "Camera": "model.camera",
+    "CompactedScene": "api.editing",
     "DataError": "errors",
     "DeviceError": "errors",
     "DeviceMemoryError": "errors",
     "EncodeOptions": "pipeline.options",
     "Encoded": "pipeline.encode",
     "PotrError": "errors",
+    "PrunedScene": "api.editing",
+    "RefittedScene": "api.editing",
+    "Rendering": "api.pictures",
+    "Renderings": "api.pictures",
     "Scene": "model.scene",
+    "SceneComparison": "api.comparing",
+    "SceneInfo": "api.describing",
     "Target": "pipeline.search",
     "UnreachableError": "errors",
     "UsageError": "errors",
-    "decode": "codec.decoder",
-    "encode": "pipeline.encode",
+    "compact": "api.editing",
+    "compare": "api.comparing",
+    "convert": "api.files",
+    "decode": "api.files",
+    "encode": "api.encoding",
     "encode_to_target": "pipeline.search",
+    "info": "api.describing",
     "load_cameras": "formats",
     "load_scene": "formats",
+    "look_around": "model.viewpoints",
     "place_cameras": "model.virtual_cameras",
-    "render": "raster.rasterizer",
+    "preview": "api.pictures",
+    "prune": "api.editing",
+    "read_cameras": "formats",
+    "read_scene": "formats",
+    "refit": "api.editing",
+    "render": "api.pictures",
+    "save": "api.files",
+    "turntable": "model.viewpoints",
 }
 
 

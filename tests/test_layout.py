@@ -27,9 +27,13 @@ FOLDERS: dict[str, set[str]] = {
     "pipeline": {"errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality"},
     "report": {"plain_text", "errors", "host", "model", "opencl", "codec", "formats", "quality", "pipeline"},
     "reference": {"errors", "model", "opencl", "raster", "stages"},
-    "cli": {
+    "api": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality",
         "pipeline", "report",
+    },
+    "cli": {
+        "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality",
+        "pipeline", "report", "api",
     },
 }  # fmt: skip
 #: They offer the whole package under short names, and start it.

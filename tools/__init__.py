@@ -30,12 +30,16 @@ What a choice costs or brings, against the alternatives (``study``):
 study.rate_distortion      size against quality: the curves that other studies compare with
 study.ablation             what does each part of the codec contribute?
 study.compare_formats      what would people use instead?
+study.virtual_views        how many virtual views, how large, how wide, at what time and memory?
 study.rates                where do the bits go, and what do they buy?
+study.antialiasing         what is lost if an antialiased scene is encoded as a classic one?
 study.compaction_curves    what does the compaction do to sparsity and pictures?
 study.removal_exactness    how far are predicted removal effects from removals in float64?
 study.removal_formulas     back to front or prefix sums: which formula of removal effects?
+study.frames               which cameras in another frame are found, and what do unseen splats cost?
 study.decoder_roads        which road to a quick decoder: compiled C or OpenCL kernels? (for bench.decode --part roads)
 study.composite_yardstick  the compositing kernel beside a loop in C
+study.lens_field           which pinhole view should stand for a distorted photograph?
 =========================  =============================================================================================
 
 What happens at the limits (``stress``):
@@ -52,7 +56,8 @@ What tests and pages are made of (``make``):
 ====================  ==================================================================================================
 make.large_scene      a scene of any size with the statistics of a real one
 make.test_data        the excerpts in tests/data
-make.foreign_files    the excerpt in other tools' formats
+make.foreign_files    the excerpt in splat-transform's formats
+make.other_tools      some splats in the formats of six tools, and how splat-transform reads them
 make.golden_files     files that every later decoder must read to the same values
 make.native           the compiled part of the decoder, in the checkout
 make.docs             the pages and tables of README and docs that are made from the code (see CONTRIBUTING.md)

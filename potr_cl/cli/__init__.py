@@ -11,8 +11,9 @@ from collections.abc import Sequence
 from importlib import import_module
 
 from potr_cl import __version__
-from potr_cl.cli import guard
+from potr_cl.cli import guard, outputs
 from potr_cl.cli.parser import CommandParser
+from potr_cl.cli.scenes import standard_input
 from potr_cl.cli.terminal import note
 from potr_cl.errors import PotrError
 from potr_cl.host.signals import unwinding
@@ -69,8 +70,11 @@ def _run(argv: Sequence[str]) -> None:
         # Drivers take as long to load as the command's modules to be imported.
         in_background(import_module("potr_cl.opencl.discovery").list_devices)
     args = command_parser(argv).parse_args(argv)
+    if "arrange" in args:
+        args.arrange(args)
     guard.check(args)
-    with unwinding():
+    outputs.check(args)
+    with unwinding(), standard_input(args), outputs.standard_output(args):
         args.run(args)
 
 

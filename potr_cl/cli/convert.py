@@ -1,23 +1,49 @@
-"""The command convert: a scene from one format to another, as it is."""
+"""The command convert: scenes from one format to another, as they are."""
 
 from __future__ import annotations
 
 import argparse
 
-from potr_cl.cli.guard import ReadFile, WrittenFile
+from potr_cl.cli.batch import add_to_option, for_each_scene, jobs
+from potr_cl.cli.guard import StandardOutput, read_file
 from potr_cl.cli.options import Commands
-from potr_cl.cli.scenes import add_trust_option, read_scene, size_of_file
+from potr_cl.cli.outputs import WrittenScene, place
+from potr_cl.cli.scenes import (
+    add_antialiased_option,
+    add_from_option,
+    add_trust_option,
+    read_scene,
+    size_of_file,
+    write_scene,
+)
 from potr_cl.cli.terminal import say
+from potr_cl.errors import UsageError
 from potr_cl.formats import scene_writer
 from potr_cl.formats.registry import extras_needed, suffixes_read, suffixes_written
+from potr_cl.formats.scenes import spz
+
+
+def _arrange(args: argparse.Namespace) -> None:
+    """Without -o the last name is the output's."""
+    if args.output is not None:
+        return
+    if len(args.scenes) != 2:
+        raise UsageError("give a scene and the name of what is written, or several scenes, --to and -o FOLDER")
+    args.output = place(str(args.scenes.pop()))
 
 
 def _convert(args: argparse.Namespace) -> None:
-    write = scene_writer(args.output)  # a wrong name is told before anything is read
+    works = jobs(args, WrittenScene, None)
+    for work in works:  # a version that the format has not is told before anything is read
+        name = f"scene{work.to}" if isinstance(work.output, StandardOutput) else work.output
+        scene_writer(name, args.spz_version)
+    for_each_scene(works, _convert_one)
+
+
+def _convert_one(args: argparse.Namespace) -> None:
     before = size_of_file(args.scene)
     scene = read_scene(args, args.scene)
-    write(scene)
-    after = size_of_file(args.output)
+    after = write_scene(args.output, scene, args.to, args.spz_version)
     say(f"{args.output}: {len(scene)} splats of SH degree {scene.sh_degree}, {after} bytes; {args.scene} has {before}")
 
 
@@ -25,10 +51,30 @@ def add_convert(commands: Commands) -> None:
     p = commands.add_parser(
         "convert",
         help="a scene from one format to another, for other tools",
+        usage="potr-cl convert IN OUT [options]\n       potr-cl convert IN [IN ...] -o FOLDER --to SUFFIX [options]",
         description=f"Read a scene ({suffixes_read()}) and write it as {suffixes_written()}. Nothing but what the "
-        f"format itself rounds is changed; axes are kept. {extras_needed()}.",
+        f"format itself rounds is changed; axes are kept. {extras_needed()}. All may be gzipped (.ply.gz). SOG is read "
+        "from folders too (meta.json, lod-meta.json), level N of streamed SOG by FOLDER#N.",
     )
-    p.add_argument("scene", type=ReadFile, metavar="IN")
-    p.add_argument("output", type=WrittenFile, metavar="OUT")
+    p.add_argument(
+        "scenes",
+        type=read_file,
+        nargs="+",
+        metavar="IN",
+        help='scenes, or "-" for standard input; without -o the last name is the one to write, "-" for standard output',
+    )
+    p.add_argument("-o", "--output", type=place, metavar="OUT", help='a file, a folder, or "-" for standard output')
+    add_to_option(p)
+    add_from_option(p)
+    versions = sorted(spz.FORMAT.versions)
+    p.add_argument(
+        "--spz-version",
+        type=int,
+        choices=versions,
+        metavar="V",
+        help=f"of .spz files: 2, which all readers that were tried take (default), 3 with finer rotations, or "
+        f"{versions[-1]}, smaller and for new readers only",
+    )
     add_trust_option(p)
-    p.set_defaults(run=_convert)
+    add_antialiased_option(p)
+    p.set_defaults(run=_convert, arrange=_arrange)

@@ -6,50 +6,51 @@ import argparse
 import contextlib
 import time
 from concurrent.futures import Future
+from dataclasses import dataclass
 from typing import Any
 
-from potr_cl.cli.guard import ReadFile, WrittenFile
-from potr_cl.cli.options import Commands, add_device_options, add_memory_option, as_bytes, size_in_bytes
+from potr_cl.api.encoding import Judge, check_photographs_have_cameras, encode_options, encode_target, proved
+from potr_cl.cli.batch import for_each_scene, jobs
+from potr_cl.cli.guard import read_file
+from potr_cl.cli.options import Commands, add_device_options, add_memory_option
+from potr_cl.cli.outputs import WrittenPage, WrittenPotr, place, writing
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_trust_option, read_scene, size_of_file, trust
+from potr_cl.cli.scenes import (
+    add_antialiased_option,
+    add_from_option,
+    add_trust_option,
+    read_scene,
+    size_of_file,
+)
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
-from potr_cl.cli.terminal import note, say, say_document
+from potr_cl.cli.terminal import note, say, say_document, say_line
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
-from potr_cl.codec.decoder import PotrFile
-from potr_cl.errors import DataError, DeviceError, PotrError, UsageError
+from potr_cl.errors import DeviceError, UsageError
 from potr_cl.formats.images import Colour, parse_colour
+from potr_cl.formats.registry import suffixes_read
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.threads import thread_pool
-from potr_cl.model.camera import Camera, test_views
+from potr_cl.model.camera import Camera, test_views, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, Stopwatch, encode
+from potr_cl.pipeline.encode import Stopwatch, encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT, PRESETS, PURPOSE
 from potr_cl.pipeline.search import Target, encode_to_target
-from potr_cl.quality.evaluator import EvaluationViews, Evaluator
+from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.report.html import PicturePair, html_report, views_to_show
-from potr_cl.report.summary import encode_report, format_encode_report, quality_report, search_report
+from potr_cl.report.html import PicturePair, html_report
+from potr_cl.report.summary import encode_report, format_encode_report, search_report
 from potr_cl.stages.refit import Refit
 
 
-def _options(args: argparse.Namespace) -> EncodeOptions:
-    if args.threads < 0:
-        raise UsageError(f"--threads is {args.threads}, it must be 0 or more")
-    options = EncodeOptions.for_preset(
-        args.preset,
-        q=args.quality,
-        background=parse_colour(args.background),
-        memory=as_bytes(args.memory),
-        threads=args.threads,
-        source_bytes=size_of_file(args.scene),
-        **stage_choices(args),
-    )
-    _ = options.parameters  # a wrong option is told before a gigabyte is read
-    return options
+def _options(args: argparse.Namespace, source_bytes: int | None = None) -> EncodeOptions:
+    return encode_options(
+        None, args.preset, stage_choices(args), q=args.quality, background=args.background, memory=args.memory,
+        threads=args.threads, source_bytes=source_bytes, cameras_anyway=args.cameras_anyway,
+    )  # fmt: skip
 
 
 def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
@@ -58,34 +59,57 @@ def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
     return wanted or not (args.cameras is None or args.no_quality)
 
 
-def _target(args: argparse.Namespace) -> Target | None:
-    if args.max_size is not None:
-        return Target(max_bytes=size_in_bytes(args.max_size))
-    return None if args.min_psnr is None else Target(min_psnr=args.min_psnr)
+@dataclass(frozen=True)
+class _Shared:
+    """What is asked for and read once, however many scenes there are.
+
+    Attributes:
+        target: a size or a PSNR to reach, if one is asked for.
+        opened: the device, which is opened while the first scene is read; None where none is needed.
+        cameras: of the file that ``--cameras`` names.
+        ground_truth: the photographs that ``--photos`` names.
+    """
+
+    target: Target | None
+    opened: Future[Device] | None
+    cameras: list[Camera] | None
+    ground_truth: GroundTruth | None
 
 
 def _encode(args: argparse.Namespace) -> None:
-    began = time.perf_counter()
-    options, target = _options(args), _target(args)
+    options, target = _options(args), encode_target(None, args.max_size, args.min_psnr)
     refit = options.stage(Refit)
-    if refit.ground_truth is not None and not (args.cameras and refit.asked_for):
-        raise UsageError("--photos needs --cameras, the views that the photographs show, and a re-fit")
+    check_photographs_have_cameras(options, args.cameras is not None)
     if args.report is None and args.report_view is not None:
         raise UsageError("--report-view needs --report, the page that shows it")
+    works = jobs(args, WrittenPotr, ".potr")
+    if args.report is not None and len(works) > 1:
+        raise UsageError("--report is about one scene: encode one at a time")
     with contextlib.ExitStack() as stack:
-        # Opened while the scene is read.
         opened = stack.enter_context(thread_pool(1)).submit(Device, args.device) if _looks(args, options) else None
         cameras = given_cameras(args)
         ground_truth = None
         if refit.ground_truth is not None and cameras is not None:
+            cameras = within_photographs(cameras)
             ground_truth = GroundTruth(refit.ground_truth, cameras, options.background)
+        shared = _Shared(target, opened, cameras, ground_truth)
+        if opened is not None and len(works) > 1:
+            opened.result()  # no scene can do without it
+        for_each_scene(works, lambda one: _encode_one(one, shared, several=len(works) > 1), args.json)
+
+
+def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> None:
+    began = time.perf_counter()
+    options = _options(args, size_of_file(args.scene))
+    target, opened, cameras = shared.target, shared.opened, shared.cameras
+    with contextlib.ExitStack() as stack:
         scene = read_scene(args, args.scene)
         device = opened.result() if opened is not None and options.look_at_views(scene) else None
         progress = stack.enter_context(contextlib.closing(Progress()))
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None
         placing = Stopwatch(progress)
         search: dict[str, Any] | None = None
-        with replacing(args.output) as file:
+        with writing(args.output) as file:
             if cameras is None and device is not None:
                 cameras = virtual_cameras(args, scene, placing)
             views = EvaluationViews.of(cameras) if cameras is not None and not args.no_quality else None
@@ -96,7 +120,7 @@ def _encode(args: argparse.Namespace) -> None:
             else:
                 found = encode_to_target(scene, cameras, target, options, progress, device, progress.tell)
                 encoded, options, search = found.encoded, found.options, search_report(target, found)
-            written, candidate = _proved(args, encoded)  # what cannot be decoded must not replace what can
+            written, candidate = proved(encoded, args.trust)  # what cannot be decoded must not replace what can
             file.write(written.data)
         watch = Stopwatch(progress)
         pictures: list[PicturePair] = []
@@ -107,31 +131,15 @@ def _encode(args: argparse.Namespace) -> None:
             quality = "not judged: there are no cameras to look from"
         seconds = placing.seconds | encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
         report = encode_report(args.scene, scene, args.output, written, encoded, options, search, quality, seconds)
-        if ground_truth is not None and cameras is not None:
+        if shared.ground_truth is not None and cameras is not None:
             used = encoded.device or device or Device(args.device)
-            _evaluate_by_ground_truth(ground_truth, cameras, scene, candidate, used, options.background)
+            _evaluate_by_ground_truth(shared.ground_truth, cameras, scene, candidate, used, options.background)
         if page is not None:
             page.write(html_report(report, pictures).encode())
     if args.json:
-        say_document(report)
+        (say_line if several else say_document)(report)
     else:
         say(format_encode_report(report))
-
-
-def _proved(args: argparse.Namespace, encoded: Encoded) -> tuple[PotrFile, Scene]:
-    """The file that was made and the scene that a decoder makes of it.
-
-    Raises:
-        PotrError: no decoder takes it.
-    """
-    try:
-        file = PotrFile.from_bytes(b"".join(encoded.pieces), **trust(args))
-        return file, file.scene()
-    except DataError as error:
-        raise PotrError(
-            f"the encoded file cannot be decoded ({error}): nothing was written. If the scene has splats that are very "
-            "far away or very large, leave them out"
-        ) from error
 
 
 def _evaluate(
@@ -149,16 +157,12 @@ def _evaluate(
     """
     watch("evaluate", 0.0)
     try:
-        device = device or (Device(args.device) if opened is None else opened.result())
-        with Evaluator(device, scene, views, parse_colour(args.background)) as evaluator:
-            quality = quality_report(views, evaluator.compare(candidate, lambda _, done: watch("evaluate", done)))
-            shown = views_to_show(quality, args.report_view) if args.report is not None else []
-            pairs = evaluator.pictures(candidate, [view["name"] for _, view in shown])
+        judge = Judge(
+            views, device or (Device(args.device) if opened is None else opened.result()), parse_colour(args.background)
+        )
+        return judge(scene, candidate, watch, args.report_view, pictures=args.report is not None)
     except DeviceError as error:
         return f"not judged: {error}", []
-    return quality, [
-        PicturePair(title, view["name"], view["psnr"], *pair) for (title, view), pair in zip(shown, pairs, strict=True)
-    ]
 
 
 def _evaluate_by_ground_truth(
@@ -184,9 +188,22 @@ def _evaluate_by_ground_truth(
 
 
 def add_encode(commands: Commands) -> None:
-    p = commands.add_parser("encode", help="a scene (.ply) to a .potr file")
-    p.add_argument("scene", type=ReadFile, metavar="SCENE.ply")
-    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.potr")
+    p = commands.add_parser("encode", help="a scene (.ply) to a .potr file, or several into a folder")
+    p.add_argument(
+        "scenes",
+        type=read_file,
+        nargs="+",
+        metavar="SCENE.ply",
+        help=f'{suffixes_read()}, or "-" for standard input; of several, all are seen from the same cameras',
+    )
+    p.add_argument(
+        "-o",
+        "--output",
+        type=place,
+        required=True,
+        metavar="OUT.potr",
+        help='.potr, a folder, or "-" for standard output',
+    )
     goal = p.add_mutually_exclusive_group()
     goal.add_argument(
         "-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (smallest) to 1 (best); default 0.5"
@@ -209,17 +226,19 @@ def add_encode(commands: Commands) -> None:
     )
     add_cameras_options(p)
     p.add_argument("--no-quality", action="store_true", help="do not judge the result; saves time")
-    p.add_argument("--json", action="store_true", help="the summary for programs")
+    p.add_argument("--json", action="store_true", help="the summary for programs; of several scenes a line each")
     p.add_argument(
         "--report",
-        type=WrittenFile,
+        type=WrittenPage,
         metavar="OUT.html",
         help="a page of its own with sizes, quality by view, pictures before and after, and the course of pruning",
     )
     p.add_argument("--report-view", metavar="NAME", help="a judging view to show besides the worst and the median one")
     add_stage_flags(p)
     p.add_argument("--threads", type=whole_number, default=0, metavar="T", help="default: one a processor")
+    add_from_option(p)
     add_trust_option(p)
+    add_antialiased_option(p)
     add_memory_option(p)
     add_device_options(p)
     p.set_defaults(run=_encode)

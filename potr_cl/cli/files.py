@@ -1,4 +1,4 @@
-"""The commands about .potr files: decode, info."""
+"""The commands about files: decode, info."""
 
 from __future__ import annotations
 
@@ -6,23 +6,29 @@ import argparse
 import time
 from typing import TYPE_CHECKING
 
-from potr_cl.cli.guard import ReadFile, WrittenFile
-from potr_cl.cli.scenes import add_trust_option, trust
+from potr_cl.cli.batch import add_to_option, for_each_scene, jobs
+from potr_cl.cli.guard import read_file
+from potr_cl.cli.outputs import WrittenScene, place
+from potr_cl.cli.scenes import add_from_option, add_trust_option, as_file, trust, write_scene
 from potr_cl.cli.terminal import say, say_document
-from potr_cl.codec.decoder import PotrFile, decode
-from potr_cl.formats.scenes import ply
+from potr_cl.codec.decoder import decode
+from potr_cl.formats.registry import suffixes_read, suffixes_written
 from potr_cl.model.scene import SH_COEFFICIENTS
-from potr_cl.report.file import file_report, format_report
 
 if TYPE_CHECKING:
     from potr_cl.cli.options import Commands
 
 
 def _decode(args: argparse.Namespace) -> None:
+    for_each_scene(jobs(args, WrittenScene, ".ply"), _decode_one)
+
+
+def _decode_one(args: argparse.Namespace) -> None:
     started = time.perf_counter()
-    scene = decode(args.file, **trust(args), sh_degree=args.sh_degree)
+    with as_file(args.scene) as file:
+        scene = decode(file, **trust(args), sh_degree=args.sh_degree)
     decoded = time.perf_counter()
-    ply.save(args.output, scene)
+    write_scene(args.output, scene, args.to)
     written = time.perf_counter()
     say(
         f"{args.output}: {len(scene)} splats, decoded in {decoded - started:.2f} s, "
@@ -31,9 +37,19 @@ def _decode(args: argparse.Namespace) -> None:
 
 
 def add_decode(commands: Commands) -> None:
-    p = commands.add_parser("decode", help="a .potr file to a .ply that every viewer opens")
-    p.add_argument("file", type=ReadFile, metavar="IN.potr")
-    p.add_argument("-o", "--output", type=WrittenFile, required=True, metavar="OUT.ply")
+    p = commands.add_parser("decode", help="a .potr file to a .ply that every viewer opens, or to another format")
+    p.add_argument(
+        "scenes", type=read_file, nargs="+", metavar="IN.potr", help='.potr files, or "-" for standard input'
+    )
+    p.add_argument(
+        "-o",
+        "--output",
+        type=place,
+        required=True,
+        metavar="OUT.ply",
+        help=f'{suffixes_written()}, a folder, or "-" for standard output',
+    )
+    add_to_option(p)
     p.add_argument(
         "--sh-degree", type=int, choices=range(len(SH_COEFFICIENTS)), metavar="N",
         help="leave out SH coefficients of degrees above N, 0 to 3, without decoding them; default: none",
@@ -43,16 +59,28 @@ def add_decode(commands: Commands) -> None:
 
 
 def _info(args: argparse.Namespace) -> None:
-    report = file_report(PotrFile.open(args.file, **trust(args)))
+    # Imported here: to decode takes less time than to import what this needs.
+    from potr_cl.api.describing import info
+
+    with as_file(args.file) as file:
+        found = info(file, **trust(args))
     if args.json:
-        say_document(report)
+        say_document(found.facts)
     else:
-        say(format_report(report))
+        say(found)
 
 
 def add_info(commands: Commands) -> None:
-    p = commands.add_parser("info", help="what a .potr file holds, and where its bytes are")
-    p.add_argument("file", type=ReadFile, metavar="IN.potr")
+    p = commands.add_parser(
+        "info",
+        help="what a scene holds and what looks wrong with it; of a .potr file also where its bytes are",
+        description=f"Reads every kind of scene: {suffixes_read()}. Says how many splats it has, how large it is, how "
+        "its opacities and scales are spread, and what looks suspicious.",
+    )
+    p.add_argument(
+        "file", type=read_file, metavar="SCENE", help='a scene of any kind that is read, or "-" for standard input'
+    )
     p.add_argument("--json", action="store_true", help="for programs")
+    add_from_option(p)
     add_trust_option(p)
     p.set_defaults(run=_info)

@@ -1,18 +1,19 @@
 """No command writes over what it reads, and no output over another (:func:`check`).
 
 A command says of each path among its arguments what becomes of it, by the argument's type: :class:`ReadFile`,
-:class:`ReadCameras`, :class:`ReadPhotographs`, :class:`WrittenFile` or :class:`WrittenFolder`. :func:`check` runs
-before every command and takes no path of which that is not said. Files are compared by what they are, not by their
-names: symbolic and hard links and names in other letters are seen through.
+:class:`ReadCameras`, :class:`ReadPhotographs`, :class:`WrittenFile` or :class:`WrittenFolder`; standard input and
+output are nobody's files. :func:`check` runs before every command and takes no path of which that is not said. Files
+are compared by what they are, not by their names: symbolic and hard links and names in other letters are seen through.
 """
 
 from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Iterable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
+from contextlib import AbstractContextManager, ExitStack, contextmanager
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 from potr_cl.errors import UsageError
 
@@ -29,6 +30,36 @@ _Identity = tuple[Any, ...]
 
 class ReadFile(_SystemPath):
     """A file that the command reads."""
+
+
+class StandardInput(_SystemPath):
+    """Standard input, given as "-"; a file of that name is given by its folder too.
+
+    Attributes:
+        source: makes the file that keeps what standard input brings, while a command runs.
+        until: closes it.
+    """
+
+    source: Callable[[], AbstractContextManager[Path]]
+    until: ExitStack
+    _file: Path | None = None
+
+    @contextmanager
+    def as_file(self) -> Iterator[Path]:
+        """The file that has what standard input brought; it is read once, when this is first called."""
+        if self._file is None:
+            self._file = self.until.enter_context(self.source())
+        yield self._file
+
+
+class StandardOutput(_SystemPath):
+    """Standard output, given as "-".
+
+    Attributes:
+        stream: takes the result, while a command runs.
+    """
+
+    stream: BinaryIO
 
 
 class ReadCameras(_SystemPath):
@@ -49,6 +80,12 @@ class WrittenFolder(_SystemPath):
 
 _READ = (ReadFile, ReadCameras, ReadPhotographs)
 _WRITTEN = (WrittenFile, WrittenFolder)
+_STREAMS = (StandardInput, StandardOutput)
+
+
+def read_file(text: str) -> Path:
+    """A type of arguments: a file that the command reads, or standard input."""
+    return StandardInput(text) if text == "-" else ReadFile(text)
 
 
 def check(args: argparse.Namespace) -> None:
@@ -60,7 +97,7 @@ def check(args: argparse.Namespace) -> None:
     """
     for name, value in vars(args).items():
         for path in value if isinstance(value, (list, tuple)) else [value]:
-            if isinstance(path, Path) and not isinstance(path, (*_READ, *_WRITTEN)):
+            if isinstance(path, Path) and not isinstance(path, (*_READ, *_WRITTEN, *_STREAMS)):
                 raise TypeError(f"argument '{name}' is a path: give it one of the types of {__name__}")
     _refuse(_given(args, (WrittenFile,)), _given(args, _READ))
 

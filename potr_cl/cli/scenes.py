@@ -1,14 +1,25 @@
-"""The scenes that a command reads."""
+"""The scenes that a command reads and writes: in files, or through standard input and output."""
 
 from __future__ import annotations
 
 import argparse
+import contextlib
 import os
+import sys
+from collections.abc import Iterable, Iterator
 from pathlib import Path
 from typing import Any
 
-from potr_cl.formats import load_scene
+from potr_cl.cli.guard import StandardInput, StandardOutput
+from potr_cl.errors import UsageError
+from potr_cl.formats import load_scene, scene_writer
+from potr_cl.formats.scene_size import bytes_of_scene
+from potr_cl.formats.streams import received, send
 from potr_cl.model.scene import Scene
+
+FROM_HELP = 'the format that "-", standard input, brings: .ply, .spz …; default: what its content says'
+TO_HELP = "the format to write where no name says it, .ply, .spz …"
+_ANTIALIASED = {"yes": True, "no": False, "auto": None}
 
 
 def add_trust_option(p: argparse._ActionsContainer) -> None:
@@ -20,23 +31,93 @@ def add_trust_option(p: argparse._ActionsContainer) -> None:
     )
 
 
+def add_from_option(p: argparse._ActionsContainer) -> None:
+    """``--from``, for every command that reads a scene from standard input."""
+    p.add_argument("--from", dest="from_suffix", metavar="SUFFIX", help=FROM_HELP)
+
+
+def add_antialiased_option(p: argparse._ActionsContainer) -> None:
+    """``--antialiased``, for every command that renders, encodes or writes the scenes that it reads."""
+    p.add_argument(
+        "--antialiased",
+        choices=tuple(_ANTIALIASED),
+        default="auto",
+        help="whether the scene was trained with antialiasing (gsplat's antialiased mode, Mip-Splatting) and is to be "
+        "rendered so; default auto: as its file says, which PLY files of gsplat and nerfstudio do not: give yes",
+    )
+
+
 def trust(args: argparse.Namespace) -> dict[str, Any]:
     """What the readers of scenes are told because of ``--trust``."""
     return {"trust": True} if args.trust else {}
 
 
 def read_scene(args: argparse.Namespace, path: Path) -> Scene:
-    """The scene of a file that the command line names.
+    """The scene of a file that the command line names, or of standard input.
 
     Raises:
         As :func:`potr_cl.formats.load_scene`.
     """
-    return load_scene(path, **trust(args))
+    with as_file(path) as file:
+        return load_scene(file, **trust(args), antialiased=_ANTIALIASED[args.antialiased])
+
+
+def write_scene(path: Path, scene: Scene, to: str | None = None, version: int | None = None) -> int:
+    """Write a scene to a file, in the format that its suffix tells, or to standard output.
+
+    Args:
+        path: of the file, or standard output.
+        scene: to write.
+        to: the suffix of the format for standard output; ".ply" by default.
+        version: of the format.
+
+    Returns:
+        The number of bytes.
+
+    Raises:
+        As :func:`potr_cl.formats.save_scene`.
+    """
+    if isinstance(path, StandardOutput):
+        suffix = to or ".ply"
+        return send(path.stream, suffix, lambda file: scene_writer(file, version)(scene))
+    scene_writer(path, version)(scene)
+    return os.stat(path).st_size
 
 
 def size_of_file(path: Path) -> int | None:
-    """Bytes of a file; None where there is none, which whoever reads it will say."""
-    try:
-        return os.stat(path).st_size if os.path.isfile(path) else None
-    except (OSError, ValueError):
-        return None
+    """Bytes of a file, or of a scene's folder; None where there is none, which whoever reads it will say."""
+    with as_file(path) as file:
+        return bytes_of_scene(file)
+
+
+def as_file(path: Path) -> contextlib.AbstractContextManager[Path]:
+    """A file that is read; of standard input, the one that holds what it brought."""
+    return path.as_file() if isinstance(path, StandardInput) else contextlib.nullcontext(path)
+
+
+@contextlib.contextmanager
+def standard_input(args: argparse.Namespace) -> Iterator[None]:
+    """Of a command: if it reads standard input, that is kept in a temporary file from its first use to the end.
+
+    Raises:
+        UsageError: two arguments are standard input, or it is a terminal; or ``--from`` is of no use.
+    """
+    inputs = [path for path in _paths(args) if isinstance(path, StandardInput)]
+    suffix = getattr(args, "from_suffix", None)
+    if len(inputs) > 1:
+        raise UsageError("standard input brings one scene only: '-' is given twice")
+    if suffix is not None and not inputs:
+        raise UsageError("--from is the format of standard input: give '-' as the scene")
+    with contextlib.ExitStack() as stack:
+        for path in inputs:
+            with contextlib.suppress(OSError, ValueError, AttributeError):
+                if sys.stdin.isatty():
+                    raise UsageError("standard input is a terminal: pipe a scene into it, or give a name")
+            path.source = lambda: received(sys.stdin.buffer, suffix)
+            path.until = stack
+        yield
+
+
+def _paths(args: argparse.Namespace) -> Iterable[Any]:
+    for value in vars(args).values():
+        yield from value if isinstance(value, (list, tuple)) else [value]

@@ -23,6 +23,28 @@ def say(text: object) -> None:
         BrokenPipeError: whoever read it has gone.
         PotrError: it cannot be written to.
     """
+    _say(plain_lines(text))
+
+
+def say_document(document: Any) -> None:
+    """Print a document as JSON, whatever its values are; see :func:`say`."""
+    say(json.dumps(plain_document(document), indent=1, allow_nan=False))
+
+
+def say_line(document: Any) -> None:
+    """The same in one line, however long, for one of several documents."""
+    _say(json.dumps(plain_document(document), allow_nan=False))  # escapes all that is not ASCII
+
+
+def note(text: object) -> None:
+    """Print lines on standard error."""
+    try:
+        _print(sys.stderr, plain_lines(text))
+    except OSError:
+        abandon(sys.stderr)
+
+
+def _say(text: str) -> None:
     try:
         _print(sys.stdout, text)
     except BrokenPipeError:
@@ -31,19 +53,6 @@ def say(text: object) -> None:
     except OSError as error:
         abandon(sys.stdout)
         raise PotrError(f"cannot write to the standard output: {error.strerror or error}") from error
-
-
-def say_document(document: Any) -> None:
-    """Print a document as JSON, whatever its values are; see :func:`say`."""
-    say(json.dumps(plain_document(document), indent=1, allow_nan=False))
-
-
-def note(text: object) -> None:
-    """Print lines on standard error."""
-    try:
-        _print(sys.stderr, text)
-    except OSError:
-        abandon(sys.stderr)
 
 
 def abandon(stream: TextIO | None) -> None:
@@ -56,12 +65,12 @@ def abandon(stream: TextIO | None) -> None:
         os.close(nowhere)
 
 
-def _print(stream: TextIO | None, text: object) -> None:
+def _print(stream: TextIO | None, text: str) -> None:
     if stream is None:  # closed by whoever started the process
         return
     # A terminal of another alphabet shows escapes rather than nothing.
     alphabet = stream.encoding or "utf-8"
-    line = plain_lines(text).encode(alphabet, "backslashreplace").decode(alphabet)
+    line = text.encode(alphabet, "backslashreplace").decode(alphabet)
     with contextlib.suppress(ValueError):  # closed meanwhile
         stream.write(f"{line}\n")
         stream.flush()

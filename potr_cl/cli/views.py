@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import argparse
+from collections.abc import Sequence
+from pathlib import Path
 
 from potr_cl.cli.guard import ReadCameras, check_photographs
 from potr_cl.cli.options import CAMERAS_HELP
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.terminal import note
 from potr_cl.formats import load_cameras
+from potr_cl.model.agreement import judge_cameras
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import FEWEST, MOST, describe, place_cameras
@@ -26,6 +29,11 @@ def add_cameras_options(p: argparse.ArgumentParser) -> None:
         metavar="N",
         help=f"to place without --cameras; default {FEWEST} to {MOST}, the fewer the more splats",
     )
+    p.add_argument(
+        "--cameras-anyway",
+        action="store_true",
+        help="take the cameras even if they do not seem to be in the scene's frame",
+    )
 
 
 def given_cameras(args: argparse.Namespace) -> list[Camera] | None:
@@ -42,6 +50,13 @@ def read_cameras(args: argparse.Namespace) -> list[Camera]:
     cameras = load_cameras(args.cameras)
     check_photographs(args, cameras)
     return cameras
+
+
+def warn_of_frame(path: Path, scene: Scene, views: Sequence[Camera]) -> None:
+    """Say so if the views of a file do not seem to be in a scene's frame; for commands that throw nothing away."""
+    judged = judge_cameras(scene, views)
+    if judged.suspicious:
+        note(f"warning: {path}: {judged.finding}")
 
 
 def virtual_cameras(args: argparse.Namespace, scene: Scene, progress: Progress) -> list[Camera]:

@@ -19,7 +19,7 @@ from potr_cl.codec.sections import Coder, Property, Section, context_groups, is_
 from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.claims import check_claim
-from potr_cl.model.scene import SH_COEFFICIENTS
+from potr_cl.model.scene import LOW_PASS, MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS
 
 MAGIC = b"POTR\r\n\x1a\n"
 #: Longest metadata that a reader accepts, bytes.
@@ -29,6 +29,15 @@ _FIXED = struct.Struct("<8sHHIQQBBHI8d8s8s")
 _FACTOR = struct.Struct("<d")
 _ENTRY = struct.Struct("<BBBBIQQ")
 _CRC = struct.Struct("<I")
+
+#: Bits of the header's flags. A reader that does not know one refuses the file: it would show another picture.
+_ANTIALIASED, _MIP_SPLATTING = 1, 2
+_FLAGS = {
+    (False, LOW_PASS): 0,
+    (True, LOW_PASS): _ANTIALIASED,
+    (True, MIP_SPLATTING_LOW_PASS): _ANTIALIASED | _MIP_SPLATTING,
+}
+_OF_FLAGS = {flags: kind for kind, flags in _FLAGS.items()}
 
 #: A splat, and a crowded cell of the octree, takes a bit of a file at least; what packs more is no scene.
 MOST_A_BYTE = 8
@@ -49,6 +58,7 @@ class Header:
         origin, side, depth: root cube and deepest level of the octree (:class:`potr_cl.codec.octree.OctreeStreams`).
         sf_scale, sf_rotation, sf_opacity, sf_dc, sf_ac: scale factors; a version may have one for all of SH.
         sections: in the order of their bytes.
+        antialiased, low_pass: how the scene is to be rendered (:class:`potr_cl.model.scene.Scene`).
     """
 
     version: int
@@ -63,6 +73,8 @@ class Header:
     sf_dc: float
     sf_ac: float
     sections: tuple[Section, ...] = field(default=())
+    antialiased: bool = False
+    low_pass: float = LOW_PASS
 
     def find(self, prop: Property, index: int = 0) -> Section | None:
         """The section of a property, None where the file has none (all of its integers are 0)."""
@@ -167,7 +179,7 @@ def assemble(header: Header, coded: list[tuple[Section, bytes]]) -> list[bytes]:
     fixed = _FIXED.pack(
         MAGIC,
         header.version,
-        0,
+        _FLAGS[header.antialiased, header.low_pass],
         header_bytes,
         file_bytes,
         header.splats,
@@ -233,8 +245,8 @@ def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) 
     else:
         sf_ac = numbers[7]
         reserved = reserved or any(fields[18])
-    if rules is None or flags or reserved or any(fields[19]):
-        raise DataError(f"format version {version} with flags {flags} is unknown")
+    if rules is None or flags not in _OF_FLAGS or reserved or any(fields[19]):
+        raise DataError(f"format version {version} with flags {flags} is unknown: update potr_cl")
     if degree >= len(SH_COEFFICIENTS) or splats < 1 or depth > 52:
         raise DataError(f"the header makes no sense: {splats} splats, SH degree {degree}, octree of {depth} levels")
     if not all(abs(x) <= _LARGEST_FLOAT32 for x in numbers[:3]) or not 0 <= numbers[3] <= 2 * _LARGEST_FLOAT32:
@@ -249,8 +261,9 @@ def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) 
     origin, side = (numbers[0], numbers[1], numbers[2]), numbers[3]
     sf_scale, sf_rotation, sf_opacity, sf_dc = numbers[4:8]
     return Header(
-        version, splats, degree, origin, side, depth, sf_scale, sf_rotation, sf_opacity, sf_dc, sf_ac, sections
-    )
+        version, splats, degree, origin, side, depth, sf_scale, sf_rotation, sf_opacity, sf_dc, sf_ac, sections,
+        *_OF_FLAGS[flags],
+    )  # fmt: skip
 
 
 def _pack_entry(section: Section) -> bytes:

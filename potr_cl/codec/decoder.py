@@ -190,7 +190,8 @@ class PotrFile:
         except MemoryError:
             needed = header.splats * (11 + 3 * self._coefficients(sh_degree)) * 4
             raise DataError(f"the scene needs {needed / 1e9:.1f} GB of memory, more than there is") from None
-        return Scene(means, log_scales, quaternions, opacity_logits, planar.transpose(2, 0, 1))
+        sh = planar.transpose(2, 0, 1)
+        return Scene(means, log_scales, quaternions, opacity_logits, sh, header.antialiased, header.low_pass)
 
     def _run(self, jobs: list[tuple[bool, _Job]], threads: int) -> NDArray[np.float32]:
         """Do some jobs, each with whether it takes the context coder, and decode the centres.

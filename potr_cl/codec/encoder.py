@@ -105,6 +105,8 @@ def code_scene(
             sf_opacity=parameters.sf_opacity,
             sf_dc=parameters.sf_dc,
             sf_ac=parameters.sf_sh,
+            antialiased=scene.antialiased,
+            low_pass=scene.low_pass,
         ),
         coded,
     )

@@ -34,6 +34,7 @@ class Geometry:
         order: (N,) index in the scene of each splat of the file.
         scales, rotations: levels of the three axes, (N,) each.
         opacities: (N,) levels.
+        antialiased, low_pass: as of the scene.
     """
 
     asked: quantize.HyperParameters
@@ -43,6 +44,8 @@ class Geometry:
     scales: list[quantize.Integers]
     rotations: list[quantize.Integers]
     opacities: quantize.Integers
+    antialiased: bool
+    low_pass: float
 
     def decoded(self, sh: NDArray[np.float32]) -> Scene:
         """What a decoder makes of it, bit for bit, in the order of the scene, with colours (N, M, 3) of that order."""
@@ -59,7 +62,7 @@ class Geometry:
         opacity_logits[self.order] = version.dequantize_opacities(self.opacities, parameters.sf_opacity)
         means = np.empty((n, 3), np.float32)
         means[self.order] = octree.parse(self.tree, n)
-        return Scene(means, log_scales, quaternions, opacity_logits, sh)
+        return Scene(means, log_scales, quaternions, opacity_logits, sh, self.antialiased, self.low_pass)
 
     def with_colour_steps(self, parameters: quantize.HyperParameters) -> Geometry:
         """The same for parameters that differ in the steps of colours alone, which geometry does not depend on."""
@@ -92,7 +95,9 @@ def quantise_geometry(
     logits = scene.opacity_logits[order].astype(np.float64)
     rotations = version.quantize_rotations(imaginary, scales, world.sf_rotation, run)
     opacities = version.quantize_opacities(logits, world.sf_opacity)
-    return Geometry(parameters, world, tree, order, scales, list(rotations), opacities)
+    return Geometry(
+        parameters, world, tree, order, scales, list(rotations), opacities, scene.antialiased, scene.low_pass
+    )
 
 
 def _nearest(means: NDArray[np.float32], views: Sequence[Camera], run: Run) -> NDArray[np.float64]:

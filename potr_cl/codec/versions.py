@@ -27,6 +27,9 @@ from potr_cl.model.scene import Scene
 
 Levels = NDArray[np.integer]
 
+#: How many times as many steps the scales of antialiased scenes have, in version 2 and after.
+ANTIALIASED_SCALE_STEPS = 2
+
 
 class FormatVersion(abc.ABC):
     """What sets a version of the format apart. Defaults are what all versions have in common so far.
@@ -144,10 +147,14 @@ class Version2(FormatVersion):
 
         A splat's size is its largest standard deviation, the typical one their median; seen from the views, the median
         of size over distance.
+
+        Scales of antialiased scenes have finer steps: their splats' opacity follows the area on screen, so that an
+        error in a thin splat's width is seen as one in its opacity.
         """
         sizes = np.exp(np.clip(scene.log_scales.max(axis=1).astype(np.float64), -60, 60))
         size = float(np.median(sizes))
-        sf_scale = min(max(parameters.sf_scale / size, 1e-3), 1e9)
+        finer = ANTIALIASED_SCALE_STEPS if scene.antialiased else 1
+        sf_scale = min(max(finer * parameters.sf_scale / size, 1e-3), 1e9)
         seen = nearest > 0
         if seen.any():
             beta = parameters.beta * float(np.median(sizes[seen] / nearest[seen]))

@@ -12,49 +12,76 @@ from typing import Any
 import numpy as np
 
 from potr_cl.errors import DataError, UsageError
-from potr_cl.formats import registry
+from potr_cl.formats import gzipped, registry
 from potr_cl.formats.cameras.view_files import read_json
+from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 
-__all__ = ["load_cameras", "load_scene", "save_scene", "scene_writer"]
+__all__ = ["load_cameras", "load_scene", "read_cameras", "read_scene", "save_scene", "scene_writer"]
 
 
-def load_scene(path: str | os.PathLike[str], trust: bool = False) -> Scene:
-    """Read a trained scene; the extension tells the format, the content where formats share an extension.
+def load_scene(path: str | os.PathLike[str], trust: bool = False, antialiased: bool | None = None) -> Scene:
+    """Read a trained scene; its name tells the format, the content where formats share an extension.
 
     Args:
-        path: of a file in one of ``registry.SCENE_FORMATS``. A .potr file is decoded.
+        path: of a file in one of ``registry.SCENE_FORMATS``, or one that is gzipped (".ply.gz"), or of a folder that
+            holds a scene in several files (SOG). A .potr file is decoded. Where a scene has levels of detail, the
+            finest is read, or the one whose number stands behind the path: "scene/lod-meta.json#1".
         trust: whether the file may hold more splats a byte than a real scene has. Without, memory and time are in
             proportion to its size.
+        antialiased: whether the scene was trained with antialiasing and is to be rendered so; None: as the file says,
+            which those of gsplat and nerfstudio do not.
 
     Raises:
         UsageError: the file cannot be opened, its extension is unknown, or it needs an extra.
         DataError: its content is damaged, or it holds too many splats for its size.
     """
     path = Path(path)
+    refuse_lfs_pointer(path)
     with _silent_overflows():
-        return registry.reader_of(path)(path, trust)
+        if path.suffix.lower() == gzipped.SUFFIX:
+            with gzipped.unpacked(path, trust) as file:
+                return registry.reader_of(file)(file, trust).rendered(antialiased)
+        return registry.reader_of(path)(path, trust).rendered(antialiased)
 
 
-def scene_writer(path: str | os.PathLike[str]) -> Callable[[Scene], None]:
+def scene_writer(path: str | os.PathLike[str], version: int | None = None) -> Callable[[Scene], None]:
     """What writes a scene to ``path`` in the format that its suffixes tell; nothing is written yet.
 
+    Args:
+        path: of the file to write.
+        version: of the format, where it has several; by default the one that most readers take.
+
     Raises:
-        UsageError: no format that is written has these suffixes (a .potr file is what an encoder makes).
+        UsageError: no format that is written has these suffixes (a .potr file is what an encoder makes), or it has no
+            such version.
     """
     path = Path(path)
-    return partial(registry.writer_of(path), path)
+    if version is None:
+        return partial(registry.writer_of(path), path)
+    entry = registry.written_format(path)
+    if version not in entry.versions:
+        known = registry.listed([str(each) for each in sorted(entry.versions)])
+        has = f"is written in version {known}" if known else "has no versions to choose from"
+        raise UsageError(f"'{path}': {entry.name} {has}, not {version}")
+    save: Callable[..., None] = registry.writer_of(path)
+    return partial(save, path, version=version)
 
 
-def save_scene(path: str | os.PathLike[str], scene: Scene) -> None:
+def save_scene(path: str | os.PathLike[str], scene: Scene, version: int | None = None) -> None:
     """Write a scene in the format that the suffixes of ``path`` tell.
+
+    Args:
+        path: of the file to write.
+        scene: to write.
+        version: see :func:`scene_writer`.
 
     Raises:
         UsageError: see :func:`scene_writer`; or ``path`` cannot be written to, or an extra is missing.
         PotrError: the format cannot hold the scene, or the system failed to write.
     """
-    scene_writer(path)(scene)
+    scene_writer(path, version)(scene)
 
 
 def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
@@ -72,6 +99,7 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
         DataError: its content is damaged.
     """
     path = Path(path)
+    refuse_lfs_pointer(path)
     try:
         with _silent_overflows():
             return _from_folder(path) if path.is_dir() else _from_file(path)
@@ -107,3 +135,7 @@ def _from_folder(folder: Path) -> list[Camera]:
             if entry.is_in(folder / subfolder):
                 return entry.load_folder(folder / subfolder)
     raise UsageError(f"the folder '{folder}' holds no cameras, expected {registry.cameras_read()}")
+
+
+#: The same under the names that go with what the readers' messages say; neither name is better than the other.
+read_scene, read_cameras = load_scene, load_cameras

@@ -27,6 +27,24 @@ class SceneLoader(Protocol):
     def __call__(self, path: Path, /, trust: bool = False) -> Scene: ...
 
 
+class SceneSaver(Protocol):
+    """Writes a scene file, which appears under its name only when it is whole.
+
+    Where a format's declaration lists ``versions``, it takes one of them as the keyword ``version`` too.
+
+    Args:
+        path: of the file.
+        scene: of any SH degree; its arrays may have any strides.
+
+    Raises:
+        UsageError: the path cannot be written to, or the format's extra is missing.
+        DataError: the format cannot hold the scene.
+        PotrError: the system failed to write.
+    """
+
+    def __call__(self, path: Path, scene: Scene, /) -> None: ...
+
+
 @dataclass(frozen=True)
 class SceneFormat:
     """A format of scene files.
@@ -38,23 +56,36 @@ class SceneFormat:
             written.
         note: one line for people, in Markdown: who uses it, which versions are read and written.
         load: reads a file.
-        save: writes a scene to a path, or None where the format is only read. Raises UsageError if the path cannot be
-            written to or the extra is missing.
+        save: writes a scene to a path, or None where the format is only read.
         not_written: what a user should do instead, as a clause, where ``save`` is None.
         extra: of the package, which brings what the format needs; None if nothing is needed.
         recognises: whether the content of a file is of this format; False for a file that cannot be read. For formats
             that share the last part of a suffix: it decides which of them reads a file, and one of them has none, to
             read what no other recognises.
+        starts: what a file may begin with, if that tells the format: for scenes that come without a name. Of formats
+            that begin alike one alone says so.
+        gzipped: whether files of the format are gzip files themselves; ``starts`` is what they unpack to then.
+        versions: that ``save`` can be asked for by its argument ``version``, the usual one first; none where there is
+            only one way to write.
+        names: of files that tell the format whatever their suffix, in lower case. A folder that holds such a file is
+            read too, and ``load`` takes either, with ``#`` and a number behind if the format has levels of detail.
+        packed: whether files are compressed, so that gzip hardly makes them smaller: then one that is gzipped may
+            unpack to little more than it is.
     """
 
     name: str
     suffixes: tuple[str, ...]
     note: str
     load: SceneLoader
-    save: Callable[[Path, Scene], None] | None = None
+    save: SceneSaver | None = None
     not_written: str = ""
     extra: str | None = None
     recognises: Callable[[Path], bool] | None = None
+    starts: tuple[bytes, ...] = ()
+    gzipped: bool = False
+    versions: tuple[int, ...] = ()
+    names: tuple[str, ...] = ()
+    packed: bool = False
 
     @property
     def extensions(self) -> tuple[str, ...]:

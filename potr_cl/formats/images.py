@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 from PIL import Image, ImageColor, PngImagePlugin, UnidentifiedImageError
 
 from potr_cl.errors import DataError, PotrError, UsageError
+from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
 from potr_cl.model.scene import FloatArray
 
 Colour = tuple[float, float, float]
@@ -97,6 +98,7 @@ def _opened_photograph(path: Path) -> Iterator[Image.Image]:
     except (FileNotFoundError, NotADirectoryError, PermissionError) as error:
         raise UsageError(f"cannot read '{path}': {error.strerror}") from None
     except UnidentifiedImageError:
+        refuse_lfs_pointer(path)
         raise DataError(
             f"'{path}' is damaged or of another kind: it is no PNG, JPEG or WebP image that can be read"
         ) from None

@@ -6,14 +6,16 @@ Reading, writing, error messages, the help of the command line and docs/formats.
 
 from __future__ import annotations
 
-from collections.abc import Callable, Iterable, Sequence
+import contextlib
+import zlib
+from collections.abc import Iterable, Sequence
 from pathlib import Path
 
-from potr_cl.errors import UsageError
+from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.cameras import cameras_json, colmap, transforms
-from potr_cl.formats.declaration import CameraFormat, SceneFormat, SceneLoader, install_command
-from potr_cl.formats.scenes import compressed_ply, ply, potr, sog, spz
-from potr_cl.model.scene import Scene
+from potr_cl.formats.declaration import CameraFormat, SceneFormat, SceneLoader, SceneSaver, install_command
+from potr_cl.formats.levels import without_level
+from potr_cl.formats.scenes import compressed_ply, gltf, ksplat, ply, potr, sog, sog_levels, splat, spz
 
 #: In the order in which people are told of them.
 SCENE_FORMATS: tuple[SceneFormat, ...] = (
@@ -22,7 +24,15 @@ SCENE_FORMATS: tuple[SceneFormat, ...] = (
     compressed_ply.FORMAT,
     spz.FORMAT,
     sog.FORMAT,
+    sog_levels.FORMAT,
+    gltf.FORMAT,
+    splat.FORMAT,
+    ksplat.FORMAT,
 )
+
+#: Bytes that a scene begins with and that may be needed to tell its format.
+START_BYTES = 1024
+_GZIP = b"\x1f\x8b"
 
 #: In the order in which a folder is searched for them. cameras.json stands before transforms.json, for it lists just
 #: the views that a scene was trained with, as they were.
@@ -34,24 +44,122 @@ CAMERA_FORMATS: tuple[CameraFormat, ...] = (
 
 
 def reader_of(path: Path) -> SceneLoader:
-    """What reads a scene file. Its format is told by its extension, and by its content where formats share that.
+    """What reads a scene; see :func:`format_of`.
 
     Raises:
         UsageError: no format has this extension.
     """
+    return format_of(path).load
+
+
+def format_of(path: Path) -> SceneFormat:
+    """The format of a scene that is read. Names and extensions tell it, and the content where formats share those.
+
+    Args:
+        path: of a file, or of a folder that holds a file whose name tells the format.
+
+    Raises:
+        UsageError: no format has this name or extension.
+    """
+    plain = without_level(path)
+    for entry in SCENE_FORMATS:
+        if any(plain.name.lower() == name or (plain / name).is_file() for name in entry.names):
+            return entry
     extension = path.suffix.lower()
     having_it = [entry for entry in SCENE_FORMATS if extension in entry.extensions]
     for entry in having_it:
         if entry.recognises is not None and entry.recognises(path):
-            return entry.load
+            return entry
     for entry in having_it:
         if entry.recognises is None:
-            return entry.load
-    raise UsageError(f"'{path}': unknown kind of scene, expected a {suffixes_read()} file")
+            return entry
+    names = listed([name for entry in SCENE_FORMATS for name in entry.names])
+    if path.is_dir():
+        raise UsageError(f"the folder '{path}' holds no scene that can be read as a folder: it has no {names}")
+    raise UsageError(f"'{path}': unknown kind of scene, expected a {suffixes_read()} file, or a folder with {names}")
 
 
-def writer_of(path: Path) -> Callable[[Path, Scene], None]:
+def suffix_of_content(start: bytes, name: str) -> str:
+    """The suffix of the format that content begins as, for a scene that comes without a name.
+
+    Args:
+        start: its first ``START_BYTES``, fewer if it is shorter.
+        name: of where it comes from, for the message.
+
+    Raises:
+        DataError: no format begins like this.
+    """
+    packed = start.startswith(_GZIP)
+    inner = _beginning_of_gzip(start) if packed else start
+    for entry in SCENE_FORMATS:
+        if inner.startswith(entry.starts) and entry.starts:
+            suffix = entry.suffixes[0]
+            return suffix if not packed or entry.gzipped else f"{suffix}.gz"
+    raise DataError(
+        f"the {name} begins like no scene that is known; of a format without a mark of its own, give the suffix with "
+        "--from"
+    )
+
+
+def _beginning_of_gzip(start: bytes) -> bytes:
+    """What the first bytes of a gzip file unpack to; nothing if they are damaged."""
+    try:
+        return zlib.decompressobj(zlib.MAX_WBITS | 16).decompress(start, 64)
+    except zlib.error:
+        return b""
+
+
+def read_suffix(suffix: str) -> str:
+    """A suffix of a format as the command line gives it, ".ply" or "ply", checked.
+
+    Raises:
+        UsageError: no format has it.
+    """
+    wanted = "." + suffix.lower().lstrip(".")
+    if wanted.removesuffix(".gz") not in _scene_suffixes(SCENE_FORMATS):
+        raise UsageError(f"'{suffix}' is no suffix of a scene: expected {suffixes_read()}")
+    return wanted
+
+
+def written_suffix(suffix: str) -> str:
+    """The same for a format that is to be written.
+
+    Raises:
+        UsageError: no format has it, or it is only read.
+    """
+    wanted = read_suffix(suffix)
+    written_format(Path(f"scene{wanted}"))
+    return wanted
+
+
+def extensions() -> frozenset[str]:
+    """The last parts of all suffixes of scenes, with the point."""
+    return frozenset(extension for entry in SCENE_FORMATS for extension in entry.extensions)
+
+
+def stem_of_scene(path: Path) -> str:
+    """The name of a scene without the suffix of its format: "a" for "a.compressed.ply", "a.ply.gz" or "a/meta.json"."""
+    plain = without_level(path)
+    if any(plain.name.lower() in entry.names for entry in SCENE_FORMATS):
+        return plain.absolute().parent.name
+    name = plain.name[:-3] if plain.name.lower().endswith(".gz") else plain.name
+    fitting = [suffix for suffix in _scene_suffixes(SCENE_FORMATS) if name.lower().endswith(suffix)]
+    return name[: -len(max(fitting, key=len))] if fitting else name
+
+
+def writer_of(path: Path) -> SceneSaver:
     """What writes a scene in the format that the suffixes of the file to be written ask for.
+
+    Raises:
+        UsageError: no format has this suffix, or it is only read.
+    """
+    save = written_format(path).save
+    assert save is not None
+    return save
+
+
+def written_format(path: Path) -> SceneFormat:
+    """The format that the suffixes of a file to be written ask for; it has a ``save``.
 
     Raises:
         UsageError: no format has this suffix, or it is only read.
@@ -60,13 +168,30 @@ def writer_of(path: Path) -> Callable[[Path, Scene], None]:
     fitting = [
         (len(suffix), entry) for entry in SCENE_FORMATS for suffix in entry.suffixes if suffixes.endswith(suffix)
     ]
+    fitting += [(len(path.name), entry) for entry in SCENE_FORMATS if path.name.lower() in entry.names]
     expected = f"scenes are written as {suffixes_written()}"
     if not fitting:
         raise UsageError(f"'{path}': {expected}")
     _, entry = max(fitting, key=lambda found: found[0])
     if entry.save is None:
         raise UsageError(f"'{path}': {entry.not_written}; {expected}")
-    return entry.save
+    return entry
+
+
+def refuse_other_than_potr(path: Path) -> None:
+    """Refuse a name for an encoded file that promises another format.
+
+    Raises:
+        UsageError: it does not end in .potr.
+    """
+    if path.suffix.lower() == ".potr":
+        return
+    said = "give it a name that ends in .potr"
+    with contextlib.suppress(UsageError):
+        writer_of(path)
+        name = path.with_name(f"{stem_of_scene(path)}.potr")
+        said = f"encode to '{name}', then 'potr-cl decode {name} -o {path}'"
+    raise UsageError(f"'{path}': encode writes .potr files only: {said}")
 
 
 def suffixes_read() -> str:
@@ -102,7 +227,7 @@ def formats_table() -> str:
     """All formats as Markdown, for docs/formats.md: a table of scenes and one of cameras."""
     scenes = [
         [
-            f"{entry.name} ({', '.join(f'`{suffix}`' for suffix in entry.suffixes)})",
+            f"{entry.name} ({', '.join(f'`{name}`' for name in (*entry.suffixes, *entry.names))})",
             "yes",
             "no" if entry.save is None else "yes",
             _needs(entry.extra),

@@ -2,14 +2,16 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import DataError, UsageError
+from potr_cl.model.lens import Lens, Pinhole
 
 Split = str  # "train" or "test"
 
@@ -30,6 +32,7 @@ class Camera:
         translation: (3,) float64, world to camera, world units.
         split: "train" (the encoder may look at it) or "test" (for judging only).
         image_path: the photograph, if the camera file names one.
+        lens: how the photograph was bent, if it was; None: the photograph is what the pinhole sees.
     """
 
     name: str
@@ -43,6 +46,7 @@ class Camera:
     translation: NDArray[np.float64]
     split: Split = "train"
     image_path: Path | None = None
+    lens: Lens | None = None
 
     def __post_init__(self) -> None:
         where = f"camera '{self.name}'"
@@ -62,6 +66,16 @@ class Camera:
             raise DataError(f"{where}: the pose's 3 x 3 part is not a rotation")
         if self.split not in ("train", "test"):
             raise DataError(f"{where}: split '{self.split}' is neither 'train' nor 'test'")
+
+    def __repr__(self) -> str:
+        at = ", ".join(f"{x:.3g}" for x in self.centre)
+        view = 2 * math.degrees(math.atan(self.width / 2 / self.fx))
+        return f"Camera('{self.name}', {self.split}, {self.width} x {self.height}, {view:.0f}° wide, at ({at}))"
+
+    @property
+    def photograph_size(self) -> tuple[int, int]:
+        """Width and height of the photograph in pixels."""
+        return (self.width, self.height) if self.lens is None else (self.lens.width, self.lens.height)
 
     @property
     def centre(self) -> NDArray[np.float64]:
@@ -89,6 +103,34 @@ def test_views(cameras: Sequence[Camera]) -> list[Camera]:
 test_views.__test__ = False  # type: ignore[attr-defined]  # pytest would collect it by its name
 
 
+def within_photographs(cameras: Sequence[Camera]) -> list[Camera]:
+    """The same cameras, each looking at no more than what its photograph shows: for comparing with photographs.
+
+    Only views with a lens are changed: they cover the field of the photograph, and its undistorted picture has gaps
+    there.
+
+    Raises:
+        DataError: no pinhole view lies within a photograph.
+    """
+    views: dict[Lens, Pinhole] = {}
+    for camera in cameras:
+        if camera.lens is not None and camera.lens not in views:
+            try:
+                views[camera.lens] = camera.lens.within()
+            except DataError as error:
+                raise DataError(f"camera '{camera.name}': {error}") from error
+    return [c if c.lens is None else replace(c, **views[c.lens]._asdict()) for c in cameras]
+
+
 def camera_centres(cameras: Sequence[Camera]) -> NDArray[np.float64]:
     """(S, 3) positions of the camera centres in world units."""
     return np.array([c.centre for c in cameras], dtype=np.float64).reshape(-1, 3)
+
+
+def focus(cameras: Sequence[Camera]) -> NDArray[np.float64]:
+    """(3,) the point in world units that the lines of sight of some cameras come nearest to, by least squares."""
+    across = np.eye(3) - np.stack([np.outer(c.rotation[2], c.rotation[2]) for c in cameras])
+    point: NDArray[np.float64] = np.linalg.lstsq(
+        across.sum(axis=0), np.einsum("nij,nj->i", across, camera_centres(cameras)), rcond=1e-9
+    )[0]
+    return point

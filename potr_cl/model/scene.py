@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import os
 from dataclasses import dataclass
 
 import numpy as np
@@ -20,6 +21,11 @@ _OPAQUE = np.float32(20)
 
 #: Number of SH coefficients a colour channel for each degree.
 SH_COEFFICIENTS = (1, 4, 9, 16)
+
+#: Variance of the low-pass filter that a picture's splats are widened by, square pixels: that of the original
+#: rasterizer, of gsplat and of viewers; and that of Mip-Splatting's code and of Brush's mip mode, which only
+#: antialiased scenes can have.
+LOW_PASS, MIP_SPLATTING_LOW_PASS = 0.3, 0.1
 
 
 @dataclass(frozen=True)
@@ -52,9 +58,13 @@ class Scene:
         opacity_logits: (N,) logit of the opacity.
         sh: (N, M, 3) spherical-harmonics coefficients, M = 1, 4, 9 or 16; [:, 0] is the DC term; the last
             axis is R, G, B.
+        antialiased: whether it was trained with Mip-Splatting's antialiasing (Yu et al. 2024): in a picture, the
+            low-pass filter then makes a splat wider and as much fainter, where it only makes it wider otherwise. See
+            :class:`potr_cl.raster.rules.RasterRules`.
+        low_pass: variance of that filter, square pixels: ``LOW_PASS``, or, if antialiased, ``MIP_SPLATTING_LOW_PASS``.
 
     Raises:
-        DataError: shapes do not belong together.
+        DataError: shapes do not belong together, or the filter is another.
     """
 
     means: FloatArray
@@ -62,6 +72,8 @@ class Scene:
     quaternions: FloatArray
     opacity_logits: FloatArray
     sh: FloatArray
+    antialiased: bool = False
+    low_pass: float = LOW_PASS
 
     def __post_init__(self) -> None:
         n = len(self.means)
@@ -82,6 +94,11 @@ class Scene:
         for name in (*wanted, "sh"):
             if getattr(self, name).dtype != np.float32:
                 raise DataError(f"scene: {name} is {getattr(self, name).dtype}, expected float32")
+        if self.low_pass != LOW_PASS and not (self.antialiased and self.low_pass == MIP_SPLATTING_LOW_PASS):
+            raise DataError(
+                f"scene: a low-pass filter of {self.low_pass:g} square pixels, expected {LOW_PASS:g}, or for an "
+                f"antialiased scene {MIP_SPLATTING_LOW_PASS:g}"
+            )
 
     def __len__(self) -> int:
         return len(self.means)
@@ -110,15 +127,47 @@ class Scene:
         e = np.exp(-np.abs(logits))
         return np.where(logits >= 0, 1 / (1 + e), e / (1 + e)).astype(np.float32)
 
+    def __repr__(self) -> str:
+        low, high = (self.means.min(axis=0), self.means.max(axis=0)) if len(self) else (np.zeros(3), np.zeros(3))
+        box = " x ".join(f"[{a:.3g}, {b:.3g}]" for a, b in zip(low, high, strict=True))
+        return f"Scene({len(self):,} splats, SH degree {self.sh_degree}, {box}, {self.nbytes / 1e6:.1f} MB)"
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the scene in the format that the suffixes of ``path`` tell, as :func:`potr_cl.save` does.
+
+        Raises:
+            As :func:`potr_cl.save`.
+        """
+        # Arrays know nothing of files: which formats there are the package knows, and is asked when it is needed.
+        import potr_cl
+
+        potr_cl.save(self, path)
+
+    def _repr_png_(self) -> bytes | None:
+        """For notebooks: the scene from four sides, or nothing where no device renders it."""
+        import potr_cl
+
+        return potr_cl.preview(self)
+
     def subset(self, index: NDArray[np.generic]) -> Scene:
         """The splats that ``index`` (integers or a boolean mask) selects, in its order."""
-        return Scene(
-            self.means[index],
-            self.log_scales[index],
-            self.quaternions[index],
-            self.opacity_logits[index],
-            self.sh[index],
+        return dataclasses.replace(
+            self,
+            means=self.means[index],
+            log_scales=self.log_scales[index],
+            quaternions=self.quaternions[index],
+            opacity_logits=self.opacity_logits[index],
+            sh=self.sh[index],
         )
+
+    def rendered(self, antialiased: bool | None) -> Scene:
+        """The scene as it is to be rendered: antialiased, classic, or, for None, as it was trained.
+
+        One that is antialiased already keeps its filter; a classic one has ``LOW_PASS``.
+        """
+        if antialiased is None or antialiased == self.antialiased:
+            return self
+        return dataclasses.replace(self, antialiased=antialiased, low_pass=LOW_PASS)
 
     def cleaned(self) -> tuple[Scene, CleanReport]:
         """Drop splats with non-finite values, turn zero quaternions into the identity, infinite opacity logits finite.
@@ -154,5 +203,5 @@ class Scene:
         if zeros:
             quaternions = scene.quaternions.copy()
             quaternions[zero] = (1, 0, 0, 0)
-            scene = Scene(scene.means, scene.log_scales, quaternions, scene.opacity_logits, scene.sh)
+            scene = dataclasses.replace(scene, quaternions=quaternions)
         return scene, CleanReport(dropped, zeros, 0)

@@ -14,7 +14,8 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.encoder import Coded
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.camera import Camera, train_views
+from potr_cl.model.agreement import require_agreement
+from potr_cl.model.camera import Camera, train_views, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import is_virtual, place_cameras
 from potr_cl.opencl.device import Device
@@ -22,6 +23,7 @@ from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
+from potr_cl.stages.pruning.unseen import Unseen
 from potr_cl.stages.refitting.refit import Refitted
 from potr_cl.stages.stage import Interlude, Progress, Stage, State, Workbench
 
@@ -35,19 +37,35 @@ class Encoded:
         nbytes: the size of the file.
         order: (N,) index in the source scene of each splat of the file.
         pruned: what pruning did; None if it was left out.
+        unseen: the splats that no training view sees; None if pruning was left out.
         refitted: what the re-fit of the colours did; None if it was left out.
         device: the device that did the work; not the one that was asked for if that had too little memory. None if no
             stage needed a device.
         seconds: wall time by stage.
+        options: that it was encoded with: those that were given, or that a search for a size or a PSNR has found.
+        source_splats: how many splats the source scene has.
     """
 
     pieces: list[bytes]
     nbytes: int
     order: NDArray[np.int64]
     pruned: Pruned | None
+    unseen: Unseen | None
     refitted: Refitted | None
     device: Device | None
     seconds: dict[str, float]
+    options: EncodeOptions
+    source_splats: int
+
+    def __repr__(self) -> str:
+        q = f"q {self.options.q:.4g} of preset {self.options.preset}"
+        splats = f"{len(self.order):,} of {self.source_splats:,} splats"
+        return f"Encoded({self.nbytes:,} bytes, {splats}, {q}, {sum(self.seconds.values()):.1f} s)"
+
+    @property
+    def data(self) -> bytes:
+        """The whole file."""
+        return b"".join(self.pieces)
 
     def save(self, path: str | os.PathLike[str]) -> None:
         """Write the file, whole or not at all.
@@ -67,6 +85,7 @@ def encode(
     options: EncodeOptions | None = None,
     progress: Progress | None = None,
     device: Device | None = None,
+    antialiased: bool | None = None,
 ) -> Encoded:
     """Encode a scene.
 
@@ -78,13 +97,16 @@ def encode(
         progress: called with a stage's name and the part of it that is done.
         device: computes; by default the best one there is. If its memory is too small, less is kept in it, and if that
             is not enough, a CPU does the work. A warning says so.
+        antialiased: whether to take it as an antialiased scene; None: as what it says that it is.
 
     Raises:
-        UsageError: options out of range, or cameras without a training view.
+        UsageError: options out of range, cameras without a training view, or cameras that are probably not in the
+            scene's frame (:func:`potr_cl.model.agreement.judge_cameras`; ``options.cameras_anyway`` takes them).
         DataError: a value too large to quantise.
         DeviceError: no device does the work.
     """
     options = options or EncodeOptions()
+    scene = scene.rendered(antialiased)
     watch = Stopwatch(progress)
     cameras = cameras_or_virtual(scene, cameras, options, watch)
     run = Run(options, watch, device)
@@ -94,12 +116,31 @@ def encode(
 def cameras_or_virtual(
     scene: Scene, cameras: Sequence[Camera] | None, options: EncodeOptions, watch: Stopwatch
 ) -> Sequence[Camera] | None:
-    """The cameras; or virtual ones, if there are none and a stage needs views."""
+    """The cameras; or virtual ones, if there are none and a stage needs views.
+
+    Where a stage fits to photographs, views with a lens look at no more than theirs show.
+
+    Raises:
+        UsageError: the training views are probably not in the scene's frame; but with ``options.cameras_anyway``.
+    """
+    check_frame(scene, cameras, options.cameras_anyway)
     if cameras is None and options.look_at_views(scene):
         watch("place cameras", 0.0)
         cameras = place_cameras(scene)
         watch("place cameras", 1.0)
+    if cameras is not None and any(getattr(stage, "ground_truth", None) is not None for stage in options.stages):
+        return within_photographs(cameras)
     return cameras
+
+
+def check_frame(scene: Scene, cameras: Sequence[Camera] | None, anyway: bool) -> None:
+    """Refuse cameras that are probably not in the scene's frame, but virtual ones and those that are wanted anyway.
+
+    Raises:
+        UsageError: they are not in it, or there is no training view among them.
+    """
+    if cameras and not anyway and not is_virtual(cameras):
+        require_agreement(scene, train_views(cameras))
 
 
 class Run:
@@ -169,9 +210,12 @@ class Run:
             nbytes=coded.nbytes,
             order=state.survivors[coded.order],
             pruned=state.learnt.get("prune"),
+            unseen=state.learnt.get("unseen"),
             refitted=state.learnt.get("refit"),
             device=self.device,
             seconds=self._watch.seconds,
+            options=self._options,
+            source_splats=len(state.source),
         )
 
 

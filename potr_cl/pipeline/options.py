@@ -29,6 +29,7 @@ class EncodeOptions:
         preset: how q sets them, and the file's version
             (:meth:`potr_cl.codec.quantize.HyperParameters.from_quality`).
         stages: the stages with their options, in their order; by default those of the preset.
+        cameras_anyway: take the cameras even if they do not seem to be in the scene's frame.
         background: R, G, B behind the scene in the views that are looked at.
         memory: how many bytes of device memory may be filled with views; None: half of a GPU's memory, 0.3 of a CPU's.
         threads: number of threads for work on the host; the bytes do not depend on it. 0: one for each processor.
@@ -38,6 +39,7 @@ class EncodeOptions:
     q: float = 0.5
     preset: Preset = DEFAULT
     stages: tuple[Stage, ...] = ()
+    cameras_anyway: bool = False
     background: tuple[float, float, float] = (0.0, 0.0, 0.0)
     memory: int | None = None
     threads: int = 0

@@ -166,6 +166,9 @@ class Found:
     value: float
     tries: list[Try]
 
+    def __repr__(self) -> str:
+        return f"Found({self.encoded!r} after {len(self.tries)} tries)"
+
 
 def encode_to_target(
     scene: Scene,
@@ -175,11 +178,12 @@ def encode_to_target(
     progress: Progress | None = None,
     device: Device | None = None,
     tell: Callable[[str], None] | None = None,
+    antialiased: bool | None = None,
 ) -> Found:
     """Encode a scene so that it meets a target, as well (or as small) as that allows.
 
     Args:
-        scene, cameras, progress, device: as :func:`potr_cl.pipeline.encode.encode` takes them.
+        scene, cameras, progress, device, antialiased: as :func:`potr_cl.pipeline.encode.encode` takes them.
         target: what to reach.
         options: its q is not looked at; single parameters that are given stay as they are.
         tell: told a line for every step.
@@ -191,6 +195,7 @@ def encode_to_target(
         DeviceError: no device does the work.
     """
     options = options or EncodeOptions()
+    scene = scene.rendered(antialiased)
     watch = Stopwatch(progress)
     cameras = cameras_or_virtual(scene, cameras, options, watch)
     if target.min_psnr is not None and not cameras:

@@ -18,12 +18,13 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
 from potr_cl.formats.cameras.view_files import IMAGE_SUFFIXES, stem
-from potr_cl.formats.images import Colour, image_size, read_ground_truth, to_8_bits
+from potr_cl.formats.images import Colour, image_size, to_8_bits
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.quality.metrics import Lpips
 from potr_cl.quality.metrics_device import Similarity, in_batches
+from potr_cl.quality.photographs import read_photograph
 from potr_cl.quality.pictures import Picture, place_pictures, rendered
 from potr_cl.raster.rasterizer import Rasterizer
 
@@ -49,6 +50,7 @@ class SceneFile:
     nbytes: int
     splats: int
     sh_degree: int
+    antialiased: bool = False
 
     @staticmethod
     def of(path: Path, scene: Scene) -> SceneFile:
@@ -61,7 +63,7 @@ class SceneFile:
             size = path.stat().st_size
         except OSError as error:
             raise UsageError(f"cannot read '{path}': {error.strerror}") from error
-        return SceneFile(path, size, len(scene), scene.sh_degree)
+        return SceneFile(path, size, len(scene), scene.sh_degree, scene.antialiased)
 
 
 @dataclass(frozen=True)
@@ -105,6 +107,14 @@ class Comparison:
     views: list[ViewFigures]
     worst: int
 
+    def __repr__(self) -> str:
+        mean, worst = mean_view(self.views).figures["b_against_a"], self.views[self.worst]
+        views = f"{len(self.views)} view{'s' if len(self.views) > 1 else ''}"
+        return (
+            f"Comparison({views}, PSNR {mean.psnr:.2f} dB, SSIM {mean.ssim:.4f}, "
+            f"worst {worst.figures['b_against_a'].psnr:.2f} dB in '{worst.name}')"
+        )
+
 
 def find_ground_truth(folder: Path, cameras: Sequence[Camera]) -> dict[str, Path]:
     """The photograph of each view: the image in ``folder`` that is named after it.
@@ -128,10 +138,11 @@ def find_ground_truth(folder: Path, cameras: Sequence[Camera]) -> dict[str, Path
             names = ", ".join(image.name for image in images)
             raise UsageError(f"several photographs of view '{camera.name}' in '{wanted.parent}': {names}; keep one")
         width, height = image_size(images[0])
-        if (width, height) != (camera.width, camera.height):
+        if (width, height) != camera.photograph_size:
+            size = " x ".join(map(str, camera.photograph_size))
             raise UsageError(
-                f"'{images[0]}' is {width} x {height} pixels, view '{camera.name}' of the cameras is {camera.width} x "
-                f"{camera.height}: give photographs and cameras of the same size"
+                f"'{images[0]}' is {width} x {height} pixels, view '{camera.name}' of the cameras is {size}: give "
+                "photographs and cameras of the same size"
             )
         found[camera.name] = images[0]
     return found
@@ -162,7 +173,8 @@ def compare(
     Args:
         a, b: the reference scene and the candidate, on one device, with the same rules and background.
         cameras: at least one.
-        ground_truth: photographs by view name, see :func:`find_ground_truth`.
+        ground_truth: photographs by view name, see :func:`find_ground_truth`; cameras with a lens must then look within
+            them (:func:`potr_cl.model.camera.within_photographs`).
         lpips: the metric, where it is installed.
         progress: called with the stage and the part of it that is done.
 
@@ -198,7 +210,7 @@ def compare(
     progress(stage, 0.0)
     with thread_pool() as pool:
         read = _ground_truth(
-            pool, [ground_truth[camera.name] for camera in cameras] if ground_truth else [], a.background
+            pool, [(ground_truth[camera.name], camera) for camera in cameras] if ground_truth else [], a.background
         )
         for some in in_batches(device, cameras):
             with rendered(a, some) as of_a, rendered(b, some) as of_b:
@@ -211,11 +223,13 @@ def compare(
     return Comparison(views, worst)
 
 
-def _ground_truth(pool: ThreadPoolExecutor, paths: Sequence[Path], background: Colour) -> Iterator[FloatArray]:
+def _ground_truth(
+    pool: ThreadPoolExecutor, photographs: Sequence[tuple[Path, Camera]], background: Colour
+) -> Iterator[FloatArray]:
     """The photographs in order, some read ahead."""
     pending: deque[Future[FloatArray]] = deque()
-    for path in paths:
-        pending.append(pool.submit(read_ground_truth, path, background))
+    for path, camera in photographs:
+        pending.append(pool.submit(read_photograph, path, camera, background))
         if len(pending) > _READ_AHEAD:
             yield pending.popleft().result()
     while pending:
@@ -258,6 +272,7 @@ def size_report(a: SceneFile, b: SceneFile) -> dict[str, Any]:
             "bytes": scene.nbytes,
             "splats": scene.splats,
             "sh_degree": scene.sh_degree,
+            "antialiased": scene.antialiased,
         }
 
     return {"a": entry(a), "b": entry(b), "size_ratio": a.nbytes / b.nbytes}

@@ -7,11 +7,12 @@ from pathlib import Path
 
 import numpy as np
 
-from potr_cl.formats.images import Colour, read_ground_truth
+from potr_cl.formats.images import Colour
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.quality.compare import find_ground_truth
 from potr_cl.quality.metrics import psnr
+from potr_cl.quality.photographs import read_photograph
 from potr_cl.raster.rasterizer import Rasterizer
 
 
@@ -20,7 +21,8 @@ class GroundTruth:
 
     Args:
         folder: holds them, named after the views.
-        cameras: the views.
+        cameras: the views; those with a lens looking within their photographs
+            (:func:`potr_cl.model.camera.within_photographs`).
         background: behind those with alpha.
 
     Raises:
@@ -33,13 +35,13 @@ class GroundTruth:
         self._background = background
 
     def picture(self, camera: Camera) -> FloatArray:
-        """(H, W, 3) float32, the photograph of a view.
+        """(H, W, 3) float32, the photograph of a view, without lens distortion.
 
         Raises:
             UsageError: it cannot be opened.
             DataError: it is damaged or has other than 8 bits a channel.
         """
-        return read_ground_truth(self._paths[camera.name], self._background)
+        return read_photograph(self._paths[camera.name], camera, self._background)
 
     def psnr(self, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> float:
         """Mean over views of the PSNR of a scene's pictures against the photographs, in decibels.

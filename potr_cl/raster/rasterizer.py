@@ -25,11 +25,11 @@ import pyopencl as cl
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.scene import LOW_PASS, FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner, Scratch
 from potr_cl.raster.launcher import launcher_for
-from potr_cl.raster.rules import INRIA, RasterRules
+from potr_cl.raster.rules import INRIA, LEAST_COMPENSATION, RasterRules
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
 from potr_cl.raster.view_set import View, ViewSet
 
@@ -75,6 +75,7 @@ class Rasterizer(Owner):
                 SH_COUNT=self._scene.sh_count,
                 NEAR=float(rules.near),
                 SQUARE_EXTENT=int(rules.square_extent),
+                **_filter_macros(scene),
             )
         self._bounds = Scratch(device, "the projected splats' bounds")
         self._counts = Scratch(device, "the tile counts")
@@ -306,16 +307,28 @@ def render(
     device: Device | None = None,
     rules: RasterRules = INRIA,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    antialiased: bool | None = None,
 ) -> tuple[FloatArray, FloatArray]:
     """Render one view of a scene; for many views keep a :class:`Rasterizer`.
 
     Args:
         device: to render on; the best one there is by default.
+        antialiased: whether to render it as an antialiased scene; None: as it was trained.
 
     Returns, Raises: as :meth:`Rasterizer.render`.
     """
-    with Rasterizer(device or Device(), scene, rules, background) as rasterizer:
+    with Rasterizer(device or Device(), scene.rendered(antialiased), rules, background) as rasterizer:
         return rasterizer.render(camera)
+
+
+def _filter_macros(scene: Scene) -> dict[str, float]:
+    """Macros of the projection that an antialiased scene needs; the kernel of classic ones has no trace of it."""
+    if not scene.antialiased:
+        return {}
+    macros = {"ANTIALIASED": 1, "LEAST_COMPENSATION_SQUARED": LEAST_COMPENSATION**2}
+    if scene.low_pass != LOW_PASS:
+        macros |= {"LOW_PASS": scene.low_pass, "LOW_PASS_SQUARED": scene.low_pass**2}
+    return macros
 
 
 def _accept(view: View, count: int) -> None:

@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.rules import LEAST_COMPENSATION, RasterRules
 
 Array = NDArray[np.float64]
 TILE = 16
@@ -78,7 +78,8 @@ class Projected:
     Attributes:
         index: (K,) splat numbers; order of depth, ties by number.
         centre: (K, 2) pixel position. covariance: (K, 2, 2) pixels squared, dilated.
-        depth: (K,). opacity: (K,). colour: (K, 3), not below 0.
+        depth: (K,). opacity: (K,), in an antialiased scene less what the dilation has added to the splat's area.
+        colour: (K, 3), not below 0.
     """
 
     index: NDArray[np.int64]
@@ -109,7 +110,8 @@ def project(scene: Scene, camera: Camera, rules: RasterRules) -> Projected:
     axes = rotation_matrices(scene.quaternions[index].astype(np.float64))
     axes = axes * np.exp(scene.log_scales[index].astype(np.float64))[:, None, :]
     m = jacobian @ camera.rotation @ axes
-    covariance = m @ np.swapaxes(m, 1, 2) + 0.3 * np.eye(2)
+    sharp = m @ np.swapaxes(m, 1, 2)
+    covariance = sharp + scene.low_pass * np.eye(2)
 
     centre = np.stack(
         [camera.fx * t[:, 0] / t[:, 2] + camera.cx, camera.fy * t[:, 1] / t[:, 2] + camera.cy],
@@ -120,6 +122,10 @@ def project(scene: Scene, camera: Camera, rules: RasterRules) -> Projected:
     basis = sh_basis(direction, scene.sh_degree)
     colour = np.einsum("nm,nmc->nc", basis, scene.sh[index].astype(np.float64)) + 0.5
     opacity = 1 / (1 + np.exp(-scene.opacity_logits[index].astype(np.float64)))
+    if scene.antialiased:
+        # Not below 0, which rounding could make of a splat that is seen edge-on.
+        ratio = np.linalg.det(sharp) / np.linalg.det(covariance)
+        opacity *= np.sqrt(np.maximum(ratio, LEAST_COMPENSATION**2))
     return Projected(index, centre, covariance, t[:, 2], opacity, np.maximum(colour, 0))
 
 

@@ -79,6 +79,8 @@ def file_report(file: PotrFile) -> dict[str, Any]:
     return {
         "splats": header.splats,
         "sh_degree": header.sh_degree,
+        "antialiased": header.antialiased,
+        "low_pass": header.low_pass,
         "q": metadata.get("q"),
         "cameras": metadata.get("cameras"),
         "bounding_box": [means.min(axis=0).tolist(), means.max(axis=0).tolist()],
@@ -107,12 +109,18 @@ def file_report(file: PotrFile) -> dict[str, Any]:
     }
 
 
+def antialiasing(report: dict[str, Any]) -> str:
+    """How a scene is to be rendered, for people, from a report's ``antialiased`` and ``low_pass``."""
+    return f"yes, low-pass filter of {report['low_pass']:g} square pixels" if report["antialiased"] else "no"
+
+
 def format_report(report: dict[str, Any]) -> str:
     """The report as lines for people."""
     low, high = report["bounding_box"]
     lines = [
         f"splats          {report['splats']}",
         f"SH degree       {report['sh_degree']}",
+        f"antialiased     {antialiasing(report)}",
         f"quality q       {'unknown' if report['q'] is None else report['q']}",
         f"cameras         {report['cameras'] or 'unknown or none'}",
         "bounding box    " + " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(low, high, strict=True)),

@@ -23,6 +23,7 @@ from potr_cl.formats.images import to_8_bits
 from potr_cl.model.scene import FloatArray
 from potr_cl.plain_text import plain
 from potr_cl.quality.compare import difference_map
+from potr_cl.report.labels import BEFORE_AND_AFTER, difference_label, view_label
 from potr_cl.report.summary import decibels
 
 _COLOURS = ("#4269d0", "#efb118", "#ff725c", "#6cc5b0", "#3ca951", "#ff8ab7", "#a463f2", "#97bbf5", "#9c6b4e")
@@ -144,17 +145,19 @@ def _pair(pair: PicturePair) -> str:
     heat, factor = difference_map(pair.before, pair.after)
     height, width = pair.before.shape[:2]
     name = _text(pair.view)
+    before, after = (_text(label) for label in BEFORE_AND_AFTER)
     size = f'width="{width}" height="{height}"'
     return (
-        f"<h3>{_text(pair.title)}: {name}, {decibels(pair.psnr)}</h3>\n"
+        f"<h3>{_text(pair.title)}: {_text(view_label(pair.view, pair.psnr))}</h3>\n"
         '<div class="pair"><figure><div class="slider">\n'
-        f'<img {size} src="{_data_uri(pair.before)}" alt="{name}, uncompressed">\n'
-        f'<img {size} class="after" src="{_data_uri(pair.after)}" alt="{name}, compressed">\n'
-        '<input type="range" min="0" max="100" value="50" step="any" aria-label="uncompressed to the left, compressed '
-        "to the right\" oninput=\"this.parentNode.style.setProperty('--at', this.value + '%')\"></div>\n"
-        "<figcaption>uncompressed | compressed</figcaption></figure>\n"
+        f'<img {size} src="{_data_uri(pair.before)}" alt="{name}, {before}">\n'
+        f'<img {size} class="after" src="{_data_uri(pair.after)}" alt="{name}, {after}">\n'
+        '<input type="range" min="0" max="100" value="50" step="any" aria-label="'
+        f'{before} to the left, {after} to the right" '
+        "oninput=\"this.parentNode.style.setProperty('--at', this.value + '%')\"></div>\n"
+        f"<figcaption>{before} | {after}</figcaption></figure>\n"
         f'<figure><img {size} src="{_data_uri(heat)}" alt="{name}, difference">\n'
-        f"<figcaption>difference × {factor}</figcaption></figure></div>"
+        f"<figcaption>{_text(difference_label(factor))}</figcaption></figure></div>"
     )
 
 

@@ -58,6 +58,7 @@ def encode_report(
             "bytes": source_bytes,
             "splats": len(scene),
             "sh_degree": scene.sh_degree,
+            "antialiased": scene.antialiased,
         },
         "file": str(target),
         "bytes": len(file.data),
@@ -67,6 +68,7 @@ def encode_report(
         "properties": _properties(contents["sections"]),
         "quality": quality,
         "pruning": None,
+        "unseen": None,
         "search": search,
         "options": options.as_dict(),
         "parameters": dataclasses.asdict(options.parameters),
@@ -80,6 +82,8 @@ def encode_report(
             "iterations": encoded.pruned.iterations,
             "history": [dataclasses.asdict(entry) for entry in encoded.pruned.history],
         }
+    if encoded.unseen is not None:
+        report["unseen"] = {**dataclasses.asdict(encoded.unseen), "said": str(encoded.unseen)}
     if encoded.device is not None:
         info = encoded.device.info
         report["device"] = {"name": info.name, "platform": info.platform, "version": info.version}
@@ -143,6 +147,10 @@ def format_encode_report(report: dict[str, Any]) -> str:
         f"{report['file']}: {report['bytes']:,} bytes, {change} than {source['file']} ({source['bytes']:,} bytes)",
         f"splats     {report['splats']:,} of {source['splats']:,}, {report['bytes_a_splat']:.2f} bytes each",
     ]
+    if report["unseen"] is not None and report["unseen"]["splats"]:
+        lines.append(f"           {report['unseen']['said']}")
+    if source["antialiased"]:
+        lines.append("rendered   as an antialiased scene")
     for place, (name, nbytes) in enumerate(report["properties"].items()):
         lines.append(f"{'' if place else 'bytes':<11}{name:<12}{nbytes:>13,}{100 * nbytes / report['bytes']:>7.1f} %")
     quality = report["quality"]

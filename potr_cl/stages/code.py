@@ -79,7 +79,7 @@ class Code(Stage):
         None,
         Flag(
             "--sf-scale",
-            "steps a unit for standard deviations; best, fast: in a typical splat's size",
+            "steps a unit for standard deviations; best, fast: in a typical splat's size, twice as many if antialiased",
             "SF",
             float,
         ),

@@ -11,8 +11,9 @@ from potr_cl.errors import UsageError
 from potr_cl.stages.pruning.measured import Measured, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.schedule import PruningOptions
+from potr_cl.stages.pruning.schedule import Pruned, PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.unseen import CHOICES, Unseen, as_of_whole, find_unseen, put_back, set_aside
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 
@@ -26,6 +27,8 @@ class Prune(Stage):
         keep, count: part or number of the splats to keep, exactly, instead of ``delta_mse_max``.
         delta_mse_max: replaces q's ΔMSE_MAX.
         iterations, decay, mapping_a: of the schedule (:class:`potr_cl.stages.pruning.schedule.PruningOptions`).
+        unseen: "keep" or "drop": what becomes of splats that no training view's picture reaches
+            (:mod:`potr_cl.model.unseen`). With ``keep`` or ``count`` they go first in any case.
         tolerance, turns, tighten, transmittance_threshold, sample, sampled, seed: of the measurements
             (:class:`potr_cl.stages.pruning.sweep_options.SweepOptions`).
 
@@ -77,6 +80,15 @@ class Prune(Stage):
             float,
         ),
     )
+    unseen: str = option(
+        "keep",
+        Flag(
+            "--unseen",
+            "splats outside of every training view's picture: keep them, coarsely coded, or drop them; with --keep or "
+            "--count they always go first",
+            choices=CHOICES,
+        ),
+    )
     tighten: bool = option(SweepOptions.tighten)
     transmittance_threshold: float | None = option(SweepOptions.transmittance_threshold)
     sample: float = option(SweepOptions.sample)
@@ -88,6 +100,8 @@ class Prune(Stage):
             raise UsageError(f"--keep is {self.keep:g}, it must be above 0 and at most 1")
         if self.keep is not None and self.count is not None:
             raise UsageError("give either the part or the number of splats to keep")
+        if self.unseen not in CHOICES:
+            raise UsageError(f"--unseen is '{self.unseen}', it must be one of {', '.join(CHOICES)}")
         _ = self._sweep_options(None), self._schedule(0.0, 1)  # refuse what is out of range at once
 
     @property
@@ -111,7 +125,24 @@ class Prune(Stage):
         return PruningOptions(delta_mse_max, self.iterations, a=self.mapping_a, count=count, decay=self.decay)
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Remove splats, and leave a :class:`potr_cl.stages.pruning.schedule.Pruned` in ``learnt``."""
+        """Remove splats, and leave a :class:`potr_cl.stages.pruning.schedule.Pruned` in ``learnt``.
+
+        And as "unseen" a :class:`potr_cl.stages.pruning.unseen.Unseen`.
+        """
+        hidden, area = find_unseen(state)
+        splats = int(np.count_nonzero(hidden))
+        kept = self.unseen == "keep" and self.keep is None and self.count is None
+        told = state.having_learnt("unseen", Unseen(splats, len(state.scene), area, kept))
+        if not (kept and splats):
+            return self._pruned(told, bench)
+        split = set_aside(told, hidden)
+        if not len(split.seen_splats):
+            everything = np.arange(splats)
+            return told.having_learnt(self.name, Pruned(everything, splats, np.full(splats, -1, np.int32), 0))
+        left = self._pruned(split.seen, bench)
+        return put_back(split, left).having_learnt(self.name, as_of_whole(split, left.learnt[self.name]))
+
+    def _pruned(self, state: State, bench: Workbench) -> State:
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene))
         bench.progress("prepare views", 0.0)

@@ -16,13 +16,14 @@ import pytest
 from PIL import Image
 
 from potr_cl import cli
-from potr_cl.cli.options import size_in_bytes
 from potr_cl.errors import DeviceError
 from potr_cl.formats import load_cameras, load_scene
 from potr_cl.formats.images import to_8_bits
 from potr_cl.formats.scenes import ply
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DEVICE_VARIABLE, compiler_fault, list_devices
+from potr_cl.pipeline.amounts import size_in_bytes
+from potr_cl.quality.compare import side_by_side
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
@@ -223,7 +224,7 @@ def test_a_device_that_fails_while_judging_leaves_the_file(tmp_path, scene_path,
     def fail(*_args):
         raise DeviceError("device 'X' vanished")
 
-    monkeypatch.setattr(cli.encode, "Evaluator", fail)
+    monkeypatch.setattr("potr_cl.api.encoding.Evaluator", fail)
     text = run(capsys, "encode", scene_path, "-o", potr, "--cameras", cameras, "--iterations", "2")
     assert "not judged: device 'X' vanished" in text
     assert load_scene(potr)
@@ -274,7 +275,7 @@ def test_prune(tmp_path, scene_path, capsys):
     assert cli.main([str(a) for a in [*arguments, "--keep", "0.5"]]) == 0
     assert len(ply.load(out)) == 100
     for limit, kept in (("0", 200), ("1e9", 1)):
-        assert cli.main([str(a) for a in [*arguments, "--delta-mse-max", limit]]) == 0
+        assert cli.main([str(a) for a in [*arguments, "--unseen", "drop", "--delta-mse-max", limit]]) == 0
         assert len(ply.load(out)) <= kept
     capsys.readouterr()
 
@@ -305,8 +306,7 @@ def test_encode_prunes(tmp_path, scene_path, capsys):
 )
 def test_wrong_pruning_options(tmp_path, scene_path, capsys, options, word):
     cameras = cameras_json(tmp_path / "cameras.json")
-    for command in ("prune", "encode"):
-        out = tmp_path / "out"
+    for command, out in (("prune", tmp_path / "out.ply"), ("encode", tmp_path / "out.potr")):
         fails(capsys, [command, scene_path, "--cameras", cameras, "-o", out, *options], 2, word)
         assert not out.exists()
 
@@ -318,8 +318,8 @@ def test_interrupted_pruning_leaves_nothing(tmp_path, scene_path, capsys, monkey
     monkeypatch.setattr("potr_cl.stages.prune.prune_scene", interrupted)
     cameras = cameras_json(tmp_path / "cameras.json")
     before = sorted(tmp_path.iterdir())
-    for command in ("prune", "encode"):
-        fails(capsys, [command, scene_path, "--cameras", cameras, "-o", tmp_path / "out"], 130, "interrupted")
+    for command, out in (("prune", "out.ply"), ("encode", "out.potr")):
+        fails(capsys, [command, scene_path, "--cameras", cameras, "-o", tmp_path / out], 130, "interrupted")
         assert sorted(tmp_path.iterdir()) == before
 
 
@@ -403,13 +403,14 @@ def test_whose_cameras_is_in_the_file(tmp_path, scene_path, capsys):
 
 def test_order_and_output_must_differ(tmp_path, scene_path, capsys):
     cameras = cameras_json(tmp_path / "cameras.json")
-    arguments = ["prune", scene_path, "--cameras", cameras, "-o", tmp_path / "x", "--order", tmp_path / "x"]
+    arguments = ["prune", scene_path, "--cameras", cameras, "-o", tmp_path / "x.ply"]
+    arguments += ["--order", tmp_path / "x.ply"]
     fails(capsys, arguments, 2, "same file")
 
 
 def test_no_such_input(tmp_path, capsys):
-    for command in ("encode", "decode"):
-        fails(capsys, [command, tmp_path / "none.potr", "-o", tmp_path / "out"], 2, "none.potr")
+    for command, out in (("encode", "out.potr"), ("decode", "out.ply")):
+        fails(capsys, [command, tmp_path / "none.potr", "-o", tmp_path / out], 2, "none.potr")
     fails(capsys, ["info", tmp_path / "none.potr"], 2, "none.potr")
     assert list(tmp_path.iterdir()) == []
 
@@ -417,8 +418,8 @@ def test_no_such_input(tmp_path, capsys):
 def test_directories(tmp_path, scene_path, potr_path, capsys):
     fails(capsys, ["decode", tmp_path, "-o", tmp_path / "out.ply"], 2, str(tmp_path))
     fails(capsys, ["info", tmp_path], 2, str(tmp_path))
-    fails(capsys, ["encode", scene_path, "-o", tmp_path], 2, str(tmp_path))
-    fails(capsys, ["decode", potr_path, "-o", tmp_path], 2, str(tmp_path))
+    fails(capsys, ["prune", scene_path, "-o", tmp_path], 2, str(tmp_path))
+    fails(capsys, ["encode", scene_path, "-o", tmp_path / "a.potr", "--report", tmp_path], 2, str(tmp_path))
     fails(capsys, ["encode", scene_path, "-o", tmp_path / "nowhere" / "a.potr"], 2, "nowhere")
 
 
@@ -499,7 +500,8 @@ def test_disk_full(tmp_path, scene_path, potr_path):
         "resource.setrlimit(resource.RLIMIT_FSIZE, (1000, 1000));"
         "from potr_cl.cli import main; sys.exit(main(sys.argv[1:]))"
     )
-    for arguments in (["encode", scene_path, "-o", tmp_path / "x", *KEEP], ["decode", potr_path, "-o", tmp_path / "x"]):
+    encode = ["encode", scene_path, "-o", tmp_path / "x.potr", *KEEP]
+    for arguments in (encode, ["decode", potr_path, "-o", tmp_path / "x.ply"]):
         result = subprocess.run(
             [sys.executable, "-c", script, *map(str, arguments)], capture_output=True, text=True, check=False
         )
@@ -635,7 +637,7 @@ def test_pictures_stay_in_their_folder(tmp_path, scene_path, cameras_path, capsy
     views[0]["img_name"] = "a_x.png"
     views[1]["img_name"] = "b/x.png"
     cameras_path.write_text(json.dumps(views))
-    fails(capsys, ["render", scene_path, "--cameras", cameras_path, "-o", out], 1, "two views", "cameras.json")
+    fails(capsys, ["render", scene_path, "--cameras", cameras_path, "-o", out], 1, "two views", "--views")
 
 
 def test_render_bad_calls(tmp_path, scene_path, cameras_path, capsys):
@@ -696,11 +698,70 @@ def test_compare_without_cameras(scene_path, potr_path, capsys):
     assert cli.main(["compare", str(scene_path), str(potr_path)]) == 0
     captured = capsys.readouterr()
     assert "times smaller" in captured.out
-    assert "--cameras" in captured.err
-    report = json.loads(run(capsys, "compare", scene_path, potr_path, "--json"))
+    assert "8 virtual views of 800 x 800 pixels" in captured.err
+    placed = [line for line in captured.err.splitlines() if "no --cameras" in line]
+    assert len(placed) == 1
+    report = json.loads(run(capsys, "compare", scene_path, potr_path, "--json", "--virtual-views", 2, "--size", 64))
     assert (report["a"]["splats"], report["b"]["splats"]) == (200, 200)
-    for option in (["--truth", "x"], ["--views", "0"], ["--split", "all"], ["-o", "x.png"]):
-        fails(capsys, ["compare", scene_path, potr_path, *option], 2, "--cameras")
+    assert [view["name"] for view in report["views"]] == ["virtual_000", "virtual_001"]
+    assert all(25 < view["b_against_a"]["psnr"] < 70 for view in report["views"])
+    turning = json.loads(run(capsys, "compare", scene_path, potr_path, "--json", "--turntable", 3, "--size", 64))
+    assert [view["name"] for view in turning["views"]] == ["turntable_000", "turntable_001", "turntable_002"]
+    one = run(capsys, "compare", scene_path, potr_path, "--turntable", 3, "--views", "1", "--size", 64)
+    assert "turntable_001" in one
+    assert "turntable_000" not in one
+    fails(capsys, ["compare", scene_path, potr_path, "--truth", "x"], 2, "--cameras")
+
+
+def test_compare_tells_sizes_where_there_is_no_device(scene_path, potr_path, capsys, monkeypatch):
+    monkeypatch.setattr("potr_cl.cli.pictures.list_devices", list)
+    assert cli.main(["compare", str(scene_path), str(potr_path)]) == 0
+    captured = capsys.readouterr()
+    assert "times smaller" in captured.out
+    assert "virtual" not in captured.out
+    assert "no OpenCL device" in captured.err
+    assert set(json.loads(run(capsys, "compare", scene_path, potr_path, "--json"))) == {"a", "b", "size_ratio"}
+
+
+def test_render_without_cameras_places_views(tmp_path, scene_path, capsys):
+    assert cli.main(["render", str(scene_path), "-o", str(tmp_path / "around"), "--size", "40"]) == 0
+    placed = [line for line in capsys.readouterr().err.splitlines() if "no --cameras" in line]
+    assert len(placed) == 1
+    assert "8 virtual views of 40 x 40 pixels" in placed[0]
+    files = sorted((tmp_path / "around").iterdir())
+    assert [file.name for file in files] == [f"virtual_{k:03d}.png" for k in range(8)]
+    run(capsys, "render", scene_path, "-o", tmp_path / "turn", "--turntable", 5, "--size", 40, "--up=-y")
+    files += sorted((tmp_path / "turn").iterdir())
+    assert [file.name for file in files[8:]] == [f"turntable_{k:03d}.png" for k in range(5)]
+    for file in files:
+        with Image.open(file) as image:
+            assert image.size == (40, 40)
+            assert np.asarray(image).std() > 5, "the scene is in the picture"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--turntable", "0"], ["0 views"]),
+        (["--virtual-views", "100000"], ["100000 views"]),
+        (["--size", "0"], ["0 x 0"]),
+        (["--size", "99999"], ["99999 x 99999"]),
+        (["--up", "sideways"], ["'sideways' is no direction", "--up=x|y|z|-x|-y|-z"]),
+        (["--up", "0,0,0"], ["'0,0,0' is no direction"]),
+        (["--up", "nan,0,1"], ["is no direction"]),
+    ],
+)
+def test_wrong_views_to_place(tmp_path, scene_path, cameras_path, capsys, options, words):
+    render = ["render", scene_path, "-o", tmp_path / "out"]
+    fails(capsys, [*render, *options], 2, *words)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("option", ["--turntable", "--virtual-views", "--up", "--size"])
+def test_views_are_placed_only_without_cameras(tmp_path, scene_path, cameras_path, capsys, option):
+    value = "z" if option == "--up" else "3"
+    for command in (["render", scene_path, "-o", tmp_path / "out"], ["compare", scene_path, scene_path]):
+        fails(capsys, [*command, "--cameras", cameras_path, option, value], 2, option, "without cameras")
 
 
 def test_compare_picture(tmp_path, scene_path, potr_path, cameras_path, capsys):
@@ -708,8 +769,16 @@ def test_compare_picture(tmp_path, scene_path, potr_path, cameras_path, capsys):
     text = run(capsys, "compare", scene_path, potr_path, "--cameras", cameras_path, "-o", picture)
     factor = int(text.split("difference times ")[1].split()[0])
     worst = text.split("worst view: ")[1].split(",")[0]
+    a, b = (Rasterizer(Device(), load_scene(path)) for path in (scene_path, potr_path))
+    view = next(camera for camera in load_cameras(cameras_path) if camera.name == worst)
     with Image.open(picture) as image:
-        assert image.size == (3 * 64, 64)
+        assert image.width == 3 * 64
+        assert image.height > 64 + 20, "there are labels above the pictures"
+        pixels = np.asarray(image)
+        assert np.array_equal(pixels[-64:], side_by_side(a.render(view)[0], b.render(view)[0])[0])
+        labels = pixels[:-64]
+        assert labels.max() > 200
+        assert all((labels[len(labels) // 2 :, k * 64 : (k + 1) * 64].max() > 200) for k in range(3))
         assert image.text["Description"] == (
             f"view {worst}: A, B and their difference times {factor}; A is scene.ply, B is scene.potr"
         )

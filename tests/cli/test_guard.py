@@ -95,11 +95,19 @@ def contents(folder: Path) -> dict[str, bytes]:
     return {str(path): path.read_bytes() for path in folder.rglob("*") if path.is_file()}
 
 
-def refused(capsys: pytest.CaptureFixture[str], folder: Path, arguments: list[str], word: str) -> None:
+def written_suffix(call: str) -> str:
+    """Of the output "{out}" of a call."""
+    for option, suffix in (("--report", ".html"), ("--order", ".npy"), ("encode", ".potr"), ("compare", ".png")):
+        if option in call:
+            return suffix
+    return ".ply"
+
+
+def refused(capsys: pytest.CaptureFixture[str], folder: Path, arguments: list[str], *words: str) -> None:
     before = contents(folder)
     assert cli.main(arguments) == 2
     said = capsys.readouterr()
-    assert word in said.err
+    assert any(word in said.err for word in words)
     assert said.err.startswith("potr-cl: ")
     assert said.err.count("\n") == 1
     assert said.out == ""
@@ -118,12 +126,15 @@ def test_an_output_that_is_an_input(
 ) -> None:
     monkeypatch.chdir(folder)
     source = folder / target
-    # Named otherwise than the input, but for what tells the format.
-    out = source if link is same_name else folder / f"link{source.suffix}"
+    # Links have the suffix that the command writes: another one is reason enough to refuse.
+    out = source if link is same_name else folder / f"link{written_suffix(call)}"
     link(source, out)
     if link is link_to_its_folder:
         out = out / source.name
-    refused(capsys, folder, [word.format(out=out) for word in call.split()], "would be replaced")
+    words = ["would be replaced"]
+    if out.name == source.name and source.suffix != written_suffix(call):
+        words += ["a name that ends in", "scenes are written as"]
+    refused(capsys, folder, [word.format(out=out) for word in call.split()], *words)
 
 
 @pytest.mark.parametrize(

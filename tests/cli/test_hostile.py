@@ -90,10 +90,11 @@ def test_numbers_that_are_none(
 def test_virtual_views_are_bounded(
     tmp_path: Path, scene_path: Path, capsys: pytest.CaptureFixture[str], command: str, number: str
 ) -> None:
-    arguments = [command, scene_path, "-o", tmp_path / "a", "--virtual-views", number]
+    out = tmp_path / ("a.potr" if command == "encode" else "a.ply")
+    arguments = [command, scene_path, "-o", out, "--virtual-views", number]
     # A line that tells of placing may stand before the error's.
     assert outcome(capsys, arguments, lines=3)[0] == 2
-    assert not (tmp_path / "a").exists()
+    assert not out.exists()
 
 
 @pytest.mark.parametrize("device", ["²", "٣٣٣", MANY_DIGITS, "-1", ESCAPES])
@@ -118,18 +119,18 @@ def calls(name: str, good: str) -> list[list[str]]:
     """A name in every place of every command that takes one, beside good ones."""
     cameras = str(ROOT / "tests" / "data" / "lego_cameras.json")
     return [
-        ["encode", name, "-o", "new"],
+        ["encode", name, "-o", "new.potr"],
         ["encode", good, "-o", name, *KEEP],
-        ["encode", good, "-o", "new", "--report", name, *KEEP],
-        ["encode", good, "-o", "new", "--cameras", name],
-        ["encode", good, "-o", "new", "--cameras", cameras, "--photos", name],
-        ["decode", name, "-o", "new"],
+        ["encode", good, "-o", "new.potr", "--report", name, *KEEP],
+        ["encode", good, "-o", "new.potr", "--cameras", name],
+        ["encode", good, "-o", "new.potr", "--cameras", cameras, "--photos", name],
+        ["decode", name, "-o", "new.ply"],
         ["info", name],
         ["convert", name, "new.ply"],
         ["convert", good, name],
-        ["prune", name, "-o", "new"],
-        ["prune", good, "-o", "new", "--order", name],
-        ["refit", good, "--reference", name, "-o", "new"],
+        ["prune", name, "-o", "new.ply"],
+        ["prune", good, "-o", "new.ply", "--order", name],
+        ["refit", good, "--reference", name, "-o", "new.ply"],
         ["render", name, "--cameras", cameras, "-o", "new"],
         ["render", good, "--cameras", name, "-o", "new"],
         ["render", good, "--cameras", cameras, "-o", name, "--views", "0"],
@@ -374,7 +375,7 @@ def test_trust_reaches_the_readers(
     cameras = str(ROOT / "tests" / "data" / "lego_cameras.json")
     scene, out = str(scene_path), str(tmp_path / "out.ply")
     for command in (
-        ["encode", scene, "-o", out, *KEEP],
+        ["encode", scene, "-o", str(tmp_path / "out.potr"), *KEEP],
         ["decode", scene, "-o", out],
         ["info", scene],
         ["convert", scene, out],

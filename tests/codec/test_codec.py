@@ -307,6 +307,43 @@ def test_golden_files_decode_for_ever(path):
 
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda p: p.stem)
+def test_golden_files_say_for_ever_how_they_are_rendered(path):
+    expected = (False, 0.3)
+    if "antialiased" in path.stem or "mip_splatting" in path.stem:
+        expected = (True, 0.1 if "mip_splatting" in path.stem else 0.3)
+    scene, independent = decode(path), decode_independently(path.read_bytes())
+    assert (scene.antialiased, scene.low_pass) == expected
+    assert (independent["antialiased"], independent["low_pass"]) == expected
+
+
+def test_flags_are_all_that_marks_an_antialiased_scene():
+    """Of version 1, whose steps are the same for all: classic files stay as they were, byte for byte."""
+    scene = random_scene(100, 1)
+    options = EncodeOptions.for_preset("paper", prune=False, compact=False)
+    classic, marked = (joined(encode(scene.rendered(kind), None, options)) for kind in (False, True))
+    assert classic[10:12] == b"\0\0"
+    assert marked[10:12] == b"\1\0"
+    changed = [i for i, (a, b) in enumerate(zip(classic, marked, strict=True)) if a != b]
+    checksum = int.from_bytes(classic[12:16], "little") - 4
+    assert set(changed) <= {10, *range(checksum, checksum + 4)}
+
+
+@pytest.mark.parametrize("preset", ["fast", "best"])
+def test_scales_of_antialiased_scenes_have_finer_steps(preset):
+    """A thin splat's width counts twice there, in its shape and in its opacity."""
+    scene = random_scene(300, 1)
+    options = EncodeOptions.for_preset(preset, prune=False, compact=False, refit=False)
+    data = [joined(encode(scene.rendered(kind), None, options)) for kind in (False, True)]
+    classic, marked = (PotrFile.from_bytes(each).header for each in data)
+    assert marked.sf_scale == 2 * classic.sf_scale
+    for each in ("sf_rotation", "sf_opacity", "sf_dc", "sf_ac"):
+        assert getattr(marked, each) == getattr(classic, each)
+    log_scales = [np.sort(decode(each).log_scales.astype(np.float64), axis=None) for each in data]
+    errors = [np.abs(np.exp(each) - np.exp(np.sort(scene.log_scales, axis=None))).mean() for each in log_scales]
+    assert errors[1] < 0.6 * errors[0]
+
+
+@pytest.mark.parametrize("path", GOLDEN, ids=lambda p: p.stem)
 def test_golden_metadata(path):
     assert isinstance(PotrFile.open(path).metadata, dict)
     json.dumps(PotrFile.open(path).metadata)

@@ -168,7 +168,8 @@ LIES = {
     "version 2 with version 1's reserved bytes": (lambda d: changed(d, 8, "<H", 2), "scale factor"),
     "coder of version 2": (lambda d: changed(d, 122, "<B", 3), "coder 3"),
     "version 0": (lambda d: changed(d, 8, "<H", 0), "unknown"),
-    "flags": (lambda d: changed(d, 10, "<H", 1), "unknown"),
+    "a low-pass filter of antialiased scenes alone": (lambda d: changed(d, 10, "<H", 2), "unknown"),
+    "flags of a later day": (lambda d: changed(d, 10, "<H", 5), "flags 5 is unknown: update potr_cl"),
     "header size": (lambda d: changed(d, 12, "<I", 4000), "damaged"),
     "gigantic header size": (lambda d: changed(d, 12, "<I", 2**32 - 1), "damaged"),
     "file size": (lambda d: changed(d, 16, "<Q", 2**60), "truncated"),
@@ -195,6 +196,14 @@ LIES = {
     "SH beyond the degree": (lambda d: changed(changed(d, 121, "<B", 3), 120, "<B", 19), "does not belong"),
     "bit flip in the header": (lambda d: d[:40] + bytes([d[40] ^ 1]) + d[41:], "checksum"),
 }
+
+
+@pytest.mark.parametrize("version", [1, 2])
+def test_flags_say_how_a_scene_is_rendered(version):
+    for flags, antialiased, low_pass in [(0, False, 0.3), (1, True, 0.3), (3, True, 0.1)]:
+        data = changed(small_file(version), 10, "<H", flags)
+        header = container.read_header(data, len(data))
+        assert (header.antialiased, header.low_pass) == (antialiased, low_pass)
 
 
 @pytest.mark.parametrize("name", LIES)

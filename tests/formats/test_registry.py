@@ -24,7 +24,7 @@ from potr_cl.formats.declaration import CameraFormat, SceneFormat, install_comma
 from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS, listed
 from potr_cl.reference.scenes import random_scene
 from tests.cases.cameras import nerfstudio, view, write_json
-from tests.cases.scenes import in_order_of
+from tests.cases.scenes import in_order_of, turned_by
 
 ROOT = Path(__file__).parents[2]
 WRITTEN = [entry for entry in SCENE_FORMATS if entry.save is not None]
@@ -60,12 +60,13 @@ def test_declarations_are_complete() -> None:
     extras = re.findall(r"^([a-z-]+) = \[", (ROOT / "pyproject.toml").read_text(), re.MULTILINE)
     for entry in (*SCENE_FORMATS, *CAMERA_FORMATS):
         assert all(re.fullmatch(r"(\.[a-z0-9]+)+", suffix) for suffix in entry.suffixes), entry.name
-        assert entry.suffixes, entry.name
+        assert entry.suffixes or getattr(entry, "names", ()), entry.name
         assert entry.note, entry.name
         assert not {"\n", "|"} & set(entry.name + entry.note), "it would break the documentation's table"
         assert entry.extra is None or entry.extra in extras, entry.name
     for entry in SCENE_FORMATS:
         assert bool(entry.not_written) == (entry.save is None), entry.name
+        assert all(re.fullmatch(r"[a-z0-9-]+\.[a-z0-9]+", each) for each in entry.names), entry.name
     for each in CAMERA_FORMATS:
         assert bool(each.json_mark) == (".json" in each.suffixes), each.name
 
@@ -102,9 +103,9 @@ def test_every_format_reads_what_it_writes(
         # The coarsest steps of all formats, and some; a format's own test knows its steps.
         assert np.abs(back.means - scene.means).max() < 0.01
         assert np.abs(back.opacities - scene.opacities).max() < 0.01
-        assert np.quantile(np.abs(back.log_scales - scene.log_scales), 0.9) < 0.1
-        unit, unit_back = (q / np.linalg.norm(q, axis=1, keepdims=True) for q in (scene.quaternions, back.quaternions))
-        assert np.abs(np.einsum("ij,ij->i", unit, unit_back)).min() > 0.999
+        angles, differences = turned_by(scene, back)
+        assert np.quantile(np.abs(differences), 0.9) < 0.1
+        assert np.cos(angles / 2).min() > 0.999
         assert np.quantile(np.abs(back.sh - scene.sh), 0.9) < 0.05
 
 
@@ -142,7 +143,7 @@ def test_formats_that_are_not_written_say_what_to_do(tmp_path: Path) -> None:
     for entry in SCENE_FORMATS:
         if entry.save is None:
             with pytest.raises(UsageError, match=re.escape(entry.not_written)):
-                save_scene(tmp_path / f"a{entry.suffixes[0]}", random_scene(3))
+                save_scene(tmp_path / (f"a{entry.suffixes[0]}" if entry.suffixes else entry.names[0]), random_scene(3))
 
 
 @pytest.mark.parametrize("suffix", [suffix for entry in SCENE_FORMATS for suffix in entry.suffixes])

@@ -3,16 +3,19 @@
 from __future__ import annotations
 
 import dataclasses
+import math
 
 import numpy as np
 import pytest
 
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_cameras, load_scene
-from potr_cl.model import virtual_cameras
 from potr_cl.model.camera import camera_centres, test_views, train_views
+from potr_cl.model.placement.candidates import places_to_try, views_from
+from potr_cl.model.placement.colour_memory import ac_basis, remembered
+from potr_cl.model.placement.matter import CROWDED, frame_of, matter_of, surroundings
 from potr_cl.model.scene import Scene
-from potr_cl.model.virtual_cameras import describe, is_virtual, place_cameras, standpoints
+from potr_cl.model.virtual_cameras import FEWEST, MOST, describe, is_virtual, place_cameras, plan, standpoints
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.rules import INRIA
@@ -75,7 +78,7 @@ def around_ball():
 
 def test_an_object_is_seen_from_all_sides(around_ball):
     outside = outside_ball(train_views(around_ball))
-    assert len(outside) >= 50
+    assert len(outside) >= len(train_views(around_ball)) // 2
     assert times_seen(BALL, BALL.means, outside).min() >= 4
     # It fills a good part of the picture.
     assert np.median([np.mean(in_view(BALL, c)) for c in outside]) > 0.7
@@ -83,43 +86,48 @@ def test_an_object_is_seen_from_all_sides(around_ball):
 
 
 def test_names_and_splits(around_ball):
-    assert (len(train_views(around_ball)), len(test_views(around_ball))) == (300, 37)
-    assert len({c.name for c in around_ball}) == 337
-    assert {(c.width, c.height) for c in around_ball} == {(600, 600)}
+    assert (len(train_views(around_ball)), len(test_views(around_ball))) == (96, 12)
+    assert len({c.name for c in around_ball}) == 108
+    assert {(c.width, c.height) for c in around_ball} == {(700, 700)}
     assert is_virtual(around_ball)
     assert not is_virtual([])
     assert not is_virtual([dataclasses.replace(around_ball[0], name="photo")])
-    assert describe(around_ball).startswith("300 virtual views and 37 to judge by placed ")
+    assert describe(around_ball).startswith("96 virtual views and 12 to judge by placed ")
     few = place_cameras(BALL, 5, 64)
     assert [c.split for c in few] == ["train"] * 5
     assert few[0].width == 64
     assert "judge" not in describe(few)
 
 
-@pytest.mark.slow
-def test_large_scenes_get_fewer_and_larger_views(monkeypatch):
-    def placed(splats_times_views: int) -> tuple[int, int]:
-        monkeypatch.setattr(virtual_cameras, "_SPLATS_TIMES_VIEWS", splats_times_views)
-        cameras = place_cameras(BALL)
-        return len(train_views(cameras)), cameras[0].width
+def test_a_plan_says_beforehand_what_is_placed(around_ball):
+    planned = plan(len(BALL))
+    assert (planned.training, planned.test) == (len(train_views(around_ball)), len(test_views(around_ball)))
+    assert planned.pixels == sum(c.width * c.height for c in train_views(around_ball))
+    assert str(planned) == f"{planned.training} views of {planned.size} x {planned.size} pixels"
 
-    assert placed(150 * len(BALL)) == (150, 849)
-    assert placed(20 * len(BALL)) == (100, 1000)
+
+def test_large_scenes_get_fewer_and_larger_views():
+    plans = [plan(splats) for splats in (1, 10_000, 1_000_000, 10_000_000)]
+    counts, sizes = [p.training for p in plans], [p.size for p in plans]
+    assert counts == sorted(counts, reverse=True)
+    assert sizes == sorted(sizes)
+    assert (counts[0], counts[-1]) == (MOST, FEWEST)
+    assert MOST > FEWEST
 
 
 def test_standpoints(around_ball):
     given = [dataclasses.replace(c, name="photo") for c in around_ball]
     assert np.array_equal(standpoints(given, BALL.means), camera_centres(given))
     places = standpoints(around_ball, BALL.means)
-    assert places.shape == (337, 4, 3)
+    assert places.shape == (108, 4, 3)
     assert np.allclose(places.mean(axis=1), camera_centres(around_ball))
     away = np.linalg.norm(places - camera_centres(around_ball)[:, None], axis=2)
-    # About the distance of the ball's surface on either side, near and far.
     assert np.allclose(away, away[:, :1])
-    ratio = away[:, 0] / np.linalg.norm(camera_centres(around_ball), axis=1)
-    assert np.allclose(
-        ratio[np.linalg.norm(camera_centres(around_ball), axis=1) > 2], virtual_cameras._AROUND, rtol=0.15
-    )
+    # In proportion to the distance of what is looked at, and well short of it.
+    distance = np.linalg.norm(camera_centres(around_ball), axis=1)
+    ratio = (away[:, 0] / distance)[distance > 2]
+    assert np.allclose(ratio, np.median(ratio), rtol=0.15)
+    assert 0.1 < np.median(ratio) < 0.5
 
 
 def test_the_same_every_time(around_ball):
@@ -250,7 +258,7 @@ def test_wrong_numbers(count, size):
 def test_the_basis_is_that_of_the_rasterizer():
     directions = np.random.default_rng(0).normal(size=(50, 3))
     directions /= np.linalg.norm(directions, axis=1, keepdims=True)
-    assert np.allclose(virtual_cameras._ac_basis(directions), sh_basis(directions, 3)[:, 1:], atol=1e-12)
+    assert np.allclose(ac_basis(directions), sh_basis(directions, 3)[:, 1:], atol=1e-12)
 
 
 def test_encode_places_them_itself(monkeypatch):
@@ -265,19 +273,21 @@ def test_encode_places_them_itself(monkeypatch):
 def test_trained_colours_remember_their_views(name, request):
     folder = request.getfixturevalue(name)
     scene, cameras = load_scene(folder / "point_cloud.ply"), load_cameras(folder / "cameras.json")
-    frame = virtual_cameras._frame(scene)
-    matter = virtual_cameras._matter(scene, frame)
-    places, _ = virtual_cameras._places(frame)
+    frame = frame_of(scene)
+    matter = matter_of(scene, frame)
+    half_view = math.tan(math.radians(25))
+    places, _ = places_to_try(frame, half_view)
     true = (camera_centres(cameras) - frame.centre) / frame.unit
     shown, kept = [], []
     for number, camera_centre in enumerate(np.concatenate([true, places[::2]])):
-        horizon, blocked = virtual_cameras._surroundings(camera_centre, matter)
-        if number < len(true) or blocked <= virtual_cameras._CROWDED:
+        horizon, blocked = surroundings(camera_centre, matter)
+        if number < len(true) or blocked <= CROWDED:
             kept.append(camera_centre)
-            view = virtual_cameras._views_from(camera_centre, virtual_cameras._HALF_VIEW, horizon, frame, matter)
-            shown.append(view[1].max(axis=0))
-    remembered = virtual_cameras._remembered(np.array(kept), shown, matter)
-    of_true, of_others = remembered[: len(true)], remembered[len(true) :]
+            _, worth, _ = views_from(camera_centre, half_view, 1.0, horizon, frame, matter)
+            shown.append(worth.max(axis=0))
+    memory = remembered(np.array(kept), shown, matter)
+    assert memory is not None
+    of_true, of_others = memory[: len(true)], memory[len(true) :]
     assert of_true.min() > 0.65
     assert np.quantile(of_true, 0.1) > 0.78
     assert np.mean(of_others < 0.6) > 0.35

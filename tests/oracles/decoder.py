@@ -58,6 +58,8 @@ class Header(NamedTuple):
     edge: float
     scale_factors: dict[int, float]
     sh_factors: tuple[float, float]
+    antialiased: bool
+    low_pass: float
 
 
 class Section(NamedTuple):
@@ -103,7 +105,8 @@ def decode(data: bytes) -> dict[str, Any]:
     """Decode a file; the arrays are float64 and in the format's order of splats.
 
     Keys: means (N, 3), scales (N, 3) linear, quaternions (N, 4) as w x y z, opacities (N,), sh (N, M, 3) as RGB,
-    and metadata, a dict. Raises ValueError for a file that breaks the format.
+    metadata, a dict, and how the scene is to be rendered: antialiased, a bool, and low_pass, square pixels. Raises
+    ValueError for a file that breaks the format.
     """
     header = read_header(data)
     sections = read_sections(data, header)
@@ -114,6 +117,8 @@ def decode(data: bytes) -> dict[str, Any]:
         "opacities": decode_opacities(sections, header),
         "sh": decode_sh(sections, header),
         "metadata": decode_metadata(sections),
+        "antialiased": header.antialiased,
+        "low_pass": header.low_pass,
     }
 
 
@@ -137,7 +142,7 @@ def read_header(data: bytes) -> Header:
     (checksum,) = struct.unpack_from("<I", data, header_size - 4)
     check(zlib.crc32(data[: header_size - 4]) == checksum, "the header's checksum is wrong")
 
-    check(flags == 0, f"unknown flags {flags}")
+    check(flags in (0, 1, 3), f"unknown flags {flags}")
     check(data[36:40] == bytes(4), "bytes 36 to 39 are not zero")
     ac_factor = scale_factors[3]
     if version == 1:
@@ -164,6 +169,8 @@ def read_header(data: bytes) -> Header:
         edge=edge,
         scale_factors=dict(zip((SCALE, ROTATION, OPACITY), scale_factors[:3], strict=True)),
         sh_factors=(scale_factors[3], ac_factor),
+        antialiased=flags % 2 == 1,
+        low_pass=0.1 if flags == 3 else 0.3,
     )
 
 

@@ -145,8 +145,11 @@ def test_a_stage_within_another_counts_for_itself(monkeypatch):
 def test_views_that_see_nothing(device):
     scene = random_scene(60, 1)
     away = [dataclasses.replace(c, translation=np.array([0, 0, -50.0])) for c in ring_of_cameras(2)]
-    left, _ = reduced(scene, [dataclasses.replace(c, split="train") for c in away], FEW, device)
+    away = [dataclasses.replace(c, split="train") for c in away]
+    left, _ = reduced(scene, away, FEW.changed(prune={"unseen": "drop"}), device)
     assert len(left) == 1  # an empty scene is no scene
+    left, _ = reduced(scene, away, FEW, device)
+    assert len(left) == len(scene)
 
 
 @pytest.mark.parametrize(

@@ -147,7 +147,13 @@ def test_identical_views_are_left_out_of_the_mean_and_said():
 def test_sizes():
     a, b = SceneFile(Path("a.ply"), 5000, 20, 3), SceneFile(Path("b.potr"), 500, 10, 3)
     assert size_report(a, b)["size_ratio"] == 10
-    assert size_report(a, b)["b"] == {"file": "b.potr", "bytes": 500, "splats": 10, "sh_degree": 3}
+    assert size_report(a, b)["b"] == {
+        "file": "b.potr",
+        "bytes": 500,
+        "splats": 10,
+        "sh_degree": 3,
+        "antialiased": False,
+    }
     assert "B is 10.0 times smaller" in format_sizes(a, b)
     assert "B is 10.0 times larger" in format_sizes(b, a)
 

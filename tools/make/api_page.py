@@ -23,15 +23,29 @@ from tools.make.markdown import NOTICE, cell, table
 
 #: The names of the package by what one does with them, in the order of the page. All of ``potr_cl.__all__`` stand here.
 _PUBLIC = {
-    "Scenes and cameras": ("load_scene", "load_cameras", "place_cameras", "Scene", "Camera"),
-    "Encode": ("encode", "EncodeOptions", "Encoded", "encode_to_target", "Target"),
-    "Decode and render": ("decode", "render"),
+    "Files of scenes and cameras": (
+        "read_scene",
+        "read_cameras",
+        "load_scene",
+        "load_cameras",
+        "save",
+        "convert",
+        "info",
+        "SceneInfo",
+        "Scene",
+        "Camera",
+    ),
+    "Encode and decode": ("encode", "Encoded", "EncodeOptions", "encode_to_target", "Target", "decode"),
+    "One stage alone": ("prune", "PrunedScene", "compact", "CompactedScene", "refit", "RefittedScene"),
+    "Pictures": ("render", "Rendering", "Renderings", "preview", "compare", "SceneComparison"),
+    "Views for scenes without cameras": ("place_cameras", "look_around", "turntable"),
     "Errors": ("PotrError", "DataError", "UsageError", "DeviceError", "DeviceMemoryError", "UnreachableError"),
 }
 
 #: Modules that are told in full to those who build on the package or change it; of a name that ends with a dot, all
 #: modules of that folder.
 _MODULES = (
+    "potr_cl.api.",
     "potr_cl.formats.",
     "potr_cl.stages.",
     "potr_cl.pipeline.",
@@ -104,16 +118,21 @@ def _index() -> Iterator[tuple[str, str]]:
         yield found.name, _inline(re.split(r"(?<=[.?!])(?<!et al\.)\s", first)[0])
 
 
+def _is_above(name: str, value: Any) -> bool:
+    """Whether this very thing stands among the public names; a module may have another of the same name."""
+    return name in potr_cl.__all__ and getattr(potr_cl, name) is value
+
+
 def _module(module: ModuleType) -> Iterator[str]:
     yield f"### {module.__name__}"
     if module.__doc__:
         yield _markdown(module.__doc__)
     own = {name: value for name, value in vars(module).items() if _is_own(module, name, value)}
-    above = [f"[`{name}`](#{name.lower()})" for name in own if name in potr_cl.__all__]
+    above = [f"[`{name}`](#{name.lower()})" for name in own if _is_above(name, own[name])]
     if above:
         yield f"{', '.join(above)}: see above."
     for name, value in own.items():
-        if name not in potr_cl.__all__:
+        if not _is_above(name, value):
             yield from _object(name, value, "####")
 
 

@@ -10,6 +10,7 @@ may change, what a decoder makes of an old file may not.
 
 from __future__ import annotations
 
+import dataclasses
 import subprocess
 import sys
 from pathlib import Path
@@ -17,7 +18,7 @@ from pathlib import Path
 import numpy as np
 
 from potr_cl.codec.decoder import PotrFile
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
@@ -63,6 +64,13 @@ def main() -> None:
         "degree2_coincident_balanced": encode(coincident, None, best),
         "degree0_one_splat_balanced": encode(random_scene(1, 0, seed=14), None, best),
         "degree0_deep_balanced": encode(_with_means(random_scene(40, 0, seed=15), deep), None, best),
+    }
+    small = random_scene(120, 1, seed=16)
+    sharper = dataclasses.replace(small, antialiased=True, low_pass=MIP_SPLATTING_LOW_PASS)
+    scenes |= {
+        "degree1_antialiased": encode(small.rendered(True), cameras, KEEP),
+        "degree1_antialiased_balanced": encode(small.rendered(True), cameras, fast),
+        "degree1_mip_splatting": encode(sharper, cameras, best),
     }
     for name, encoded in scenes.items():
         version = PotrFile.from_bytes(b"".join(encoded.pieces)).header.version

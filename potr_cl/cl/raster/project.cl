@@ -9,14 +9,20 @@
        SH_COUNT       see sh.clh;
        NEAR           splats whose depth is at or below it are not drawn, in world units;
        SQUARE_EXTENT  1: a splat is drawn only in the tiles that the original's square of three standard deviations
-                      touches; 0: wherever its alpha reaches 1/255. */
+                      touches; 0: wherever its alpha reaches 1/255;
+       ANTIALIASED    1: what the low-pass filter adds to a splat's area it takes from its opacity, which is multiplied
+                      by sqrt(det S / det(S + LOW_PASS I)), S the covariance on screen; 0, the default: it does not;
+       LEAST_COMPENSATION_SQUARED  the least value under that root; must be given if ANTIALIASED;
+       LOW_PASS, LOW_PASS_SQUARED  square pixels added to a splat's variances on screen, and their square. */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
 #include "include/view_set.clh"
 #include "include/sh.clh"
 
-/* Square pixels added to a splat's variances on screen, and their square. */
+#ifndef ANTIALIASED
+#define ANTIALIASED 0
+#endif
 #ifndef LOW_PASS
 #define LOW_PASS 0.3f
 #define LOW_PASS_SQUARED 0.09f
@@ -116,6 +122,11 @@ kernel void project(
     vfloat n1 = mx[2] * my[0] - mx[0] * my[2];
     vfloat n2 = mx[0] * my[1] - mx[1] * my[0];
     vfloat determinant = n0 * n0 + n1 * n1 + n2 * n2 + LOW_PASS * (sxx + syy) + LOW_PASS_SQUARED;
+#if ANTIALIASED
+    vfloat kept = (n0 * n0 + n1 * n1 + n2 * n2) / determinant;
+    lo += 0.5f * log2(fmax(kept, LEAST_COMPENSATION_SQUARED));
+    drawn = drawn && (lo >= LOG2_ALPHA_MIN);
+#endif
     sxx += LOW_PASS;
     syy += LOW_PASS;
 

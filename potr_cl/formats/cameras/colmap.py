@@ -13,6 +13,7 @@ import struct
 from collections.abc import Iterator
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -24,7 +25,11 @@ from potr_cl.formats.cameras.view_files import (
     excerpt,
     image_name,
     image_side,
+    lens_coefficients,
+    lens_of,
+    pinhole_fields,
     read_bytes,
+    tell_of_lenses,
     view_names,
 )
 from potr_cl.formats.declaration import CameraFormat
@@ -35,8 +40,20 @@ _MODELS = (
     *("SIMPLE_PINHOLE", "PINHOLE", "SIMPLE_RADIAL", "RADIAL", "OPENCV", "OPENCV_FISHEYE", "FULL_OPENCV", "FOV"),
     *("SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE", "THIN_PRISM_FISHEYE", "RAD_TAN_THIN_PRISM_FISHEYE"),
 )
-#: Those without distortion, and how many parameters they have.
-_PINHOLES = {"SIMPLE_PINHOLE": 3, "PINHOLE": 4}
+#: Those that are read, and the names of their parameters in order: one focal length or two, the principal point, and
+#: what :class:`potr_cl.model.lens.Lens` calls the rest.
+_READ = {
+    "SIMPLE_PINHOLE": "f cx cy",
+    "PINHOLE": "fx fy cx cy",
+    "SIMPLE_RADIAL": "f cx cy k1",
+    "RADIAL": "f cx cy k1 k2",
+    "OPENCV": "fx fy cx cy k1 k2 p1 p2",
+    "FULL_OPENCV": "fx fy cx cy k1 k2 p1 p2 k3 q1 q2 q3",
+    "SIMPLE_RADIAL_FISHEYE": "f cx cy k1",
+    "RADIAL_FISHEYE": "f cx cy k1 k2",
+    "OPENCV_FISHEYE": "fx fy cx cy k1 k2 k3 k4",
+    "THIN_PRISM_FISHEYE": "fx fy cx cy k1 k2 p1 p2 k3 k4 s1 s2",
+}
 
 _CAMERA = struct.Struct("<IiQQ")  # id, model, width, height; then the parameters as float64
 _IMAGE = struct.Struct("<I7dI")  # id, rotation, translation, camera; then the name, a zero, the 2-D points
@@ -47,11 +64,29 @@ _LARGEST_ID = 2**32 - 1
 
 @dataclass(frozen=True)
 class _Lens:
-    """A camera as COLMAP means it: what images have in common. ``params``: focal lengths and principal point."""
+    """A camera as COLMAP means it: what images have in common. ``params``: in the order that the model has them."""
 
+    model: str
     width: int
     height: int
     params: tuple[float, ...]
+
+    def fields(self, where: str) -> dict[str, Any]:
+        """What :func:`camera_of` takes of it."""
+        named = dict(zip(_READ[self.model].split(), self.params, strict=True))
+        fx = named.get("fx", named.get("f"))
+        size = {
+            "width": image_side(self.width, f"{where}: the width of its camera"),
+            "height": image_side(self.height, f"{where}: the height of its camera"),
+        }
+        frame = {**size, "fx": fx, "fy": named.get("fy", fx), "cx": named["cx"], "cy": named["cy"]}
+        lens = lens_coefficients(named, fisheye="FISHEYE" in self.model)
+        if lens is None:
+            return frame
+        try:
+            return pinhole_fields(lens_of(**frame, **lens))
+        except DataError as error:
+            raise DataError(f"{where}: {error}") from error
 
 
 @dataclass(frozen=True)
@@ -84,7 +119,7 @@ def load(folder: Path) -> list[Camera]:
 
     Raises:
         UsageError: a file cannot be opened.
-        DataError: the model is damaged, or a camera is not a pinhole.
+        DataError: the model is damaged, or a camera is of a model that is not read.
     """
     ending = ".bin" if (folder / "cameras.bin").exists() else ".txt"
     lenses, images = _lenses(folder / f"cameras{ending}"), _images(folder / f"images{ending}")
@@ -96,16 +131,19 @@ def load(folder: Path) -> list[Camera]:
             raise DataError(f"'{folder}' is a damaged COLMAP model: image {image.number} has an unknown camera")
     files = [image_name(image.name, f"'{path}': the name of image {image.number}") for image in images]
     ground_truth = _ground_truth(folder)
-    return [
+    cameras = [
         _camera(path, image, lenses[image.lens], name, split, ground_truth / file if ground_truth else None)
         for image, name, file, split in zip(images, view_names(files, path), files, every_eighth(files), strict=True)
     ]
+    tell_of_lenses(folder, cameras)
+    return cameras
 
 
 FORMAT = CameraFormat(
     name="COLMAP model (cameras and images as .bin or .txt)",
     suffixes=(".bin", ".txt"),
-    note="binary or text, also in the folder `sparse/0` or `sparse`; every 8th view by name is a test view",
+    note="binary or text, with or without lens distortion, also in the folder `sparse/0` or `sparse`; every 8th view "
+    "by name is a test view",
     recognises=lambda path, content: is_model(path.parent),
     load=lambda path, content: load(path.parent),
     is_in=is_model,
@@ -120,12 +158,7 @@ def _camera(path: Path, image: _Image, lens: _Lens, name: str, split: str, groun
     return camera_of(
         path,
         name=name,
-        width=image_side(lens.width, f"'{path}', view '{name}': the width of its camera"),
-        height=image_side(lens.height, f"'{path}', view '{name}': the height of its camera"),
-        fx=lens.params[0],
-        fy=lens.params[-3],  # the only focal length of a SIMPLE_PINHOLE
-        cx=lens.params[-2],
-        cy=lens.params[-1],
+        **lens.fields(f"'{path}', view '{name}'"),
         rotation=_matrix(*image.rotation),
         translation=np.array(image.translation),
         split=split,
@@ -171,10 +204,10 @@ def _images(path: Path) -> list[_Image]:
     return sorted(images, key=lambda image: image.name)
 
 
-def _distorted(path: Path, camera: str, model: str) -> DataError:
+def _unread(path: Path, camera: str, model: str) -> DataError:
     return DataError(
-        f"'{path}': camera {camera} has the model {excerpt(model)}, only {' and '.join(_PINHOLES)} are supported: "
-        "undistort the images with 'colmap image_undistorter' and use the model that it writes"
+        f"'{path}': camera {camera} has the model {excerpt(model)}, which is not read: undistort the images with "
+        "'colmap image_undistorter' and use the model that it writes"
     )
 
 
@@ -200,11 +233,11 @@ def _binary_lenses(data: bytes, path: Path) -> Iterator[tuple[int, _Lens]]:
         for _ in range(count):
             number, model, width, height = _CAMERA.unpack_from(data, offset)
             name = _MODELS[model] if 0 <= model < len(_MODELS) else f"number {model}"
-            if name not in _PINHOLES:
-                raise _distorted(path, str(number), name)
-            params = struct.unpack_from(f"<{_PINHOLES[name]}d", data, offset + _CAMERA.size)
+            if name not in _READ:
+                raise _unread(path, str(number), name)
+            params = struct.unpack_from(f"<{len(_READ[name].split())}d", data, offset + _CAMERA.size)
             offset += _CAMERA.size + 8 * len(params)
-            yield number, _Lens(width, height, params)
+            yield number, _Lens(name, width, height, params)
     except struct.error as error:
         raise _truncated(path) from error
     if offset != len(data):
@@ -237,12 +270,12 @@ def _text_lenses(data: bytes, path: Path) -> Iterator[tuple[int, _Lens]]:
             continue
         if len(fields) < 4:
             raise _truncated(path)
-        if fields[1] not in _PINHOLES:
-            raise _distorted(path, excerpt(fields[0]), fields[1])
-        if len(fields) != 4 + _PINHOLES[fields[1]]:
+        if fields[1] not in _READ:
+            raise _unread(path, excerpt(fields[0]), fields[1])
+        if len(fields) != 4 + len(_READ[fields[1]].split()):
             raise _truncated(path)
         params = tuple(_real(field, path) for field in fields[4:])
-        yield _whole(fields[0], path), _Lens(_whole(fields[2], path), _whole(fields[3], path), params)
+        yield _whole(fields[0], path), _Lens(fields[1], _whole(fields[2], path), _whole(fields[3], path), params)
 
 
 def _text_images(data: bytes, path: Path) -> Iterator[_Image]:

@@ -32,9 +32,13 @@ from potr_cl.formats.cameras.view_files import (
     excerpt,
     image_name,
     image_side,
+    lens_coefficients,
+    lens_of,
     matrix,
     number,
+    pinhole_fields,
     read_json,
+    tell_of_lenses,
     view_names,
 )
 from potr_cl.formats.declaration import CameraFormat
@@ -42,7 +46,10 @@ from potr_cl.model.camera import Camera
 
 _log = logging.getLogger("potr_cl")
 
-_PINHOLES = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE")  # OPENCV without distortion is a pinhole
+#: Models of nerfstudio and COLMAP, all of them Brown's, of which some coefficients may be missing; and the fisheyes.
+_BROWN = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL", "RADIAL")
+_FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
+#: As nerfstudio has them: k3 and k4 are further radial terms of both kinds.
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 
@@ -83,7 +90,8 @@ def load(path: Path) -> list[Camera]:
 
     Raises:
         UsageError: the file cannot be opened.
-        DataError: it is no transforms file, a frame of it is damaged, or its lens is distorted.
+        DataError: it is no transforms file, a frame of it is damaged, or its camera is no pinhole, not even a distorted
+            one.
     """
     return parse([(read_json(path), path)])
 
@@ -108,7 +116,7 @@ FORMAT = CameraFormat(
     name="transforms.json",
     suffixes=(".json",),
     note="of Blender (`transforms_train.json`, `transforms_test.json`) and of nerfstudio, with its "
-    "`dataparser_transforms.json`",
+    "`dataparser_transforms.json`, with or without lens distortion",
     recognises=lambda path, content: isinstance(content, dict) and "frames" in content,
     load=lambda path, content: parse([(content, path)]),
     is_in=is_in,
@@ -127,10 +135,12 @@ def parse(contents: list[tuple[Any, Path]]) -> list[Camera]:
         frames += of_file
     names = view_names([frame.file for frame in frames], contents[0][1])
     placements = {path: _placement(content, path) for content, path in contents}
-    return [
+    cameras = [
         _camera(frame, name, split, *placements[frame.path])
         for frame, name, split in zip(frames, names, splits, strict=True)
     ]
+    tell_of_lenses(contents[0][1], cameras)
+    return cameras
 
 
 def _frames(content: Any, path: Path) -> list[_Frame]:
@@ -171,7 +181,7 @@ def _listed(content: dict[str, Any], key: str, files: list[str], path: Path) -> 
 
 
 def _camera(frame: _Frame, name: str, split: str, placement: NDArray[np.float64], scale: float) -> Camera:
-    _check_lens(frame)
+    distortion = _distortion(frame)
     image = _image_path(frame)
     width, height = _image_size(frame, image)
     fx = _focal_length(frame, "x", width)
@@ -184,15 +194,23 @@ def _camera(frame: _Frame, name: str, split: str, placement: NDArray[np.float64]
         raise DataError(f"{frame.where('transform_matrix')}: its last row is not 0 0 0 1")
     to_world = placement @ np.vstack([to_world[:3], (0, 0, 0, 1)])
     rotation = (to_world[:3, :3] @ _OPENGL_TO_OPENCV).T
+    fields: dict[str, Any] = {
+        "width": width,
+        "height": height,
+        "fx": fx,
+        "fy": fx if fy is None else fy,
+        "cx": width / 2 if cx is None else cx,
+        "cy": height / 2 if cy is None else cy,
+    }
+    if distortion is not None:
+        try:
+            fields = pinhole_fields(lens_of(**fields, **distortion))
+        except DataError as error:
+            raise DataError(f"'{frame.path}', frame {frame.index}: {error}") from error
     return camera_of(
         frame.path,
         name=name,
-        width=width,
-        height=height,
-        fx=fx,
-        fy=fx if fy is None else fy,
-        cx=width / 2 if cx is None else cx,
-        cy=height / 2 if cy is None else cy,
+        **fields,
         rotation=rotation,
         translation=-rotation @ (scale * to_world[:3, 3]),
         split=split,
@@ -200,18 +218,16 @@ def _camera(frame: _Frame, name: str, split: str, placement: NDArray[np.float64]
     )
 
 
-def _check_lens(frame: _Frame) -> None:
-    mend = "undistort the images first ('colmap image_undistorter', then load its sparse model) and train on them"
+def _distortion(frame: _Frame) -> dict[str, Any] | None:
+    """The coefficients of the frame's lens, as :func:`lens_coefficients` gives them."""
+    mend = "leave these views out, or cut them into pinhole views, as nerfstudio's ns-process-data does"
     model = frame.get("camera_model")
-    if model is not None and model not in _PINHOLES:
+    if model is not None and model not in (*_BROWN, *_FISHEYES):
         raise DataError(
-            f"{frame.where('camera_model')} is {excerpt(model)}, only pinhole cameras are supported: {mend}"
+            f"{frame.where('camera_model')} is {excerpt(model)}, whose pictures no pinhole view can stand for: {mend}"
         )
-    for key in _DISTORTION:
-        if frame.number(key):
-            raise DataError(f"{frame.where(key)} is {frame.number(key)}, only undistorted views are supported: {mend}")
-    if frame.get("is_fisheye") is True:
-        raise DataError(f"{frame.where('is_fisheye')} is set, only pinhole cameras are supported: {mend}")
+    values = {key: frame.number(key) or 0.0 for key in _DISTORTION}
+    return lens_coefficients(values, fisheye=model in _FISHEYES or frame.get("is_fisheye") is True)
 
 
 def _image_path(frame: _Frame) -> Path:

@@ -3,9 +3,12 @@
 from __future__ import annotations
 
 import collections
+import functools
 import json
+import logging
+import math
 import os
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -14,6 +17,9 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.camera import Camera
+from potr_cl.model.lens import MOST_HALF_FIELD, Lens, Pinhole
+
+_log = logging.getLogger("potr_cl")
 
 IMAGE_SUFFIXES = frozenset({".png", ".jpg", ".jpeg", ".webp", ".bmp", ".tif", ".tiff", ".exr", ".heic"})
 
@@ -118,6 +124,67 @@ def camera_of(path: Path, **fields: Any) -> Camera:
             return Camera(**fields)
     except DataError as error:
         raise DataError(f"'{path}', {error}") from error
+
+
+@functools.lru_cache(maxsize=64)
+def lens_of(**values: Any) -> Lens:
+    """A lens; views mostly share one.
+
+    Raises:
+        DataError: the values are no lens's.
+    """
+    return Lens(**values)
+
+
+@functools.lru_cache(maxsize=64)
+def _covering(lens: Lens) -> tuple[Pinhole, bool]:
+    return lens.covering()
+
+
+def lens_coefficients(values: Mapping[str, float], fisheye: bool) -> dict[str, Any] | None:
+    """The coefficients of a :class:`Lens` from k1 …, q1 …, p1, p2, s1 and s2, where missing ones are 0.
+
+    Returns:
+        What it takes besides size and intrinsics; None for a pinhole.
+    """
+
+    def series(letter: str, most: int) -> tuple[float, ...]:
+        found = [values.get(f"{letter}{number}", 0.0) for number in range(1, most + 1)]
+        while found and not found[-1]:
+            found.pop()
+        return tuple(found)
+
+    radial, quotient = series("k", 4), series("q", 3)
+    tangential, prism = ((values.get(f"{letter}1", 0.0), values.get(f"{letter}2", 0.0)) for letter in "ps")
+    if not (fisheye or radial or quotient or any(tangential) or any(prism)):
+        return None
+    return {"fisheye": fisheye, "radial": radial, "quotient": quotient, "tangential": tangential, "prism": prism}
+
+
+def pinhole_fields(lens: Lens) -> dict[str, Any]:
+    """What :func:`camera_of` takes of a view that covers the field of a distorted photograph.
+
+    Raises:
+        DataError: the view would have more pixels on a side than are read.
+    """
+    view, _ = _covering(lens)
+    if max(view.width, view.height) > _MAX_SIDE:
+        raise DataError(f"a pinhole view of its field has {view.width} x {view.height} pixels, too many")
+    return {**view._asdict(), "lens": lens}
+
+
+def tell_of_lenses(path: Path, cameras: Sequence[Camera]) -> None:
+    """Log one line if views have lens distortion."""
+    lenses = [camera.lens for camera in cameras if camera.lens is not None]
+    if not lenses:
+        return
+    cut = sum(not _covering(lens)[1] for lens in lenses)
+    widest = 2 * math.degrees(MOST_HALF_FIELD)
+    beyond = f"; of {cut} the edges are left out, beyond {widest:.0f} degrees or what the lens's formula describes"
+    _log.warning(
+        "'%s': %d of %d views have lens distortion: pinhole views that cover the same field stand for them%s",
+        path, len(lenses), len(cameras), beyond if cut else "",
+    )  # fmt: skip
 
 
 def view_names(files: Sequence[str], path: Path) -> list[str]:

@@ -13,7 +13,8 @@ from typing import BinaryIO
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.gsply_arrays import EXTRA, from_scene, library, to_scene
-from potr_cl.formats.scenes.scene_files import opened
+from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
+from potr_cl.formats.scenes.scene_files import opened, tell_of_low_pass
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 
@@ -53,8 +54,9 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     """
     with opened(path) as (file, size):
         gsply = library(path)
-        data = gsply.decompress_from_bytes(_canonical(path, file, size))
-    return to_scene(path, data)
+        content, comments = _canonical(path, file, size)
+        data = gsply.decompress_from_bytes(content)
+    return marked(to_scene(path, data), comments)
 
 
 def save(path: str | os.PathLike[str], scene: Scene) -> None:
@@ -65,8 +67,13 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
         PotrError: the system failed to write.
     """
     gsply = library(path)
+    tell_of_low_pass(path, scene)
+    content = gsply.compress_to_bytes(from_scene(gsply, scene))
+    if scene.antialiased:
+        first = f"ply\n{_FORMAT}\n".encode("ascii")
+        content = content.replace(first, first + f"comment {ANTIALIASED_COMMENT}\n".encode("ascii"), 1)
     with replacing(path) as file:
-        file.write(gsply.compress_to_bytes(from_scene(gsply, scene)))
+        file.write(content)
 
 
 FORMAT = SceneFormat(
@@ -80,9 +87,12 @@ FORMAT = SceneFormat(
 )
 
 
-def _canonical(path: str | os.PathLike[str], file: BinaryIO, size: int) -> bytearray:
-    """A file with a header of our own. Not as bytes: the library's kernels are compiled for arrays that can change."""
-    lines, start = _header_lines(path, file.read(_MAX_HEADER_BYTES))
+def _canonical(path: str | os.PathLike[str], file: BinaryIO, size: int) -> tuple[bytearray, list[str]]:
+    """A file with a header of our own, and the comments of its own.
+
+    Not as bytes: the library's kernels are compiled for arrays that can change.
+    """
+    lines, comments, start = _header_lines(path, file.read(_MAX_HEADER_BYTES))
     chunks, splats, rest = _counts(path, lines)
     elements = [("chunk", chunks, _BOUNDS), ("vertex", splats, _VERTEX), ("sh", splats, _coefficients(rest))]
     header = ["ply", _FORMAT]
@@ -98,19 +108,22 @@ def _canonical(path: str | os.PathLike[str], file: BinaryIO, size: int) -> bytea
     if len(content) < values:
         raise DataError(f"'{path}' became shorter while it was read")
     whole += content
-    return whole
+    return whole, comments
 
 
-def _header_lines(path: str | os.PathLike[str], head: bytes) -> tuple[list[str], int]:
-    """The lines between the first and the last of a header, without comments, and where the values start."""
+def _header_lines(path: str | os.PathLike[str], head: bytes) -> tuple[list[str], list[str], int]:
+    """The lines between the first and the last of a header, its comments, and where the values start."""
     lines: list[str] = []
+    comments: list[str] = []
     start = 0
     while (end := head.find(b"\n", start)) >= 0:
         line = head[start:end].decode("latin-1")
         start = end + 1
         if line == "end_header" and lines[:1] == ["ply"]:
-            return lines[1:], start
-        if not line.startswith(("comment ", "obj_info ")) and line != "comment":
+            return lines[1:], comments, start
+        if line.startswith(("comment ", "obj_info ")) or line == "comment":
+            comments.append(line.partition(" ")[2])
+        else:
             lines.append(line)
     raise DataError(f"'{path}' has a damaged PLY header")
 

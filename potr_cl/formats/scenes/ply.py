@@ -17,9 +17,11 @@ from plyfile import PlyData, PlyElement, PlyListProperty
 
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.scene_files import cleaned
+from potr_cl.formats.scenes.filter_3d import FILTER_3D, folded
+from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
+from potr_cl.formats.scenes.scene_files import NO_EXTENT, cleaned
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
+from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
 
 _log = logging.getLogger("potr_cl")
 
@@ -27,6 +29,8 @@ _log = logging.getLogger("potr_cl")
 _BLOCK_BYTES = 1 << 20
 _MAX_HEADER_BYTES = 1 << 20
 _NORMALS = ("nx", "ny", "nz")
+#: Properties f_rest_* of degree 3, and of degree 4, of which those of degree 3 are read.
+_MOST_REST, _REST_OF_DEGREE_4 = 45, 72
 
 
 @dataclass(frozen=True)
@@ -38,20 +42,25 @@ class _Header:
         byte_order: "<" or ">"; of no meaning for text.
         elements: with their number of rows, in file order.
         size: bytes up to the first value.
+        comments: without the word "comment".
     """
 
     text: bool
     byte_order: str
     elements: list[tuple[PlyElement, int]]
     size: int
+    comments: list[str]
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     """Read a trained scene from a PLY file.
 
     Accepted are binary files of either byte order and ASCII ones, properties in any order and of any numeric type,
-    with or without normals, SH degree 0 to 3 with ``f_rest_*`` channel after channel. Further properties and
-    elements are dropped. What had to be dropped or mended is reported once to the logger "potr_cl".
+    with or without normals, SH degree 0 to 3 with ``f_rest_*`` channel after channel; of degree 4, the coefficients of
+    degree 4 are dropped. Splats with two scales (2DGS) are flat along their third axis. Comments tell whether the scene
+    is antialiased (:mod:`potr_cl.formats.scenes.ply_comments`), or the property ``filter_3D``, which is folded into
+    scales and opacities (:mod:`potr_cl.formats.scenes.filter_3d`). Further properties and elements are dropped. What
+    had to be dropped or mended is reported once to the logger "potr_cl".
 
     Args:
         path: of the PLY file.
@@ -86,7 +95,9 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
     """Write a scene in the original layout, which every viewer opens.
 
     Binary little-endian float32: x y z, nx ny nz (zero), f_dc_*, f_rest_* (all red, all green, all blue), opacity,
-    scale_*, rot_*. The file appears under its name only when it is whole.
+    scale_*, rot_*. The header of an antialiased scene says so in a comment, as Brush's does; one with Mip-Splatting's
+    low-pass filter also has the property filter_3D, which is 0, as nothing is left to be folded in. The file appears
+    under its name only when it is whole.
 
     Args:
         path: of the file to write.
@@ -98,7 +109,13 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
     """
     rest = scene.sh.shape[1] - 1
     names = ["x", "y", "z", *_NORMALS, *_property_names(rest * 3)[3:]]
-    header = ["ply", "format binary_little_endian 1.0", f"element vertex {len(scene)}"]
+    end = len(names)
+    if scene.low_pass == MIP_SPLATTING_LOW_PASS:
+        names.append(FILTER_3D)
+    header = ["ply", "format binary_little_endian 1.0"]
+    if scene.antialiased:
+        header.append(f"comment {ANTIALIASED_COMMENT}")
+    header.append(f"element vertex {len(scene)}")
     header += [f"property float {name}" for name in names]
     header += ["end_header", ""]
     height = _BLOCK_BYTES // (4 * len(names))
@@ -112,9 +129,9 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
             block[:, 6:9] = scene.sh[span, 0]
             for channel in range(3):
                 block[:, 9 + channel * rest : 9 + (channel + 1) * rest] = scene.sh[span, 1:, channel]
-            block[:, -8] = scene.opacity_logits[span]
-            block[:, -7:-4] = scene.log_scales[span]
-            block[:, -4:] = scene.quaternions[span]
+            block[:, end - 8] = scene.opacity_logits[span]
+            block[:, end - 7 : end - 4] = scene.log_scales[span]
+            block[:, end - 4 : end] = scene.quaternions[span]
             file.write(block.data)
 
 
@@ -122,20 +139,21 @@ FORMAT = SceneFormat(
     name="3DGS PLY",
     suffixes=(".ply",),
     note="as the original implementation, gsplat, nerfstudio, Postshot, Brush and SuperSplat write it: SH degree 0 to "
-    "3, binary or ASCII, properties in any order; the original layout is written",
+    "3 (of 4, what 3 has), binary or ASCII, properties in any order, 2DGS too; the original layout is written",
     load=load,
     save=save,
+    starts=(b"ply\n", b"ply\r"),
 )
 
 
-def _property_names(rest: int) -> list[str]:
+def _property_names(rest: int, scales: int = 3) -> list[str]:
     """The properties that hold a splat with ``rest`` AC coefficients, in the original order, without normals."""
     return [
         *("x", "y", "z"),
         *(f"f_dc_{i}" for i in range(3)),
         *(f"f_rest_{i}" for i in range(rest)),
         "opacity",
-        *(f"scale_{i}" for i in range(3)),
+        *(f"scale_{i}" for i in range(scales)),
         *(f"rot_{i}" for i in range(4)),
     ]
 
@@ -143,20 +161,30 @@ def _property_names(rest: int) -> list[str]:
 def _read(path: str | os.PathLike[str], stream: io.FileIO, size: int) -> Scene:
     header = _read_header(path, stream)
     vertex, count = _vertex_element(path, header)
-    rest = _check_properties(path, header, vertex)
+    rest, scales = _check_properties(path, header, vertex)
     offset = _check_size(path, header, size)
     if count == 0:
         raise DataError(f"'{path}' holds no splat")
     _report_dropped(path, header, vertex, rest)
+    kept = min(rest, _MOST_REST)
+    if rest > kept:
+        _log.warning("'%s': SH degree 4 is left out: only degrees 0 to 3 are kept", path)
+    if scales < 3:
+        _log.warning("'%s' has two scales a splat (2DGS): the third is read as 1e-9 unit, along the third axis", path)
 
     scene = Scene(
         np.empty((count, 3), dtype=np.float32),
         np.empty((count, 3), dtype=np.float32),
         np.empty((count, 4), dtype=np.float32),
         np.empty(count, dtype=np.float32),
-        np.empty((count, 1 + rest // 3, 3), dtype=np.float32),
+        np.empty((count, 1 + kept // 3, 3), dtype=np.float32),
     )
-    columns = _columns(scene)
+    columns = _columns(scene, rest // 3)
+    if scales < 3:
+        columns.pop("scale_2")[:] = NO_EXTENT
+    filters = np.empty(count, dtype=np.float32) if FILTER_3D in {p.name for p in vertex.properties} else None
+    if filters is not None:
+        columns[FILTER_3D] = filters
     start = 0
     stream.seek(offset)
     blocks = _text_blocks if header.text else _binary_blocks
@@ -166,16 +194,17 @@ def _read(path: str | os.PathLike[str], stream: io.FileIO, size: int) -> Scene:
             for name, column in columns.items():
                 column[start : start + len(block)] = block[name]
             start += len(block)
-    return scene
+    if filters is not None:
+        return folded(scene, filters)
+    return marked(scene, header.comments)
 
 
-def _columns(scene: Scene) -> dict[str, FloatArray]:
-    """Where in the scene's arrays each property belongs: views of N values."""
+def _columns(scene: Scene, rest: int) -> dict[str, FloatArray]:
+    """Where in the scene's arrays each property belongs: views of N values. A channel has ``rest`` AC coefficients."""
     columns = {name: scene.means[:, i] for i, name in enumerate("xyz")}
-    rest = scene.sh.shape[1] - 1
     for channel in range(3):
         columns[f"f_dc_{channel}"] = scene.sh[:, 0, channel]
-        for i in range(rest):
+        for i in range(scene.sh.shape[1] - 1):
             columns[f"f_rest_{channel * rest + i}"] = scene.sh[:, 1 + i, channel]
     columns["opacity"] = scene.opacity_logits
     columns |= {f"scale_{i}": scene.log_scales[:, i] for i in range(3)}
@@ -192,6 +221,7 @@ def _read_header(path: str | os.PathLike[str], stream: io.FileIO) -> _Header:
     if newline is None:
         raise DataError(f"'{path}' is not a PLY file: it does not start with the line 'ply'")
     lines: list[bytes] = []
+    comments: list[str] = []
     counts = []
     position = 0
     while not (lines and lines[-1] == b"end_header"):
@@ -202,7 +232,8 @@ def _read_header(path: str | os.PathLike[str], stream: io.FileIO) -> _Header:
         position = end + len(newline)
         fields = line.split()
         if fields[:1] in ([b"comment"], [b"obj_info"]):
-            continue  # may be in any encoding
+            comments.append(line.partition(fields[0])[2].decode("latin-1"))  # may be in any encoding
+            continue
         if fields[:1] == [b"element"] and len(fields) == 3:
             counts.append(_count(path, fields[2]))
             line = b"element %s 0" % fields[1]
@@ -210,7 +241,7 @@ def _read_header(path: str | os.PathLike[str], stream: io.FileIO) -> _Header:
     # With counts of zero the library parses the header and has no values to read.
     try:
         ply = PlyData.read(io.BytesIO(b"\n".join([*lines, b""])))
-        return _Header(ply.text, ply.byte_order, list(zip(ply.elements, counts, strict=True)), position)
+        return _Header(ply.text, ply.byte_order, list(zip(ply.elements, counts, strict=True)), position, comments)
     except Exception as error:  # the library raises what its parts happen to raise
         raise DataError(f"'{path}' has a damaged PLY header: {_one_line(error)}") from error
 
@@ -229,8 +260,8 @@ def _vertex_element(path: str | os.PathLike[str], header: _Header) -> tuple[PlyE
     raise DataError(f"'{path}' is no 3DGS scene: it has no element 'vertex' (its elements: {_shortened(found)})")
 
 
-def _check_properties(path: str | os.PathLike[str], header: _Header, vertex: PlyElement) -> int:
-    """Check that the properties of a splat are all there; return the number of f_rest_* among them."""
+def _check_properties(path: str | os.PathLike[str], header: _Header, vertex: PlyElement) -> tuple[int, int]:
+    """Check that the properties of a splat are all there; return the numbers of f_rest_* and scale_* among them."""
     names = {p.name for p in vertex.properties}
     if "packed_position" in names:
         raise DataError(
@@ -238,8 +269,9 @@ def _check_properties(path: str | os.PathLike[str], header: _Header, vertex: Ply
             "or run 'splat-transform IN.compressed.ply OUT.ply'"
         )
     rest = sum(str(name).startswith("f_rest_") for name in names)
-    accepted = [3 * (m - 1) for m in SH_COEFFICIENTS]
-    missing = [name for name in _property_names(rest) if name not in names]
+    accepted = [*(3 * (m - 1) for m in SH_COEFFICIENTS), _REST_OF_DEGREE_4]
+    scales = 3 if "scale_2" in names or "scale_1" not in names else 2
+    missing = [name for name in _property_names(rest, scales) if name not in names]
     if missing:
         message = f"'{path}' is no 3DGS scene: its vertices lack the properties {_shortened(', '.join(missing))}"
         if "opacity" in names and {"red", "green", "blue"} <= names:
@@ -248,12 +280,11 @@ def _check_properties(path: str | os.PathLike[str], header: _Header, vertex: Ply
             message += "; this is a mesh or a point cloud"
         raise DataError(message)
     if rest not in accepted:
-        hint = " (SH degree 4: export at most 3 bands)" if rest == 72 else ""
-        raise DataError(f"'{path}': {rest} f_rest properties{hint}, expected one of {accepted}")
+        raise DataError(f"'{path}': {rest} f_rest properties, expected one of {accepted}")
     before = itertools.takewhile(lambda entry: entry[0] is not vertex, header.elements)
     if any(isinstance(p, PlyListProperty) for element in (vertex, *(e for e, _ in before)) for p in element.properties):
         raise DataError(f"'{path}': list properties in or before the element 'vertex' are not supported")
-    return rest
+    return rest, scales
 
 
 def _check_size(path: str | os.PathLike[str], header: _Header, size: int) -> int:
@@ -284,7 +315,7 @@ def _check_size(path: str | os.PathLike[str], header: _Header, size: int) -> int
 
 
 def _report_dropped(path: str | os.PathLike[str], header: _Header, vertex: PlyElement, rest: int) -> None:
-    known = {*_property_names(rest), *_NORMALS}
+    known = {*_property_names(rest), *_NORMALS, FILTER_3D}
     extra = [p.name for p in vertex.properties if p.name not in known]
     if extra:
         _log.warning("'%s': dropped %d unknown properties: %s", path, len(extra), _shortened(", ".join(extra)))

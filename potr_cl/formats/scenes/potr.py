@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from potr_cl.codec.container import MAGIC
 from potr_cl.codec.decoder import decode
 from potr_cl.formats.declaration import SceneFormat
 
@@ -11,4 +12,6 @@ FORMAT = SceneFormat(
     note="this package's own: what `encode` makes of a scene in any of these formats; files of every version are read",
     load=decode,
     not_written="a .potr file is made by the command encode, which reads all that convert reads",
+    starts=(MAGIC,),
+    packed=True,
 )

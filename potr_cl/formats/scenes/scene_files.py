@@ -7,20 +7,35 @@ import logging
 import os
 import stat
 from collections.abc import Iterator
+from contextvars import ContextVar
 from dataclasses import replace
+from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
 import numpy as np
 
 from potr_cl.codec import octree
+from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError, PotrError, UsageError
-from potr_cl.model.scene import Scene
+from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
+from potr_cl.model.scene import LOW_PASS, CleanReport, FloatArray, Scene
+
+#: Where somebody wants to know what was mended in files that are read.
+_MENDED: ContextVar[list[CleanReport] | None] = ContextVar("mended", default=None)
 
 _log = logging.getLogger("potr_cl")
 
 #: Eight bits cannot tell anything beyond from an opacity of 0 or 1.
 _LARGEST_LOGIT = np.float32(20)
 _LONG = np.float32(1e15)
+#: Characters of a value out of a file that a message shows.
+_LONGEST_SAID = 60
+#: Logarithm of a standard deviation that no picture shows, for splats that are flat.
+NO_EXTENT = np.float32(np.log(1e-9))
+#: As other tools read an opacity of 0 or 1 that a byte holds.
+LEAST_OPACITY = np.float32(1e-6)
+#: The SH basis function of degree 0: of formats that hold colours.
+SH_0 = 0.28209479177387814
 #: In formats of other tools a splat takes several bytes; of more than this a byte no scene is made.
 MOST_A_BYTE = 1
 
@@ -43,12 +58,111 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[BinaryIO, int]]:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
             raise UsageError(f"'{path}' is not a regular file")
-        try:
+        with reading(path):
             yield file, status.st_size
-        except (PotrError, MemoryError):
-            raise
-        except Exception as error:  # a library raises what its parts happen to raise
-            raise DataError(f"'{path}' is damaged or of another kind: {first_line(error)}") from error
+
+
+@contextlib.contextmanager
+def reading(path: str | os.PathLike[str]) -> Iterator[None]:
+    """Of a block that reads a file: whatever is raised in it is an error of ours.
+
+    Raises:
+        DataError: anything but memory failed.
+    """
+    try:
+        yield
+    except (PotrError, MemoryError):
+        raise
+    except Exception as error:  # a library raises what its parts happen to raise
+        raise DataError(f"'{path}' is damaged or of another kind: {first_line(error)}") from error
+
+
+def file_in_folder(path: str | os.PathLike[str], name: str) -> Path | None:
+    """The file ``name`` that a path means, which may be its own or that of the folder it is in; None for another file.
+
+    Args:
+        path: as the user gave it.
+        name: of the file, in lower case.
+    """
+    given = Path(path)
+    if given.name.lower() == name and not given.is_dir():
+        return given
+    return given / name if (given / name).is_file() else None
+
+
+def related(file: Path, name: object) -> Path:
+    """A file that ``file`` names, beside it or in a folder below.
+
+    Raises:
+        DataError: the name is none, or leads out of the folder; or there is a Git-LFS pointer in the file's place.
+    """
+    parts = PurePosixPath(name).parts if isinstance(name, str) else ()
+    if not parts or not all(part.isprintable() for part in parts) or {"..", "/", "//"} & set(parts):
+        raise DataError(f"'{file}' is damaged: it names a file {shown(name)}")
+    if PureWindowsPath(*parts).drive or any("\\" in part for part in parts):
+        raise DataError(f"'{file}' is damaged: it names a file {shown(name)}")
+    found = file.parent.joinpath(*parts)
+    refuse_lfs_pointer(found)
+    return found
+
+
+def shown(value: object) -> str:
+    """A value out of a file, for a message: not long."""
+    said = repr(value)
+    return said if len(said) <= _LONGEST_SAID else said[:_LONGEST_SAID] + "…"
+
+
+def joined(scenes: list[Scene]) -> Scene:
+    """Scenes as one; those of a lower SH degree get coefficients of zero.
+
+    It is antialiased if all are, alike; as in splat-transform, it is classic where they differ.
+
+    Args:
+        scenes: at least one.
+    """
+    if not scenes[1:]:
+        return scenes[0]
+    most = max(scene.sh.shape[1] for scene in scenes)
+    sh = np.zeros((sum(map(len, scenes)), most, 3), np.float32)
+    start = 0
+    for scene in scenes:
+        sh[start : start + len(scene), : scene.sh.shape[1]] = scene.sh
+        start += len(scene)
+    alike = len({(scene.antialiased, scene.low_pass) for scene in scenes}) == 1
+    return replace(
+        scenes[0].rendered(None if alike else False),
+        means=np.concatenate([scene.means for scene in scenes]),
+        log_scales=np.concatenate([scene.log_scales for scene in scenes]),
+        quaternions=np.concatenate([scene.quaternions for scene in scenes]),
+        opacity_logits=np.concatenate([scene.opacity_logits for scene in scenes]),
+        sh=sh,
+    )
+
+
+def logits(opacities: FloatArray) -> FloatArray:
+    """Logits of opacities from bytes, (N,); 0 and 1 become what eight bits cannot tell from them."""
+    inside = np.clip(opacities, LEAST_OPACITY, np.float32(1) - LEAST_OPACITY)
+    return natural_logarithm(inside / (np.float32(1) - inside))
+
+
+def log_of_scales(scales: FloatArray) -> FloatArray:
+    """Logarithms of standard deviations, (N, 3); splats without extent get one that no picture shows.
+
+    Negative ones have no logarithm: NaN, so that their splats are dropped.
+    """
+    flat = np.maximum(scales.reshape(-1), np.exp(NO_EXTENT))
+    return np.where(scales >= 0, natural_logarithm(flat).reshape(scales.shape), np.float32(np.nan))
+
+
+@contextlib.contextmanager
+def noting_mends() -> Iterator[list[CleanReport]]:
+    """Of all scenes that are read within the block, what had to be mended; the log is not told of it then."""
+    mended: list[CleanReport] = []
+    token = _MENDED.set(mended)
+    try:
+        yield mended
+    finally:
+        _MENDED.reset(token)
 
 
 def cleaned(path: str | os.PathLike[str], scene: Scene) -> Scene:
@@ -61,6 +175,10 @@ def cleaned(path: str | os.PathLike[str], scene: Scene) -> Scene:
         scene, report = scene.cleaned()
     except DataError as error:
         raise DataError(f"'{path}': {error}") from error
+    noted = _MENDED.get()
+    if noted is not None:
+        noted.append(report)
+        return scene
     if report.non_finite:
         _log.warning("'%s': dropped %d splats with non-finite values", path, report.non_finite)
     if report.infinite_opacities:
@@ -68,6 +186,18 @@ def cleaned(path: str | os.PathLike[str], scene: Scene) -> Scene:
     if report.zero_quaternions:
         _log.warning("'%s': turned %d quaternions of length zero into no rotation", path, report.zero_quaternions)
     return scene
+
+
+def tell_of_low_pass(path: str | os.PathLike[str], scene: Scene) -> None:
+    """Say that a format which knows only the usual low-pass filter cannot hold a scene's own."""
+    if scene.low_pass != LOW_PASS:
+        _log.warning(
+            "'%s': this format cannot say that the scene has a low-pass filter of %g square pixels, as Mip-Splatting's "
+            "have: it will be drawn with the usual %g, a little softer",
+            path,
+            scene.low_pass,
+            LOW_PASS,
+        )
 
 
 def arranged(scene: Scene) -> Scene:

@@ -1,6 +1,6 @@
-"""Scenes as SOG files (PlayCanvas' .sog), version 2: a zip archive of a description and lossless WebP images.
+"""Scenes as SOG (PlayCanvas), version 2: a description and lossless WebP images, in a zip archive (.sog) or a folder.
 
-A pixel is a splat. Everything is read once: what is checked is what is used.
+A pixel is a splat. What is checked is what is used: a folder's files are read once.
 """
 
 from __future__ import annotations
@@ -10,6 +10,8 @@ import json
 import math
 import os
 import zipfile
+from collections.abc import Callable
+from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -18,15 +20,19 @@ from numpy.typing import NDArray
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, cleaned, opened
+from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, cleaned, file_in_folder, opened, reading, related
 from potr_cl.model.claims import check_claim
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
+#: Of the scene, in an archive or a folder.
+DESCRIPTION = "meta.json"
 #: What is packed in a SOG file is compressed already; only its description shrinks.
 _DESCRIPTION_BYTES = 1 << 22
 #: Others take memory that an archive's size does not bound.
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
 _CODEBOOK = 256
+#: The "model" of a scene that was trained with antialiasing; one without has none.
+_ANTIALIASED = "antialiased"
 #: Most entries of a palette of SH coefficients; they stand 64 in a row.
 _PALETTE, _PALETTE_COLUMNS = 1 << 16, 64
 #: The alpha of a quaternion's pixel: this and the number of its largest part, of w, x, y, z.
@@ -40,60 +46,141 @@ U8 = NDArray[np.uint8]
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
-    """Read a scene from a SOG file.
+    """Read a scene from a SOG file or folder.
 
     Args:
-        path: of the file.
+        path: of the .sog, or of the file meta.json in a folder, or of that folder.
         trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
 
     Raises:
         UsageError: there is no such file.
         DataError: it is damaged, of another version, or holds too many splats for its size.
     """
+    folder = file_in_folder(path, DESCRIPTION)
+    if folder is not None:
+        parts = Folder(folder)
+        with reading(path):
+            return cleaned(path, Sog(path, parts.description(), parts.stored, parts.size, trust).scene())
     with opened(path) as (file, size):
-        scene = _Archive(path, file, size, trust).scene()
+        archive = _opened_archive(path, file, size)
+        scene = Sog(path, archive.read(DESCRIPTION), archive.read, size, trust).scene()
     return cleaned(path, scene)
 
 
 FORMAT = SceneFormat(
     name="SOG",
     suffixes=(".sog",),
-    note="of PlayCanvas; version 2 is read",
+    names=(DESCRIPTION,),
+    note="of PlayCanvas; version 2 is read, packed (`.sog`) or as a folder",
     load=load,
-    not_written="nothing here writes .sog: convert to .ply, and that with splat-transform",
+    starts=(b"PK\x03\x04",),
+    not_written="nothing here writes SOG: convert to .ply, and that with splat-transform",
+    packed=True,
 )
 
 
-class _Archive:
-    """The files of a SOG archive, of which nothing is trusted."""
+class Folder:
+    """The files of a SOG folder, each of which is read once.
 
-    def __init__(self, path: str | os.PathLike[str], file: BinaryIO, size: int, trust: bool) -> None:
+    Args:
+        path: of its description.
+
+    Attributes:
+        size: bytes of the description and the images that it names.
+
+    Raises:
+        UsageError: one of the files cannot be opened.
+        DataError: the description is damaged, or names a file outside of the folder.
+    """
+
+    def __init__(self, path: Path) -> None:
         self._path = path
-        self._zip = zipfile.ZipFile(file)
-        entries = self._zip.infolist()
-        if sum(entry.file_size for entry in entries) > 2 * size + _DESCRIPTION_BYTES:
-            raise self._damaged("it would unpack to far more than its size")
-        if any(entry.compress_size > size for entry in entries):
-            raise self._damaged("its contents are said to be larger than itself")  # room would be made for them
-        if any(entry.compress_type not in _METHODS for entry in entries):
-            raise self._damaged("it is packed in a way that no SOG file is")
-        meta = json.loads(self._zip.read("meta.json"))
+        with opened(path) as (file, size):
+            if size > _DESCRIPTION_BYTES:
+                raise DataError(f"'{path}' is no description of a SOG scene: it has {size} bytes")
+            self._description = file.read()
+            names = _names_of_images(json.loads(self._description))
+        self._images = {name: self._read(name) for name in names}
+        self.size = size + sum(map(len, self._images.values()))
+
+    def description(self) -> bytes:
+        """The bytes of meta.json."""
+        return self._description
+
+    def stored(self, name: str) -> bytes:
+        """The bytes of an image."""
+        return self._images[name]
+
+    def _read(self, name: str) -> bytes:
+        with opened(related(self._path, name)) as (file, _):
+            content: bytes = file.read()
+        return content
+
+
+def _names_of_images(meta: Any) -> list[str]:
+    """The names in a description, each once; what is none of names is left for whoever looks for the image."""
+    parts = meta.values() if isinstance(meta, dict) else ()
+    lists = [part.get("files") for part in parts if isinstance(part, dict)]
+    names = [name for names in lists if isinstance(names, list) for name in names[:2] if isinstance(name, str)]
+    return list(dict.fromkeys(names))
+
+
+def _opened_archive(path: str | os.PathLike[str], file: BinaryIO, size: int) -> zipfile.ZipFile:
+    archive = zipfile.ZipFile(file)
+    entries = archive.infolist()
+    if sum(entry.file_size for entry in entries) > 2 * size + _DESCRIPTION_BYTES:
+        raise DataError(f"'{path}' is damaged: it would unpack to far more than its size")
+    if any(entry.compress_size > size for entry in entries):  # room would be made for them
+        raise DataError(f"'{path}' is damaged: its contents are said to be larger than itself")
+    if any(entry.compress_type not in _METHODS for entry in entries):
+        raise DataError(f"'{path}' is damaged: it is packed in a way that no SOG file is")
+    return archive
+
+
+class Sog:
+    """A SOG scene, of whose parts nothing is trusted.
+
+    Args:
+        path: for messages.
+        description: the bytes of meta.json.
+        read: gives an image by the name that the description has for it.
+        size: bytes of all of them.
+        trust: whether there may be more splats than a real scene has in so many bytes.
+
+    Attributes:
+        count: of splats, as described.
+    """
+
+    def __init__(
+        self,
+        path: str | os.PathLike[str],
+        description: bytes,
+        read: Callable[[str], bytes],
+        size: int,
+        trust: bool,
+    ) -> None:
+        self._path, self._read = path, read
+        meta = json.loads(description)
+        if not isinstance(meta, dict) or not {"version", "means"} & set(meta):
+            raise DataError(f"'{path}' is no description of a SOG scene")
         if meta.get("version") != 2:
             version = meta.get("version", 1)
             said = version if type(version) is int and abs(version) < 1000 else "unknown"
-            raise DataError(f"'{path}' is a SOG file of version {said}, only 2 can be read")
+            raise DataError(
+                f"'{path}' is a SOG file of version {said}, only 2 can be read: convert it with splat-transform"
+            )
         self._meta = meta
-        self._count = _whole(meta["count"])
-        if not 0 < self._count < 2**31:
+        self.count = _whole(meta["count"])
+        if not 0 < self.count < 2**31:
             raise self._damaged(f"a count of {_said(meta['count'])} splats")
         try:
-            check_claim(self._count, size, MOST_A_BYTE, trust)
+            check_claim(self.count, size, MOST_A_BYTE, trust)
         except DataError as error:
             raise DataError(f"'{path}': {error}") from None
 
     def scene(self) -> Scene:
         """The values of all pixels, block by block, an image after another."""
-        count = self._count
+        count = self.count
         coefficients = 1
         if "shN" in self._meta:
             bands = _whole(self._meta["shN"]["bands"])
@@ -125,7 +212,7 @@ class _Archive:
             scene.opacity_logits[block] = logits.take(colours[block, 3])
         if coefficients > 1:
             self._fill_rest(scene.sh[:, 1:])
-        return scene
+        return scene.rendered(self._meta.get("model") == _ANTIALIASED)
 
     def _fill_means(self, means: FloatArray) -> None:
         low, high = self._pixels("means", 0), self._pixels("means", 1)
@@ -156,7 +243,7 @@ class _Archive:
             rest[block] = np.where((index >= 0)[:, None, None], values[index], np.float32(0))
 
     def _blocks(self) -> list[slice]:
-        return [slice(start, min(start + _BLOCK, self._count)) for start in range(0, self._count, _BLOCK)]
+        return [slice(start, min(start + _BLOCK, self.count)) for start in range(0, self.count, _BLOCK)]
 
     def _codebook(self, name: str) -> FloatArray:
         return np.array(self._numbers(name, "codebook", _CODEBOOK), np.float32)
@@ -174,9 +261,9 @@ class _Archive:
     def _check_pixels(self, name: str, index: int) -> None:
         """That an image has a pixel for each splat and few more, before any is unpacked."""
         width, height = self._size(name, index)
-        if not self._count <= width * height <= 2 * self._count + 2**16:
+        if not self.count <= width * height <= 2 * self.count + 2**16:
             what = "labels" if name == "shN" else "pixels"
-            raise self._damaged(f"'{name}' has {width} x {height} {what} for {self._count} splats")
+            raise self._damaged(f"'{name}' has {width} x {height} {what} for {self.count} splats")
 
     def _size(self, name: str, index: int) -> tuple[int, int]:
         size = webp_size(self._stored(name, index))
@@ -196,7 +283,7 @@ class _Archive:
             return pixels
 
     def _stored(self, name: str, index: int) -> bytes:
-        return self._zip.read(self._meta[name]["files"][index])
+        return self._read(self._meta[name]["files"][index])
 
     def _damaged(self, what: str) -> DataError:
         return DataError(f"'{self._path}' is damaged: {what}")

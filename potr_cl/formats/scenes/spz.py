@@ -1,4 +1,4 @@
-"""Scenes as SPZ files (Niantic's .spz): versions 1 to 4 are read, version 3 is written.
+"""Scenes as SPZ files (Niantic's .spz): versions 1 to 4 are read, 2 to 4 are written.
 
 SPZ names axes of its own (right, up, back), but converters, Niantic's included, keep those of the PLY by default, and
 a file rarely says which it holds. So axes are kept as they are, in both directions.
@@ -11,7 +11,7 @@ import logging
 import os
 import struct
 import zlib
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, BinaryIO
 
 import numpy as np
@@ -19,9 +19,10 @@ import zstandard
 from numpy.typing import NDArray
 
 from potr_cl.codec.logarithm import natural_logarithm
+from potr_cl.codec.quantize import canonical_rotations
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, arranged, cleaned, opened
+from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, arranged, cleaned, opened, tell_of_low_pass
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.claims import check_claim
@@ -35,8 +36,18 @@ _HEADER = struct.Struct("<4sIIBBBB")
 _HEADER_4_BYTES = 32
 _STREAM = struct.Struct("<QQ")
 _ANTIALIASED, _EXTENSIONS = 1, 2
+#: Versions that are one stream, usually gzipped.
+_LEGACY = range(1, 4)
+#: The version whose positions are half floats.
+_HALF_FLOATS = 1
+_LARGEST_DEGREE = 4
 #: A file may have extensions behind its splats; no known one comes near.
 _EXTENSION_BYTES = 1 << 20
+
+#: Those that are written, the usual one first.
+_VERSIONS = (2, 3, 4)
+#: Of each stream of version 4.
+_ZSTD_LEVEL = 12
 
 #: Positions are integers of 24 bits with a sign; 12 of them are the fraction in all files that other tools write.
 _POSITION_LIMIT = 2**23 - 1
@@ -71,12 +82,14 @@ class _Header:
     @property
     def sizes(self) -> list[int]:
         """Bytes of positions, opacities, colours, scales, rotations and SH, in this order."""
-        rotation = 3 if self.version < 3 else 4
-        return [self.splats * size for size in (9, 1, 3, 3, rotation, 3 * (SH_COEFFICIENTS[self.degree] - 1))]
+        position, rotation = 6 if self.version == _HALF_FLOATS else 9, 3 if self.version < 3 else 4
+        return [self.splats * size for size in (position, 1, 3, 3, rotation, 3 * ((self.degree + 1) ** 2 - 1))]
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
-    """Read a scene from an SPZ file of version 1 to 4 and SH degree 0 to 3.
+    """Read a scene from an SPZ file of version 1 to 4; versions 1 to 3 may be gzipped or not.
+
+    Of SH degree 4, the coefficients of degree 4 are dropped.
 
     Args:
         path: of the file.
@@ -93,21 +106,29 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
         start = file.read(_HEADER_4_BYTES)
         file.seek(0)
         if start[:2] == b"\x1f\x8b":
+            header, properties = _read_gzip(path, gzip.GzipFile(fileobj=file), size, trust)
+        elif int.from_bytes(start[4:8], "little") in _LEGACY:
             header, properties = _read_gzip(path, file, size, trust)
         else:
             header, properties = _read_streams(path, file.read(), trust)
-        scene = _unpacked(header, properties)
-    if header.flags & _ANTIALIASED:
-        _log.warning("'%s' was trained for a rasterizer with antialiasing: it is rendered without", path)
+        scene = _unpacked(header, properties).rendered(bool(header.flags & _ANTIALIASED))
+    if header.degree >= len(SH_COEFFICIENTS):
+        _log.warning("'%s': SH degree 4 is left out: only degrees 0 to 3 are kept", path)
     if header.flags & _EXTENSIONS:
         _log.warning("'%s' has extensions: they are left out, and axes are kept as they are", path)
     return cleaned(path, scene)
 
 
-def save(path: str | os.PathLike[str], scene: Scene) -> None:
-    """Write a scene as SPZ, version 3; the file appears under its name only when it is whole.
+def save(path: str | os.PathLike[str], scene: Scene, version: int = _VERSIONS[0]) -> None:
+    """Write a scene as SPZ; the file appears under its name only when it is whole.
 
     Positions are stored in steps of 1/4096 unit, as every tool writes them; in a scene too large for that, coarser.
+
+    Args:
+        path: of the file.
+        scene: of any SH degree.
+        version: 2, rotations in 8 bits a part; 3, rotations in 10 bits; 4, the same content packed by zstd instead of
+            gzip. docs/formats.md has a table of the readers that take them.
 
     Raises:
         UsageError: ``path`` cannot be written to.
@@ -122,18 +143,28 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
         raise DataError(f"'{path}': SPZ cannot hold a splat {largest:.3g} units from the origin")
     if bits < _FRACTIONAL_BITS:
         _log.warning("'%s': the scene is large for SPZ: positions are stored in steps of 1/%d unit", path, 2**bits)
-    header = _HEADER.pack(_MAGIC, 3, len(scene), scene.sh_degree, bits, 0, 0)
-    content = b"".join([header, *_packed(arranged(scene), bits)])
+    tell_of_low_pass(path, scene)
+    flags = _ANTIALIASED if scene.antialiased else 0
+    properties = _packed(_well_conditioned(arranged(scene)) if version == 2 else arranged(scene), bits, version)
+    streams = sum(map(bool, properties)) if version > 3 else 0
+    header = _HEADER.pack(_MAGIC, version, len(scene), scene.sh_degree, bits, flags, streams)
     with replacing(path) as file:
-        _write_gzip(file, content)
+        if version > 3:
+            _write_streams(file, header, properties)
+        else:
+            _write_gzip(file, b"".join([header, *properties]))
 
 
 FORMAT = SceneFormat(
     name="SPZ",
     suffixes=(".spz",),
-    note="of Niantic; versions 1 to 4 are read, version 3, which every reader knows, is written",
+    note="of Niantic; versions 1 to 4 are read, 2 to 4 are written: which readers take which stands below",
     load=load,
     save=save,
+    starts=(_MAGIC,),
+    gzipped=True,
+    versions=_VERSIONS,
+    packed=True,
 )
 
 
@@ -141,12 +172,11 @@ FORMAT = SceneFormat(
 
 
 def _read_gzip(
-    path: str | os.PathLike[str], file: BinaryIO, size: int, trust: bool
+    path: str | os.PathLike[str], stream: gzip.GzipFile | BinaryIO, size: int, trust: bool
 ) -> tuple[_Header, list[bytes | memoryview]]:
     """Versions 1 to 3: one stream, of which no more is unpacked than its header tells of."""
     try:
-        stream = gzip.GzipFile(fileobj=file)
-        header = _header(path, stream.read(_HEADER.size), range(1, 4), size, trust)
+        header = _header(path, stream.read(_HEADER.size), _LEGACY, size, trust)
         properties: list[bytes | memoryview] = [stream.read(wanted) for wanted in header.sizes]
         beyond = _EXTENSION_BYTES if header.flags & _EXTENSIONS else 0
         if len(stream.read(beyond + 1)) > beyond:  # to the end, where gzip has its checksum
@@ -192,11 +222,11 @@ def _header(path: str | os.PathLike[str], start: bytes, versions: range, size: i
     _, version, splats, degree, bits, flags, streams = _HEADER.unpack_from(start)
     if version not in versions:
         raise DataError(f"'{path}' is an SPZ file of version {version}, which is not known or not packed like this")
-    if degree >= len(SH_COEFFICIENTS):
+    if degree > _LARGEST_DEGREE:
         raise DataError(f"'{path}' has SH degree {degree}: export at most 3 bands")
     if splats == 0:
         raise DataError(f"'{path}' holds no splat")
-    if not 1 <= bits <= _MOST_FRACTIONAL_BITS:
+    if version != _HALF_FLOATS and not 1 <= bits <= _MOST_FRACTIONAL_BITS:
         raise DataError(f"'{path}' is damaged: positions with {bits} fractional bits")
     try:
         check_claim(splats, size, MOST_A_BYTE, trust)
@@ -223,12 +253,25 @@ def _write_gzip(file: BinaryIO, content: bytes) -> None:
     file.write(struct.pack("<II", zlib.crc32(content), len(content) & 0xFFFFFFFF))
 
 
+def _write_streams(file: BinaryIO, header: bytes, properties: list[bytes]) -> None:
+    """Version 4: the header up to the table, the table, and a zstd frame for each property that is not empty."""
+    parts = [part for part in properties if part]
+    with thread_pool() as pool:
+        frames = list(pool.map(lambda part: zstandard.ZstdCompressor(level=_ZSTD_LEVEL).compress(part), parts))
+    start = header + struct.pack("<I", _HEADER_4_BYTES)
+    file.write(start.ljust(_HEADER_4_BYTES, b"\0"))
+    for part, frame in zip(parts, frames, strict=True):
+        file.write(_STREAM.pack(len(frame), len(part)))
+    for frame in frames:
+        file.write(frame)
+
+
 # ---------------------------------------------------------------------------------------------------- values
 
 
 def _unpacked(header: _Header, properties: list[bytes | memoryview]) -> Scene:
     """The values of a file's bytes, block by block."""
-    count, coefficients = header.splats, SH_COEFFICIENTS[header.degree]
+    count, coefficients = header.splats, SH_COEFFICIENTS[min(header.degree, len(SH_COEFFICIENTS) - 1)]
     positions, opacities, colours, scales, rotations, rest = (
         np.frombuffer(part, np.uint8).reshape(count, -1) for part in properties
     )
@@ -246,21 +289,24 @@ def _unpacked(header: _Header, properties: list[bytes | memoryview]) -> Scene:
     dc = (byte / np.float32(255) - np.float32(0.5)) / np.float32(_COLOUR_SCALE)
     for start in range(0, count, _BLOCK):
         block = slice(start, start + _BLOCK)
-        scene.means[block] = _positions(positions[block], header.fractional_bits)
+        scene.means[block] = _positions(positions[block], header)
         scene.log_scales[block] = (byte / 16 - 10).take(scales[block])
         scene.quaternions[block] = _smallest_three(rotations[block]) if header.version > 2 else _xyz(rotations[block])
         scene.opacity_logits[block] = logits.take(opacities[block, 0])
         scene.sh[block, 0] = dc.take(colours[block])
         if coefficients > 1:
-            scene.sh[block, 1:] = ((byte - 128) / 128).take(rest[block]).reshape(-1, coefficients - 1, 3)
+            stored = rest[block, : 3 * (coefficients - 1)]
+            scene.sh[block, 1:] = ((byte - 128) / 128).take(stored).reshape(-1, coefficients - 1, 3)
     return scene
 
 
-def _positions(stored: U8, fractional_bits: int) -> FloatArray:
+def _positions(stored: U8, header: _Header) -> FloatArray:
+    if header.version == _HALF_FLOATS:
+        return np.ascontiguousarray(stored).view("<f2").astype(np.float32)
     parts = stored.reshape(-1, 3, 3).astype(np.int32)
     values = parts[..., 0] | parts[..., 1] << 8 | parts[..., 2] << 16
     values = (values ^ 0x800000) - 0x800000
-    positions: FloatArray = values.astype(np.float32) * np.float32(2.0**-fractional_bits)
+    positions: FloatArray = values.astype(np.float32) * np.float32(2.0**-header.fractional_bits)
     return positions
 
 
@@ -287,7 +333,7 @@ def _xyz(stored: U8) -> FloatArray:
     return np.column_stack([np.sqrt(np.maximum(left, 0)), xyz])
 
 
-def _packed(scene: Scene, fractional_bits: int) -> list[bytes]:
+def _packed(scene: Scene, fractional_bits: int, version: int) -> list[bytes]:
     """The bytes of a scene with unit quaternions, property by property."""
 
     def as_bytes(values: NDArray[Any]) -> bytes:
@@ -301,9 +347,27 @@ def _packed(scene: Scene, fractional_bits: int) -> list[bytes]:
             as_bytes(255 / (1 + np.exp(-scene.opacity_logits))),
             as_bytes(scene.sh[:, 0] * np.float32(_COLOUR_SCALE * 255) + np.float32(127.5)),
             as_bytes((scene.log_scales + np.float32(10)) * np.float32(16)),
-            _packed_rotations(scene.quaternions),
+            _packed_rotations(scene.quaternions) if version > 2 else as_bytes(_first_three(scene.quaternions)),
             as_bytes(scene.sh[:, 1:] * np.float32(128) + np.float32(128)),
         ]
+
+
+def _well_conditioned(scene: Scene) -> Scene:
+    """The same splats with their axes numbered such that w, which version 2 leaves to the reader, is the largest part.
+
+    A reader takes w from the squares of the others: where it is small, their rounding would turn the splat by degrees.
+    """
+    imaginary, log_scales = canonical_rotations(scene.quaternions, scene.log_scales)
+    real = np.sqrt(np.maximum(1 - (imaginary * imaginary).sum(axis=1), 0))
+    quaternions = np.column_stack([real, imaginary]).astype(np.float32)
+    return replace(scene, quaternions=quaternions, log_scales=log_scales)
+
+
+def _first_three(quaternions: FloatArray) -> NDArray[Any]:
+    """x, y and z of unit quaternions with w >= 0, from 0 to 255: a reader takes w from the others."""
+    signs = np.where(quaternions[:, :1] < 0, np.float32(-1), np.float32(1))
+    parts: NDArray[Any] = (quaternions[:, 1:] * signs + np.float32(1)) * np.float32(127.5)
+    return parts
 
 
 def _packed_rotations(quaternions: FloatArray) -> bytes:

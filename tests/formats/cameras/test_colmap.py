@@ -81,14 +81,65 @@ def test_folders_in_image_names_tell_views_apart(text_model: Path) -> None:
     refused(text_model, r"more than one view has the image '20240212_003919\.jpg'")
 
 
-def test_distorted_camera_models(model: Path, text_model_lines: Callable[[str], Path]) -> None:
+def test_camera_models_that_are_not_read(model: Path, text_model_lines: Callable[[str], Path]) -> None:
     data = (model / "cameras.bin").read_bytes()
-    for number, name in ((2, "SIMPLE_RADIAL"), (4, "OPENCV"), (5, "OPENCV_FISHEYE"), (99, "number 99")):
+    for number, name in ((7, "FOV"), (11, "RAD_TAN_THIN_PRISM_FISHEYE"), (99, "number 99"), (-1, "number -1")):
         (model / "cameras.bin").write_bytes(data[:12] + struct.pack("<i", number) + data[16:])
-        refused(
-            model, f"camera 1 has the model '{name}', only SIMPLE_PINHOLE and PINHOLE .* 'colmap image_undistorter'"
-        )
-    refused(text_model_lines("1 OPENCV 990 742 800 800 495 371 0 0 0 0\n"), "'1' has the model 'OPENCV', only")
+        refused(model, f"camera 1 has the model '{name}', which is not read: .* 'colmap image_undistorter'")
+    refused(text_model_lines("1 FOV 990 742 800 800 495 371 0.9\n"), "'1' has the model 'FOV', which is not read")
+
+
+DISTORTED = {
+    "SIMPLE_RADIAL": (2, [800, 495, 371, -0.05]),
+    "RADIAL": (3, [800, 495, 371, -0.05, 0.01]),
+    "OPENCV": (4, [800, 810, 495, 371, -0.05, 0.01, 0.001, -0.001]),
+    "OPENCV_FISHEYE": (5, [600, 610, 495, 371, 0.01, 0.001, 0, 0]),
+    "FULL_OPENCV": (6, [800, 810, 495, 371, -0.05, 0.01, 0.001, -0.001, 0, 0.01, 0, 0]),
+    "SIMPLE_RADIAL_FISHEYE": (8, [600, 495, 371, 0.01]),
+    "RADIAL_FISHEYE": (9, [600, 495, 371, 0.01, 0.001]),
+    "THIN_PRISM_FISHEYE": (10, [600, 610, 495, 371, 0.01, 0.001, 0.001, -0.001, 0, 0, 0.001, 0]),
+}
+
+
+@pytest.mark.parametrize("name", DISTORTED)
+def test_distorted_cameras_cover_the_same_field(
+    model: Path,
+    text_model_lines: Callable[[str], Path],
+    caplog: pytest.LogCaptureFixture,
+    name: str,
+) -> None:
+    number, params = DISTORTED[name]
+    header = struct.pack("<QIiQQ", 1, 1, number, 990, 742)
+    (model / "cameras.bin").write_bytes(header + struct.pack(f"<{len(params)}d", *params))
+    cameras = load_cameras(model)
+    assert caplog.text.count("lens distortion") == 1
+    (lens,) = {camera.lens for camera in cameras}
+    assert lens is not None
+    assert lens.fisheye == ("FISHEYE" in name)
+    assert (lens.fx, lens.cx, lens.cy) == (params[0], 495, 371)
+    assert {(camera.width, camera.height) for camera in cameras} == {lens.covering()[0][:2]}
+    # The middle and a point off it are where COLMAP has them.
+    pycolmap = pytest.importorskip("pycolmap")
+    theirs = pycolmap.Camera(model=name, width=990, height=742, params=params)
+    u, v = lens.distorted(np.array([0.0, 0.3]), np.array([0.0, -0.2]))
+    wanted = theirs.img_from_cam(np.array([[0, 0, 1], [0.3, -0.2, 1]]))
+    np.testing.assert_allclose(np.stack([u * lens.fx + lens.cx, v * lens.fy + lens.cy], axis=1), wanted, atol=1e-9)
+    text = text_model_lines(f"1 {name} 990 742 {' '.join(map(str, params))}\n")
+    assert {camera.lens for camera in load_cameras(text)} == {lens}
+
+
+def test_a_lens_that_bends_nothing_is_none(text_model_lines: Callable[[str], Path]) -> None:
+    (camera, *_) = load_cameras(text_model_lines("1 OPENCV 990 742 800 810 495 371 0 0 0 0\n"))
+    assert camera.lens is None
+    assert (camera.width, camera.height, camera.fx, camera.fy) == (990, 742, 800, 810)
+
+
+def test_insane_lenses(text_model_lines: Callable[[str], Path]) -> None:
+    refused(text_model_lines("1 SIMPLE_RADIAL 990 742 800 495 371 -50\n"), "camera 1|view .*folds the picture over")
+    refused(text_model_lines("1 SIMPLE_RADIAL 990 742 800 495 371 nan\n"), "coefficient")
+    refused(text_model_lines("1 SIMPLE_RADIAL 990 742 -800 495 371 0.1\n"), "intrinsics")
+    refused(text_model_lines("1 SIMPLE_RADIAL 990 99999999 800 495 371 0.1\n"), "not a number of pixels")
+    refused(text_model_lines("1 SIMPLE_RADIAL 990 742 800 495 371\n"), "truncated")
 
 
 def test_damaged_text_models(text_model_lines: Callable[[str], Path]) -> None:

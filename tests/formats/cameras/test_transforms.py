@@ -11,6 +11,7 @@ import pytest
 from PIL import Image
 
 from potr_cl.formats import load_cameras
+from potr_cl.model.lens import Lens
 from tests.cases.cameras import IDENTITY, nerfstudio, pixel, refused, write_image, write_json
 from tests.cases.images import png_of
 
@@ -109,13 +110,42 @@ def test_views_are_moved_to_nerfstudios_training_space(tmp_path: Path, caplog: p
 
 
 @pytest.mark.parametrize(
+    ("changes", "lens"),
+    [
+        ({"k1": 0.01}, {"radial": (0.01,)}),
+        ({"k1": 0.01, "k2": 0.002, "p1": 1e-3, "p2": 2e-3}, {"radial": (0.01, 0.002), "tangential": (1e-3, 2e-3)}),
+        ({"k3": 0.001}, {"radial": (0, 0, 0.001)}),
+        ({"camera_model": "OPENCV_FISHEYE"}, {"fisheye": True}),
+        ({"camera_model": "OPENCV_FISHEYE", "k4": 0.01}, {"fisheye": True, "radial": (0, 0, 0, 0.01)}),
+        ({"is_fisheye": True, "k1": 0.02}, {"fisheye": True, "radial": (0.02,)}),
+        ({"camera_model": "SIMPLE_RADIAL", "k1": 0.02}, {"radial": (0.02,)}),
+    ],
+)
+def test_lenses(changes: dict[str, Any], lens: dict[str, Any], tmp_path: Path) -> None:
+    cameras = load_cameras(write_json(tmp_path / "transforms.json", nerfstudio(["a.png", "b.png"], **changes)))
+    expected = Lens(40, 30, 50, 60, 21, 14, **lens)
+    assert [camera.lens for camera in cameras] == [expected] * 2
+    assert (cameras[0].width, cameras[0].height) == expected.covering()[0][:2]
+
+
+def test_a_frame_has_its_own_lens(tmp_path: Path) -> None:
+    content = nerfstudio(["a.png", "b.png", "c.png"])
+    content["frames"][1] |= {"k1": -0.05}
+    a, b, c = load_cameras(write_json(tmp_path / "transforms.json", content))
+    assert (a.lens, c.lens) == (None, None)
+    assert b.lens == Lens(40, 30, 50, 60, 21, 14, radial=(-0.05,))
+
+
+@pytest.mark.parametrize(
     ("changes", "message"),
     [
-        ({"k1": 0.01}, r"frame 0: 'k1' is 0\.01, only undistorted views .*'colmap image_undistorter'"),
-        ({"k4": -1e-9}, "'k4' is -1e-09"),
-        ({"camera_model": "OPENCV_FISHEYE"}, "'camera_model' is 'OPENCV_FISHEYE', only pinhole cameras"),
-        ({"camera_model": "EQUIRECTANGULAR"}, "only pinhole cameras"),
-        ({"is_fisheye": True}, "'is_fisheye' is set"),
+        ({"k1": -30}, "frame 0: its lens distortion folds the picture over"),
+        ({"k1": "a"}, "'k1' is 'a', not a finite number"),
+        (
+            {"camera_model": "EQUIRECTANGULAR"},
+            "is 'EQUIRECTANGULAR', whose pictures no pinhole view can",
+        ),
+        ({"camera_model": 3}, "'camera_model' is 3"),
         ({"fl_x": None}, "frame 0: neither 'fl_x' nor 'camera_angle_x' is given"),
         ({"fl_x": None, "camera_angle_x": 4}, "'camera_angle_x' is 4.0, not an angle"),
         ({"fl_x": -1}, "camera 'a': intrinsics"),

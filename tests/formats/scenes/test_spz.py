@@ -6,6 +6,7 @@ import gzip
 import struct
 import time
 import tracemalloc
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -16,13 +17,14 @@ from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import spz
 from potr_cl.model.claims import FREE_SPLATS
 from potr_cl.reference.scenes import random_scene
-from tests.cases.scenes import in_order_of
+from tests.cases.scenes import in_order_of, turned_by
 
 
+@pytest.mark.parametrize("version", [3, 4])
 @pytest.mark.parametrize("degree", range(4))
-def test_spz_keeps_every_property_to_its_step(tmp_path, degree):
+def test_spz_keeps_every_property_to_its_step(tmp_path, degree, version):
     scene = random_scene(300, degree, seed=degree)
-    spz.save(tmp_path / "a.spz", scene)
+    spz.save(tmp_path / "a.spz", scene, version)
     back = in_order_of(scene, spz.load(tmp_path / "a.spz"))
     assert np.abs(back.means - scene.means).max() <= 0.5 / 4096 + 1e-6
     assert np.abs(back.log_scales - np.clip(scene.log_scales, -10, 5.9375)).max() <= 0.5 / 16 + 1e-5
@@ -34,6 +36,19 @@ def test_spz_keeps_every_property_to_its_step(tmp_path, degree):
     if degree:
         ac = np.clip(scene.sh[:, 1:], -1, 127 / 128)
         assert np.abs(back.sh[:, 1:] - ac).max() <= 0.5 / 128 + 1e-5
+
+
+def test_version_2_keeps_every_shape_to_its_step(tmp_path):
+    """Its rotations may be those of another numbering of a splat's axes: the shape is the same, so that is compared."""
+    scene = random_scene(2000, 1)
+    spz.save(tmp_path / "a.spz", scene)  # version 2 is the usual one
+    assert gzip.decompress((tmp_path / "a.spz").read_bytes())[4] == 2
+    back = in_order_of(scene, spz.load(tmp_path / "a.spz"))
+    thick = replace(scene, log_scales=np.clip(scene.log_scales, -10, 5.9375))  # what a byte can say
+    angles, differences = turned_by(thick, back)
+    # Half a step of 1/127.5 in each of three parts, of a quaternion whose real part is at least 0.85.
+    assert angles.max() <= 2 * np.sqrt(3) * 0.5 / 127.5 / 0.85
+    assert np.abs(differences).max() <= 0.5 / 16 + 1e-5
 
 
 def test_a_large_scene_is_stored_more_coarsely(tmp_path, caplog):
@@ -49,14 +64,13 @@ def test_a_large_scene_is_stored_more_coarsely(tmp_path, caplog):
     assert not (tmp_path / "b.spz").exists()
 
 
-@pytest.mark.parametrize(("flag", "said"), [(1, "antialiasing"), (2, "extensions")])
-def test_flags_that_matter_are_said(tmp_path, data, caplog, flag, said):
+def test_extensions_are_said(tmp_path, data, caplog):
     content = bytearray(gzip.decompress((data / "foreign" / "version_3.spz").read_bytes()))
-    content[14] |= flag
+    content[14] |= 2
     path = tmp_path / "a.spz"
     path.write_bytes(gzip.compress(bytes(content)))
     assert len(load_scene(path)) == 1500
-    assert said in caplog.text
+    assert "extensions" in caplog.text
 
 
 def spz_header(splats, version=3, degree=3):
@@ -72,7 +86,7 @@ def spz_header(splats, version=3, degree=3):
         (gzip.compress(spz_header(4_000_000_000)), "--trust"),
         (gzip.compress(spz_header(10)), "truncated"),
         (gzip.compress(spz_header(0)), "no splat"),
-        (gzip.compress(spz_header(10, degree=4)), "SH degree 4"),
+        (gzip.compress(spz_header(10, degree=5)), "SH degree 5"),
         (gzip.compress(spz_header(1000) + bytes(3_000_000)), "more than the splats"),
         (gzip.compress(spz_header(10, version=9) + bytes(650)), "version 9"),
         (spz_header(4_000_000_000, version=4) + bytes(100), "--trust"),
@@ -95,7 +109,7 @@ def test_a_scene_has_the_same_bytes_whenever_it_is_written(tmp_path, monkeypatch
             spz.save(tmp_path / f"{day}.spz", scene)
         first, second = ((tmp_path / f"{day}.spz").read_bytes() for day in (1, 2))
         assert first == second
-        assert len(gzip.decompress(first)) == 16 + splats * (16 + 4 + 24)
+        assert len(gzip.decompress(first)) == 16 + splats * (16 + 3 + 24)
 
 
 def test_nothing_is_written_but_beside_the_file(tmp_path, monkeypatch):
@@ -114,13 +128,16 @@ def test_content_and_values_are_those_of_another_program(tmp_path, data):
     from potr_cl.formats.scenes.gsply_arrays import from_scene
 
     scene = random_scene(3000, 3)
-    spz.save(tmp_path / "ours.spz", scene)
+    spz.save(tmp_path / "ours.spz", scene, version=3)
     other.write_spz(tmp_path / "theirs.spz", from_scene(gsply, scene), version=3, fractional_bits=12)
     ours, theirs = (gzip.decompress((tmp_path / name).read_bytes()) for name in ("ours.spz", "theirs.spz"))
     assert len(ours) == len(theirs)
     assert sum(a != b for a, b in zip(ours, theirs, strict=True)) <= 5  # ties that rounding breaks either way
-    for name in ("version_3.spz", "version_4.spz", "degree_1.spz"):
-        expected, got = other.read_spz(data / "foreign" / name), spz.load(data / "foreign" / name)
+    written = [tmp_path / f"{version}.spz" for version in (2, 3, 4)]
+    for version, path in enumerate(written, 2):
+        spz.save(path, scene, version)
+    for path in (*written, *(data / "foreign" / name for name in ("version_3.spz", "version_4.spz", "degree_1.spz"))):
+        expected, got = other.read_spz(path), spz.load(path)
         assert np.array_equal(got.means, expected.means)
         assert np.array_equal(got.log_scales, expected.scales)
         assert np.abs(got.quaternions - expected.quats).max() < 1e-6
@@ -131,7 +148,7 @@ def test_content_and_values_are_those_of_another_program(tmp_path, data):
 
 @pytest.mark.parametrize("version", [1, 2])
 def test_rotations_of_old_versions(tmp_path, version):
-    body = bytes(9) + bytes([255, 0, 0, 0]) + bytes(3) + bytes([255, 128, 127])
+    body = bytes(6 if version == 1 else 9) + bytes([255, 0, 0, 0]) + bytes(3) + bytes([255, 128, 127])
     (tmp_path / "a.spz").write_bytes(gzip.compress(spz_header(1, version, 0) + body))
     w, x, y, z = load_scene(tmp_path / "a.spz").quaternions[0]
     assert (w, x) == (0, 1)
@@ -199,3 +216,55 @@ def test_values_beyond_bytes_give_no_warning(tmp_path, recwarn):
     spz.save(tmp_path / "a.spz", scene)
     assert len(spz.load(tmp_path / "a.spz")) == 20
     assert not recwarn.list
+
+
+@pytest.mark.parametrize("version", [2, 3, 4])
+def test_coefficients_of_degree_4_are_left_out(tmp_path, caplog, version):
+    count, rng = 40, np.random.default_rng(version)
+    sizes = (9, 1, 3, 3, 3 if version < 3 else 4)
+    parts = [rng.integers(0, 256, (count, size), np.uint8) for size in sizes]
+    rest = rng.integers(0, 256, (count, 24, 3), np.uint8)
+    scenes = []
+    for degree, kept in ((3, 15), (4, 24)):
+        content = [part.tobytes() for part in (*parts, rest[:, :kept])]
+        path = tmp_path / f"{degree}.spz"
+        if version < 4:
+            path.write_bytes(gzip.compress(spz_header(count, version, degree) + b"".join(content)))
+        else:
+            table = [(len(zstandard.compress(part)), len(part)) for part in content]
+            path.write_bytes(version_4(count, [zstandard.compress(part) for part in content], degree, table))
+        scenes.append(load_scene(path))
+    assert np.array_equal(scenes[0].sh, scenes[1].sh)
+    assert np.array_equal(scenes[0].quaternions, scenes[1].quaternions)
+    assert [r.getMessage() for r in caplog.records] == [
+        f"'{path}': SH degree 4 is left out: only degrees 0 to 3 are kept"
+    ]
+
+
+@pytest.mark.parametrize("version", [1, 2, 3])
+def test_content_that_is_not_gzipped(tmp_path, version):
+    content = spz_header(100, version, 1) + np.random.default_rng(0).bytes(100 * ((16, 19, 20)[version - 1] + 9))
+    (tmp_path / "packed.spz").write_bytes(gzip.compress(content))
+    (tmp_path / "raw.spz").write_bytes(content)
+    packed, raw = load_scene(tmp_path / "packed.spz"), load_scene(tmp_path / "raw.spz")
+    assert np.array_equal(packed.means, raw.means)
+    assert np.array_equal(packed.sh, raw.sh)
+    for bad, said in ((content[:-1], "truncated"), (content + b"0", "more than the splats"), (content[:20], "trunc")):
+        (tmp_path / "raw.spz").write_bytes(bad)
+        with pytest.raises(DataError, match=said):
+            load_scene(tmp_path / "raw.spz")
+    (tmp_path / "raw.spz").write_bytes(spz_header(4_000_000_000, version, 1) + bytes(1000))
+    with pytest.raises(DataError, match="--trust"):
+        load_scene(tmp_path / "raw.spz")
+
+
+def test_positions_of_version_1_are_half_floats(tmp_path):
+    """As Niantic's library reads them, and gaussforge and spz-js with it."""
+    rng = np.random.default_rng(0)
+    positions = rng.normal(size=(70, 3)).astype("<f2")
+    body = positions.tobytes() + rng.bytes(70 * 10)
+    (tmp_path / "a.spz").write_bytes(gzip.compress(struct.pack("<4sIIBBBB", b"NGSP", 1, 70, 0, 0, 0, 0) + body))
+    scene = load_scene(tmp_path / "a.spz")
+    assert np.array_equal(scene.means, positions.astype(np.float32))
+    rows = np.frombuffer(body[420:], np.uint8)
+    assert np.array_equal(scene.log_scales, rows[280:490].reshape(70, 3) / np.float32(16) - 10)

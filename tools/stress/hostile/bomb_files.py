@@ -3,18 +3,15 @@
 from __future__ import annotations
 
 import gzip
-import io
 import json
 import struct
 import zipfile
 import zlib
 from collections.abc import Callable
-from functools import cache
 from typing import Any
 
 import numpy as np
 import zstandard
-from PIL import Image
 
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
@@ -24,6 +21,7 @@ from tools.stress.hostile import (
     picture_files,
     ply_files,
     potr_files,
+    scene_bomb_files,
     sog_files,
     spz_files,
 )
@@ -182,21 +180,8 @@ def _spz_streams(splats: int, said: int | None = None) -> Files:
     return {"a.spz": spz_files.streamed(said or splats, 3, streams, sizes)}
 
 
-@cache
-def _webp(side: int) -> bytes:
-    out = io.BytesIO()
-    Image.new("RGBA", (side, side), (1, 2, 3, 255)).save(out, "WEBP", lossless=True, method=0)
-    return out.getvalue()
-
-
 def _sog_pictures(side: int, splats: int) -> Files:
-    files = sog_files.parts(4, 0)
-    large = _webp(side)
-    files = {name: data if name == "meta.json" else large for name, data in files.items()}
-    meta = json.loads(files["meta.json"])
-    meta["count"] = splats
-    files["meta.json"] = json.dumps(meta).encode()
-    return {"a.sog": sog_files.archive(files)}
+    return {"a.sog": sog_files.archive(sog_files.equal_splats(side, splats))}
 
 
 def _sog_member(name: str, content: bytes) -> Files:
@@ -337,6 +322,7 @@ BOMBS: dict[str, dict[str, Callable[[], Files]]] = {
         "48 GB by 3,000 names for one member": _sog_overlapping,
         "a codebook of a million": lambda: _sog_meta(sh0={"codebook": [0] * 1_000_000, "files": ["sh0.webp"]}),
     },
+    **scene_bomb_files.BOMBS,
     "cameras.json": {
         "100,000 brackets": _json("cameras.json", b"[" * 100_000),
         "100,000 nested objects": _json("cameras.json", b'{"a":' * 100_000),
@@ -380,6 +366,6 @@ BOMBS: dict[str, dict[str, Callable[[], Files]]] = {
             "a.webp": b"RIFF" + struct.pack("<I", 22) + b"WEBPVP8L" + struct.pack("<I", 10)
             + b"\x2f" + struct.pack("<I", 16382 | 16382 << 14) + bytes(5)
         },
-        "2,000² equal pixels": lambda: {"a.webp": _webp(2000)},
+        "2,000² equal pixels": lambda: {"a.webp": sog_files.one_colour(2000)},
     },
 }  # fmt: skip

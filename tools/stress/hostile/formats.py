@@ -20,10 +20,14 @@ from potr_cl.model.scene import Scene
 from potr_cl.report.file import file_report, format_report
 from tools.stress.hostile import (
     camera_files,
+    gltf_files,
+    gzip_files,
     picture_files,
     ply_files,
     potr_files,
     sog_files,
+    sog_folder_files,
+    splat_files,
     spz_files,
 )
 
@@ -151,6 +155,21 @@ FORMATS: dict[str, Format] = {
     ),
     "spz": _single("a.spz", spz_files.originals, spz_files.changed, read_scene, 64 * MIB, 2048, twice=True),
     "sog": _single("a.sog", sog_files.originals, sog_files.changed, read_scene, 64 * MIB, 2048, twice=True),
+    "sog-folder": Format(
+        sog_folder_files.originals, sog_folder_files.changed, read_scene, 64 * MIB, 2048, twice=True
+    ),
+    "sog-levels": Format(
+        sog_folder_files.level_originals, sog_folder_files.changed_levels, read_scene, 64 * MIB, 2048, twice=True
+    ),
+    "glb": Format(gltf_files.originals, gltf_files.changed, read_scene, 64 * MIB, 2048, twice=True),
+    "gltf": Format(gltf_files.gltf_originals, gltf_files.changed_gltf, read_scene, 64 * MIB, 2048, twice=True),
+    "splat": _single(
+        "a.splat", splat_files.splat_originals, splat_files.changed_splat, read_scene, 32 * MIB, 64, twice=True
+    ),
+    "ksplat": _single(
+        "a.ksplat", splat_files.ksplat_originals, splat_files.changed_ksplat, read_scene, 32 * MIB, 64, twice=True
+    ),
+    "ply.gz": _single("a.ply.gz", gzip_files.originals, gzip_files.changed, read_scene, 64 * MIB, 4096, twice=True),
     "cameras.json": Format(
         camera_files.good_cameras_json, camera_files.changed_cameras_json, read_cameras, 32 * MIB, 128
     ),

@@ -63,6 +63,20 @@ def parts(splats: int, bands: int) -> dict[str, bytes]:
     return files
 
 
+@cache
+def one_colour(side: int) -> bytes:
+    """A picture of one colour, which takes few bytes however large it is."""
+    out = io.BytesIO()
+    Image.new("RGBA", (side, side), (1, 2, 3, 255)).save(out, "WEBP", lossless=True, method=0)
+    return out.getvalue()
+
+
+def equal_splats(side: int, splats: int) -> dict[str, bytes]:
+    """The files of an archive whose pictures have one colour."""
+    files = dict.fromkeys(parts(4, 0), one_colour(side))
+    return files | {"meta.json": json.dumps(description(splats, 0)).encode()}
+
+
 def archive(files: dict[str, bytes], method: int = zipfile.ZIP_STORED) -> bytes:
     """The files as a .sog."""
     out = io.BytesIO()

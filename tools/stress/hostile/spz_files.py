@@ -9,7 +9,6 @@ from random import Random
 
 import zstandard
 
-from potr_cl.model.scene import SH_COEFFICIENTS
 from tools.stress.hostile.changes import damaged, interesting
 
 _MAGIC = b"NGSP"
@@ -19,7 +18,7 @@ _EXTENSIONS = 2
 
 def sections(version: int, splats: int, degree: int, rng: Random) -> list[bytes]:
     """The content of positions, opacities, colours, scales, rotations and SH, random."""
-    sizes = (9, 1, 3, 3, 3 if version < 3 else 4, 3 * (SH_COEFFICIENTS[degree] - 1))
+    sizes = (6 if version == 1 else 9, 1, 3, 3, 3 if version < 3 else 4, 3 * ((degree + 1) ** 2 - 1))
     return [rng.randbytes(size * splats) for size in sizes]
 
 
@@ -39,7 +38,7 @@ def originals() -> list[bytes]:
     """Good files of every version and SH degree."""
     files, rng = [], Random(0)
     for version in (1, 2, 3, 4):
-        for degree in range(4):
+        for degree in range(5):
             parts = [part for part in sections(version, 3, degree, rng) if part]
             if version < 4:
                 files.append(gzip.compress(legacy(version, 3, degree, b"".join(parts)), mtime=0))
@@ -52,7 +51,7 @@ def originals() -> list[bytes]:
 def changed(rng: Random) -> bytes:
     """A small file of a random version, changed."""
     version = rng.choice((1, 2, 3, 4))
-    splats, degree = rng.choice((1, 3, 20)), rng.randrange(4)
+    splats, degree = rng.choice((1, 3, 20)), rng.randrange(5)
     parts = sections(version, splats, degree, rng)
     if version == 4:
         return _changed_streams(splats, degree, [part for part in parts if part], rng)

@@ -1,0 +1,250 @@
+"""Judge a scene by pictures: :func:`compare`, and its result, which shows the worst view in notebooks."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from potr_cl.api.inputs import (
+    CamerasSource,
+    ColourSource,
+    DeviceSource,
+    SceneSource,
+    bytes_of_file,
+    cameras_of,
+    chosen_views,
+    colour_of,
+    device_of,
+    name_of,
+    rules_of,
+    scene_of,
+)
+from potr_cl.api.pictures import png_bytes
+from potr_cl.api.views import Viewpoints, told
+from potr_cl.errors import UsageError
+from potr_cl.formats.images import Colour, write_png
+from potr_cl.host.atomic_write import replacing
+from potr_cl.model.camera import Camera, within_photographs
+from potr_cl.model.scene import Scene
+from potr_cl.plain_text import plain
+from potr_cl.quality.compare import (
+    Comparison,
+    SceneFile,
+    ViewFigures,
+    comparison_report,
+    find_ground_truth,
+    format_comparison,
+    format_sizes,
+    mean_view,
+    size_report,
+)
+from potr_cl.quality.compare import compare as compare_pictures
+from potr_cl.quality.metrics import Lpips
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import RULES, RasterRules
+from potr_cl.report.labels import U8, comparison_picture, shrunk
+
+#: Pixels that a notebook's picture is wide at most: it is kept in the notebook.
+_SHOWN = 960
+
+
+@dataclass(frozen=True, repr=False)
+class SceneComparison:
+    """What one scene's pictures are worth against another's.
+
+    Attributes:
+        a, b: the reference and the candidate.
+        figures: of all views.
+        picture: (H, W, 3) uint8, the worst view: A, B and their difference, labelled.
+        factor: by which the difference is amplified in it.
+        settings: device, rules and background.
+        notes: what else there is to say, a line each.
+    """
+
+    a: SceneFile
+    b: SceneFile
+    figures: Comparison
+    picture: U8
+    factor: int
+    settings: dict[str, Any]
+    notes: list[str]
+
+    @property
+    def mean(self) -> ViewFigures:
+        """Means over the views, see :func:`potr_cl.quality.compare.mean_view`."""
+        return mean_view(self.figures.views)
+
+    @property
+    def psnr(self) -> float:
+        """Mean over the views of the PSNR of B against A in decibels; infinite if all pictures are identical."""
+        return self.mean.figures["b_against_a"].psnr
+
+    @property
+    def ssim(self) -> float:
+        """Mean over the views of the SSIM of B against A."""
+        return self.mean.figures["b_against_a"].ssim
+
+    @property
+    def worst(self) -> ViewFigures:
+        """The view with the lowest PSNR of B against A."""
+        return self.figures.views[self.figures.worst]
+
+    @property
+    def caption(self) -> str:
+        """What the picture shows, in words."""
+        return f"view {self.worst.name}: A, B and their difference times {self.factor}"
+
+    def report(self) -> dict[str, Any]:
+        """All figures, ready for JSON."""
+        return {
+            **size_report(self.a, self.b),
+            **self.settings,
+            **comparison_report(self.figures),
+            "notes": self.notes,
+        }
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the picture of the worst view as PNG.
+
+        Raises:
+            UsageError: it cannot be written there.
+        """
+        with replacing(path) as file:
+            self.write_picture(file)
+
+    def write_picture(self, file: Any) -> None:
+        """Write the picture of the worst view as PNG to an open binary file."""
+        names = f"A is {self.a.path.name}, B is {self.b.path.name}"
+        write_png(file, self.picture, plain(f"{self.caption}; {names}"))
+
+    def __repr__(self) -> str:
+        views = f"{len(self.figures.views)} view{'s' if len(self.figures.views) > 1 else ''}"
+        ratio = f"{self.a.nbytes / self.b.nbytes:.3g} times smaller"
+        worst = f"worst {self.worst.figures['b_against_a'].psnr:.2f} dB in '{self.worst.name}'"
+        return f"SceneComparison({views}, PSNR {self.psnr:.2f} dB, SSIM {self.ssim:.4f}, {worst}, {ratio})"
+
+    def __str__(self) -> str:
+        """The tables that the command ``compare`` prints."""
+        return "\n\n".join([format_sizes(self.a, self.b), format_comparison(self.figures), "\n".join(self.notes)])
+
+    def _repr_png_(self) -> bytes:
+        return png_bytes(shrunk(self.picture, _SHOWN))
+
+
+def compare(
+    a: SceneSource,
+    b: SceneSource,
+    cameras: CamerasSource | None = None,
+    *,
+    truth: str | os.PathLike[str] | None = None,
+    views: Sequence[str | int] | None = None,
+    split: str | None = None,
+    virtual_views: int | None = None,
+    turntable: int | None = None,
+    up: str | Sequence[float] | None = None,
+    size: int | None = None,
+    output: str | os.PathLike[str] | None = None,
+    device: DeviceSource = None,
+    rules: RasterRules | str = "inria",
+    background: ColourSource = "black",
+    trust: bool = False,
+    antialiased: bool | None = None,
+    progress: Callable[[str, float], None] | None = None,
+) -> SceneComparison:
+    """Render two scenes from the same views and compare, as the command ``compare`` does.
+
+    Args:
+        a: the uncompressed scene, or its file.
+        b: the one to judge: a scene, a file, or the result of :func:`potr_cl.encode`.
+        cameras: or their file; None: views are placed around A.
+        truth: a folder of photographs named after the views: A and B are judged by them too.
+        views: names or indices of views.
+        split: "train", "test" or "all"; by default the test views, or all if there are none.
+        virtual_views, turntable, up, size: of the views that are placed, see :func:`potr_cl.render`.
+        output: a PNG file to write: the worst view of A, of B, and their difference, labelled.
+        device: to render on, or what it is called.
+        rules: of the rasterizer to follow: inria or gsplat.
+        background: R, G, B from 0 to 1, or a colour's name.
+        trust, antialiased: as of :func:`potr_cl.load_scene`.
+        progress: called with what is done and the part of it that is done.
+
+    Raises:
+        UsageError: an option is out of range or contradicts another, or a photograph is missing.
+        DataError: a file is damaged.
+        DeviceError: a view does not fit the device, or the device failed.
+    """
+    colour, wanted = colour_of(background), rules_of(rules)
+    points = Viewpoints(virtual_views, turntable, up, size)
+    given = cameras_of(cameras)
+    if given is not None:
+        points.refuse_with_cameras()
+    elif truth is not None:
+        raise UsageError("--truth needs --cameras, the views that the photographs show")
+    scene_a = scene_of(a, trust, antialiased)
+    there = given or points.placed(scene_a)
+    scene_b = scene_of(b, trust, antialiased)
+    comparison = compare_scenes(
+        (named(a, scene_a), scene_a),
+        (named(b, scene_b), scene_b),
+        chosen_views(there, views, split),
+        device=device,
+        rules=wanted,
+        background=colour,
+        truth=None if truth is None else Path(truth),
+        progress=progress,
+        notes=[] if given else [f"no cameras: {told(there)}"],
+    )
+    if output is not None:
+        comparison.save(output)
+    return comparison
+
+
+def named(source: SceneSource, scene: Scene) -> SceneFile:
+    """The facts of a scene; one that comes from no file counts with the bytes of its arrays."""
+    nbytes = bytes_of_file(source)
+    return SceneFile(name_of(source), scene.nbytes if nbytes is None else nbytes, len(scene), scene.sh_degree)
+
+
+def compare_scenes(
+    a: tuple[SceneFile, Scene],
+    b: tuple[SceneFile, Scene],
+    views: Sequence[Camera],
+    *,
+    device: DeviceSource,
+    rules: RasterRules,
+    background: Colour,
+    truth: Path | None = None,
+    progress: Callable[[str, float], None] | None = None,
+    notes: Sequence[str] = (),
+) -> SceneComparison:
+    """The same for scenes that have been read and views that have been chosen.
+
+    Raises:
+        As :func:`compare`.
+    """
+    views = within_photographs(views) if truth is not None else views
+    ground_truth = find_ground_truth(truth, views) if truth is not None else None
+    lpips, told_of = None, list(notes)
+    if a[1].antialiased != b[1].antialiased:
+        ways = " and ".join(
+            f"{name} is rendered {'with' if scene.antialiased else 'without'} antialiasing"
+            for name, scene in (("A", a[1]), ("B", b[1]))
+        )
+        told_of.append(f"warning: {ways}, as the files say: give --antialiased yes or no to render both alike")
+    try:
+        lpips = Lpips()
+    except UsageError as missing:
+        told_of.append(str(missing))
+    opened = device_of(device)
+    with Rasterizer(opened, a[1], rules, background) as of_a, Rasterizer(opened, b[1], rules, background) as of_b:
+        figures = compare_pictures(of_a, of_b, views, ground_truth, lpips, progress or (lambda _stage, _done: None))
+        worst = figures.views[figures.worst]
+        pictures = [each.render(views[figures.worst])[0] for each in (of_a, of_b)]
+    psnr = None if worst.identical else worst.figures["b_against_a"].psnr
+    picture, factor = comparison_picture(pictures[0], pictures[1], worst.name, psnr, (a[0].path.name, b[0].path.name))
+    called = next((name for name, known in RULES.items() if known == rules), "own")
+    settings = {"device": opened.info.name, "rules": called, "background": background}
+    return SceneComparison(a[0], b[0], figures, picture, factor, settings, told_of)

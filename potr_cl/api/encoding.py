@@ -1,0 +1,290 @@
+"""A whole encode in one call, from files or objects, with the options of the command line: :func:`encode`."""
+
+from __future__ import annotations
+
+import contextlib
+import os
+import time
+from collections.abc import Callable, Collection, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+from potr_cl.api.inputs import (
+    CamerasSource,
+    ColourSource,
+    DeviceSource,
+    SceneSource,
+    bytes_of_file,
+    cameras_of,
+    colour_of,
+    device_of,
+    name_of,
+    scene_of,
+)
+from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.quantize import Preset
+from potr_cl.errors import DataError, PotrError, UsageError
+from potr_cl.formats.images import Colour
+from potr_cl.formats.registry import refuse_other_than_potr
+from potr_cl.host.atomic_write import replacing
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+from potr_cl.model.virtual_cameras import place_cameras
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.amounts import as_bytes, size_in_bytes
+from potr_cl.pipeline.encode import Encoded, Stopwatch
+from potr_cl.pipeline.encode import encode as run_stages
+from potr_cl.pipeline.keywords import stage_changes
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.presets import DEFAULT
+from potr_cl.pipeline.search import Found, Target, encode_to_target
+from potr_cl.quality.evaluator import EvaluationViews, Evaluator
+from potr_cl.report.html import PicturePair, html_report, views_to_show
+from potr_cl.report.summary import encode_report, quality_report, search_report
+from potr_cl.stages.refit import Refit
+from potr_cl.stages.stage import Progress, Stage
+
+
+def encode(
+    scene: SceneSource,
+    cameras: CamerasSource | None = None,
+    options: EncodeOptions | None = None,
+    progress: Progress | None = None,
+    device: DeviceSource = None,
+    *,
+    q: float | None = None,
+    preset: Preset | None = None,
+    max_size: int | str | None = None,
+    min_psnr: float | None = None,
+    virtual_views: int | None = None,
+    output: str | os.PathLike[str] | None = None,
+    report: str | os.PathLike[str] | None = None,
+    report_view: str | None = None,
+    background: ColourSource | None = None,
+    memory: float | None = None,
+    threads: int | None = None,
+    trust: bool = False,
+    antialiased: bool | None = None,
+    cameras_anyway: bool | None = None,
+    tell: Callable[[str], None] | None = None,
+    **choices: Any,
+) -> Encoded:
+    """Encode a scene, as the command ``encode`` does, with the same options.
+
+    Args:
+        scene: to encode, or its file.
+        cameras: the training views among them decide which splats may go, and how coarse centres may be; or their
+            file. None: virtual ones are placed if the options ask for anything that looks at views; if not, γ alone
+            decides about centres.
+        options: all at once, instead of the keywords or to be changed by them.
+        progress: called with a stage's name and the part of it that is done.
+        device: computes, or what it is called; by default the one that should be fastest. If its memory is too small,
+            less is kept in it, and if that is not enough, a CPU does the work. A warning says so.
+        q: quality, 0 (smallest) to 1 (best); 0.5 by default.
+        preset: best, fast or paper; best by default.
+        max_size: find the quality that fills this size: bytes, or a text such as "8MB".
+        min_psnr: find the quality that just reaches this PSNR in decibels against the uncompressed scene.
+        virtual_views: how many views to place without cameras.
+        output: a .potr file to write; an existing one is only replaced by what a decoder takes.
+        report: a page of HTML to write: sizes, quality by view, pictures before and after, and the course of pruning.
+        report_view: a view to show there besides the worst and the median one.
+        background: R, G, B from 0 to 1, or a colour's name; black by default.
+        memory: GiB of device memory to keep views in; by default half of it, 0.3 of a CPU's.
+        threads: on the host; one for each processor by default.
+        trust, antialiased: as of :func:`potr_cl.load_scene`.
+        cameras_anyway: take the cameras even if they do not seem to be in the scene's frame.
+        tell: told a line for every step of a search for a size or a PSNR.
+        choices: any option of a stage by the name of its flag: ``keep=0.5`` is ``--keep 0.5``, ``prune=False`` is
+            ``--no-prune``, ``refit="off"`` is ``--refit off``; ``lambda_`` stands for ``--lambda``, as lambda is a word
+            of Python. A stage's name may be given all its options: ``prune={"iterations": 16}``.
+
+    Raises:
+        UsageError: an option is unknown, out of range, or contradicts another; cameras without a training view.
+        UnreachableError: no quality meets ``max_size`` or ``min_psnr``.
+        DataError: a file is damaged, or a value is too large to quantise.
+        DeviceError: no device does the work.
+    """
+    began = time.perf_counter()
+    settings = encode_options(
+        options, preset, choices, q=q, background=background, memory=memory, threads=threads,
+        source_bytes=bytes_of_file(scene), cameras_anyway=cameras_anyway,
+    )  # fmt: skip
+    target = encode_target(q, max_size, min_psnr)
+    if output is not None:
+        refuse_other_than_potr(Path(output))
+    check_photographs_have_cameras(settings, cameras is not None)
+    if report is None and report_view is not None:
+        raise UsageError("report_view needs report, the page that shows it")
+    opened = None if device is None else device_of(device)
+    views = cameras_of(cameras)
+    what = scene_of(scene, trust, antialiased)
+    if views is None and virtual_views is not None and settings.look_at_views(what):
+        views = place_cameras(what, virtual_views)
+    if views is None and report is not None and settings.look_at_views(what):
+        views = place_cameras(what)
+    judging = EvaluationViews.of(views) if views is not None and report is not None else None
+    if report_view is not None and judging is not None:
+        judging.named(report_view)  # an unknown name is told before the work
+    with contextlib.ExitStack() as stack:
+        file = stack.enter_context(replacing(output)) if output is not None else None
+        page = stack.enter_context(replacing(report)) if report is not None else None
+        found: Found | None = None
+        if target is None:
+            encoded = run_stages(what, views, settings, progress, opened)
+        else:
+            found = encode_to_target(what, views, target, settings, progress, opened, tell)
+            encoded = found.encoded
+        if file is None and page is None:
+            return encoded
+        written, candidate = proved(encoded, trust)
+        if file is not None:
+            file.write(written.data)
+        if page is not None:
+            quality: dict[str, Any] | str = "not judged: there are no cameras to look from"
+            pictures: list[PicturePair] = []
+            watch = Stopwatch(progress)
+            if judging is not None:
+                judge = Judge(judging, encoded.device or opened or Device(), encoded.options.background)
+                quality, pictures = judge(what, candidate, watch, report_view, pictures=True)
+            seconds = encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
+            source = name_of(scene)
+            if settings.source_bytes is None:  # of a scene in memory, the bytes of its arrays stand for a file's
+                settings = settings.changed(source_bytes=what.nbytes)
+            used = encoded.options.changed(source_bytes=settings.source_bytes)
+            search = search_report(target, found) if target is not None and found is not None else None
+            document = encode_report(
+                source, what, Path(output or "(in memory)"), written, encoded, used, search, quality, seconds
+            )
+            page.write(html_report(document, pictures).encode())
+    return encoded
+
+
+def encode_options(
+    options: EncodeOptions | None,
+    preset: Preset | None,
+    choices: dict[str, Any],
+    *,
+    q: float | None = None,
+    background: ColourSource | None = None,
+    memory: float | None = None,
+    threads: int | None = None,
+    source_bytes: int | None = None,
+    cameras_anyway: bool | None = None,
+    stages: Collection[type[Stage]] | None = None,
+) -> EncodeOptions:
+    """The options that keywords ask for, checked.
+
+    Args:
+        options: to be changed by the others; None: those of the preset.
+        choices: of stages, see :func:`potr_cl.pipeline.keywords.stage_changes`.
+        stages: of which choices are allowed; None: of all.
+        memory: in GiB.
+
+    Raises:
+        UsageError: an option is unknown or out of range, or both options and a preset are given.
+    """
+    if threads is not None and threads < 0:
+        raise UsageError(f"--threads is {threads}, it must be 0 or more")
+    changes: dict[str, Any] = {
+        "q": q,
+        "background": None if background is None else colour_of(background),
+        "memory": as_bytes(memory),
+        "threads": threads,
+        "source_bytes": source_bytes,
+        "cameras_anyway": cameras_anyway,
+    }
+    changes = {name: value for name, value in changes.items() if value is not None} | stage_changes(choices, stages)
+    if options is None:
+        options = EncodeOptions.for_preset(preset or DEFAULT, **changes)
+    elif preset is not None:
+        raise UsageError("give either options or a preset: the options have one")
+    else:
+        options = options.changed(**changes)
+    _ = options.parameters  # a wrong option is told before a gigabyte is read
+    return options
+
+
+def encode_target(q: float | None, max_size: int | str | None, min_psnr: float | None) -> Target | None:
+    """What to reach, if anything.
+
+    Raises:
+        UsageError: more than one goal is given, or it is out of range.
+    """
+    if sum(goal is not None for goal in (q, max_size, min_psnr)) > 1:
+        raise UsageError("give one of q, max_size and min_psnr: the others follow from it")
+    if max_size is not None:
+        return Target(max_bytes=size_in_bytes(max_size) if isinstance(max_size, str) else max_size)
+    return None if min_psnr is None else Target(min_psnr=min_psnr)
+
+
+def check_photographs_have_cameras(options: EncodeOptions, cameras: bool) -> None:
+    """Refuse photographs to fit without the views that they show.
+
+    Raises:
+        UsageError: there are no cameras, or there is no re-fit.
+    """
+    refit = options.stage(Refit)
+    if refit.ground_truth is not None and not (cameras and refit.asked_for):
+        raise UsageError("--photos needs --cameras, the views that the photographs show, and a re-fit")
+
+
+def proved(encoded: Encoded, trust: bool = False) -> tuple[PotrFile, Scene]:
+    """The file that was made and the scene that a decoder makes of it.
+
+    Raises:
+        PotrError: no decoder takes it.
+    """
+    try:
+        file = PotrFile.from_bytes(encoded.data, **({"trust": True} if trust else {}))
+        return file, file.scene()
+    except DataError as error:
+        raise PotrError(
+            f"the encoded file cannot be decoded ({error}): nothing was written. If the scene has splats that are very "
+            "far away or very large, leave them out"
+        ) from error
+
+
+@dataclass(frozen=True)
+class Judge:
+    """Says how much an encode has lost, in pictures.
+
+    Attributes:
+        views: to judge by.
+        device: to render on.
+        background: behind the scene.
+    """
+
+    views: EvaluationViews
+    device: Device
+    background: Colour
+
+    def __call__(
+        self, scene: Scene, candidate: Scene, watch: Stopwatch, chosen: str | None = None, pictures: bool = False
+    ) -> tuple[dict[str, Any], list[PicturePair]]:
+        """The figures, and pictures for a report.
+
+        Args:
+            scene: uncompressed.
+            candidate: as a decoder sees it.
+            watch: told how far the stage "evaluate" is.
+            chosen: a view to show besides the worst and the median one.
+            pictures: whether to make any.
+
+        Raises:
+            DeviceError: a view does not fit the device, or the device failed.
+        """
+        watch("evaluate", 0.0)
+        with Evaluator(self.device, scene, self.views, self.background) as evaluator:
+            quality = quality_report(self.views, evaluator.compare(candidate, lambda _, done: watch("evaluate", done)))
+            shown = views_to_show(quality, chosen) if pictures else []
+            pairs = evaluator.pictures(candidate, [view["name"] for _, view in shown])
+        return quality, [
+            PicturePair(title, view["name"], view["psnr"], *pair)
+            for (title, view), pair in zip(shown, pairs, strict=True)
+        ]
+
+
+def views_or_placed(scene: Scene, cameras: Sequence[Camera] | None, count: int | None) -> Sequence[Camera]:
+    """The cameras, or virtual ones."""
+    return cameras if cameras is not None else place_cameras(scene, count)

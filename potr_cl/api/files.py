@@ -1,0 +1,103 @@
+"""Files of scenes: :func:`save`, :func:`convert` and :func:`decode`.
+
+To decode takes less time than to import what other functions need, so little is imported here.
+"""
+
+from __future__ import annotations
+
+import os
+from pathlib import Path
+from typing import TYPE_CHECKING, Any
+
+from potr_cl.api.inputs import SceneSource, encoded_bytes, scene_of
+from potr_cl.codec.decoder import decode as decode_file
+from potr_cl.host.atomic_write import replacing
+from potr_cl.model.scene import Scene
+
+if TYPE_CHECKING:
+    from potr_cl.pipeline.encode import Encoded
+
+
+def save(scene: SceneSource, path: str | os.PathLike[str]) -> None:
+    """Write a scene in the format that the suffixes of ``path`` tell; the file appears only when it is whole.
+
+    Args:
+        scene: to write. The result of :func:`potr_cl.encode` is written as it is to a .potr file, and decoded for any
+            other format.
+        path: of the file.
+
+    Raises:
+        UsageError: no format that is written has these suffixes, ``path`` cannot be written to, or an extra is missing.
+        PotrError: the format cannot hold the scene, or the system failed to write.
+    """
+    from potr_cl.formats import scene_writer
+
+    data = encoded_bytes(scene)
+    if data is not None and Path(path).suffix.lower() == ".potr":
+        with replacing(path) as file:
+            file.write(data)
+        return
+    write = scene_writer(path)  # a wrong name is told before anything is read
+    write(scene_of(scene))
+
+
+def convert(
+    scene: SceneSource,
+    output: str | os.PathLike[str],
+    *,
+    spz_version: int | None = None,
+    trust: bool = False,
+    antialiased: bool | None = None,
+) -> Scene:
+    """Read a scene and write it in another format, as the command ``convert`` does.
+
+    Args:
+        scene: its file, usually.
+        output: the file to write; its suffixes tell the format.
+        spz_version: of an .spz file, 2, 3 or 4; by default the one that all readers that were tried take.
+        trust, antialiased: as of :func:`potr_cl.load_scene`.
+
+    Returns:
+        The scene, as it was read.
+
+    Raises:
+        UsageError, DataError: as :func:`potr_cl.load_scene` and :func:`save`.
+    """
+    from potr_cl.formats import scene_writer
+
+    write = scene_writer(output, spz_version)
+    read = scene_of(scene, trust, antialiased)
+    write(read)
+    return read
+
+
+def decode(
+    file: str | os.PathLike[str] | bytes | Encoded,
+    trust: bool = False,
+    sh_degree: int | None = None,
+    *,
+    output: str | os.PathLike[str] | None = None,
+) -> Scene:
+    """Decode a .potr file, as the command ``decode`` does.
+
+    Args:
+        file: its path, its bytes, or the result of :func:`potr_cl.encode`.
+        trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
+        sh_degree: leave out SH coefficients of higher degrees, without decoding them; None: none.
+        output: a file to write the scene to as well, usually a .ply.
+
+    Raises:
+        UsageError: the path cannot be read, ``output`` not be written to, or there is no such degree.
+        DataError: not a .potr file, a damaged one, or too many splats for its size.
+    """
+    write = None
+    if output is not None:
+        from potr_cl.formats import scene_writer
+
+        write = scene_writer(output)
+    data = encoded_bytes(file)
+    told: dict[str, Any] = ({"trust": True} if trust else {}) | ({} if sh_degree is None else {"sh_degree": sh_degree})
+    scene = decode_file(file if data is None else data, **told)  # type: ignore[arg-type]
+    if write is not None:
+        write(scene)
+    return scene

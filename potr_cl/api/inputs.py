@@ -1,0 +1,182 @@
+"""What the functions of this folder take: scenes, cameras, devices and colours, as objects or as a user names them."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Sequence
+from pathlib import Path
+from typing import TYPE_CHECKING, Any, TypeAlias
+
+from potr_cl.codec.decoder import decode
+from potr_cl.errors import UsageError
+from potr_cl.model.camera import Camera, test_views, train_views
+from potr_cl.model.scene import Scene
+
+# What reads files, colours and devices is imported where it is needed: to decode takes less time than to import it.
+if TYPE_CHECKING:
+    from potr_cl.api.editing import Edited
+    from potr_cl.formats.images import Colour
+    from potr_cl.opencl.device import Device
+    from potr_cl.opencl.discovery import DeviceInfo
+    from potr_cl.pipeline.encode import Encoded
+    from potr_cl.raster.rules import RasterRules
+
+#: A scene, or what one is taken from: a path of any format that is read, the result of a stage or of an encode, or a
+#: .potr file's bytes.
+SceneSource: TypeAlias = "Scene | str | os.PathLike[str] | Edited | Encoded | bytes"
+#: Cameras, or what they are read from.
+CamerasSource: TypeAlias = "Sequence[Camera] | str | os.PathLike[str]"
+#: A colour as numbers from 0 to 1, or as the command line takes it.
+ColourSource: TypeAlias = "str | Sequence[float]"
+#: A device, or what it is called: an index, part of a name, "cpu" or "gpu".
+DeviceSource: TypeAlias = "Device | DeviceInfo | str | None"
+
+
+def scene_of(source: SceneSource, trust: bool = False, antialiased: bool | None = None) -> Scene:
+    """The scene that a source stands for.
+
+    Args:
+        source: see :data:`SceneSource`.
+        trust, antialiased: as of :func:`potr_cl.formats.load_scene`.
+
+    Raises:
+        UsageError, DataError: as :func:`potr_cl.formats.load_scene`.
+    """
+    if isinstance(source, Scene):
+        return source.rendered(antialiased)
+    data = encoded_bytes(source)
+    if data is not None:
+        return decode(data, **_trusting(trust)).rendered(antialiased)
+    scene = getattr(source, "scene", None)
+    if isinstance(scene, Scene):
+        return scene.rendered(antialiased)
+    if isinstance(source, (str, os.PathLike)):
+        from potr_cl.formats import load_scene
+
+        return load_scene(source, **_trusting(trust)).rendered(antialiased)
+    raise UsageError(f"a scene is wanted, or the path of its file, not {type(source).__name__}")
+
+
+def encoded_bytes(source: object) -> bytes | None:
+    """The bytes of a .potr file, of such bytes or of the result of an encode; None for anything else."""
+    if isinstance(source, bytes):
+        return source
+    # Asked by name: what makes an encode's result takes long to import, and is there if there is one.
+    pieces = getattr(source, "pieces", None)
+    return b"".join(pieces) if isinstance(pieces, list) else None
+
+
+def cameras_of(source: CamerasSource | None) -> list[Camera] | None:
+    """The cameras that a source stands for; None for None.
+
+    Raises:
+        UsageError: there is no camera; and as :func:`potr_cl.formats.load_cameras`.
+    """
+    if source is None:
+        return None
+    if isinstance(source, (str, os.PathLike)):
+        from potr_cl.formats import load_cameras
+
+        return load_cameras(source)
+    cameras = list(source)
+    if not cameras:
+        raise UsageError("the list of cameras is empty: leave it out, and virtual ones are placed")
+    return cameras
+
+
+def device_of(source: DeviceSource) -> Device:
+    """The device that a source stands for; the one that should be fastest for None.
+
+    Raises:
+        DeviceError: there is none, or it does not work.
+    """
+    from potr_cl.opencl.device import Device
+
+    return source if isinstance(source, Device) else Device(source)
+
+
+def colour_of(source: ColourSource) -> Colour:
+    """A colour as three numbers.
+
+    Raises:
+        UsageError: it is none.
+    """
+    from potr_cl.formats.images import parse_colour
+
+    text = source if isinstance(source, str) else ",".join(repr(float(part)) for part in source)
+    return parse_colour(text)
+
+
+def rules_of(source: RasterRules | str) -> RasterRules:
+    """The rules of a rasterizer, by its name.
+
+    Raises:
+        UsageError: there is no rasterizer of this name.
+    """
+    from potr_cl.raster.rules import RULES
+
+    if not isinstance(source, str):
+        return source
+    if source not in RULES:
+        raise UsageError(f"there are no rules of a rasterizer '{source}': choose {' or '.join(RULES)}")
+    return RULES[source]
+
+
+def bytes_of_file(source: SceneSource) -> int | None:
+    """Bytes of the file that a scene comes from; None where it comes from none, or whoever reads it will say so."""
+    data = encoded_bytes(source)
+    if data is not None:
+        return len(data)
+    if not isinstance(source, (str, os.PathLike)):
+        return None
+    try:
+        return os.stat(source).st_size if os.path.isfile(source) else None
+    except (OSError, ValueError):
+        return None
+
+
+def name_of(source: SceneSource) -> Path:
+    """What a scene is called in results: its path, or what it is."""
+    if isinstance(source, (str, os.PathLike)):
+        return Path(source)
+    return Path("(encoded)" if encoded_bytes(source) is not None else "(scene in memory)")
+
+
+def chosen_views(
+    cameras: Sequence[Camera], views: Sequence[str | int] | None = None, split: str | None = None
+) -> list[Camera]:
+    """The views that are asked for by name or by split; without either the test views, or all if there are none.
+
+    Args:
+        views: names, or indices from 0 in the cameras' order; a view that is named like a number is that view.
+        split: "train", "test" or "all".
+
+    Raises:
+        UsageError: there is no such view.
+    """
+    if views is not None and split is not None:
+        raise UsageError("give either views or a split")
+    if views is not None:
+        by_name = {camera.name: camera for camera in cameras}
+        by_name = {str(index): camera for index, camera in enumerate(cameras)} | by_name
+        for name in map(str, views):
+            if name not in by_name:
+                raise UsageError(
+                    f"there is no view '{name}': the cameras hold {len(cameras)} views, from 0 ('{cameras[0].name}') "
+                    f"to {len(cameras) - 1} ('{cameras[-1].name}')"
+                )
+        return list(dict.fromkeys(by_name[str(name)] for name in views))
+    if split == "all":
+        return list(cameras)
+    if split == "train":
+        return train_views(cameras)
+    if split not in (None, "test"):
+        raise UsageError(f"there is no split '{split}': choose train, test or all")
+    tests = test_views(cameras)
+    if split == "test" and not tests:
+        raise UsageError("none of the cameras is a test view: use --split all, or name views with --views")
+    return tests or list(cameras)
+
+
+def _trusting(trust: bool) -> dict[str, Any]:
+    return {"trust": True} if trust else {}

@@ -1,0 +1,279 @@
+"""Pictures of scenes: :func:`render`, and its results, which show themselves in notebooks."""
+
+from __future__ import annotations
+
+import io
+import os
+from collections.abc import Iterator, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import NamedTuple, overload
+
+from potr_cl.api.inputs import (
+    CamerasSource,
+    ColourSource,
+    DeviceSource,
+    SceneSource,
+    cameras_of,
+    chosen_views,
+    colour_of,
+    device_of,
+    rules_of,
+    scene_of,
+)
+from potr_cl.api.views import Viewpoints, told
+from potr_cl.errors import DataError, DeviceError, UsageError
+from potr_cl.formats.images import to_8_bits, write_png
+from potr_cl.host.atomic_write import replacing
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import RasterRules
+from potr_cl.report.labels import U8, contact_sheet
+
+#: Pixels along a side of each of a preview's pictures.
+_PREVIEW = 200
+
+
+class Rendering(NamedTuple):
+    """A picture of a scene; in a notebook it shows itself.
+
+    Attributes:
+        image: (H, W, 3) float32, linear in the scene's colours, not clamped above.
+        transmittance: (H, W) float32, the share of the background that shows through.
+    """
+
+    image: FloatArray
+    transmittance: FloatArray
+
+    def __repr__(self) -> str:
+        height, width = self.transmittance.shape
+        return f"Rendering({width} x {height} pixels, {100 * float(self.transmittance.mean()):.0f} % background)"
+
+    @property
+    def pixels(self) -> U8:
+        """(H, W, 3) uint8, clamped."""
+        return to_8_bits(self.image)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the picture as PNG, whole or not at all.
+
+        Raises:
+            UsageError: it cannot be written there.
+        """
+        with replacing(path) as file:
+            write_png(file, self.pixels)
+
+    def _repr_png_(self) -> bytes:
+        return png_bytes(self.pixels)
+
+
+@dataclass(frozen=True, repr=False)
+class Renderings(Sequence[Rendering]):
+    """Pictures of a scene from several views, in their order; in a notebook they show themselves on one page.
+
+    Attributes:
+        cameras: the views.
+        pictures: one for each.
+        note: what views were placed, where no cameras were given; else nothing.
+    """
+
+    cameras: list[Camera]
+    pictures: list[Rendering]
+    note: str = ""
+
+    def __repr__(self) -> str:
+        first, last = self.cameras[0], self.cameras[-1]
+        views = f"{len(self)} views from '{first.name}' to '{last.name}'" if len(self) > 1 else f"view '{first.name}'"
+        return f"Renderings({views}, {first.width} x {first.height} pixels)"
+
+    def __len__(self) -> int:
+        return len(self.pictures)
+
+    @overload
+    def __getitem__(self, place: int | str) -> Rendering: ...
+    @overload
+    def __getitem__(self, place: slice) -> list[Rendering]: ...
+    def __getitem__(self, place: int | str | slice) -> Rendering | list[Rendering]:
+        """A picture by its place or by the name of its view."""
+        if not isinstance(place, str):
+            return self.pictures[place]
+        for camera, picture in zip(self.cameras, self.pictures, strict=True):
+            if camera.name == place:
+                return picture
+        raise KeyError(place)
+
+    def sheet(self, heading: str = "") -> U8:
+        """All pictures small on one page, (H, W, 3) uint8, each under the name of its view."""
+        pairs = zip(self.cameras, self.pictures, strict=True)
+        return contact_sheet([(picture.pixels, camera.name) for camera, picture in pairs], heading)
+
+    def save(self, folder: str | os.PathLike[str]) -> list[Path]:
+        """Write each picture as PNG into a folder, which is made if need be; named after the views.
+
+        Returns:
+            The files' paths.
+
+        Raises:
+            UsageError: the folder cannot be made or written to.
+            DataError: two views would have one file.
+        """
+        paths = picture_files(Path(folder), self.cameras)
+        make_folder(Path(folder))
+        for path, picture in zip(paths, self.pictures, strict=True):
+            picture.save(path)
+        return paths
+
+    def _repr_png_(self) -> bytes:
+        return png_bytes(self.sheet())
+
+
+@overload
+def render(
+    scene: SceneSource,
+    cameras: Camera,
+    device: DeviceSource = None,
+    rules: RasterRules | str = "inria",
+    background: ColourSource = "black",
+    *,
+    trust: bool = False,
+    antialiased: bool | None = None,
+) -> Rendering: ...
+@overload
+def render(
+    scene: SceneSource,
+    cameras: CamerasSource | None = None,
+    device: DeviceSource = None,
+    rules: RasterRules | str = "inria",
+    background: ColourSource = "black",
+    *,
+    views: Sequence[str | int] | None = None,
+    split: str | None = None,
+    virtual_views: int | None = None,
+    turntable: int | None = None,
+    up: str | Sequence[float] | None = None,
+    size: int | None = None,
+    output: str | os.PathLike[str] | None = None,
+    trust: bool = False,
+    antialiased: bool | None = None,
+) -> Renderings: ...
+def render(
+    scene: SceneSource,
+    cameras: Camera | CamerasSource | None = None,
+    device: DeviceSource = None,
+    rules: RasterRules | str = "inria",
+    background: ColourSource = "black",
+    *,
+    views: Sequence[str | int] | None = None,
+    split: str | None = None,
+    virtual_views: int | None = None,
+    turntable: int | None = None,
+    up: str | Sequence[float] | None = None,
+    size: int | None = None,
+    output: str | os.PathLike[str] | None = None,
+    trust: bool = False,
+    antialiased: bool | None = None,
+) -> Rendering | Renderings:
+    """Render a scene, as the command ``render`` does.
+
+    For very many views keep a :class:`potr_cl.raster.rasterizer.Rasterizer`: the pictures of this function are all in
+    memory at the end.
+
+    Args:
+        scene: to look at, or its file.
+        cameras: one camera, several, or their file; None: views are placed.
+        device: to render on, or what it is called; the one that should be fastest by default.
+        rules: of the rasterizer to follow: inria, the original's, or gsplat.
+        background: R, G, B from 0 to 1, or a colour's name.
+        views: names or indices of the views to render; all by default.
+        split: render only "train" or "test" views.
+        virtual_views: how many views to place without cameras; 8 by default.
+        turntable: so many views from a circle around the scene instead.
+        up: which way is up in placed views: "x", "y", "z", "-x", "-y", "-z", three numbers; by default a guess.
+        size: pixels along a side of the pictures of placed views; 800 by default.
+        output: a folder to write the pictures to as well, as PNG files named after their views.
+        trust, antialiased: as of :func:`potr_cl.load_scene`.
+
+    Returns:
+        A :class:`Rendering`, the image and the transmittance, for one camera; else :class:`Renderings`.
+
+    Raises:
+        UsageError: an option is out of range, or contradicts another.
+        DataError: a file is damaged.
+        DeviceError: a view does not fit the device, or the device failed.
+    """
+    colour, wanted = colour_of(background), rules_of(rules)
+    points = Viewpoints(virtual_views, turntable, up, size)
+    if isinstance(cameras, Camera):
+        with Rasterizer(device_of(device), scene_of(scene, trust, antialiased), wanted, colour) as rasterizer:
+            return Rendering(*rasterizer.render(cameras))
+    given = cameras_of(cameras)
+    if given is not None:
+        points.refuse_with_cameras()
+    what = scene_of(scene, trust, antialiased)
+    there = given or points.placed(what)
+    note = "" if given else told(there)
+    chosen = chosen_views(there, views, split or (None if views is not None else "all"))
+    paths = picture_files(Path(output), chosen) if output is not None else []
+    with Rasterizer(device_of(device), what, wanted, colour) as rasterizer:
+        pictures = [Rendering(*rasterizer.render(camera)) for camera in chosen]
+    result = Renderings(chosen, pictures, note)
+    if paths and output is not None:
+        result.save(output)
+    return result
+
+
+def preview(scene: SceneSource) -> bytes | None:
+    """A small picture of a scene from four sides, as the bytes of a PNG file: what notebooks show of it.
+
+    None where no device renders it: a notebook then shows the line of text that the scene is anyway.
+    """
+    what = scene_of(scene)
+    try:
+        pictures = render(what, turntable=4, size=_PREVIEW)
+    except DeviceError:
+        return None
+    return png_bytes(pictures.sheet(repr(what)))
+
+
+def picture_files(folder: Path, cameras: Sequence[Camera]) -> list[Path]:
+    """The PNG file of each view in a folder; views' names, which others chose, do not lead out of it.
+
+    Raises:
+        DataError: two views would have one file.
+    """
+    names = [camera.name.replace("/", "_") + ".png" for camera in cameras]
+    if len(set(names)) < len(names):
+        raise DataError("two views of the cameras would be written to one file: choose among them with --views")
+    return [folder / name for name in names]
+
+
+def make_folder(folder: Path) -> None:
+    """Make a folder unless it is there.
+
+    Raises:
+        UsageError: it cannot be made.
+    """
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot make the folder '{folder}': {error.strerror}") from None
+
+
+def written_pictures(rasterizer: Rasterizer, cameras: Sequence[Camera], paths: Sequence[Path]) -> Iterator[Path]:
+    """Render views and write them one after another, so that no more than one is in memory; yields what is written.
+
+    Raises:
+        UsageError: a file cannot be written.
+        DeviceError: a view does not fit the device, or the device failed.
+    """
+    for camera, path in zip(cameras, paths, strict=True):
+        Rendering(*rasterizer.render(camera)).save(path)
+        yield path
+
+
+def png_bytes(pixels: U8) -> bytes:
+    """(H, W, 3) uint8 as the bytes of a PNG file."""
+    file = io.BytesIO()
+    write_png(file, pixels)
+    return file.getvalue()

@@ -1,0 +1,106 @@
+"""The views to look at a scene from where a user wants pictures: cameras that are given, or views placed for it."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from potr_cl.errors import UsageError
+from potr_cl.model.camera import Camera, camera_centres, focus
+from potr_cl.model.scene import Scene
+from potr_cl.model.viewpoints import AXES, SIZE, VIEWS, look_around, turntable
+
+
+@dataclass(frozen=True)
+class Viewpoints:
+    """How to look at a scene that comes without cameras.
+
+    Attributes:
+        count: how many views to place; None: 8.
+        turntable: how many views from a circle around the scene to take instead.
+        up: which way is up: x, y, z, -x, -y, -z, three numbers, or auto, a guess.
+        size: pixels along a side of the square pictures; None: 800.
+
+    Raises:
+        UsageError: these are no directions, or both kinds of views are asked for.
+    """
+
+    count: int | None = None
+    turntable: int | None = None
+    up: str | Sequence[float] | None = None
+    size: int | None = None
+
+    def __post_init__(self) -> None:
+        if self.count is not None and self.turntable is not None:
+            raise UsageError("give either --virtual-views or --turntable: each says how many views to place")
+        _ = self.direction
+
+    @property
+    def asked_for(self) -> list[str]:
+        """What has been said of views to place, as the command line calls it: it contradicts cameras."""
+        given = {
+            "--virtual-views": self.count,
+            "--turntable": self.turntable,
+            "--up": self.up,
+            "--size": self.size,
+        }
+        return [name for name, value in given.items() if value is not None]
+
+    @property
+    def direction(self) -> tuple[float, ...] | None:
+        """(3,) what is up; None for a guess."""
+        if self.up is None or self.up == "auto":
+            return None
+        if not isinstance(self.up, str):
+            return tuple(float(part) for part in self.up)
+        if self.up in AXES:
+            return AXES[self.up]
+        try:
+            parts = tuple(float(part) for part in self.up.split(","))
+        except ValueError:
+            parts = ()
+        if len(parts) != 3 or not np.isfinite(parts).all() or not any(parts):
+            raise UsageError(f"'{self.up}' is no direction: give --up={'|'.join(AXES)}, X,Y,Z or auto")
+        return parts
+
+    def placed(self, scene: Scene) -> list[Camera]:
+        """The views.
+
+        Raises:
+            UsageError: too few or too many are asked for.
+        """
+        size = SIZE if self.size is None else self.size
+        if self.turntable is not None:
+            return turntable(scene, self.turntable, size, self.direction)
+        return look_around(scene, VIEWS if self.count is None else self.count, size, self.direction)
+
+    def refuse_with_cameras(self) -> None:
+        """Say that cameras are given and that views are to be placed contradict each other.
+
+        Raises:
+            UsageError: views are to be placed.
+        """
+        if self.asked_for:
+            raise UsageError(f"{self.asked_for[0]} is for scenes without cameras: leave it out, or --cameras")
+
+
+def told(cameras: Sequence[Camera]) -> str:
+    """One line about views that were placed: what they are, where, and which way is up in them."""
+    centres, middle = camera_centres(cameras), focus(cameras)
+    distance = float(np.median(np.linalg.norm(centres - middle, axis=1)))
+    turning = cameras[0].name.startswith("turntable_")
+    kind = "views of a turntable" if turning else "virtual views"
+    # Of level cameras, what is up in the scene is what is up in each picture, but for their tilt.
+    right = np.stack([camera.rotation[0] for camera in cameras])
+    up = np.linalg.svd(np.concatenate([right, np.zeros((2, 3))]))[2][-1]
+    up = up * np.sign(-up @ np.mean([camera.rotation[1] for camera in cameras], axis=0) or 1)
+    return (
+        f"{len(cameras)} {kind if len(cameras) > 1 else kind.replace('views', 'view')} of {cameras[0].width} x "
+        f"{cameras[0].height} pixels, {distance:.3g} units from ({_listed(middle)}), up is ({_listed(up)})"
+    )
+
+
+def _listed(numbers: Sequence[float] | np.ndarray[tuple[int, ...], np.dtype[np.float64]]) -> str:
+    return ", ".join(f"{round(float(x), 3) + 0.0:.3g}" for x in numbers)

@@ -1,0 +1,325 @@
+"""Scenes as glTF files (.glb, .gltf) with the extension KHR_gaussian_splatting of the Khronos Group.
+
+Read are all splats of the asset's scene, where its nodes put them. Scales and opacities are stored as they are, not as
+logarithms and logits; a rotation has w last. The axes are the file's: glTF's y points up, where the PLY files of most
+trainers have it point down, and splat-transform turns a scene by 180 degrees about z when it writes one.
+
+Specification: github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian_splatting.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+import os
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.logarithm import natural_logarithm
+from potr_cl.errors import DataError
+from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.scenes.gltf_file import Asset
+from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, cleaned, joined, log_of_scales, reading, shown
+from potr_cl.model.claims import check_claim
+from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
+from potr_cl.model.sh_rotation import rotated_sh
+
+_log = logging.getLogger("potr_cl")
+
+_EXTENSION = "KHR_gaussian_splatting"
+_POINTS = 0
+_SRGB, _LINEAR = "srgb_rec709_display", "lin_rec709_display"
+#: Extensions of the asset that change nothing of what is read here, or are read.
+_HARMLESS = {_EXTENSION, "KHR_mesh_quantization", "KHR_materials_unlit", "KHR_texture_transform"}
+#: Every scene may have so many meshes with splats, each of which takes time.
+_MOST_PARTS = 4096
+#: Largest difference from a rotation that a node's matrix may have by rounding.
+_ROUNDING = 1e-3
+
+Matrix = NDArray[np.float64]
+
+
+def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
+    """Read the splats of a glTF scene.
+
+    Args:
+        path: of the .glb or .gltf file.
+        trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
+
+    Raises:
+        UsageError: a file is missing.
+        DataError: it is damaged, holds no splats or too many for its size, or has them in a way that is not read.
+    """
+    asset = Asset(path)
+    with reading(path):
+        return cleaned(path, _scene(path, asset, trust))
+
+
+FORMAT = SceneFormat(
+    name="glTF",
+    suffixes=(".glb", ".gltf"),
+    note="with the Khronos Group's KHR_gaussian_splatting, uncompressed, floats or integers; nodes' transforms are "
+    "applied, axes kept",
+    load=load,
+    not_written="nothing here writes glTF: convert to .ply, and that with splat-transform",
+    starts=(b"glTF",),
+)
+
+
+def _scene(path: str | os.PathLike[str], asset: Asset, trust: bool) -> Scene:
+    others = [name for name in asset.description.get("extensionsRequired", []) if name not in _HARMLESS]
+    found: list[tuple[dict[str, Any], _Node]] = []
+    left_out = 0
+    for node in _nodes(asset):
+        for primitive in asset.entry("meshes", node.entry["mesh"]).get("primitives", []):
+            if isinstance(primitive, dict) and _EXTENSION in primitive.get("extensions", {}):
+                found.append((primitive, node))
+            else:
+                left_out += 1
+    if not found:
+        raise DataError(
+            f"'{path}' holds no Gaussian splats: no part of its scene has the extension {_EXTENSION}; it is a mesh or "
+            "a point cloud"
+        )
+    primitives = {id(primitive): primitive for primitive, _ in found}
+    for primitive in primitives.values():
+        _check_kind(path, asset, primitive)
+    if others:
+        raise DataError(f"'{path}' needs the glTF extension {shown(others[0])}, which is not known here")
+    counts = {number: _count(asset, primitive) for number, primitive in primitives.items()}
+    try:
+        check_claim(sum(counts[id(primitive)] for primitive, _ in found), asset.size, MOST_A_BYTE, trust)
+        if len(found) > _MOST_PARTS and not trust:
+            raise DataError(f"{len(found)} meshes with splats are more than are read without --trust (trust=True)")
+    except DataError as error:
+        raise DataError(f"'{path}': {error}") from None
+    if left_out:
+        _log.warning("'%s': left out %d parts of the scene that are no splats", path, left_out)
+    scenes = {number: _splats(path, asset, primitive) for number, primitive in primitives.items()}
+    return joined([_placed(path, scenes[id(primitive)], node.matrix(asset)) for primitive, node in found])
+
+
+@dataclasses.dataclass
+class _Node:
+    """A node of the scene: what the file says of it, and the node above it."""
+
+    entry: dict[str, Any]
+    above: _Node | None
+    known: Matrix | None = None
+
+    def matrix(self, asset: Asset) -> Matrix:
+        """(4, 4) from its axes to those of the scene."""
+        chain: list[_Node] = []
+        node: _Node | None = self
+        while node is not None and node.known is None:
+            chain.append(node)
+            node = node.above
+        matrix = np.eye(4) if node is None or node.known is None else node.known
+        for below in reversed(chain):
+            matrix = below.known = matrix @ _matrix(asset, below.entry)
+        return matrix
+
+
+def _nodes(asset: Asset) -> list[_Node]:
+    """The nodes of the scene that have a mesh."""
+    nodes = asset.description.get("nodes", [])
+    if "scenes" in asset.description:
+        roots = asset.entry("scenes", asset.description.get("scene", 0)).get("nodes", [])
+    else:
+        children = {child for node in nodes for child in node.get("children", [])}
+        roots = [number for number in range(len(nodes)) if number not in children]
+    found, seen = [], set()
+    left: list[tuple[Any, _Node | None]] = [(number, None) for number in reversed(roots)]
+    while left:
+        number, above = left.pop()
+        node = _Node(asset.entry("nodes", number), above)
+        if number in seen:
+            raise asset.damaged(f"node {number} stands twice in its scene")
+        seen.add(number)
+        if "mesh" in node.entry:
+            found.append(node)
+        left += [(child, node) for child in reversed(node.entry.get("children", []))]
+    return found
+
+
+def _matrix(asset: Asset, node: dict[str, Any]) -> Matrix:
+    """(4, 4) from a node's axes to those of the node above it."""
+    if "matrix" in node:
+        return _numbers(asset, node, "matrix", [0.0] * 16).reshape(4, 4).T
+    matrix = np.eye(4)
+    rotation = _numbers(asset, node, "rotation", [0.0, 0.0, 0.0, 1.0])
+    scale = _numbers(asset, node, "scale", [1.0, 1.0, 1.0])
+    length = np.linalg.norm(rotation)
+    if not length > 0:
+        raise asset.damaged("a node's rotation has the length zero")
+    matrix[:3, :3] = _rotation_matrix(rotation[[3, 0, 1, 2]] / length) * scale
+    matrix[:3, 3] = _numbers(asset, node, "translation", [0.0, 0.0, 0.0])
+    return matrix
+
+
+def _numbers(asset: Asset, node: dict[str, Any], key: str, default: list[float]) -> Matrix:
+    values = node.get(key, default)
+    if (
+        not isinstance(values, list)
+        or len(values) != len(default)
+        or not all(type(value) in (int, float) and abs(value) < 1e30 for value in values)
+    ):
+        raise asset.damaged(f"the '{key}' of a node is not {len(default)} numbers")
+    return np.array(values, np.float64)
+
+
+def _check_kind(path: str | os.PathLike[str], asset: Asset, primitive: dict[str, Any]) -> None:
+    """That splats are of the kind that the base extension describes, which is that of 3DGS."""
+    kind = primitive["extensions"][_EXTENSION]
+    if not isinstance(kind, dict):
+        raise asset.damaged(f"its {_EXTENSION} is no object")
+    packed = kind.get("extensions", {})
+    if packed:
+        name = next(iter(packed))
+        why = "whose text is a draft still, and " if "spz" in str(name) else ""
+        raise DataError(
+            f"'{path}' has its splats in the extension {shown(name)}, {why}which cannot be read: export it without "
+            "compression, or as .spz"
+        )
+    for key, default, known in (
+        ("kernel", "ellipse", ("ellipse",)),
+        ("projection", "perspective", ("perspective",)),
+        ("colorSpace", _SRGB, (_SRGB, _LINEAR)),
+    ):
+        if kind.get(key, default) not in known:
+            raise DataError(f"'{path}' has splats whose {key} is {shown(kind[key])}: only {known[0]} can be read")
+    if kind.get("colorSpace", _SRGB) == _LINEAR:
+        _log.warning("'%s' has linear colours: they are kept as they are, and look darker than they should", path)
+    if primitive.get("mode", 4) != _POINTS:
+        raise asset.damaged("its splats are no points")
+    if not isinstance(primitive.get("attributes"), dict):
+        raise asset.damaged("its splats have no attributes")
+
+
+def _count(asset: Asset, primitive: dict[str, Any]) -> int:
+    return asset.count(primitive["attributes"].get("POSITION"))
+
+
+def _splats(path: str | os.PathLike[str], asset: Asset, primitive: dict[str, Any]) -> Scene:
+    """The splats of a primitive, in the axes of its node."""
+    attributes: dict[str, Any] = primitive["attributes"]
+    count = _count(asset, primitive)
+
+    def values(name: str, parts: int) -> FloatArray:
+        if name not in attributes:
+            raise asset.damaged(f"its splats have no {name}")
+        if asset.count(attributes[name]) != count:
+            raise asset.damaged(f"{name} is not as long as POSITION")
+        return asset.values(attributes[name], parts)
+
+    degree = 0
+    while degree < 3 and f"{_EXTENSION}:SH_DEGREE_{degree + 1}_COEF_0" in attributes:
+        degree += 1
+    if f"{_EXTENSION}:SH_DEGREE_4_COEF_0" in attributes:
+        _log.warning("'%s': SH degree 4 is left out: only degrees 0 to 3 are kept", path)
+    sh = np.empty((count, SH_COEFFICIENTS[degree], 3), np.float32)
+    names = [f"{_EXTENSION}:SH_DEGREE_{k}_COEF_{n}" for k in range(degree + 1) for n in range(2 * k + 1)]
+    for k, name in enumerate(names):
+        sh[:, k] = values(name, 3)
+    scales = values(f"{_EXTENSION}:SCALE", 3)
+    if (scales < 0).any():
+        raise DataError(
+            f"'{path}' has negative scales: an early draft of {_EXTENSION} had logarithms there, which cannot be told "
+            "from damage: export it anew"
+        )
+    opacities = values(f"{_EXTENSION}:OPACITY", 1)[:, 0]
+    if not ((opacities >= 0) & (opacities <= 1) | np.isnan(opacities)).all():
+        raise asset.damaged("there are opacities that are not between 0 and 1")
+    rotations = values(f"{_EXTENSION}:ROTATION", 4)
+    return Scene(values("POSITION", 3), log_of_scales(scales), rotations[:, [3, 0, 1, 2]], _logits(opacities), sh)
+
+
+def _logits(opacities: FloatArray) -> FloatArray:
+    """Logits of float32 opacities; infinite ones, which are mended later, of 0 and 1."""
+    inside = (opacities > 0) & (opacities < 1)
+    middle = np.where(inside, opacities, np.float32(0.5))
+    logits = natural_logarithm(middle) - natural_logarithm(np.float32(1) - middle)
+    return np.where(inside, logits, np.where(opacities >= 1, np.inf, np.where(opacities <= 0, -np.inf, np.nan))).astype(
+        np.float32
+    )
+
+
+def _placed(path: str | os.PathLike[str], scene: Scene, matrix: Matrix) -> Scene:
+    """Splats in the axes of the scene."""
+    if np.array_equal(matrix, np.eye(4)):
+        return scene
+    linear = matrix[:3, :3]
+    lengths = np.linalg.norm(linear, axis=0)
+    if not np.isfinite(matrix).all() or not (lengths > 0).all():
+        raise DataError(f"'{path}' is damaged: a node's transform is no transform")
+    rotation = linear / lengths
+    if np.abs(rotation.T @ rotation - np.eye(3)).max() > _ROUNDING or np.linalg.det(rotation) < 0:
+        raise DataError(f"'{path}' has splats in a node that is sheared or mirrored, which splats cannot be")
+    scene = dataclasses.replace(
+        scene, means=(scene.means.astype(np.float64) @ linear.T + matrix[:3, 3]).astype(np.float32)
+    )
+    if np.abs(rotation - np.eye(3)).max() > 0:
+        scene = dataclasses.replace(scene, sh=rotated_sh(scene.sh, rotation))
+    if np.ptp(lengths) > _ROUNDING * lengths.max():
+        return _stretched(scene, linear)
+    logarithms = scene.log_scales + np.float32(np.log(lengths.mean()))
+    return dataclasses.replace(
+        scene, log_scales=logarithms, quaternions=_turned(scene.quaternions, _quaternions(rotation[None])[0])
+    )
+
+
+def _stretched(scene: Scene, linear: Matrix) -> Scene:
+    """Splats whose axes a matrix scales differently: their new axes are the singular vectors."""
+    log_scales, quaternions = np.empty_like(scene.log_scales), np.empty_like(scene.quaternions)
+    block = 1 << 14
+    for start in range(0, len(scene), block):
+        rows = slice(start, start + block)
+        unit = scene.quaternions[rows].astype(np.float64)
+        unit /= np.maximum(np.linalg.norm(unit, axis=1, keepdims=True), 1e-30)
+        axes = _rotation_matrix(unit) * np.exp(scene.log_scales[rows].astype(np.float64))[:, None, :]
+        good = np.isfinite(axes.reshape(len(axes), 9)).all(axis=1)
+        axes[~good] = np.eye(3)
+        vectors, values, _ = np.linalg.svd(linear @ axes)
+        vectors[np.linalg.det(vectors) < 0, :, 2] *= -1
+        log_scales[rows] = log_of_scales(values.astype(np.float32))
+        log_scales[rows][~good] = np.nan
+        quaternions[rows] = _quaternions(vectors)
+    return dataclasses.replace(scene, log_scales=log_scales, quaternions=quaternions)
+
+
+def _rotation_matrix(quaternions: Matrix) -> Matrix:
+    """(…, 3, 3) from unit quaternions (…, 4), w first."""
+    w, x, y, z = np.moveaxis(quaternions, -1, 0)
+    rows = [
+        [1 - 2 * (y * y + z * z), 2 * (x * y - w * z), 2 * (x * z + w * y)],
+        [2 * (x * y + w * z), 1 - 2 * (x * x + z * z), 2 * (y * z - w * x)],
+        [2 * (x * z - w * y), 2 * (y * z + w * x), 1 - 2 * (x * x + y * y)],
+    ]
+    return np.stack([np.stack(row, axis=-1) for row in rows], axis=-2)
+
+
+def _quaternions(rotations: Matrix) -> Matrix:
+    """(n, 4) unit quaternions, w first, of rotation matrices (n, 3, 3), each by its largest part."""
+    products = np.empty((len(rotations), 4, 4))
+    products[:, 1:, 1:] = rotations + rotations.transpose(0, 2, 1)
+    for k in range(3):
+        a, b = (k + 1) % 3, (k + 2) % 3
+        products[:, 0, k + 1] = products[:, k + 1, 0] = rotations[:, b, a] - rotations[:, a, b]
+    trace = np.einsum("nii->n", rotations)
+    products[:, 0, 0] = 1 + trace
+    for k in range(3):
+        products[:, k + 1, k + 1] = 1 + 2 * rotations[:, k, k] - trace
+    largest = np.einsum("nii->ni", products).argmax(axis=1)
+    rows = products[np.arange(len(rotations)), largest]
+    quaternions: Matrix = rows / np.linalg.norm(rows, axis=1, keepdims=True)
+    return quaternions
+
+
+def _turned(quaternions: FloatArray, by: Matrix) -> FloatArray:
+    """The product of one quaternion with each of many, w first."""
+    w, x, y, z = by
+    matrix = np.array([[w, -x, -y, -z], [x, w, -z, y], [y, z, w, -x], [z, -y, x, w]])
+    turned: FloatArray = (quaternions.astype(np.float64) @ matrix.T).astype(np.float32)
+    return turned

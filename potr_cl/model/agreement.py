@@ -1,0 +1,242 @@
+"""Do these cameras belong to this scene? :func:`judge_cameras` says; :func:`require_agreement` refuses what does not.
+
+A scene that was turned, shifted or scaled after training, or cameras of another scene: whoever removes what no such
+camera misses removes the scene. So both are looked at before anything is thrown away:
+
+- what part of the splats a view shows, and what part of its picture is not background;
+- how large a splat is in the picture, as a part of it: far from usual where units differ;
+- how much the colours vary towards the view (:mod:`potr_cl.model.sightings`): little, if they were never trained from
+  there.
+
+None of these is wrong in itself: a view may see a corner only, an excerpt fills few pixels, and a scene of degree 0
+remembers nothing. So what counts is whether the cameras fit *much better* if the scene is moved in one of the ways in
+which scenes are moved (:mod:`potr_cl.model.motions`). Cameras for which no such way is better are taken as they are,
+unless they see nothing at all. docs/benchmarks/frames.md has what this finds, and by which margin.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.errors import UsageError
+from potr_cl.model.camera import Camera
+from potr_cl.model.motions import Motion, likely_motions
+from potr_cl.model.scene import Scene
+from potr_cl.model.sightings import Poses, Sample, Sights, look, poses, sample
+
+#: Views that are looked at; those of them by which motions are chosen, and how many of each kind (once by how well they
+#: fit, once by how usual they are) are then looked at in all.
+_VIEWS, _FEW, _CHOSEN = 16, 4, 3
+#: A fit of this or more cannot be surpassed by much: nothing else is tried.
+_FINE = -0.9
+#: A motion must fit at least so well to be believed in.
+_PLAUSIBLE = -2.1
+#: By how much a motion must fit better: with many views, if people know its size, and if it was fitted to the cameras;
+#: and what one view needs on top, which falls with this power of their number. (One view may look at a bare wall.)
+_BETTER, _FITTED = 0.42, 1.2
+_ALONE, _FALL = 5.0, 1.5
+#: Of several motions that fit as well but for this, the most usual one is told.
+_AS_WELL = 0.35
+#: Part of a scene's splats that views must see at least, whatever the rest.
+_LEAST_SEEN = 0.005
+#: The least that a view can count for: it sees nothing.
+_NOTHING = 1e-3
+#: From which :attr:`~potr_cl.model.sightings.Sights.remembered` on the colours know a view, and how much that counts.
+_KNOWN, _MEMORY = 0.6, 4.0
+#: A typical splat's size, as a part of the picture's, and the factor that is a standard deviation from it.
+_USUAL_SIZE, _SIZE_SPREAD = 0.005, 4.0
+
+
+@dataclass(frozen=True)
+class Fit:
+    """How well cameras suit a scene.
+
+    Attributes:
+        total: about 0 at best; a logarithm: 0.7 less is half as plausible in every view.
+        seen: part of the scene's splats that any of the views sees.
+        covered: part of the pictures that shows the scene and not the background; mean over views.
+        known: part of the views that the colours know, of those of which they can tell; None if they tell of none.
+        size: of a typical splat, as a part of a picture's size; None where none is seen.
+    """
+
+    total: float
+    seen: float
+    covered: float
+    known: float | None
+    size: float | None
+
+
+@dataclass(frozen=True)
+class Judgement:
+    """Whether cameras belong to a scene.
+
+    Attributes:
+        views: that were looked at.
+        fit: of the cameras as they are.
+        motion: what was done to the scene, most likely, if the cameras are not in its frame; None if no motion that was
+            tried fits plausibly, or none had to be tried.
+        moved: the fit if that is undone.
+        needed: by how much the motion had to fit better to be believed.
+    """
+
+    views: int
+    fit: Fit
+    motion: Motion | None = None
+    moved: Fit | None = None
+    needed: float = math.inf
+
+    @property
+    def gain(self) -> float:
+        """By how much the motion fits better."""
+        return -math.inf if self.moved is None else self.moved.total - self.fit.total
+
+    @property
+    def blind(self) -> bool:
+        """Whether the views see nothing to speak of."""
+        return self.fit.seen < _LEAST_SEEN
+
+    @property
+    def suspicious(self) -> bool:
+        """Whether the cameras are probably not in the scene's frame."""
+        return self.blind or self.gain >= self.needed
+
+    @property
+    def finding(self) -> str:
+        """What was found, in a sentence without a full stop; for cameras that are suspicious."""
+        fit = self.fit
+        facts = [f"{self.views} views see {_percent(fit.seen)} of the splats, {_percent(fit.covered)} of the pictures"]
+        if fit.known is not None and fit.known < 1:
+            facts.append(f"the colours know {_percent(fit.known)} of the views")
+        text = f"the cameras do not seem to be in the scene's frame: {', '.join(facts)}"
+        if self.motion is None or self.moved is None or self.gain < self.needed:
+            return text
+        moved = self.moved
+        then = f"{_percent(moved.seen)} and {_percent(moved.covered)}"
+        if moved.known is not None:
+            then += f", {_percent(moved.known)} known"
+        return f"{text}; they fit if the scene was {self.motion.name} after training ({then})"
+
+    @property
+    def remedy(self) -> str:
+        """What bring both together again, in a few words."""
+        undone = "" if self.motion is None or self.gain < self.needed else self.motion.undone
+        if undone:
+            return f"bring the scene back ({undone})"
+        if self.motion is not None and self.gain >= self.needed:
+            return "give the cameras of this scene, or undo what moved it"
+        return "give the cameras of this scene"
+
+
+def judge_cameras(scene: Scene, cameras: Sequence[Camera]) -> Judgement:
+    """Judge whether cameras and scene belong together.
+
+    It looks at a sample of the scene through some of the views, on the processor: a tenth of a second, or one where
+    there is doubt. The same scene and cameras are judged the same everywhere.
+
+    Args:
+        scene: clean, at least one splat.
+        cameras: at least one; the training views if only these will be looked at.
+
+    Raises:
+        UsageError: there is no camera.
+    """
+    if not cameras:
+        raise UsageError("there is no camera to judge")
+    at = sample(scene)
+    world = poses(cameras)
+    some = world.some(_spread(len(cameras), _VIEWS))
+    fit = _fit(look(at, some))
+    if fit.seen < _LEAST_SEEN and len(cameras) > len(some.centres):
+        # Few of many views may be those that see it: all are asked before it is said that none does.
+        more = look(at, world.some(_spread(len(cameras), 6 * _VIEWS)))
+        fit = Fit(fit.total, float(more.seen.any(axis=0).mean()), fit.covered, fit.known, fit.size)
+    views = len(some.centres)
+    found = None if fit.total >= _FINE else _best_motion(at, some, fit)
+    if found is None:
+        return Judgement(views, fit)
+    motion, moved = found
+    return Judgement(views, fit, motion, moved, _needed(motion, views))
+
+
+def require_agreement(scene: Scene, cameras: Sequence[Camera]) -> None:
+    """Refuse cameras that are probably not in the scene's frame.
+
+    Args:
+        scene: clean, at least one splat.
+        cameras: at least one.
+
+    Raises:
+        UsageError: they are not, with what was found and what can be done.
+    """
+    judged = judge_cameras(scene, cameras)
+    if judged.suspicious:
+        raise UsageError(
+            f"{judged.finding}: {judged.remedy}, leave --cameras out (virtual ones are placed), or, if they are right, "
+            "--cameras-anyway"
+        )
+
+
+def _fit(sights: Sights) -> Fit:
+    share = np.sqrt(sights.seen.mean(axis=1) * sights.covered)
+    tells = np.isfinite(sights.remembered)
+    memory = np.log(np.clip(np.where(tells, sights.remembered, 1) / _KNOWN, 0.05, 1))
+    sizes = sights.sizes[np.isfinite(sights.sizes)]
+    size = float(np.median(sizes)) if len(sizes) else None
+    odd = 3.0 if size is None else 0.5 * (math.log(max(size, 1e-30) / _USUAL_SIZE) / math.log(_SIZE_SPREAD)) ** 2
+    known = float(np.mean(sights.remembered[tells] >= _KNOWN)) if tells.any() else None
+    return Fit(
+        total=float(np.log(np.maximum(share, _NOTHING)).mean() + _MEMORY * memory.mean() - odd),
+        seen=float(sights.seen.any(axis=0).mean()),
+        covered=float(sights.covered.mean()),
+        known=known,
+        size=size,
+    )
+
+
+def _best_motion(at: Sample, cameras: Poses, fit: Fit) -> tuple[Motion, Fit] | None:
+    """The motion after which the cameras fit best, and how well; None if it is not plausible."""
+    views = len(cameras.centres)
+    motions = list(likely_motions(cameras, at))
+    rough = cameras.some(_spread(views, _FEW))
+    totals = np.array([_fit(look(at, motion.of(rough))).total for motion in motions])
+    best = _promising(totals, np.array([motion.fitted for motion in motions]))
+    tried = [(motions[number], _fit(look(at, motions[number].of(cameras)))) for number in best]
+    gains = [(each.total - fit.total - _needed(motion, views), motion, each) for motion, each in tried]
+    gains = [gain for gain in gains if gain[2].total >= _PLAUSIBLE]
+    if not gains:
+        return None
+    # What people do to scenes explains more than what could be fitted to any cameras.
+    enough = [gain for gain in gains if gain[0] >= 0]
+    gains = [gain for gain in enough if not gain[1].fitted] or enough or gains
+    most = max(margin for margin, _, _ in gains)
+    return next((motion, moved) for margin, motion, moved in gains if margin >= most - _AS_WELL)
+
+
+def _promising(totals: NDArray[np.float64], fitted: NDArray[np.bool_]) -> NDArray[np.int64]:
+    """Numbers of the motions to look at closely: of either kind the best ones, and the most usual of the good ones."""
+    chosen: list[int] = []
+    for kind in (False, True):
+        own = np.flatnonzero(fitted == kind)
+        if len(own):
+            chosen += own[np.argsort(-totals[own], kind="stable")[:_CHOSEN]].tolist()
+            chosen += own[totals[own] >= totals[own].max() - _AS_WELL][:_CHOSEN].tolist()
+    return np.unique(chosen)
+
+
+def _needed(motion: Motion, views: int) -> float:
+    return (_FITTED if motion.fitted else _BETTER) + _ALONE * math.exp(-_FALL * math.log(views))
+
+
+def _spread(count: int, wanted: int) -> NDArray[np.int64]:
+    """Numbers of so many of ``count`` things, evenly spread."""
+    return np.unique(np.linspace(0, count - 1, min(count, wanted)).round().astype(np.int64))
+
+
+def _percent(part: float) -> str:
+    percent = 100 * part
+    return f"{percent:.0f} %" if percent >= 9.5 or percent == 0 else f"{percent:.2g} %"

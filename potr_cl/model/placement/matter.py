@@ -1,0 +1,160 @@
+"""Where a scene is, how large, and what hides what from a place: points in a coarse cube map, no rendering."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.model.placement.sampling import F64, low_discrepancy
+from potr_cl.model.scene import Scene
+
+F32 = NDArray[np.float32]
+
+#: A place is in dense matter if more than this part of all directions is taken up within this (in median radii).
+CROWDED, _ELBOW_ROOM = 0.005, 0.2
+#: The renderer's near plane in world units, with room to spare: nothing nearer than this is ever seen.
+_NEAR = 0.25
+#: Splats that the views are judged by, and points that hide them.
+_TARGETS = 3000
+_OCCLUDERS = 20000
+#: Nothing is farther away than this, in median radii.
+_FAR = 1e6
+#: Cells along a side of the cube map.
+_CELLS = 24
+#: A splat's opacity above which it counts as matter.
+_OPAQUE = 0.1
+#: Distance, in median radii, up to which a splat of median size shows all its detail.
+_REACH = 2.5
+
+
+@dataclass(frozen=True)
+class Frame:
+    """Where the scene is and how large: everything below happens in units of ``unit`` around ``centre``.
+
+    Attributes:
+        centre: (3,) weighted median of the opaque splats' centres.
+        unit: their median distance from it, in world units.
+        up: (3,) unit vector across which they spread least.
+        near: the renderer's near plane.
+    """
+
+    centre: F64
+    unit: float
+    up: F64
+    near: float
+
+
+@dataclass(frozen=True)
+class Matter:
+    """What there is to see, in the frame's units.
+
+    Attributes:
+        targets: (K, 3) centres of splats that the views are judged by.
+        reach: (K,) distance up to which each shows all its detail.
+        colours: (K, M - 1, 3) their AC coefficients, of unit norm; zero if there are none to speak of.
+        occluders: (3, P) points on all opaque splats.
+        areas: (P,) of the surface that each point stands for; 0 if it is too wide to be in the way.
+    """
+
+    targets: F64
+    reach: F64
+    colours: F32
+    occluders: F32
+    areas: F32
+
+
+def frame_of(scene: Scene) -> Frame:
+    """Medians, which neither floaters nor a far shell move."""
+    means = scene.means.astype(np.float64)
+    weights = np.where(scene.opacities > _OPAQUE, scene.opacities, 1e-6).astype(np.float64)
+    centre = np.array([_weighted_quantile(means[:, axis], weights, 0.5) for axis in range(3)])
+    offsets = means - centre
+    distance = np.linalg.norm(offsets, axis=1)
+    unit = _weighted_quantile(distance, weights, 0.5)
+    # Where splats coincide, their own size is all the size there is.
+    sizes = np.exp(np.clip(scene.log_scales.max(axis=1).astype(np.float64), -60, 60))
+    unit = max(unit, 2 * _weighted_quantile(sizes, weights, 0.5) if unit < 1e-6 * (1 + np.abs(centre).max()) else 0)
+    unit = float(np.clip(unit, max(1e-6 * np.abs(centre).max(), 1e-9), 1e12))
+    inner = distance <= 2 * unit
+    spread = (offsets[inner] * weights[inner, None]).T @ offsets[inner]
+    up = np.linalg.eigh(spread / max(np.abs(spread).max(), 1e-300))[1][:, 0]
+    return Frame(centre, unit, up * np.sign(up[np.argmax(np.abs(up))]), _NEAR / unit)
+
+
+def matter_of(scene: Scene, frame: Frame) -> Matter:
+    opacity = scene.opacities.astype(np.float64)
+    solid = np.flatnonzero(opacity > _OPAQUE)
+    if len(solid) == 0:
+        solid = np.arange(len(scene))
+    means = np.clip((scene.means[solid].astype(np.float64) - frame.centre) / frame.unit, -_FAR, _FAR)
+    scales = np.exp(np.clip(scene.log_scales[solid].astype(np.float64) - math.log(frame.unit), -30, 3))
+
+    chosen = np.unique(np.linspace(0, len(solid) - 1, _TARGETS).astype(np.int64))
+    largest = scales[chosen].max(axis=1)
+    relative = np.sqrt(largest / max(float(np.median(largest)), 1e-12))
+    colours = scene.sh[solid[chosen], 1:].astype(np.float64)
+    norm = np.sqrt((colours**2).sum(axis=(1, 2)))
+    colours = np.where(norm > 1e-4, 1 / np.maximum(norm, 1e-4), 0)[:, None, None] * colours
+
+    # Half of the points by number, half by area: a wall may be a few large splats, a small thing thousands.
+    area = 2 * np.pi * np.sort(scales, axis=1)[:, 1:].prod(axis=1) * opacity[solid]
+    capped = np.minimum(area, 1000 * area.mean())
+    odds = capped / max(capped.sum(), 1e-300) + 1 / len(area)
+    sums = np.cumsum(odds)
+    rows = np.searchsorted(sums, (np.arange(_OCCLUDERS) + 0.5) / _OCCLUDERS * sums[-1]).clip(0, len(solid) - 1)
+    areas = area[rows] * sums[-1] / (odds[rows] * _OCCLUDERS)
+    # Haze and backdrops: of so wide a splat it means nothing that one of its few points is near.
+    areas[areas > _ELBOW_ROOM**2] = 0
+    q = scene.quaternions[solid[rows]].astype(np.float64)
+    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-30)
+    local = (2 * low_discrepancy(_OCCLUDERS, 3) - 1) * scales[rows]
+    across = 2 * np.cross(q[:, 1:], local)
+    points = means[rows] + local + q[:, :1] * across + np.cross(q[:, 1:], across)
+    return Matter(
+        means[chosen],
+        _REACH * relative.clip(0.5, 4),
+        colours.astype(np.float32),
+        points.T.astype(np.float32),
+        areas.astype(np.float32),
+    )
+
+
+def surroundings(camera_centre: F64, matter: Matter) -> tuple[F32, float]:
+    """What is around ``camera centre``.
+
+    Returns:
+        Distance of the nearest point in each cell of the cube map, infinite where there is none; and the part of all
+        directions that matter within arm's length takes up.
+    """
+    rays = matter.occluders - camera_centre.astype(np.float32)[:, None]
+    squared = np.einsum("ij,ij->j", rays, rays)
+    horizon = np.full(6 * _CELLS * _CELLS, np.inf, np.float32)
+    np.minimum.at(horizon, cell_of(rays), np.sqrt(squared))
+    near = squared < _ELBOW_ROOM**2
+    blocked = np.minimum(matter.areas[near] / np.maximum(4 * np.pi * squared[near], 1e-30), 1)
+    return horizon, float(blocked.sum(dtype=np.float64))
+
+
+def cell_of(rays: F32) -> NDArray[np.int64]:
+    """Number of the cube map's cell in each direction, (3, n), of any length but 0."""
+    x, y, z = rays
+    size_x, size_y, size_z = np.abs(rays)
+    along_x = (size_x >= size_y) & (size_x >= size_z)
+    along_y = ~along_x & (size_y >= size_z)
+    major = np.where(along_x, x, np.where(along_y, y, z))
+    scale = np.float32(_CELLS / 2) / np.maximum(np.abs(major), np.float32(1e-30))
+    u = np.where(along_x, y, np.where(along_y, z, x)) * scale + np.float32(_CELLS / 2)
+    v = np.where(along_x, z, np.where(along_y, x, y)) * scale + np.float32(_CELLS / 2)
+    u, v = (np.minimum(c.astype(np.int64), _CELLS - 1) for c in (u, v))
+    axis = np.where(along_x, 0, np.where(along_y, 1, 2))
+    cells: NDArray[np.int64] = ((2 * axis + (major > 0)) * _CELLS + u) * _CELLS + v
+    return cells
+
+
+def _weighted_quantile(values: F64, weights: F64, part: float) -> float:
+    order = np.argsort(values, kind="stable")
+    sums = np.cumsum(weights[order])
+    return float(values[order[min(int(np.searchsorted(sums, part * sums[-1])), len(order) - 1)]])

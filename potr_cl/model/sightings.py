@@ -1,0 +1,268 @@
+"""What views see of a scene, roughly and quickly: :func:`look`, on a :class:`Sample` of the scene. Pure NumPy.
+
+A few thousand points stand for the scene's surface and hide what is behind them; some splats are looked at in the
+pictures. That is enough to tell whether a view looks at the scene at all, from how far, and from where the scene's
+colours were trained.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.model.camera import Camera, camera_centres
+from potr_cl.model.placement.colour_memory import ac_basis
+from potr_cl.model.scene import Scene
+
+F64 = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+
+#: Nothing nearer than this, in world units, is seen: the renderer's near plane.
+_NEAR = 0.2
+#: Splats that a scene is thinned to, splats that are looked at, points that hide what is behind them.
+_THINNED, _TARGETS, _POINTS = 60_000, 1_500, 6_000
+#: A splat's opacity above which it counts as matter.
+_OPAQUE = 0.1
+#: Nothing is farther away than this, in units of the sample.
+_FAR = 1e6
+#: Cells along a side of a picture: of the map of depths, and of the map of what is covered.
+_DEPTHS, _COVERS = 32, 16
+#: A cell is wide: what is a little behind its nearest point may be the same surface. In units, and as a part.
+_BEHIND, _DEEPER = 0.05, 1.05
+#: Directions in which colours are looked at to know how much they vary at all.
+_DIRECTIONS = 96
+#: Splats with coefficients to speak of that a view must see, for the colours to tell whether they know it.
+_INFORMATIVE = 30
+#: Coefficients a channel but DC, from which on colours tell one side from the other: those of two degrees.
+_TELLING = 8
+
+
+@dataclass(frozen=True)
+class Sample:
+    """A scene in short, in units of ``unit`` around ``centre``.
+
+    Attributes:
+        centre: (3,) world units; median of the opaque splats' centres.
+        unit: their median distance from it, in world units.
+        targets: (K, 3) centres of some of them, evenly chosen.
+        sizes: (K,) their largest standard deviation.
+        colours: (K, M - 1, 3) AC coefficients, of unit norm; zero where there are none to speak of.
+        overall: (D, K) energy of the colours (see :func:`_energy`) in directions all around.
+        informative: (K,) whose colours depend on the direction.
+        points: (P, 3) on the scene's surfaces.
+        areas: (P,) opacity-weighted area that each stands for.
+    """
+
+    centre: F64
+    unit: float
+    targets: F64
+    sizes: F64
+    colours: F64
+    overall: F64
+    informative: Mask
+    points: F64
+    areas: F64
+
+    @property
+    def remembers(self) -> bool:
+        """Whether the colours can tell from where they were trained: a degree of 2 or more, and enough of them."""
+        return self.colours.shape[1] >= _TELLING and int(self.informative.sum()) >= _INFORMATIVE
+
+
+@dataclass(frozen=True)
+class Poses:
+    """Where some cameras stand.
+
+    Attributes:
+        centres: (V, 3).
+        rotations: (V, 3, 3) world to camera; of determinant -1 in a mirrored frame.
+        windows: (V, 4) the pictures' left, right, upper and lower edges, at distance 1.
+        near: the near plane.
+    """
+
+    centres: F64
+    rotations: F64
+    windows: F64
+    near: float
+
+    def some(self, views: NDArray[np.int64]) -> Poses:
+        """Those of some of the cameras, by their numbers."""
+        return Poses(self.centres[views], self.rotations[views], self.windows[views], self.near)
+
+    def moved(self, axes: F64, scale: float, shift: F64) -> Poses:
+        """The same cameras after the world was moved: x became scale · axes x + shift."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            centres = scale * self.centres @ axes.T + shift
+        return Poses(centres, self.rotations @ axes.T, self.windows, self.near * scale)
+
+    def within(self, of: Sample) -> Poses:
+        """The same cameras in the units of a sample."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            centres = np.nan_to_num((self.centres - of.centre) / of.unit)
+        return Poses(np.clip(centres, -_FAR, _FAR), self.rotations, self.windows, self.near / of.unit)
+
+
+@dataclass(frozen=True)
+class Sights:
+    """What each of V views sees.
+
+    Attributes:
+        seen: (V, K) which targets, not hidden by others.
+        covered: (V,) part of the picture that shows matter and not background.
+        sizes: (V,) size of a typical seen splat as a part of the picture's; NaN where none is seen.
+        remembered: (V,) how strongly the colours of what is seen vary towards the view, as a part of how they vary in
+            the best directions; NaN where the colours do not tell.
+    """
+
+    seen: Mask
+    covered: F64
+    sizes: F64
+    remembered: F64
+
+
+def sample(scene: Scene) -> Sample:
+    """A sample of a scene, the same on every call.
+
+    Args:
+        scene: clean, at least one splat.
+    """
+    rows = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), _THINNED)).astype(np.int64))
+    opaque = rows[scene.opacities[rows] > _OPAQUE]
+    scene = scene.subset(opaque if len(opaque) else rows)
+    means = scene.means.astype(np.float64)
+    centre = np.median(means, axis=0)
+    log_scales = scene.log_scales.astype(np.float64)
+    unit = float(np.median(np.linalg.norm(means - centre, axis=1)))
+    own = float(np.exp(np.clip(np.median(log_scales.max(axis=1)), -60, 60)))
+    # Where splats coincide, their own size is all the size there is.
+    unit = float(np.clip(unit if unit > 1e-6 * (1 + np.abs(centre).max()) else 2 * own, 1e-9, 1e12))
+    means = np.clip((means - centre) / unit, -_FAR, _FAR)
+    scales = np.exp(np.clip(log_scales - math.log(unit), -30, 3))
+
+    chosen = np.unique(np.linspace(0, len(means) - 1, _TARGETS).astype(np.int64))
+    colours = scene.sh[chosen, 1:].astype(np.float64)
+    norm = np.sqrt((colours**2).sum(axis=(1, 2)))
+    colours *= np.where(norm > 1e-4, 1 / np.maximum(norm, 1e-4), 0)[:, None, None]
+    around = ac_basis(on_sphere(_DIRECTIONS))[:, : colours.shape[1]]
+    overall = np.einsum("dm,kmc->dkc", around, colours, optimize=True) ** 2
+    points, areas = _surface(means, scales, scene)
+    return Sample(
+        centre,
+        unit,
+        means[chosen],
+        scales[chosen].max(axis=1),
+        colours,
+        overall.sum(axis=2),
+        np.asarray(colours.any(axis=(1, 2))),
+        points,
+        areas,
+    )
+
+
+def poses(cameras: Sequence[Camera]) -> Poses:
+    """Where cameras stand, in world units."""
+    windows = [(-c.cx / c.fx, (c.width - c.cx) / c.fx, -c.cy / c.fy, (c.height - c.cy) / c.fy) for c in cameras]
+    rotations = np.array([camera.rotation for camera in cameras])
+    return Poses(camera_centres(cameras), rotations, np.array(windows), _NEAR)
+
+
+def look(at: Sample, world: Poses) -> Sights:
+    """What views see of a scene.
+
+    Args:
+        at: the scene.
+        world: of the views, in world units.
+    """
+    views = world.within(at)
+    shape = (len(views.centres), len(at.targets))
+    seen, covered = np.zeros(shape, bool), np.zeros(shape[0])
+    sizes, remembered = np.full(shape[0], np.nan), np.full(shape[0], np.nan)
+    for view, (camera_centre, rotation, window) in enumerate(
+        zip(views.centres, views.rotations, views.windows, strict=True)
+    ):
+        seen[view], depths, covered[view] = _picture(at, camera_centre, rotation, window, views.near)
+        now = np.flatnonzero(seen[view])
+        if not len(now):
+            continue
+        extent = math.sqrt(max((window[1] - window[0]) * (window[3] - window[2]), 1e-30))
+        sizes[view] = float(np.median(at.sizes[now] / depths[now])) / extent
+        now = now[at.informative[now]]
+        if at.remembers and len(now) >= _INFORMATIVE:
+            rays = at.targets[now] - camera_centre
+            towards = rays / np.maximum(np.linalg.norm(rays, axis=1), 1e-300)[:, None]
+            own = _energy(towards, at.colours[now])
+            known = np.bincount(now, minlength=shape[1])
+            best = float(np.quantile(at.overall @ known / len(now), 0.95))
+            remembered[view] = float(own.mean()) / max(best, 1e-12)
+    return Sights(seen, covered, sizes, remembered)
+
+
+def on_sphere(count: int) -> F64:
+    """(count, 3) unit vectors, evenly spread: Fibonacci's spiral."""
+    step = np.arange(count) + 0.5
+    z = 1 - 2 * step / count
+    turn = math.pi * (1 + math.sqrt(5)) * step
+    side = np.sqrt(1 - z * z)
+    return np.stack([side * np.cos(turn), side * np.sin(turn), z], axis=1)
+
+
+def _surface(means: F64, scales: F64, scene: Scene) -> tuple[F64, F64]:
+    """Points on splats, half of them by number and half by area, and the area that each stands for."""
+    area = 2 * np.pi * np.sort(scales, axis=1)[:, 1:].prod(axis=1) * scene.opacities
+    capped = np.minimum(area, 1000 * area.mean())
+    odds = capped / max(float(capped.sum()), 1e-300) + 1 / len(area)
+    sums = np.cumsum(odds)
+    rows = np.searchsorted(sums, (np.arange(_POINTS) + 0.5) / _POINTS * sums[-1]).clip(0, len(means) - 1)
+    areas = area[rows] * sums[-1] / (odds[rows] * _POINTS)
+    q = scene.quaternions[rows].astype(np.float64)
+    q /= np.maximum(np.linalg.norm(q, axis=1, keepdims=True), 1e-30)
+    # Within one standard deviation, on the spiral's directions in an order that is not the splats'.
+    local = on_sphere(_POINTS)[(np.arange(_POINTS) * 2741) % _POINTS] * scales[rows]
+    across = 2 * np.cross(q[:, 1:], local)
+    return means[rows] + local + q[:, :1] * across + np.cross(q[:, 1:], across), areas
+
+
+def _picture(at: Sample, camera_centre: F64, rotation: F64, window: F64, near: float) -> tuple[Mask, F64, float]:
+    """Which targets a view shows, the depths of all, and the part of the picture that is covered."""
+
+    def projected(points: F64) -> tuple[Mask, F64, F64, F64]:
+        x, y, depth = rotation @ (points - camera_centre).T
+        ahead = depth > near
+        over = 1 / np.where(ahead, depth, 1)
+        u = (x * over - window[0]) / max(window[1] - window[0], 1e-30)
+        v = (y * over - window[2]) / max(window[3] - window[2], 1e-30)
+        inside = ahead & (u >= 0) & (u < 1) & (v >= 0) & (v < 1)
+        return inside, depth, u, v
+
+    inside, depth, u, v = projected(at.points)
+    shown = np.flatnonzero(inside)
+    u, v, depth = u[shown], v[shown], depth[shown]
+    nearest = np.full(_DEPTHS * _DEPTHS, np.inf)
+    np.minimum.at(nearest, (v * _DEPTHS).astype(np.int64) * _DEPTHS + (u * _DEPTHS).astype(np.int64), depth)
+    cells = (v * _COVERS).astype(np.int64) * _COVERS + (u * _COVERS).astype(np.int64)
+    extent = max((window[1] - window[0]) * (window[3] - window[2]), 1e-30)
+    layers = np.bincount(cells, at.areas[shown] / (depth * depth) * (_COVERS**2 / extent), minlength=_COVERS**2)
+    covered = float(-np.expm1(-layers).sum()) / _COVERS**2
+
+    inside, depth, u, v = projected(at.targets)
+    shown = np.flatnonzero(inside)
+    cell = (v[shown] * _DEPTHS).astype(np.int64) * _DEPTHS + (u[shown] * _DEPTHS).astype(np.int64)
+    seen = np.zeros(len(at.targets), bool)
+    seen[shown] = depth[shown] <= _DEEPER * nearest[cell] + _BEHIND
+    return seen, depth, covered
+
+
+def _energy(towards: F64, colours: F64) -> F64:
+    """(n,) squared deviation of colours (n, M - 1, 3) from their mean over all directions, each in its own direction.
+
+    Training moves coefficients along the basis functions of its views' directions, so this deviation, averaged over
+    many splats, is large in directions from which they were looked at.
+    """
+    basis = ac_basis(towards)[:, : colours.shape[1]]
+    deviation = np.einsum("km,kmc->kc", basis, colours)
+    energy: F64 = np.einsum("kc,kc->k", deviation, deviation)
+    return energy

@@ -1,0 +1,75 @@
+"""The splats that no view's picture reaches: :func:`unseen_splats`. Pure NumPy.
+
+These are the splats beside, behind or right in front of every camera, whatever hides the others. Views cannot say what
+they are worth: perhaps nothing, perhaps the other half of the scene, of which somebody gave no cameras.
+"""
+
+from __future__ import annotations
+
+import math
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+
+#: The renderer's near plane, world units: a splat whose centre is nearer is not drawn.
+_NEAR = 0.2
+#: How far splats reach, in standard deviations, and what a renderer adds to that, in pixels.
+_REACH, _PIXELS = 3.5, 2.0
+#: Splats looked at at a time.
+_BLOCK = 1 << 17
+
+
+def unseen_splats(scene: Scene, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
+    """Which splats lie outside of every view's picture.
+
+    Args:
+        scene: clean.
+        cameras: the views; without any, no splat is seen.
+
+    Returns:
+        (N,) whether it is unseen. A splat of which any part may touch a picture is not, even if others hide it.
+    """
+    unseen = np.ones(len(scene), bool)
+    # Views far from each other first: what one does not see the next one may.
+    order = np.argsort((np.arange(len(cameras)) * (math.sqrt(5) - 1) / 2) % 1, kind="stable")
+    for start in range(0, len(scene), _BLOCK):
+        left = np.arange(start, min(start + _BLOCK, len(scene)))
+        means = scene.means[left].astype(np.float64)
+        with np.errstate(over="ignore"):
+            reach = _REACH * np.exp(np.minimum(scene.log_scales[left].max(axis=1), 80).astype(np.float64))
+        for view in order:
+            shown = _shows(cameras[view], means, reach)
+            unseen[left[shown]] = False
+            left, means, reach = left[~shown], means[~shown], reach[~shown]
+            if not len(left):
+                break
+    return unseen
+
+
+def opacity_weighted_areas(scene: Scene) -> NDArray[np.float64]:
+    """(N,) area of each splat's largest cross-section times its opacity, up to a common factor; for shares of a scene.
+
+    The factor makes the largest of them 1, so that no scene's units are too large.
+    """
+    largest_two = np.sort(scene.log_scales.astype(np.float64), axis=1)[:, 1:].sum(axis=1)
+    areas: NDArray[np.float64] = np.exp(largest_two - largest_two.max(initial=-math.inf)) * scene.opacities
+    return areas
+
+
+def _shows(camera: Camera, means: NDArray[np.float64], reach: NDArray[np.float64]) -> NDArray[np.bool_]:
+    """Which spheres touch the pyramid that a view sees; their centres in front of the near plane."""
+    with np.errstate(over="ignore", invalid="ignore"):
+        x, y, depth = camera.rotation @ means.T + camera.translation[:, None]
+        shown = depth > _NEAR
+        for along, focal, centre, pixels in (
+            (x, camera.fx, camera.cx, camera.width),
+            (y, camera.fy, camera.cy, camera.height),
+        ):
+            low, high = (-_PIXELS - centre) / focal, (pixels + _PIXELS - centre) / focal
+            shown &= along - low * depth > -reach * math.hypot(1, low)
+            shown &= along - high * depth < reach * math.hypot(1, high)
+    return np.asarray(shown)

@@ -1,0 +1,109 @@
+"""Splats that no training view sees, set aside while the others are pruned: :func:`set_aside`, :func:`put_back`."""
+
+from __future__ import annotations
+
+import dataclasses
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
+from potr_cl.stages.pruning.schedule import Pruned
+from potr_cl.stages.stage import State
+
+#: What can be done with them.
+CHOICES = ("keep", "drop")
+
+
+@dataclass(frozen=True)
+class Unseen:
+    """The splats that no training view sees.
+
+    Attributes:
+        splats: how many they are.
+        of: how many splats the scene has.
+        area: their part of the scene's opacity-weighted area, 0 to 1.
+        kept: whether they were kept, without what of their colours depends on the direction.
+    """
+
+    splats: int
+    of: int
+    area: float
+    kept: bool
+
+    def __str__(self) -> str:
+        what = "kept, coarsely coded" if self.kept else "dropped"
+        part = self.splats / self.of
+        return (
+            f"no training view sees {self.splats:,} splats ({100 * part:.2g} %), {100 * self.area:.2g} % of the "
+            f"scene's opacity-weighted area: {what}"
+        )
+
+
+@dataclass(frozen=True)
+class Split:
+    """A state in two parts.
+
+    Attributes:
+        whole: the state.
+        seen: the state of the splats that views see.
+        seen_splats, unseen_splats: their numbers in the whole state's scene, ascending.
+    """
+
+    whole: State
+    seen: State
+    seen_splats: NDArray[np.int64]
+    unseen_splats: NDArray[np.int64]
+
+
+def find_unseen(state: State) -> tuple[NDArray[np.bool_], float]:
+    """Which splats of a state no training view sees, and their part of the opacity-weighted area."""
+    unseen = unseen_splats(state.scene, state.views)
+    areas = opacity_weighted_areas(state.scene)
+    return unseen, float(areas[unseen].sum() / max(float(areas.sum()), 1e-300))
+
+
+def set_aside(state: State, unseen: NDArray[np.bool_]) -> Split:
+    """Part a state in what views see and what they do not."""
+    seen = np.flatnonzero(~unseen)
+    return Split(state, state.keeping(seen), seen, np.flatnonzero(unseen))
+
+
+def put_back(split: Split, pruned: State) -> State:
+    """The state with what pruning left of the seen splats, and with all the others.
+
+    The others lose the coefficients of their colours that depend on the direction: nobody looked at them from any.
+    """
+    scene = split.whole.scene.subset(split.unseen_splats)
+    sh = scene.sh.copy()
+    sh[:, 1:] = 0
+    scene = dataclasses.replace(scene, sh=sh)
+    numbers = np.concatenate([pruned.survivors, split.whole.survivors[split.unseen_splats]])
+    order = np.argsort(numbers)
+    left = pruned.scene
+    together = dataclasses.replace(
+        left,
+        means=np.concatenate([left.means, scene.means])[order],
+        log_scales=np.concatenate([left.log_scales, scene.log_scales])[order],
+        quaternions=np.concatenate([left.quaternions, scene.quaternions])[order],
+        opacity_logits=np.concatenate([left.opacity_logits, scene.opacity_logits])[order],
+        sh=np.concatenate([left.sh, scene.sh])[order],
+    )
+    return dataclasses.replace(pruned, scene=together, survivors=numbers[order], geometry=None)
+
+
+def as_of_whole(split: Split, pruned: Pruned) -> Pruned:
+    """What pruning did to the seen splats, as what it did to all: the unseen ones were kept, and nobody misses them."""
+    aside = len(split.unseen_splats)
+    removed = len(pruned.order) - pruned.kept
+    iteration_of = np.full(aside + len(pruned.order), -1, np.int32)
+    iteration_of[split.seen_splats] = pruned.iteration_of
+    seen = split.seen_splats[pruned.order]
+    return Pruned(
+        np.concatenate([seen[:removed], split.unseen_splats, seen[removed:]]),
+        pruned.kept + aside,
+        iteration_of,
+        pruned.iterations,
+        tuple(dataclasses.replace(each, left=each.left + aside) for each in pruned.history),
+    )

@@ -1,0 +1,313 @@
+"""Every option of the command line is a keyword of the function of its command, and means the same.
+
+Each is given once on the command line and once in Python: what comes out must be equal to the last byte, and, where the
+option has anything to do with it, other than without the option.
+"""
+
+from __future__ import annotations
+
+import argparse
+import inspect
+import json
+import re
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+import potr_cl
+from potr_cl import cli
+from potr_cl.api.encoding import encode_options
+from potr_cl.cli import command_parser
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import list_devices
+from potr_cl.pipeline.keywords import stage_keywords
+
+#: The commands that have a function of their name.
+COMMANDS = ("encode", "prune", "compact", "refit", "decode", "info", "convert", "render", "compare")
+#: Options that have no keyword, and why.
+COMMAND_LINE_ONLY = {
+    "--help": "Python has its own",
+    "--json": "results are objects; SceneComparison.report() and SceneInfo.facts are what it prints",
+    "--from": "for standard input",
+    "--to": "for standard output and folders of scenes",
+    "--no-quality": "nothing is judged unless a report is asked for: compare() judges",
+}
+#: Of each option what is typed, and the same in Python; {name} stands for a path of the test's files. What has the
+#: command's name in front is for that command alone.
+VALUES: dict[str, tuple[list[str], Any]] = {
+    "--output": (["{output}"], "{output}"),
+    "--cameras": (["{cameras}"], "{cameras}"),
+    "--reference": (["{reference}"], "{reference}"),
+    "--quality": (["0.2"], 0.2),
+    "--max-size": (["9kB"], "9kB"),
+    "--min-psnr": (["28"], 28),
+    "--preset": (["paper"], "paper"),
+    "--virtual-views": (["5"], 5),
+    "--report": (["{report}"], "{report}"),
+    "--report-view": (["view_5"], "view_5"),
+    "--order": (["{order}"], "{order}"),
+    "--no-prune": ([], False),
+    "--keep": (["0.4"], 0.4),
+    "--count": (["60"], 60),
+    "--delta-mse-max": (["1e-4"], 1e-4),
+    "--iterations": (["3"], 3),
+    "--tolerance": (["0.5"], 0.5),
+    "--turns": (["3"], 3),
+    "--damping": (["0"], 0),
+    "--mapping-a": (["4"], 4),
+    "--compact": ([], True),
+    "--compact-at": (["0.2"], 0.2),
+    "--lambda": (["0.5"], 0.5),
+    "--alpha": (["0.5"], 0.5),
+    "--colour-model": (["rgb"], "rgb"),
+    "--weighting": (["visibility"], "visibility"),
+    "--one-pass": ([], True),
+    "--refit": (["off"], "off"),
+    "--drop": (["1e-5"], 1e-5),
+    "--refit-at": (["0.3", "0.6"], [0.3, 0.6]),
+    "--photos": (["{photos}"], "{photos}"),
+    "--truth": (["{photos}"], "{photos}"),
+    "--entropy": (["npz"], "npz"),
+    "--zstd-level": (["3"], 3),
+    "--gamma": (["0.1"], 0.1),
+    "--beta": (["0.2"], 0.2),
+    "--sf-dc": (["9"], 9),
+    "--sf-sh": (["9"], 9),
+    "--sf-opacity": (["9"], 9),
+    "--sf-rotation": (["9"], 9),
+    "--sf-scale": (["9"], 9),
+    "--steps": (["2"], 2),
+    "--prior": (["5"], 5),
+    "--threads": (["1"], 1),
+    "--trust": ([], True),
+    "--antialiased": (["yes"], True),
+    "--sh-degree": (["1"], 1),
+    "--spz-version": (["3"], 3),
+    "--cameras-anyway": ([], True),
+    "--unseen": (["drop"], "drop"),
+    "--memory": (["0.25"], 0.25),
+    "--background": (["0.2,0.4,0.8"], (0.2, 0.4, 0.8)),
+    "--device": (["{device}"], "{device}"),
+    "--rules": (["gsplat"], "gsplat"),
+    "--views": (["view_2", "4"], ["view_2", 4]),
+    "--split": (["train"], "train"),
+    "--turntable": (["3"], 3),
+    "--up": (["=-x"], "-x"),
+    "--size": (["48"], 48),
+}
+#: What only says how the work is done.
+SAME_RESULT = {"--threads", "--trust", "--memory", "--device", "--output", "--cameras", "--reference", "--report",
+               "--report-view", "--order", "--tolerance", "--cameras-anyway", "--unseen"}  # fmt: skip
+#: The compaction weighs views by what they show of a splat, whatever is behind it; no splat of this scene improves the
+#: match by going; and without a number of virtual views dozens are placed, which takes long.
+NO_DIFFERENCE = {
+    ("encode", "--mapping-a"),
+    ("prune", "--mapping-a"),
+    ("compact", "--background"),
+    *((command, "--virtual-views") for command in ("encode", "prune", "compact", "refit")),
+}
+#: What else has to be given for an option to have anything to do: as typed, and in Python.
+WITH: dict[str, list[str]] = {
+    "--report-view": ["--report"],
+    "--compact-at": ["--compact", "--keep"],
+    "--lambda": ["--compact"],
+    "--alpha": ["--compact"],
+    "--colour-model": ["--compact"],
+    "--weighting": ["--compact"],
+    "--one-pass": ["--compact"],
+    "--iterations": ["--keep"],
+    "--turns": ["--keep"],
+    "--damping": ["--keep"],
+    "--mapping-a": ["--keep"],
+    "--refit-at": ["--keep"],
+}
+#: Options that cannot be given with cameras.
+WITHOUT_CAMERAS = {"--virtual-views", "--turntable", "--up", "--size"}
+
+
+def options_of(command: str) -> list[argparse.Action]:
+    parser = command_parser([command])
+    commands = next(action for action in parser._actions if isinstance(action, argparse._SubParsersAction))
+    return [action for action in commands.choices[command]._actions if action.option_strings]
+
+
+def flag_of(action: argparse.Action) -> str:
+    return next(name for name in action.option_strings if name.startswith("--"))
+
+
+CASES = [(command, flag_of(action)) for command in COMMANDS for action in options_of(command)]
+CASES = [(command, flag) for command, flag in CASES if flag not in COMMAND_LINE_ONLY]
+
+
+def keywords_of(command: str) -> set[str]:
+    """Those in the function's own signature, and those of stages where it takes any."""
+    signature = inspect.signature(getattr(potr_cl, command)).parameters
+    own = {name for name, each in signature.items() if each.kind is not inspect.Parameter.VAR_KEYWORD}
+    takes_more = any(each.kind is inspect.Parameter.VAR_KEYWORD for each in signature.values())
+    return own | (set(stage_keywords()) if takes_more else set())
+
+
+def keyword(command: str, flag: str) -> str:
+    """What an option is called in Python, by the rule that docs/python.md states."""
+    if flag == "--quality":
+        return "q"
+    name = flag.removeprefix("--").removeprefix("no-").replace("-", "_")
+    return "lambda_" if name == "lambda" else name
+
+
+@pytest.mark.parametrize(("command", "flag"), CASES)
+def test_every_option_is_a_keyword(command, flag):
+    assert keyword(command, flag) in keywords_of(command), (
+        f"potr_cl.{command} has no keyword for {flag}: give it one, or say in COMMAND_LINE_ONLY why not"
+    )
+    assert flag in VALUES, f"say in VALUES what {flag} is called with"
+
+
+@pytest.fixture(scope="module")
+def files(tmp_path_factory, data) -> dict[str, Path]:
+    """What the commands are given: a part of the excerpt, and some of its views, small."""
+    folder = tmp_path_factory.mktemp("given")
+    views = json.loads((data / "lego_cameras.json").read_text())
+    tests = [view for view in views if view["split"] == "test"]
+    few = [*[view for view in views if view["split"] == "train"][:5], *tests[:2]]
+    for number, view in enumerate(few):
+        factor = 48 / max(view["width"], view["height"])
+        view["img_name"] = f"view_{number}"
+        for name in ("fx", "fy"):
+            view[name] *= factor
+        view["width"], view["height"] = round(view["width"] * factor), round(view["height"] * factor)
+    cameras = folder / "cameras.json"
+    cameras.write_text(json.dumps(few))
+    scene = potr_cl.read_scene(data / "lego_excerpt.ply")
+    scene = scene.subset(np.arange(0, len(scene), 5))
+    scene.save(folder / "scene.ply")
+    reduced = scene.subset(np.arange(0, len(scene), 2))
+    reduced.save(folder / "reduced.ply")
+    potr_cl.encode(scene, prune=False, refit=False, compact=False, q=0.3, output=folder / "scene.potr")
+    potr_cl.render(folder / "reduced.ply", cameras, output=folder / "photos")
+    chosen = Device().info
+    index = next(str(k) for k, info in enumerate(list_devices()) if info == chosen)
+    return {
+        "scene": folder / "scene.ply",
+        "reduced": folder / "reduced.ply",
+        "reference": folder / "scene.ply",
+        "potr": folder / "scene.potr",
+        "cameras": cameras,
+        "photos": folder / "photos",
+        "device": Path(index),
+    }
+
+
+@pytest.fixture(scope="module")
+def known() -> dict[tuple[str, ...], Any]:
+    """Outcomes of calls that several options are compared with."""
+    return {}
+
+
+def outcome(folder: Path, result: Any) -> dict[str, Any]:
+    """All that a call leaves behind: files by name, and figures."""
+    left: dict[str, Any] = {
+        str(path.relative_to(folder)): headings(path) if path.suffix == ".html" else path.read_bytes()
+        for path in sorted(folder.rglob("*"))
+        if path.is_file()
+    }
+    return left | ({"figures": result} if result is not None else {})
+
+
+def figures(report: dict[str, Any]) -> dict[str, Any]:
+    """A report but for its remarks, in which the command line speaks of its own options."""
+    return {name: value for name, value in report.items() if name != "notes"}
+
+
+def headings(page: Path) -> list[str]:
+    """Of a report, whose times are never the same."""
+    return re.findall(r"<h[23]>.*?</h[23]>", page.read_text("utf-8"))
+
+
+def called(command: str, flags: list[str], files: dict[str, Path], folder: Path, capsys: Any) -> tuple[Any, Any]:
+    """The outcome of a command with some options, from the command line and from Python."""
+    outcomes = []
+    for side in ("typed", "python"):
+        here = folder / side
+        here.mkdir(parents=True)
+        suffix = {"encode": ".potr", "render": "", "compare": ".png"}.get(command, ".ply")
+        suffix = ".spz" if "--spz-version" in flags else suffix
+        names = {**files, "output": here / f"out{suffix}", "report": here / "page.html", "order": here / "order.npy"}
+        paths = {name: str(path) for name, path in names.items()}
+        sources = {"decode": ["potr"], "refit": ["reduced"], "compare": ["scene", "reduced"]}.get(command, ["scene"])
+        positional = [paths[name] for name in sources]
+        if side == "typed":
+            words = [command, *positional]
+            for flag in flags:
+                values = [value.format(**paths) for value in VALUES[flag][0]]
+                words += [flag + values[0]] if values and values[0].startswith("=") else [flag, *values]
+            if command in ("info", "compare"):
+                words.append("--json")
+            capsys.readouterr()
+            assert cli.main(words) == 0, capsys.readouterr().err
+            out = capsys.readouterr().out
+            outcomes.append(outcome(here, figures(json.loads(out)) if "--json" in words else None))
+        else:
+            given: dict[str, Any] = {}
+            for flag in flags:
+                value = VALUES[flag][1]
+                given[keyword(command, flag)] = value.format(**paths) if isinstance(value, str) else value
+            result = getattr(potr_cl, command)(*positional, **given)
+            facts = result.facts if command == "info" else result.report() if command == "compare" else None
+            outcomes.append(outcome(here, facts and figures(json.loads(json.dumps(facts)))))
+    return outcomes[0], outcomes[1]
+
+
+def usual(command: str, flag: str) -> list[str]:
+    """What a command is given besides an option."""
+    available = {flag_of(action) for action in options_of(command)}
+    given = [name for name in ("--output", "--reference") if name in available]
+    if "--cameras" in available and flag not in WITHOUT_CAMERAS:
+        given.append("--cameras")
+    if flag in ("--up", "--size"):
+        given.append("--turntable")
+    elif flag in WITHOUT_CAMERAS and command in ("render", "compare"):
+        given.append("--size")
+    return [*given, *(name for name in WITH.get(flag, []) if name in available)]
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize(("command", "flag"), CASES)
+def test_and_means_the_same(command, flag, files, known, tmp_path, capsys):
+    base = [name for name in usual(command, flag) if name != flag]
+    typed, python = called(command, [*base, flag], files, tmp_path / "with", capsys)
+    assert typed, "nothing came out"
+    assert typed == python
+    if flag in SAME_RESULT or command in ("info", "convert") or (command, flag) in NO_DIFFERENCE:
+        return
+    key = (command, *base)
+    if key not in known:
+        known[key], _ = called(command, base, files, tmp_path / "without", capsys)
+    assert typed != known[key], f"{flag} changes nothing here: the test does not see what it means"
+
+
+def test_choices_of_stages_by_name() -> None:
+    options = encode_options(None, "paper", {"mapping_a": 4, "one_pass": True, "prune": {"iterations": 7}, "refit": 3})
+    assert (options.prune.mapping_a, options.prune.iterations) == (4, 7)
+    assert (options.compact.two_pass, options.refit.steps) == (False, 3)
+    assert not encode_options(None, "best", {"refit": False}).refit.on
+    assert not encode_options(None, "best", {"prune": False}).prune.on
+    assert encode_options(None, "best", {"refit": "auto"}).refit.steps == 8
+
+
+@pytest.mark.parametrize(
+    ("choices", "said"),
+    [
+        ({"iteration": 3}, "did you mean 'iterations'"),
+        ({"xyzzy": 3}, "there is no option 'xyzzy'"),
+        ({"entropy": "gzip"}, "choose one of"),
+        ({"one_pass": 1}, "True or False"),
+        ({"keep": "half"}, "no value"),
+        ({"keep": 1.5}, "at most 1"),
+    ],
+)
+def test_wrong_choices(choices, said) -> None:
+    with pytest.raises(potr_cl.UsageError, match=said):
+        potr_cl.encode("no such file", **choices)

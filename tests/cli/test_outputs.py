@@ -1,0 +1,117 @@
+"""Where results go: no file gets another format than its name says, and nothing is computed that cannot be written."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+from potr_cl import UsageError, cli, encode
+from potr_cl.formats import load_scene
+from potr_cl.formats.scenes import ply
+from potr_cl.reference.scenes import random_scene
+
+KEEP = ["--no-prune", "--no-compact", "--refit", "off"]
+
+
+@pytest.fixture
+def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]) -> Path:
+    """The current folder, with a scene and what encode makes of it."""
+    monkeypatch.chdir(tmp_path)
+    ply.save("a.ply", random_scene(100, 1))
+    assert cli.main(["encode", "a.ply", "-o", "a.potr", *KEEP]) == 0
+    (tmp_path / "sub").mkdir()
+    capsys.readouterr()
+    return tmp_path
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        ("encode a.ply -o b.spz", "encode to 'b.potr', then 'potr-cl decode b.potr -o b.spz'"),
+        ("encode a.ply -o b.compressed.ply", "encode to 'b.potr'"),
+        ("encode a.ply -o b.png", "a name that ends in .potr"),
+        ("encode a.ply -o b", "a name that ends in .potr"),
+        ("encode a.ply -o b.potr --report b.png", "a name that ends in .html"),
+        ("decode a.potr -o b.sog", "written as"),
+        ("decode a.potr -o b.potr", "command encode"),
+        ("decode a.potr -o b.png", "written as"),
+        ("decode a.potr -o b", "written as"),
+        ("decode a.potr -o b.ply --to spz", "tells its format itself"),
+        ("decode a.potr -o sub --to sog", "written as"),
+        ("decode a.potr -o sub --to .xyz", "'.xyz' is no suffix of a scene"),
+        ("convert a.ply b.xyz", "written as"),
+        ("prune a.ply -o b.splat", "written as"),
+        ("prune a.ply -o b.potr", "command encode"),
+        ("prune a.ply -o b.ply --order b.txt", "--order writes an array of NumPy"),
+        ("compact a.ply -o b.png", "written as"),
+        ("refit a.ply --reference a.ply -o b.png", "written as"),
+        ("compare a.ply a.potr --cameras none -o b.jpg", "a name that ends in .png"),
+        ("render a.ply --cameras none -o a.potr", "a file of this name"),
+        ("render a.ply --cameras none -o b.png", "a folder of pictures is written"),
+        ("convert a.ply b.ply --spz-version 3", "has no versions to choose from"),
+        ("encode a.ply -o no/b.potr", "no' does not exist"),
+        ("encode a.ply -o b.potr --report no/b.html", "no' does not exist"),
+        ("encode a.ply -o b.potr --report sub", "is a directory"),
+        ("decode a.potr -o no/b.ply", "no' does not exist"),
+        ("prune a.ply -o sub", "is a directory"),
+        ("compact a.ply -o sub", "is a directory"),
+        ("refit a.ply --reference a.ply -o sub", "is a directory"),
+        ("compare a.ply a.potr --cameras none -o sub", "is a directory"),
+    ],
+)
+def test_refused_in_one_line_before_any_work(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch, call: str, said: str
+) -> None:
+    for reader in ("potr_cl.cli.scenes.load_scene", "potr_cl.cli.files.decode", "potr_cl.cli.views.load_cameras"):
+        monkeypatch.setattr(reader, lambda *_, **__: pytest.fail("something was read"))
+    before = sorted(folder.rglob("*"))
+    assert cli.main(call.split()) == 2
+    told = capsys.readouterr()
+    assert said in told.err
+    assert told.err.startswith("potr-cl: ")
+    assert told.err.count("\n") == 1
+    assert told.out == ""
+    assert sorted(folder.rglob("*")) == before
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".PLY", ".compressed.ply"])
+@pytest.mark.parametrize(
+    "command",
+    [
+        "decode a.potr -o",
+        "convert a.ply",
+        "prune a.ply --iterations 2 --virtual-views 8 -o",
+        "compact a.ply --virtual-views 8 -o",
+        "refit a.ply --reference a.ply --steps 1 --virtual-views 8 -o",
+    ],
+)
+def test_a_scene_is_written_as_its_name_says(folder: Path, command: str, suffix: str) -> None:
+    if "compressed" in suffix:
+        pytest.importorskip("gsply", reason="the extra convert is not installed")
+    out = f"out{suffix}"
+    assert cli.main([*command.split(), out]) == 0
+    content = Path(out).read_bytes()
+    assert content.startswith(b"\x1f\x8b" if suffix == ".spz" else b"ply")
+    assert (b"packed_position" in content[:4000]) == ("compressed" in suffix)
+    assert 0 < len(load_scene(out)) <= 100
+
+
+def test_versions_of_spz(folder: Path, capsys: pytest.CaptureFixture[str]) -> None:
+    import gzip
+
+    for version, options in ((2, []), (2, ["--spz-version", "2"]), (3, ["--spz-version", "3"])):
+        assert cli.main(["convert", "a.ply", "a.spz", *options]) == 0
+        assert gzip.decompress(Path("a.spz").read_bytes())[4] == version
+        assert len(load_scene("a.spz")) == 100
+    assert cli.main(["convert", "a.ply", "a.spz", "--spz-version", "4"]) == 0
+    assert Path("a.spz").read_bytes()[:5] == b"NGSP\x04"
+    assert len(load_scene("a.spz")) == 100
+    with pytest.raises(SystemExit):
+        cli.main(["convert", "a.ply", "a.spz", "--spz-version", "1"])
+
+
+def test_encode_from_python_writes_no_other_name(folder: Path) -> None:
+    with pytest.raises(UsageError, match=r"encode to 'b\.potr'"):
+        encode("a.ply", output="b.spz", prune=False, compact=False, refit="off")
+    assert not Path("b.spz").exists()

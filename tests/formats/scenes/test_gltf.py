@@ -1,0 +1,295 @@
+"""glTF with KHR_gaussian_splatting: every kind of accessor and buffer, nodes' transforms, and bad files."""
+
+from __future__ import annotations
+
+import json
+import struct
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from potr_cl import DataError, Scene, UsageError
+from potr_cl.formats import load_scene
+from potr_cl.model.claims import FREE_SPLATS
+from potr_cl.reference.raster import rotation_matrices, sh_basis
+from potr_cl.reference.scenes import random_scene
+from tests.cases.gltf import PREFIX, Attributes, attributes, described, glb, gltf
+
+
+def covariances(scene: Scene) -> np.ndarray:
+    unit = scene.quaternions / np.linalg.norm(scene.quaternions, axis=1, keepdims=True)
+    axes = rotation_matrices(unit.astype(np.float64)) * np.exp(scene.log_scales.astype(np.float64))[:, None]
+    return axes @ axes.transpose(0, 2, 1)
+
+
+def written(path: Path, parts: Attributes, node: dict[str, Any] | None = None) -> Path:
+    path.write_bytes(glb(*described(parts, node)))
+    return path
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_floats(degree: int, tmp_path: Path) -> None:
+    scene = random_scene(300, degree)
+    back = load_scene(written(tmp_path / "a.glb", attributes(scene)))
+    np.testing.assert_array_equal(back.means, scene.means)
+    np.testing.assert_array_equal(back.quaternions, scene.quaternions)
+    np.testing.assert_array_equal(back.sh, scene.sh)
+    np.testing.assert_allclose(back.log_scales, scene.log_scales, rtol=0, atol=1e-6)
+    np.testing.assert_allclose(back.opacities, scene.opacities, rtol=0, atol=2e-7)
+
+
+@pytest.mark.parametrize("kind", ["inline", "beside", "with a space"])
+def test_buffers_of_a_gltf(kind: str, tmp_path: Path) -> None:
+    description, content = described(attributes(random_scene(20, 1)))
+    uri = {"inline": None, "beside": "parts/a.bin", "with a space": "a%20b.bin"}[kind]
+    (tmp_path / "parts").mkdir()
+    (tmp_path / (uri or "unused").replace("%20", " ")).write_bytes(content)
+    (tmp_path / "a.gltf").write_bytes(gltf(description, content, uri))
+    np.testing.assert_array_equal(load_scene(tmp_path / "a.gltf").sh, random_scene(20, 1).sh)
+
+
+def test_integers(tmp_path: Path) -> None:
+    """As the specification allows: rotations in signed integers, scales and opacities in unsigned ones."""
+    rng = np.random.default_rng(0)
+    parts = attributes(random_scene(50, 0))
+    position = rng.integers(-32767, 32768, (50, 3)).astype("<i2")
+    rotation = rng.integers(-127, 128, (50, 4)).astype("i1")
+    scale = rng.integers(1, 65536, (50, 3)).astype("<u2")
+    opacity = rng.integers(1, 255, (50, 1)).astype("u1")
+    parts["POSITION"] = position, True
+    parts[f"{PREFIX}ROTATION"] = rotation, True
+    parts[f"{PREFIX}SCALE"] = scale, True
+    parts[f"{PREFIX}OPACITY"] = opacity, True
+    scene = load_scene(written(tmp_path / "a.glb", parts))
+    np.testing.assert_allclose(scene.means, position / 32767, atol=1e-7)
+    np.testing.assert_allclose(scene.quaternions, rotation[:, [3, 0, 1, 2]] / 127, atol=1e-7)
+    np.testing.assert_allclose(scene.scales, scale / 65535, rtol=1e-6)
+    np.testing.assert_allclose(scene.opacities, opacity[:, 0] / 255, atol=1e-6)
+    parts[f"{PREFIX}SCALE"] = scale, False
+    parts["POSITION"] = position, False
+    scene = load_scene(written(tmp_path / "b.glb", parts))
+    np.testing.assert_allclose(scene.scales, scale.astype(float), rtol=1e-6)
+    np.testing.assert_array_equal(scene.means, position)
+
+
+def test_flat_and_opaque_splats(tmp_path: Path) -> None:
+    parts = attributes(random_scene(3, 0))
+    parts[f"{PREFIX}SCALE"][0][0, 2] = 0
+    parts[f"{PREFIX}OPACITY"][0][:2, 0] = (0, 1)
+    scene = load_scene(written(tmp_path / "a.glb", parts))
+    assert len(scene) == 3
+    assert scene.scales[0, 2] == pytest.approx(1e-9, rel=1e-5)
+    assert scene.opacities[:2] == pytest.approx([0, 1], abs=1e-8)
+
+
+NODES: dict[str, dict[str, Any]] = {
+    "shift": {"translation": [1, -2, 3]},
+    "half a turn": {"rotation": [0, 0, 1, 0]},
+    "any rotation": {"rotation": [0.5, -0.1, 0.7, 0.5], "translation": [5, 0, 0]},
+    "scale": {"scale": [3, 3, 3], "rotation": [0.1, 0.2, 0.3, 0.4]},
+    "stretch": {"scale": [3, 0.5, 1], "rotation": [0.1, 0.2, 0.3, 0.4]},
+    "matrix": {"matrix": [0, 2, 0, 0, -2, 0, 0, 0, 0, 0, 2, 0, 1, 2, 3, 1]},
+}
+
+
+def matrix_of(node: dict[str, Any]) -> np.ndarray:
+    """By the definition of glTF, with the quaternion as an exponential."""
+    if "matrix" in node:
+        return np.array(node["matrix"], float).reshape(4, 4).T
+    x, y, z, w = np.array(node.get("rotation", [0, 0, 0, 1])) / np.linalg.norm(node.get("rotation", [0, 0, 0, 1]))
+    cross = np.array([[0, -z, y], [z, 0, -x], [-y, x, 0]])
+    matrix = np.eye(4)
+    matrix[:3, :3] = (np.eye(3) + 2 * w * cross + 2 * cross @ cross) @ np.diag(node.get("scale", [1, 1, 1]))
+    matrix[:3, 3] = node.get("translation", [0, 0, 0])
+    return matrix
+
+
+@pytest.mark.parametrize("name", NODES)
+def test_transforms_of_nodes(name: str, tmp_path: Path) -> None:
+    scene, matrix = random_scene(100, 3), matrix_of(NODES[name])
+    back = load_scene(written(tmp_path / "a.glb", attributes(scene), NODES[name]))
+    linear = matrix[:3, :3]
+    np.testing.assert_allclose(back.means, scene.means @ linear.T + matrix[:3, 3], rtol=1e-5, atol=1e-5)
+    np.testing.assert_allclose(covariances(back), linear @ covariances(scene) @ linear.T, rtol=1e-4, atol=1e-6)
+    # Seen from a direction that turns with the scene, a colour stays.
+    rotation = linear / np.linalg.norm(linear, axis=0)
+    directions = np.random.default_rng(1).normal(size=(100, 3))
+    directions /= np.linalg.norm(directions, axis=1, keepdims=True)
+    before = np.einsum("nm,nmc->nc", sh_basis(directions, 3), scene.sh)
+    after = np.einsum("nm,nmc->nc", sh_basis(directions @ rotation.T, 3), back.sh)
+    np.testing.assert_allclose(after, before, atol=1e-5)
+
+
+def test_nodes_below_nodes_and_several_meshes(tmp_path: Path) -> None:
+    description, content = described(attributes(random_scene(10, 1)))
+    description["nodes"] = [
+        {"children": [1, 2], "translation": [10, 0, 0]},
+        {"mesh": 0, "scale": [2, 2, 2]},
+        {"mesh": 0, "rotation": [0, 1, 0, 0]},
+        {"mesh": 0},  # in no scene
+    ]
+    (tmp_path / "a.glb").write_bytes(glb(description, content))
+    scene, means = load_scene(tmp_path / "a.glb"), random_scene(10, 1).means
+    assert len(scene) == 20
+    np.testing.assert_allclose(scene.means[:10], means * 2 + (10, 0, 0), atol=1e-5)
+    np.testing.assert_allclose(scene.means[10:], means * (-1, 1, -1) + (10, 0, 0), atol=1e-5)
+    del description["scenes"], description["scene"]
+    (tmp_path / "a.glb").write_bytes(glb(description, content))
+    assert len(load_scene(tmp_path / "a.glb")) == 30
+
+
+def kind_of(description: dict[str, Any]) -> dict[str, Any]:
+    found: dict[str, Any] = description["meshes"][0]["primitives"][0]["extensions"]["KHR_gaussian_splatting"]
+    return found
+
+
+def names_of(description: dict[str, Any]) -> dict[str, int]:
+    found: dict[str, int] = description["meshes"][0]["primitives"][0]["attributes"]
+    return found
+
+
+@pytest.mark.parametrize(
+    ("change", "message"),
+    [
+        (lambda d: d.pop("asset"), "no glTF file"),
+        (lambda d: d["asset"].update(version="1.0"), "version '1.0', only 2"),
+        (lambda d: d["meshes"][0]["primitives"][0].pop("extensions"), "no Gaussian splats.* mesh or a point cloud"),
+        (lambda d: d["nodes"][0].pop("mesh"), "no Gaussian splats"),
+        (
+            lambda d: kind_of(d).update(extensions={"KHR_gaussian_splatting_compression_spz_2": {"bufferView": 0}}),
+            "spz_2', whose text is a draft still.*export it without compression, or as .spz",
+        ),
+        (lambda d: kind_of(d).update(kernel="gabor"), "kernel is 'gabor': only ellipse"),
+        (lambda d: kind_of(d).update(projection="orthographic"), "projection is 'orthographic'"),
+        (lambda d: kind_of(d).update(colorSpace="BT.2020-HLG"), "colorSpace is"),
+        (lambda d: d.update(extensionsRequired=["KHR_draco_mesh_compression"]), "needs the glTF extension 'KHR_draco"),
+        (lambda d: d["bufferViews"][0].update(extensions={"EXT_meshopt_compression": {}}), "packed with 'EXT_meshopt"),
+        (lambda d: d["meshes"][0]["primitives"][0].update(mode=4), "no points"),
+        (lambda d: names_of(d).pop("KHR_gaussian_splatting:SCALE"), "no KHR_gaussian_splatting:SCALE"),
+        (lambda d: names_of(d).pop("KHR_gaussian_splatting:SH_DEGREE_1_COEF_2"), "no .*SH_DEGREE_1_COEF_2"),
+        (lambda d: names_of(d).update(POSITION=99), "there is no 99 among its accessors"),
+        (lambda d: d["accessors"][1].update(count=9), "ROTATION is not as long as POSITION"),
+        (lambda d: d["accessors"][0].update(count=10**9), "--trust"),
+        (lambda d: [each.update(count=60_000) for each in d["accessors"]], "does not lie within its buffer"),
+        (lambda d: d["accessors"][0].update(byteOffset=10**6), "does not lie within its buffer"),
+        (lambda d: d["accessors"][0].update(componentType=7), "of an unknown type"),
+        (lambda d: d["accessors"][0].update(type="VEC4"), "of type VEC4"),
+        (lambda d: d["accessors"][0].update(sparse={}), "sparse"),
+        (lambda d: d["bufferViews"][0].update(byteStride=1), "does not lie within its buffer"),
+        (lambda d: d["bufferViews"][0].update(byteLength=10**8), "a view does not lie"),
+        (lambda d: d["bufferViews"][0].update(byteOffset=-1), "impossible 'byteOffset': -1"),
+        (lambda d: d["buffers"][0].update(byteLength=10**8), "buffer 0 is truncated"),
+        (
+            lambda d: d["buffers"].append({"byteLength": 4}) or d["bufferViews"][0].update(buffer=1),
+            "buffer 1 is nowhere",
+        ),
+        (lambda d: d["nodes"][0].update(children=[0]), "node 0 stands twice"),
+        (lambda d: d["nodes"][0].update(scale=[1, 1, -1]), "sheared or mirrored"),
+        (lambda d: d["nodes"][0].update(matrix=[1, 0, 0, 0, 1, 1, *[0] * 4, 1, *[0] * 4, 1]), "sheared or mirrored"),
+        (lambda d: d["nodes"][0].update(scale=[0, 1, 1]), "no transform"),
+        (lambda d: d["nodes"][0].update(rotation=[0, 0, 0, 0]), "length zero"),
+        (lambda d: d["nodes"][0].update(translation=[1, 2]), "'translation' of a node is not 3 numbers"),
+        (lambda d: d["nodes"][0].update(translation=[1, 2, "x"]), "not 3 numbers"),
+        (lambda d: d.update(nodes=5), "among its nodes"),
+        (lambda d: d.update(scenes=[5]), "no object"),
+    ],
+)
+def test_what_is_refused(change: Any, message: str, tmp_path: Path) -> None:
+    description, content = described(attributes(random_scene(10, 1)))
+    change(description)
+    (tmp_path / "a.glb").write_bytes(glb(description, content))
+    with pytest.raises(DataError, match=message) as caught:
+        load_scene(tmp_path / "a.glb")
+    assert "\n" not in str(caught.value)
+    assert str(tmp_path / "a.glb") in str(caught.value)
+
+
+@pytest.mark.parametrize("size", [0, 3, 4, 11, 19, 20, 30, 500, -1])
+def test_truncated_files(size: int, tmp_path: Path) -> None:
+    data = glb(*described(attributes(random_scene(10, 1))))
+    size %= len(data)
+    (tmp_path / "a.glb").write_bytes(data[:size])
+    with pytest.raises(DataError):
+        load_scene(tmp_path / "a.glb")
+    (tmp_path / "a.glb").write_bytes(struct.pack("<4sII", b"glTF", 2, size)[:size] + data[12:size])
+    with pytest.raises(DataError):
+        load_scene(tmp_path / "a.glb")
+
+
+def test_logarithms_as_scales(tmp_path: Path) -> None:
+    parts = attributes(random_scene(10, 0))
+    parts[f"{PREFIX}SCALE"] = (random_scene(10, 0).log_scales.astype("<f4"), False)
+    with pytest.raises(DataError, match="negative scales: an early draft"):
+        load_scene(written(tmp_path / "a.glb", parts))
+
+
+def test_opacities_beyond_one(tmp_path: Path) -> None:
+    parts = attributes(random_scene(10, 0))
+    parts[f"{PREFIX}OPACITY"][0][3] = 1.5
+    with pytest.raises(DataError, match="opacities that are not between 0 and 1"):
+        load_scene(written(tmp_path / "a.glb", parts))
+
+
+@pytest.mark.parametrize(
+    "uri", ["../secret.bin", "/etc/passwd", "a/../../secret.bin", "%2e%2e/secret.bin", "..\\secret.bin"]
+)
+def test_buffers_outside_of_the_folder_are_not_opened(uri: str, tmp_path: Path) -> None:
+    description, content = described(attributes(random_scene(10, 0)))
+    (tmp_path / "secret.bin").write_bytes(content)
+    (tmp_path / "scene").mkdir()
+    (tmp_path / "scene" / "a.gltf").write_bytes(gltf(description, content, uri))
+    with pytest.raises(DataError, match="it names a file"):
+        load_scene(tmp_path / "scene" / "a.gltf")
+
+
+def test_buffers_that_are_not_there(tmp_path: Path) -> None:
+    description, content = described(attributes(random_scene(10, 0)))
+    (tmp_path / "a.gltf").write_bytes(gltf(description, content, "gone.bin"))
+    with pytest.raises(UsageError, match=r"cannot open '.*gone.bin'"):
+        load_scene(tmp_path / "a.gltf")
+    (tmp_path / "a.gltf").write_bytes(gltf(description, content, "https://example.com/a.bin"))
+    with pytest.raises(UsageError, match="download it"):
+        load_scene(tmp_path / "a.gltf")
+    for bad in ("data:application/octet-stream,abc", "data:;base64,%%%"):
+        (tmp_path / "a.gltf").write_bytes(gltf(description, content, bad))
+        with pytest.raises(DataError, match="base64"):
+            load_scene(tmp_path / "a.gltf")
+
+
+def test_one_mesh_in_countless_nodes(tmp_path: Path) -> None:
+    """Its splats would be as many as the file has bytes, times a thousand."""
+    description, content = described(attributes(random_scene(1000, 0)))
+    description["nodes"] = [{"mesh": 0}] * 2000
+    description["scenes"] = [{"nodes": list(range(2000))}]
+    (tmp_path / "a.glb").write_bytes(glb(description, content))
+    with pytest.raises(DataError, match=r"2000000 splats in \d+ bytes .*--trust"):
+        load_scene(tmp_path / "a.glb")
+    assert len(load_scene(tmp_path / "a.glb", trust=True)) == 2_000_000 > FREE_SPLATS
+
+
+def test_values_that_are_none_are_dropped(tmp_path: Path) -> None:
+    parts = attributes(random_scene(10, 0))
+    parts["POSITION"][0][0] = np.nan
+    parts[f"{PREFIX}SCALE"][0][1] = np.nan
+    parts[f"{PREFIX}OPACITY"][0][2] = np.nan
+    scene = load_scene(written(tmp_path / "a.glb", parts, NODES["stretch"]))
+    assert len(scene) == 7
+
+
+def test_other_parts_are_left_out(tmp_path: Path, caplog: pytest.LogCaptureFixture) -> None:
+    description, content = described(attributes(random_scene(10, 0)))
+    description["meshes"][0]["primitives"].append({"attributes": {"POSITION": 0}})
+    kind_of(description)["colorSpace"] = "lin_rec709_display"
+    (tmp_path / "a.glb").write_bytes(glb(description, content))
+    assert len(load_scene(tmp_path / "a.glb")) == 10
+    assert "left out 1 parts" in caplog.text
+    assert "linear colours" in caplog.text
+
+
+def test_deep_descriptions(tmp_path: Path) -> None:
+    for text in (b"[" * 100_000, b'{"asset": ' * 50_000, b"\xff\xfe", b"null", json.dumps({"asset": 3}).encode()):
+        (tmp_path / "a.gltf").write_bytes(text)
+        with pytest.raises(DataError):
+            load_scene(tmp_path / "a.gltf")

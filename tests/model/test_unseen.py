@@ -1,0 +1,58 @@
+"""Splats outside of every picture."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
+from potr_cl.reference.scenes import plain_splats, random_splats, ring_of_cameras, straight_camera
+
+
+def test_what_lies_beside_behind_and_right_in_front_is_unseen():
+    camera = straight_camera(60, 60, 60.0, fy=60.0)
+    places = [
+        [0, 0, 5],
+        [0, 0, -5],
+        [0, 0, 0.1],
+        [4, 0, 5],
+        [-4, 0, 5],
+        [0, 4, 5],
+        [0, -4, 5],
+        [2.4, 0, 5],
+        [0, 0, 1e6],
+    ]
+    scene = plain_splats(places, 0.01)
+    assert unseen_splats(scene, [camera]).tolist() == [False, True, True, True, True, True, True, False, False]
+
+
+def test_a_large_splat_beside_the_picture_reaches_into_it():
+    camera = straight_camera(60, 60, 60.0, fy=60.0)
+    assert unseen_splats(plain_splats([[4, 0, 5]], 0.01), [camera])[0]
+    assert not unseen_splats(plain_splats([[4, 0, 5]], 1.0), [camera])[0]
+
+
+def test_every_view_counts_and_without_views_all_are_unseen():
+    scene = random_splats(300)
+    cameras = ring_of_cameras(5, 2.0)
+    each = [unseen_splats(scene, [camera]) for camera in cameras]
+    assert 0 < np.count_nonzero(each[0]) < 300
+    np.testing.assert_array_equal(unseen_splats(scene, cameras), np.logical_and.reduce(each))
+    assert unseen_splats(scene, []).all()
+
+
+@pytest.mark.parametrize("value", [1e30, 3e38])
+def test_values_at_the_ends_of_single_precision(value):
+    scene = random_splats(20)
+    scene = dataclasses.replace(scene, means=np.full_like(scene.means, value))
+    assert unseen_splats(scene, ring_of_cameras(3)).shape == (20,)
+    huge = dataclasses.replace(scene, log_scales=np.full_like(scene.log_scales, 88))
+    assert np.isfinite(opacity_weighted_areas(huge)).all()
+
+
+def test_shares_of_area():
+    scene = plain_splats(np.zeros((3, 3)), [[1.0, 1.0, 0.1], [2.0, 1.0, 0.1], [1.0, 0.1, 0.1]], [0.0, 0.0, 30.0])
+    areas = opacity_weighted_areas(scene)
+    np.testing.assert_allclose(areas / areas[0], [1, 2, 0.2], rtol=1e-5)

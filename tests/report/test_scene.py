@@ -1,0 +1,232 @@
+"""What is said of a scene, in every format: counts, bounds, histograms, and each thing that looks wrong."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+
+import numpy as np
+import pytest
+
+import potr_cl
+from potr_cl import Scene
+from potr_cl.formats import registry
+from potr_cl.formats.scenes import ply
+from potr_cl.reference.scenes import random_scene
+from potr_cl.report.scene import format_scene, scene_report
+
+
+@pytest.fixture
+def scene(lego_excerpt) -> Scene:
+    return lego_excerpt
+
+
+def found(scene: Scene) -> dict[str, int]:
+    return {entry["what"]: entry["splats"] for entry in potr_cl.info(scene)["suspicious"]}
+
+
+def changed(scene: Scene, **arrays) -> Scene:
+    return dataclasses.replace(scene, **{name: np.asarray(array, np.float32) for name, array in arrays.items()})
+
+
+def test_a_good_scene_is_not_suspicious(scene):
+    assert found(scene) == {}
+
+
+@pytest.mark.slow
+def test_nor_are_whole_trained_scenes(lego, plush):
+    for folder in (lego, plush):
+        assert potr_cl.info(folder / "point_cloud.ply").suspicious == []
+
+
+def test_facts(scene):
+    report = scene_report(scene)
+    assert (report["splats"], report["sh_degree"]) == (1500, 3)
+    assert np.array_equal(report["bounding_box"], [scene.means.min(axis=0), scene.means.max(axis=0)])
+    (low, high), (inner_low, inner_high) = report["bounding_box"], report["robust_bounding_box"]
+    assert all(a <= b < c <= d for a, b, c, d in zip(low, inner_low, inner_high, high, strict=True))
+    for name, values in (("opacity", scene.opacities), ("scale", scene.scales.max(axis=1))):
+        facts = report[name]
+        assert sum(facts["counts"]) == 1500
+        assert len(facts["edges"]) == len(facts["counts"]) + 1
+        assert facts["edges"] == sorted(facts["edges"])
+        assert facts["quantiles"]["median"] == pytest.approx(np.median(values), rel=1e-5)
+        inner = np.histogram(values, facts["edges"])[0]
+        assert np.abs(inner - facts["counts"]).sum() <= 6, "but for what lies beyond the outermost edges"
+    assert json.loads(json.dumps(report, allow_nan=False)) == report
+
+
+def test_bars_are_as_long_as_what_they_count(scene):
+    lines = format_scene(scene_report(scene)).splitlines()
+    counts = scene_report(scene)["opacity"]["counts"]
+    bars = [line.count("#") for line in lines if line.startswith("  ") and " to " in line][:10]
+    assert max(bars) == 40
+    assert bars[int(np.argmax(counts))] == 40
+    assert all(bar == pytest.approx(40 * n / max(counts), abs=1) for bar, n in zip(bars, counts, strict=True))
+    assert lines[-1] == "suspicious      nothing"
+
+
+def test_outliers_do_not_move_the_robust_bounds(scene):
+    means = scene.means.copy()
+    means[:5] = 1e4
+    report = scene_report(changed(scene, means=means))
+    assert report["bounding_box"][1] == [1e4] * 3
+    assert max(report["robust_bounding_box"][1]) < 1
+
+
+def nan(scene):
+    sh = scene.sh.copy()
+    sh[:3, 5, 1] = np.nan
+    means = scene.means.copy()
+    means[3] = np.inf
+    return changed(scene, sh=sh, means=means), {"non_finite": 4}
+
+
+def zero_quaternions(scene):
+    quaternions = scene.quaternions.copy()
+    quaternions[10:17] = 0
+    return changed(scene, quaternions=quaternions), {"zero_quaternions": 7}
+
+
+def infinite_opacities(scene):
+    logits = scene.opacity_logits.copy()
+    logits[:2] = np.inf
+    return changed(scene, opacity_logits=logits), {"infinite_opacities": 2}
+
+
+def transparent(scene):
+    return changed(scene, opacity_logits=np.linspace(-20, -9, 1500)), {"all_transparent": 1500}
+
+
+def mostly_transparent(scene):
+    logits = scene.opacity_logits.copy()
+    logits[:1400] = -20
+    others = np.count_nonzero(scene.opacities[1400:] < 1 / 255)
+    return changed(scene, opacity_logits=logits), {"mostly_transparent": 1400 + others}
+
+
+def activated_opacities(scene):
+    return changed(scene, opacity_logits=scene.opacities), {"activated_opacities": 1500}
+
+
+def activated_scales(scene):
+    return changed(scene, log_scales=scene.scales), {"activated_scales": 1500, "huge_scales": 1500}
+
+
+def activated_colours(scene):
+    sh = scene.sh.copy()
+    sh[:, 0] = np.clip(0.5 + 0.28 * sh[:, 0], 0, 1)
+    return changed(scene, sh=sh), {"activated_colours": 1500}
+
+
+def no_ac(scene):
+    sh = scene.sh.copy()
+    sh[:, 1:] = 0
+    return changed(scene, sh=sh), {"unused_sh_degree": 1500}
+
+
+def no_third_degree(scene):
+    sh = scene.sh.copy()
+    sh[:, 9:] = 0
+    return changed(scene, sh=sh), {"unused_sh_degree": 1500}
+
+
+def duplicates(scene):
+    means = scene.means.copy()
+    means[700:1000] = means[:300]
+    return changed(scene, means=means), {"duplicated_positions": 300}
+
+
+def far_outliers(scene):
+    means = scene.means.copy()
+    means[::300] += 1e5
+    return changed(scene, means=means), {"far_outliers": 5}
+
+
+def huge(scene):
+    log_scales = scene.log_scales.copy()
+    log_scales[:6] = 3
+    return changed(scene, log_scales=log_scales), {"huge_scales": 6}
+
+
+def flat(scene):
+    log_scales = scene.log_scales.copy()
+    log_scales[:, 0] = -30
+    return changed(scene, log_scales=log_scales), {"flat_scales": 1500}
+
+
+WRONG = [
+    nan, zero_quaternions, infinite_opacities, transparent, mostly_transparent, activated_opacities, activated_scales,
+    activated_colours, no_ac, no_third_degree, duplicates, far_outliers, huge, flat,
+]  # fmt: skip
+
+
+@pytest.mark.parametrize("wrong", WRONG, ids=[each.__name__ for each in WRONG])
+def test_what_looks_wrong_is_said(scene, wrong, tmp_path, caplog):
+    bad, expected = wrong(scene)
+    assert found(bad) == expected
+    info = potr_cl.info(bad)
+    count = next(iter(expected.values()))
+    assert info.suspicious
+    assert all(line in str(info) for line in info.suspicious)
+    if count < 1500:
+        assert f"{count:,} " in info.suspicious[0]
+    # From a file, whose reader mends what cannot be kept, the same is said, and once.
+    path = tmp_path / "bad.ply"
+    ply.save(path, bad)
+    assert {entry["what"]: entry["splats"] for entry in potr_cl.info(path)["suspicious"]} == expected
+    assert not caplog.records
+
+
+def test_two_zeros_are_one_place():
+    scene = random_scene(100, 0)
+    means = scene.means.copy()
+    means[:50, 0], means[:50, 1:] = 0.0, 1.0
+    means[:25, 0] = -0.0
+    assert found(changed(scene, means=means))["duplicated_positions"] == 49
+
+
+@pytest.mark.parametrize("count", [1, 2, 3])
+def test_scenes_of_few_splats(count):
+    scene = random_scene(count, 1)
+    assert scene_report(scene)["splats"] == count
+    assert str(potr_cl.info(scene))
+
+
+def test_extreme_values_are_told_in_numbers_that_json_knows():
+    scene = random_scene(200, 0)
+    log_scales = scene.log_scales.copy()
+    log_scales[0], log_scales[1] = 3e38, -3e38
+    means = scene.means.copy()
+    means[2] = 3e38
+    report = scene_report(changed(scene, log_scales=log_scales, means=means))
+    json.dumps(report, allow_nan=False)
+    assert format_scene(report)
+
+
+def test_every_format_that_is_read_is_told(tmp_path, data, scene):
+    files = [path for path in (data / "foreign").iterdir() if path.is_file()]
+    for entry in registry.SCENE_FORMATS:
+        if entry.save is not None:
+            path = tmp_path / f"scene{entry.suffixes[0]}"
+            potr_cl.save(scene, path)
+            files.append(path)
+    potr_cl.encode(scene, prune=False, refit=False, compact=False, output=tmp_path / "scene.potr")
+    files.append(tmp_path / "scene.potr")
+    told = set()
+    for path in files:
+        info = potr_cl.info(path)
+        assert info["splats"] == 1500
+        assert info["bytes"] == path.stat().st_size
+        assert info["opacity"]["quantiles"]["median"] == pytest.approx(0.906, abs=0.02), path
+        assert info["scale"]["quantiles"]["median"] == pytest.approx(0.0198, rel=0.1), path
+        assert np.allclose(info["robust_bounding_box"], scene_report(scene)["robust_bounding_box"], atol=5e-3), path
+        told.add(info["format"])
+    for path in (data / "other_tools").rglob("*"):  # of another scene
+        kinds = [entry for entry in registry.SCENE_FORMATS if path.name.lower().endswith(entry.suffixes)]
+        if (path.is_file() and kinds) or path.name in ("splat-transform_lod", "splat-transform_sog"):
+            info = potr_cl.info(path)
+            assert info["splats"] == len(potr_cl.read_scene(path)), path
+            assert sum(info["opacity"]["counts"]) == info["splats"]
+            told.add(info["format"])
+    assert told == {entry.name for entry in registry.SCENE_FORMATS}

@@ -1,0 +1,161 @@
+"""docs/python.md and the examples: their code runs, in the order of the page, and prints what they say."""
+
+from __future__ import annotations
+
+import contextlib
+import io
+import json
+import os
+import re
+import runpy
+import subprocess
+import sys
+from collections.abc import Iterator
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).parents[1]
+EXAMPLES = ROOT / "examples"
+NOTEBOOKS = sorted(EXAMPLES.glob("*.ipynb"))
+#: Bytes of a notebook with its pictures, beyond which a clone of the repository would notice.
+MOST_BYTES = 500_000
+
+
+@pytest.fixture
+def clone(tmp_path, data, monkeypatch) -> Path:
+    """A folder in which the data are where they are in a clone, and in which anything may be written."""
+    (tmp_path / "tests").mkdir()
+    (tmp_path / "tests" / "data").symlink_to(data)
+    (tmp_path / "examples").mkdir()
+    for file in EXAMPLES.iterdir():
+        (tmp_path / "examples" / file.name).symlink_to(file)
+    monkeypatch.chdir(tmp_path)
+    return tmp_path
+
+
+def expected(code: str) -> list[str]:
+    return re.findall(r"# -> (.+)$", code, re.MULTILINE)
+
+
+def run(code: str, names: dict[str, object], name: str) -> str:
+    printed = io.StringIO()
+    with contextlib.redirect_stdout(printed):
+        exec(compile(code, name, "exec"), names)
+    return printed.getvalue()
+
+
+def check_printed(code: str, printed: str) -> None:
+    """Each line that the code promises is printed, in this order; … stands for anything."""
+    at = 0
+    for line in expected(code):
+        pattern = ".*?".join(map(re.escape, line.strip().split("…")))
+        found = re.compile(rf"^{pattern}", re.MULTILINE).search(printed, at)
+        assert found, f"not printed: {line}\nbut: {printed[at:]}"
+        at = found.end()
+
+
+@pytest.mark.slow
+def test_the_code_of_the_page_runs(clone):
+    page = (ROOT / "docs" / "python.md").read_text("utf-8")
+    blocks = re.findall(r"^```python\n(.*?)^```", page, re.MULTILINE | re.DOTALL)
+    assert len(blocks) > 10
+    names: dict[str, object] = {"__name__": "__main__"}
+    for number, block in enumerate(blocks):
+        check_printed(block, run(block, names, f"docs/python.md, block {number}"))
+    assert {"excerpt.potr", "report.html", "worst.png", "pictures"} <= {path.name for path in clone.iterdir()}
+
+
+def cells(notebook: Path) -> Iterator[str]:
+    for cell in json.loads(notebook.read_text("utf-8"))["cells"]:
+        if cell["cell_type"] == "code":
+            yield "".join(cell["source"])
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=[path.name for path in NOTEBOOKS])
+def test_a_notebooks_code_runs(notebook, clone, monkeypatch):
+    """Without Jupyter: what its last expressions would show is made."""
+    monkeypatch.chdir(clone / "examples")
+    names: dict[str, object] = {"__name__": "__main__"}
+    for code in cells(notebook):
+        run(code, names, notebook.name)
+        last = code.strip().splitlines()[-1]
+        if re.fullmatch(r"\w+", last):
+            shown = names[last]
+            assert shown._repr_png_().startswith(b"\x89PNG") if hasattr(shown, "_repr_png_") else repr(shown)
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=[path.name for path in NOTEBOOKS])
+def test_a_notebook_runs_in_jupyter(notebook, clone):
+    nbformat = pytest.importorskip("nbformat")
+    nbclient = pytest.importorskip("nbclient")
+    pytest.importorskip("ipykernel")
+    document = nbformat.read(notebook, as_version=4)
+    client = nbclient.NotebookClient(document, timeout=300, resources={"metadata": {"path": str(clone / "examples")}})
+    # The kernel is another process, which is to find this clone's package.
+    os.environ["PYTHONPATH"] = os.pathsep.join(filter(None, [str(ROOT), os.environ.get("PYTHONPATH", "")]))
+    client.execute()
+    kinds = {kind for cell in document.cells for output in cell.get("outputs", []) for kind in output.get("data", {})}
+    assert {"image/png", "text/plain"} <= kinds
+
+
+@pytest.mark.parametrize("notebook", NOTEBOOKS, ids=[path.name for path in NOTEBOOKS])
+def test_a_notebook_is_committed_with_small_outputs(notebook):
+    document = json.loads(notebook.read_text("utf-8"))
+    code = [cell for cell in document["cells"] if cell["cell_type"] == "code"]
+    assert any("image/png" in output.get("data", {}) for cell in code for output in cell["outputs"])
+    assert not any(output["output_type"] == "error" for cell in code for output in cell["outputs"])
+    assert notebook.stat().st_size < MOST_BYTES
+    text = notebook.read_text("utf-8")
+    assert "/work/" not in text
+    assert "/home/" not in text
+
+
+def test_there_are_examples():
+    assert NOTEBOOKS
+    listed = (EXAMPLES / "README.md").read_text("utf-8")
+    for file in EXAMPLES.iterdir():
+        assert file.name == "README.md" or f"({file.name})" in listed, f"examples/README.md does not list {file.name}"
+
+
+@pytest.mark.slow
+def test_quality_ladder(clone, monkeypatch, capsys):
+    scene, cameras = "tests/data/lego_excerpt.ply", "tests/data/lego_cameras.json"
+    monkeypatch.setattr(sys, "argv", ["quality_ladder.py", scene, cameras, "--preset", "fast", "--steps", "3"])
+    runpy.run_path(str(EXAMPLES / "quality_ladder.py"), run_name="__main__")
+    lines = capsys.readouterr().out.splitlines()
+    assert lines[0] == "q,bytes,splats,psnr,ssim"
+    rows = [[float(value) for value in line.split(",")] for line in lines[1:]]
+    assert [row[0] for row in rows] == [0.0, 0.5, 1.0]
+    for column in (1, 3, 4):
+        values = [row[column] for row in rows]
+        assert values == sorted(values), "better is larger"
+    assert len(set(row[1] for row in rows)) == 3
+
+
+@pytest.mark.slow
+def test_compress_folder(clone):
+    folder = clone / "scenes"
+    (folder / "inner").mkdir(parents=True)
+    for name in ("a.ply", "inner/b.ply"):
+        (folder / name).symlink_to(clone / "tests" / "data" / "lego_excerpt.ply")
+    (folder / "broken.ply").write_bytes(b"ply\nnot one\n")
+    done = subprocess.run(
+        [sys.executable, "examples/compress_folder.py", "scenes", "out", "--max-size", "20kB", "--preset", "fast"],
+        capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert done.returncode == 1, "one scene was damaged"
+    assert sorted(str(path.relative_to(clone / "out")) for path in (clone / "out").rglob("*.potr")) == [
+        "a.potr",
+        "inner/b.potr",
+    ]
+    assert all(path.stat().st_size <= 20_000 for path in (clone / "out").rglob("*.potr"))
+    assert "broken.ply" in done.stderr
+    assert "Traceback" not in done.stderr
+    again = subprocess.run(
+        [sys.executable, "examples/compress_folder.py", "scenes", "out", "--max-size", "20kB"],
+        capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
+    )  # fmt: skip
+    assert again.stdout.count("is there already") == 2
