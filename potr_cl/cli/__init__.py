@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import logging
 import os
+import shlex
 import sys
 import traceback
 from collections.abc import Sequence
@@ -70,6 +71,7 @@ def _run(argv: Sequence[str]) -> None:
         # Drivers take as long to load as the command's modules to be imported.
         in_background(import_module("potr_cl.opencl.discovery").list_devices)
     args = command_parser(argv).parse_args(argv)
+    args.typed = shlex.join(["potr-cl", *argv])
     if "arrange" in args:
         args.arrange(args)
     guard.check(args)

@@ -127,7 +127,9 @@ def _refit(args: argparse.Namespace) -> None:
         raise UsageError("--photos needs --cameras, the views that the photographs show")
     cameras = given_cameras(args)
     if args.photos is not None and cameras is not None:
-        GroundTruth(args.photos, within_photographs(cameras), background)
+        missing = GroundTruth(args.photos, within_photographs(cameras), background).missing
+        if missing is not None:
+            note(missing)
     scene, reference = read_scene(args, args.scene), read_scene(args, args.reference)
     check_rendered_alike((str(args.scene), scene), (str(args.reference), reference))
     device = Device(args.device)
