@@ -122,7 +122,7 @@ def test_there_are_examples():
 
 @pytest.mark.slow
 def test_quality_ladder(clone, monkeypatch, capsys):
-    scene, cameras = "tests/data/lego_excerpt.ply", "tests/data/lego_cameras.json"
+    scene, cameras = "tests/data/plush_excerpt.ply", "tests/data/plush_excerpt_cameras.json"
     monkeypatch.setattr(sys, "argv", ["quality_ladder.py", scene, cameras, "--preset", "fast", "--steps", "3"])
     runpy.run_path(str(EXAMPLES / "quality_ladder.py"), run_name="__main__")
     lines = capsys.readouterr().out.splitlines()
@@ -140,7 +140,7 @@ def test_compress_folder(clone):
     folder = clone / "scenes"
     (folder / "inner").mkdir(parents=True)
     for name in ("a.ply", "inner/b.ply"):
-        (folder / name).symlink_to(clone / "tests" / "data" / "lego_excerpt.ply")
+        (folder / name).symlink_to(clone / "tests" / "data" / "plush_excerpt.ply")
     (folder / "broken.ply").write_bytes(b"ply\nnot one\n")
     done = subprocess.run(
         [sys.executable, "examples/compress_folder.py", "scenes", "out", "--max-size", "20kB", "--preset", "fast"],

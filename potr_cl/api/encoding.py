@@ -266,7 +266,7 @@ def by_photographs(
 ) -> dict[str, Any]:
     """What photographs say of an encode that was asked to fit to them; see :func:`judge_by_photographs`."""
     figures = judge_by_photographs(ground_truth, cameras, scenes, device, background)
-    return photographs_report(encoded.photographs, ground_truth.missing, figures)
+    return photographs_report(encoded, ground_truth.missing, figures)
 
 
 @dataclass(frozen=True)

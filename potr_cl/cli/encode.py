@@ -18,6 +18,7 @@ from potr_cl.api.encoding import (
     proved,
 )
 from potr_cl.cli.batch import for_each_scene, jobs
+from potr_cl.cli.forecasts import tell_what_is_ahead
 from potr_cl.cli.guard import read_file
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option
 from potr_cl.cli.outputs import WrittenPage, WrittenPotr, place, writing
@@ -31,7 +32,7 @@ from potr_cl.cli.scenes import (
     size_of_file,
 )
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
-from potr_cl.cli.terminal import note, say, say_document, say_line
+from potr_cl.cli.terminal import note, say_document, say_done, say_line
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
 from potr_cl.errors import DeviceError, UsageError
 from potr_cl.formats.images import parse_colour
@@ -61,7 +62,7 @@ def _options(args: argparse.Namespace, source_bytes: int | None = None) -> Encod
 
 def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
     """Whether anything may be rendered: to encode, or to judge what was encoded."""
-    wanted = any(stage.asked_for and stage.needs_views for stage in options.stages)
+    wanted = any(s.asked_for and s.needs_views and not s.serves_others for s in options.stages)
     return wanted or not (args.cameras is None or args.no_quality)
 
 
@@ -118,6 +119,8 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
         with writing(args.output) as file:
             if cameras is None and device is not None:
                 cameras = virtual_cameras(args, scene, placing)
+            if device is not None and cameras is not None:
+                tell_what_is_ahead(device, scene, cameras, options, target is not None)
             views = EvaluationViews.of(cameras) if cameras is not None and not args.no_quality else None
             if args.report_view is not None:
                 _ = views and views.named(args.report_view)  # an unknown name is told before the work
@@ -150,7 +153,7 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
     if args.json:
         (say_line if several else say_document)(report)
     else:
-        say(format_encode_report(report))
+        say_done(format_encode_report(report))
 
 
 def _evaluate(
@@ -201,7 +204,10 @@ def _photographs(
         note(found["missing"])
     if found["file"] < found["uncompressed"] and encoded.photographs is not None and encoded.photographs.kept:
         lost = found["uncompressed"] - found["file"]
-        note(f"warning: on {found['kind']} photographs the file is {lost:.2f} dB worse than the uncompressed scene")
+        note(
+            f"warning: on {found['kind']} photographs the file is {lost:.2f} dB worse than the uncompressed scene",
+            "warning",
+        )
     return found
 
 

@@ -190,6 +190,8 @@ class Run:
             return stage.run(state, bench)
         if not state.views or not stage.looks_at(state.scene):
             return state
+        if stage.serves_others and not options.look_at_views(state.scene):
+            return state
 
         def work(device: Device, memory: int | None) -> State:
             return stage.run(state, dataclasses.replace(bench, device=device, memory=memory))

@@ -20,7 +20,6 @@ from potr_cl.quality.compare import Comparison, Figures, mean_view
 from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.quality.ground_truth import PhotographFigures
 from potr_cl.report.file import file_report
-from potr_cl.stages.refitting.photographs import PhotographChoice
 
 #: Sections of :func:`potr_cl.report.file.file_report` by the property that they belong to, as their names begin.
 _PROPERTIES = ("position", "scale", "rotation", "opacity", "colour: DC", "colour: AC")
@@ -141,21 +140,20 @@ def quality_report(views: EvaluationViews, comparison: Comparison) -> dict[str, 
     }
 
 
-def photographs_report(
-    choice: PhotographChoice | None, missing: str | None, figures: PhotographFigures
-) -> dict[str, Any]:
+def photographs_report(encoded: Encoded, missing: str | None, figures: PhotographFigures) -> dict[str, Any]:
     """What photographs say of an encode that was asked to fit to them.
 
     Args:
-        choice: what held-out photographs said during the encode.
+        encoded: the encode, which knows what held-out photographs said on the way.
         missing: which views have no photograph, in a line.
         figures: of the scene and the file.
     """
     uncompressed, file = figures.means
+    choice, held_out = encoded.photographs, None
+    if choice is not None:
+        held_out = {**dataclasses.asdict(choice), "kept": choice.kept, "said": str(choice)}
     return {
-        "held_out": None
-        if choice is None
-        else {**dataclasses.asdict(choice), "kept": choice.kept, "said": str(choice)},
+        "held_out": held_out,
         "missing": missing,
         "kind": figures.kind,
         "uncompressed": uncompressed,

@@ -16,7 +16,7 @@ from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
 from potr_cl.stages.refitting.refit import RefitOptions, Refitted, active_coefficients, refit_colours
-from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
+from potr_cl.stages.refitting.targets import GroundTruthTargets, PartlyPhotographed, RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 
@@ -135,13 +135,20 @@ class Refit(Stage):
 
         with ExitStack() as stack:
             stack.callback(bench.progress, "refit", 1.0)
-            with Rasterizer(bench.opened, state.source, background=bench.background) as rasterizer:
-                refitted = fitted(state.views, RenderedTargets(rasterizer, state.views), 0)
+            rasterizer = stack.enter_context(Rasterizer(bench.opened, state.source, background=bench.background))
+            refitted = fitted(state.views, RenderedTargets(rasterizer, state.views), 0)
             choice = None
             if self.ground_truth is not None:
-                photographs = GroundTruth(self.ground_truth, state.views, bench.background)
-                fit_to, judging = hold_out(photographs.of(state.views))
-                to_photographs = fitted(fit_to, GroundTruthTargets(bench.opened, photographs, fit_to), 1)
+                given, added = state.views[: len(state.views) - state.added], state.views[-state.added :]
+                photographs = GroundTruth(self.ground_truth, given, bench.background)
+                fit_to, judging = hold_out(photographs.of(given))
+                of_photographs = GroundTruthTargets(bench.opened, photographs, fit_to)
+                targets: Targets = of_photographs
+                views = fit_to
+                if state.added:  # nobody photographed these
+                    views = [*fit_to, *added]
+                    targets = PartlyPhotographed(of_photographs, len(fit_to), RenderedTargets(rasterizer, views))
+                to_photographs = fitted(views, targets, 1)
                 psnrs = []
                 for each in (to_photographs, refitted):
                     with Rasterizer(bench.opened, replace(decoded, sh=each.sh), background=bench.background) as judged:

@@ -140,7 +140,7 @@ def test_encode_tells_what_it_did(tmp_path, scene_path, capsys):
 @pytest.fixture
 def excerpt(data):
     """Arguments that encode a real excerpt fast."""
-    return ["encode", data / "lego_excerpt.ply", "--cameras", data / "lego_cameras.json", "--iterations", "4"]
+    return ["encode", data / "plush_excerpt.ply", "--cameras", data / "plush_excerpt_cameras.json", "--iterations", "4"]
 
 
 def test_encode_to_a_size(tmp_path, excerpt, capsys):
@@ -196,16 +196,16 @@ def test_sizes_as_people_write_them(text, size):
 def test_encode_report_page(tmp_path, excerpt, capsys):
     page = tmp_path / "page.html"
     encode = [*excerpt, "-o", tmp_path / "a.potr"]
-    run(capsys, *encode, "--report", page, "--report-view", "test_r_0")
+    run(capsys, *encode, "--report", page, "--report-view", "20240212_003919")
     text = page.read_text()
-    assert "worst view: test_r_66" in text
-    assert "chosen view: test_r_0" in text
+    assert "worst view: 20240212_004138" in text
+    assert "chosen view: 20240212_003919" in text
     assert text.count("<img") == 9
     run(capsys, *encode, "--report", page, "--no-quality")
     assert "not judged, as asked" in page.read_text()
     page.unlink()
-    fails(capsys, [*encode, "--report", page, "--report-view", "nobody"], 2, "no view 'nobody'", "'test_r_0'")
-    fails(capsys, [*encode, "--report-view", "test_r_0"], 2, "--report")
+    fails(capsys, [*encode, "--report", page, "--report-view", "nobody"], 2, "no view 'nobody'", "'20240212_003919'")
+    fails(capsys, [*encode, "--report-view", "20240212_003919"], 2, "--report")
     fails(capsys, [*encode, "--report", tmp_path / "a.potr"], 2, "name the same file")
     fails(capsys, [*encode, "--report", tmp_path / "nowhere" / "page.html"], 2, "does not exist")
     assert [path.name for path in tmp_path.iterdir()] == ["a.potr"]

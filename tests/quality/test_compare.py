@@ -37,17 +37,17 @@ BACKGROUND = (0.25, 0.5, 1.0)
 
 
 @pytest.fixture(scope="module")
-def rasterizers(lego_excerpt):
+def rasterizers(plush_excerpt):
     """The excerpt, and the excerpt with other colours."""
     device = Device()
-    s = lego_excerpt
+    s = plush_excerpt
     other = Scene(s.means, s.log_scales, s.quaternions, s.opacity_logits, s.sh * np.float32(0.9))
     return Rasterizer(device, s, background=BACKGROUND), Rasterizer(device, other, background=BACKGROUND)
 
 
 @pytest.fixture(scope="module")
-def views(lego_excerpt_cameras):
-    return [c for c in lego_excerpt_cameras if c.split == "test"]
+def views(plush_excerpt_cameras):
+    return [c for c in plush_excerpt_cameras if c.split == "test"]
 
 
 def comparison(*psnrs):
