@@ -24,10 +24,11 @@ Integers = NDArray[np.signedinteger]
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
 
-#: "paper": the paper's steps and its file (version 1). "best": steps of equal worth, the smallest file. "fast": the
+#: "paper": the paper's steps and its file (version 1). "best": steps of equal worth, a small file. "smallest": the same
+#: with more looks at more views. "fast": the
 #: same with fewer looks at the views and quick coding.
-Preset = Literal["paper", "fast", "best"]
-PRESETS: tuple[Preset, ...] = ("paper", "fast", "best")
+Preset = Literal["paper", "fast", "best", "smallest"]
+PRESETS: tuple[Preset, ...] = ("paper", "fast", "best", "smallest")
 
 #: Added to a quantised opacity before the division: the paper's shift of the reconstruction off the bin's centre.
 OPACITY_SHIFT = 0.25
@@ -152,6 +153,7 @@ _VALUES: dict[Preset, Callable[[float, Mapping[str, float]], HyperParameters]] =
     "paper": _paper,
     "fast": _balanced,
     "best": _balanced,
+    "smallest": _balanced,
 }
 
 

@@ -34,6 +34,7 @@ _TYPICAL: dict[Preset, tuple[tuple[float, ...], tuple[float, ...]]] = {
         (35.7, 36.1, 36.7, 37.6, 39.3, 41.0, 42.7, 44.5, 46.3, 48.0, 49.7, 51.5, 53.3),
     ),
 }
+_TYPICAL["smallest"] = _TYPICAL["best"]
 #: Bounds of a measured rate, as parts of the typical one, beyond the places that are known.
 SLOWEST, FASTEST = 0.25, 3.0
 

@@ -50,7 +50,7 @@ class Between(Stage):
             "views to look at besides, for each training view, between it and its neighbours; off: none",
             "N",
             _number,
-            default="auto, as many as the scene needs",
+            default="the preset's: auto, as many as the scene needs, in smallest, else off",
         ),
     )
     spread: float = option(SPREAD)
