@@ -35,7 +35,7 @@ import numpy as np
 from potr_cl.codec import decoder, encoder
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.encoder import code_scene
-from potr_cl.codec.native import functions
+from potr_cl.codec.native import arrays, functions
 from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError
@@ -90,7 +90,7 @@ def _how_often() -> tuple[int, ...]:
 
 def work(seed: int, first: int, stop: int, compare: int) -> None:
     """Decode files; print a line of JSON for each that differs, and after each batch."""
-    untouched = functions._address
+    untouched = arrays.address
     kept: list[Any] = []
 
     def copied(array: Any, dtype: Any, number: int, writable: bool = False) -> int:
@@ -100,7 +100,11 @@ def work(seed: int, first: int, stop: int, compare: int) -> None:
         return untouched(array, dtype, number, writable)
 
     at = os.open(os.environ["POTR_STRESS_AT"], os.O_WRONLY | os.O_CREAT)
-    with patch.object(functions, "_address", copied), patch.object(decoder, "thread_pool", _at_once):
+    with (
+        patch.object(arrays, "address", copied),
+        patch.object(functions, "address", copied),
+        patch.object(decoder, "thread_pool", _at_once),
+    ):
         tally = dict.fromkeys(("read", "refused", "compared"), 0)
         for number in range(first, stop):
             data = changed_file(seed, number)

@@ -1,0 +1,74 @@
+"""The C functions with the types of their arguments (:func:`declared`), as potr_native.h has them."""
+
+from __future__ import annotations
+
+import ctypes
+from typing import Any
+
+_SIZE, _NUMBER, _POINTER, _WORD = ctypes.c_size_t, ctypes.c_int, ctypes.c_void_p, ctypes.c_uint64
+_REAL = ctypes.c_float
+
+#: Argument types and result of each function, in the order of the C declarations.
+_DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
+    "potr_context_table": (_NUMBER, [_POINTER, _SIZE, _SIZE, _POINTER]),
+    "potr_context_stream": (
+        _NUMBER,
+        [_POINTER, _SIZE, *[_POINTER] * 3, _SIZE, *[_POINTER] * 6, _SIZE, _POINTER, _POINTER],
+    ),
+    "potr_context_beside": (_WORD, [_POINTER, _SIZE, _POINTER]),
+    "potr_context_join": (None, [_POINTER, _SIZE, _SIZE, _POINTER]),
+    "potr_octree_levels": (
+        _NUMBER,
+        [_POINTER, _SIZE, _POINTER, _SIZE, _NUMBER, _NUMBER, _POINTER, _POINTER, _POINTER],
+    ),
+    "potr_octree_tails": (
+        _NUMBER,
+        [_POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _POINTER, _WORD, _WORD, _NUMBER, _POINTER],
+    ),
+    "potr_octree_centres": (
+        _NUMBER,
+        [_POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _POINTER, _WORD, _WORD, _NUMBER, *[_POINTER] * 6, _WORD],
+    ),
+    "potr_encode_recent": (None, [_POINTER, _SIZE, _SIZE, _POINTER]),
+    "potr_encode_cells": (None, [_POINTER, _SIZE, _POINTER, _POINTER, _SIZE, ctypes.c_int32, _POINTER]),
+    "potr_encode_count": (None, [_POINTER, _SIZE, _POINTER]),
+    "potr_encode_stream": (_SIZE, [_POINTER, _SIZE, _SIZE, _POINTER, _POINTER, _POINTER]),
+    "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
+}
+#: Those that there are for several kinds of integers, by what their names begin with.
+_OF_KINDS: dict[str, tuple[Any, list[Any], tuple[str, ...]]] = {
+    "potr_context_integers_": (
+        _NUMBER,
+        [_POINTER, _SIZE, _SIZE, _POINTER, _WORD, _WORD, _NUMBER, _NUMBER, _POINTER, _POINTER],
+        ("medium", "wide"),
+    ),
+    "potr_join_planes_": (None, [_POINTER, _SIZE, ctypes.c_uint, _NUMBER, _POINTER], ("medium", "wide")),
+    "potr_colours_of_": (
+        None,
+        [_POINTER, _POINTER, _POINTER, _SIZE, _REAL, _POINTER, _POINTER, _POINTER],
+        ("narrow", "medium", "wide"),
+    ),
+    "potr_look_up_": (_WORD, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER, _SIZE], ("narrow", "medium", "wide")),
+    "potr_rotations_of_": (
+        None,
+        [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _SIZE, _POINTER],
+        ("narrow", "medium", "wide"),
+    ),
+}
+
+
+def declared(library: ctypes.CDLL) -> dict[str, Any]:
+    """The functions of a library by name, told what they take.
+
+    Raises:
+        AttributeError: one is missing.
+    """
+    functions: dict[str, Any] = {}
+    for name, (result, arguments) in _DECLARATIONS.items():
+        functions[name] = library[name]
+        functions[name].restype, functions[name].argtypes = result, arguments
+    for start, (result, arguments, kinds) in _OF_KINDS.items():
+        for name in (start + kind for kind in kinds):
+            functions[name] = library[name]
+            functions[name].restype, functions[name].argtypes = result, arguments
+    return functions
