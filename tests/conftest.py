@@ -34,15 +34,15 @@ def data() -> Path:
 
 
 @pytest.fixture(scope="session")
-def lego_excerpt() -> Scene:
+def plush_excerpt() -> Scene:
     """1500 splats of a real scene, SH degree 3."""
-    return load_scene(DATA / "lego_excerpt.ply")
+    return load_scene(DATA / "plush_excerpt.ply")
 
 
 @pytest.fixture(scope="session")
-def lego_excerpt_cameras() -> list[Camera]:
+def plush_excerpt_cameras() -> list[Camera]:
     """9 training and 3 test views that see the excerpt."""
-    return load_cameras(DATA / "lego_cameras.json")
+    return load_cameras(DATA / "plush_excerpt_cameras.json")
 
 
 @pytest.fixture(scope="session")

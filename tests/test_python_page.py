@@ -122,7 +122,7 @@ def test_there_are_examples():
 
 @pytest.mark.slow
 def test_quality_ladder(clone, monkeypatch, capsys):
-    scene, cameras = "tests/data/lego_excerpt.ply", "tests/data/lego_cameras.json"
+    scene, cameras = "tests/data/plush_excerpt.ply", "tests/data/plush_excerpt_cameras.json"
     monkeypatch.setattr(sys, "argv", ["quality_ladder.py", scene, cameras, "--preset", "fast", "--steps", "3"])
     runpy.run_path(str(EXAMPLES / "quality_ladder.py"), run_name="__main__")
     lines = capsys.readouterr().out.splitlines()
@@ -140,10 +140,10 @@ def test_compress_folder(clone):
     folder = clone / "scenes"
     (folder / "inner").mkdir(parents=True)
     for name in ("a.ply", "inner/b.ply"):
-        (folder / name).symlink_to(clone / "tests" / "data" / "lego_excerpt.ply")
+        (folder / name).symlink_to(clone / "tests" / "data" / "plush_excerpt.ply")
     (folder / "broken.ply").write_bytes(b"ply\nnot one\n")
     done = subprocess.run(
-        [sys.executable, "examples/compress_folder.py", "scenes", "out", "--max-size", "40kB", "--preset", "fast"],
+        [sys.executable, "examples/compress_folder.py", "scenes", "out", "--max-size", "45kB", "--preset", "fast"],
         capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert done.returncode == 1, "one scene was damaged"
@@ -151,11 +151,11 @@ def test_compress_folder(clone):
         "a.potr",
         "inner/b.potr",
     ]
-    assert all(path.stat().st_size <= 40_000 for path in (clone / "out").rglob("*.potr"))
+    assert all(path.stat().st_size <= 45_000 for path in (clone / "out").rglob("*.potr"))
     assert "broken.ply" in done.stderr
     assert "Traceback" not in done.stderr
     again = subprocess.run(
-        [sys.executable, "examples/compress_folder.py", "scenes", "out", "--max-size", "40kB"],
+        [sys.executable, "examples/compress_folder.py", "scenes", "out", "--max-size", "45kB"],
         capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert again.stdout.count("is there already") == 2

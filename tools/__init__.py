@@ -16,6 +16,9 @@ bench.decode           how fast does a file decode, by compiled code, NumPy or O
 bench.codec            speed, memory and size of the codec alone
 bench.search           what does encoding to a size or a PSNR cost, against one plain encode?
 bench.virtual_cameras  what does encoding without cameras cost?
+bench.forecast         how far off is what an encode says beforehand of its time and memory?
+bench.install          what does an installation take, and where are there wheels?
+bench.views_between    what do views between the training views bring, and what do they take?
 bench.needs            what is a scene charged for splats, views and tiles that nobody needs?
 bench.busy             how busy is the device during an encode, stage by stage?
 bench.kernels          processor time of each kernel, on machines that do other work too
@@ -56,6 +59,8 @@ What tests and pages are made of (``make``):
 ====================  ==================================================================================================
 make.large_scene      a scene of any size with the statistics of a real one
 make.test_data        the excerpts in tests/data
+make.release          a wheel and an sdist that are ready for a package index
+make.readme_picture   the picture at the top of the README
 make.foreign_files    the excerpt in splat-transform's formats
 make.other_tools      some splats in the formats of six tools, and how splat-transform reads them
 make.golden_files     files that every later decoder must read to the same values

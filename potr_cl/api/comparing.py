@@ -39,6 +39,7 @@ from potr_cl.quality.compare import (
     format_comparison,
     format_sizes,
     mean_view,
+    missing_photographs,
     size_report,
 )
 from potr_cl.quality.compare import compare as compare_pictures
@@ -228,6 +229,9 @@ def compare_scenes(
     views = within_photographs(views) if truth is not None else views
     ground_truth = find_ground_truth(truth, views) if truth is not None else None
     lpips, told_of = None, list(notes)
+    if ground_truth is not None:
+        told_of += filter(None, [missing_photographs(ground_truth, views)])
+        views = [view for view in views if view.name in ground_truth]
     if a[1].antialiased != b[1].antialiased:
         ways = " and ".join(
             f"{name} is rendered {'with' if scene.antialiased else 'without'} antialiasing"

@@ -312,7 +312,7 @@ def refit(
             progress: as of :func:`prune`.
 
     Raises:
-        As :func:`prune`; and UsageError if a photograph is missing or there are no cameras for them.
+        As :func:`prune`; and UsageError if no training view has a photograph, or there are no cameras for them.
     """
     colour = colour_of(background)
     options = RefitOptions(steps=steps, drop=drop, lam=lambda_, prior=prior)
@@ -330,6 +330,8 @@ def refit(
     opened = device_of(device)
     there = views_or_placed(original, given, virtual_views)
     views = train_views(there)
+    if ground_truth is not None:
+        views = ground_truth.of(views)
     tell: Progress = progress or (lambda _what, _done: None)
 
     def work(device: Device, memory: int | None) -> Refitted:
@@ -354,7 +356,7 @@ def refit(
     if write is not None:
         write(result)
     done = RefittedScene(result, len(reduced), used, refitted, len(views))
-    held_out = test_views(there)
+    held_out = test_views(there) if ground_truth is None else ground_truth.of(test_views(there))
     if not held_out:
         return done
     if ground_truth is not None:

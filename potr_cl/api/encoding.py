@@ -29,7 +29,7 @@ from potr_cl.formats.images import Colour
 from potr_cl.formats.registry import refuse_other_than_potr
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.amounts import as_bytes, size_in_bytes
@@ -40,8 +40,9 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT
 from potr_cl.pipeline.search import Found, Target, encode_to_target
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
+from potr_cl.quality.ground_truth import GroundTruth, judge_by_photographs
 from potr_cl.report.html import PicturePair, html_report, views_to_show
-from potr_cl.report.summary import encode_report, quality_report, search_report
+from potr_cl.report.summary import encode_report, photographs_report, quality_report, search_report
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Progress, Stage
 
@@ -143,9 +144,18 @@ def encode(
         if page is not None:
             quality: dict[str, Any] | str = "not judged: there are no cameras to look from"
             pictures: list[PicturePair] = []
+            ground_truth: GroundTruth | None = None
+            photographs: dict[str, Any] | None = None
             watch = Stopwatch(progress)
             if judging is not None:
-                judge = Judge(judging, encoded.device or opened or Device(), encoded.options.background)
+                used_device = encoded.device or opened or Device()
+                folder = settings.stage(Refit).ground_truth
+                if folder is not None and views is not None:
+                    ground_truth = GroundTruth(folder, views, encoded.options.background)
+                    photographs = by_photographs(
+                        ground_truth, views, encoded, (what, candidate), used_device, encoded.options.background
+                    )
+                judge = Judge(judging, used_device, encoded.options.background, ground_truth)
                 quality, pictures = judge(what, candidate, watch, report_view, pictures=True)
             seconds = encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
             source = name_of(scene)
@@ -154,8 +164,9 @@ def encode(
             used = encoded.options.changed(source_bytes=settings.source_bytes)
             search = search_report(target, found) if target is not None and found is not None else None
             document = encode_report(
-                source, what, Path(output or "(in memory)"), written, encoded, used, search, quality, seconds
-            )
+                source, what, Path(output or "(in memory)"), written, encoded, used, search, quality, seconds,
+                photographs,
+            )  # fmt: skip
             page.write(html_report(document, pictures).encode())
     return encoded
 
@@ -245,6 +256,19 @@ def proved(encoded: Encoded, trust: bool = False) -> tuple[PotrFile, Scene]:
         ) from error
 
 
+def by_photographs(
+    ground_truth: GroundTruth,
+    cameras: Sequence[Camera],
+    encoded: Encoded,
+    scenes: tuple[Scene, Scene],
+    device: Device,
+    background: Colour,
+) -> dict[str, Any]:
+    """What photographs say of an encode that was asked to fit to them; see :func:`judge_by_photographs`."""
+    figures = judge_by_photographs(ground_truth, cameras, scenes, device, background)
+    return photographs_report(encoded, ground_truth.missing, figures)
+
+
 @dataclass(frozen=True)
 class Judge:
     """Says how much an encode has lost, in pictures.
@@ -253,11 +277,13 @@ class Judge:
         views: to judge by.
         device: to render on.
         background: behind the scene.
+        ground_truth: photographs to show beside the pictures, if there are any.
     """
 
     views: EvaluationViews
     device: Device
     background: Colour
+    ground_truth: GroundTruth | None = None
 
     def __call__(
         self, scene: Scene, candidate: Scene, watch: Stopwatch, chosen: str | None = None, pictures: bool = False
@@ -280,9 +306,13 @@ class Judge:
             shown = views_to_show(quality, chosen) if pictures else []
             pairs = evaluator.pictures(candidate, [view["name"] for _, view in shown])
         return quality, [
-            PicturePair(title, view["name"], view["psnr"], *pair)
+            PicturePair(title, view["name"], view["psnr"], *pair, self._photograph(view["name"]))
             for (title, view), pair in zip(shown, pairs, strict=True)
         ]
+
+    def _photograph(self, name: str) -> FloatArray | None:
+        found = [] if self.ground_truth is None else self.ground_truth.of([self.views.named(name)])
+        return self.ground_truth.picture(found[0]) if self.ground_truth is not None and found else None
 
 
 def views_or_placed(scene: Scene, cameras: Sequence[Camera] | None, count: int | None) -> Sequence[Camera]:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import argparse
-import logging
 import os
+import shlex
 import sys
 import traceback
 from collections.abc import Sequence
@@ -12,9 +12,10 @@ from importlib import import_module
 
 from potr_cl import __version__
 from potr_cl.cli import guard, outputs
+from potr_cl.cli.completion import SHELLS, PrintCompletion
 from potr_cl.cli.parser import CommandParser
 from potr_cl.cli.scenes import standard_input
-from potr_cl.cli.terminal import note
+from potr_cl.cli.terminal import note, speak
 from potr_cl.errors import PotrError
 from potr_cl.host.signals import unwinding
 from potr_cl.host.threads import in_background
@@ -45,18 +46,18 @@ def main(argv: Sequence[str] | None = None) -> int:
     Returns:
         0 success, 1 bad data, 2 wrong usage, 130 interrupted. A wrong call raises SystemExit with 2, as argparse does.
     """
-    logging.basicConfig(format="%(message)s", level=logging.WARNING)
+    speak("normal")
     argv = sys.argv[1:] if argv is None else argv
     try:
         _run(argv)
     except PotrError as error:
-        note(f"potr-cl: {error}")
+        note(f"potr-cl: {error}", "error")
         return error.exit_code
     except MemoryError:
-        note("potr-cl: not enough memory for this scene")
+        note("potr-cl: not enough memory for this scene", "error")
         return 1
     except KeyboardInterrupt:
-        note("potr-cl: interrupted; no file is left half written")
+        note("potr-cl: interrupted; no file is left half written", "error")
         return 130
     except BrokenPipeError:
         return 0  # the reader (head, less) has gone; what it read was right
@@ -70,6 +71,8 @@ def _run(argv: Sequence[str]) -> None:
         # Drivers take as long to load as the command's modules to be imported.
         in_background(import_module("potr_cl.opencl.discovery").list_devices)
     args = command_parser(argv).parse_args(argv)
+    args.typed = shlex.join(["potr-cl", *argv])
+    speak(args.loudness)
     if "arrange" in args:
         args.arrange(args)
     guard.check(args)
@@ -84,23 +87,41 @@ def command_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:
         prog="potr-cl", description="Compress trained 3D Gaussian Splatting scenes without retraining."
     )
     parser.add_argument("--version", action="version", version=f"potr-cl {__version__}")
+    parser.add_argument(
+        "--print-completion",
+        action=PrintCompletion,
+        choices=SHELLS,
+        help="print the script by which a shell completes this command line (needs the extra completion)",
+    )
     commands = parser.add_subparsers(dest="command", required=True, metavar="COMMAND")
     # To decode takes less time than to import what other commands need.
     for command in [argv[0]] if argv and argv[0] in COMMANDS else COMMANDS:
         getattr(import_module(f"potr_cl.cli.{COMMANDS[command]}"), f"add_{command}")(commands)
+        _add_loudness(commands.choices[command])
     return parser
+
+
+def _add_loudness(command: argparse.ArgumentParser) -> None:
+    """What every command understands of how much it shall say."""
+    how = command.add_argument_group("messages").add_mutually_exclusive_group()
+    for name, text in (
+        ("quiet", "print errors, warnings, and what was asked for as the result; no progress, no summary of a file"),
+        ("verbose", "print more: the device, its driver, what is passed over"),
+    ):
+        how.add_argument(f"--{name}", dest="loudness", action="store_const", const=name, default="normal", help=text)
 
 
 def _unforeseen(error: Exception) -> int:
     """One line for an error that no code expected: a traceback would quote, as it is, what files hold."""
     if os.environ.get(TRACEBACK_VARIABLE):
-        note("".join(traceback.format_exception(error)).rstrip())
+        note("".join(traceback.format_exception(error)).rstrip(), "error")
     if isinstance(error, OSError) and error.strerror:
         where = "" if error.filename is None else f"'{error.filename}': "
-        note(plain(f"potr-cl: {where}{error.strerror}"))
+        note(plain(f"potr-cl: {where}{error.strerror}"), "error")
     else:
         note(
             plain(f"potr-cl: unforeseen {type(error).__name__}: {error}")
-            + f"; please report it with what the environment variable {TRACEBACK_VARIABLE}=1 adds to this message"
+            + f"; please report it with what the environment variable {TRACEBACK_VARIABLE}=1 adds to this message",
+            "error",
         )
     return 1

@@ -16,7 +16,7 @@ from potr_cl.cli.scenes import (
     size_of_file,
     write_scene,
 )
-from potr_cl.cli.terminal import say
+from potr_cl.cli.terminal import say_done
 from potr_cl.errors import UsageError
 from potr_cl.formats import scene_writer
 from potr_cl.formats.registry import extras_needed, suffixes_read, suffixes_written
@@ -44,7 +44,8 @@ def _convert_one(args: argparse.Namespace) -> None:
     before = size_of_file(args.scene)
     scene = read_scene(args, args.scene)
     after = write_scene(args.output, scene, args.to, args.spz_version)
-    say(f"{args.output}: {len(scene)} splats of SH degree {scene.sh_degree}, {after} bytes; {args.scene} has {before}")
+    said = f"{len(scene)} splats of SH degree {scene.sh_degree}, {after} bytes; {args.scene} has {before}"
+    say_done(f"{args.output}: {said}")
 
 
 def add_convert(commands: Commands) -> None:

@@ -10,6 +10,7 @@ import numpy as np
 
 from potr_cl.api.editing import RefittedScene, check_rendered_alike, compact, decibels_of, prune, refit, stage_options
 from potr_cl.cli.batch import add_to_option
+from potr_cl.cli.forecasts import tell_what_is_ahead
 from potr_cl.cli.guard import ReadPhotographs, read_file
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option
 from potr_cl.cli.outputs import WrittenNumbers, scene_output
@@ -17,7 +18,7 @@ from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import add_antialiased_option, add_from_option, add_trust_option, read_scene, write_scene
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
-from potr_cl.cli.terminal import note, say
+from potr_cl.cli.terminal import note, say_done
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import parse_colour
@@ -26,6 +27,8 @@ from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
+from potr_cl.pipeline.amounts import as_bytes
+from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
@@ -34,22 +37,25 @@ from potr_cl.stages.refitting.refit import RefitOptions
 
 def _prune(args: argparse.Namespace) -> None:
     choices: dict[str, Any] = {**stage_choices(args)}
-    _ = stage_options(Prune, args.quality, args.background, args.memory, choices)  # told before a gigabyte is read
+    options = stage_options(
+        Prune, args.quality, args.background, args.memory, choices
+    )  # told before a gigabyte is read
     scene, cameras, device = _inputs(args)
     with contextlib.ExitStack() as stack:
         order = stack.enter_context(replacing(args.order)) if args.order is not None else None
         progress = stack.enter_context(contextlib.closing(Progress()))
+        cameras = cameras or virtual_cameras(args, scene, progress)
+        tell_what_is_ahead(device, scene, cameras, options)
         result = prune(
-            scene, cameras or virtual_cameras(args, scene, progress),
-            q=args.quality, memory=args.memory, background=args.background, device=device, progress=progress,
-            cameras_anyway=args.cameras_anyway, **choices,
+            scene, cameras, q=args.quality, memory=args.memory, background=args.background,
+            device=device, progress=progress, cameras_anyway=args.cameras_anyway, **choices,
         )  # fmt: skip
         write_scene(args.output, result.scene, args.to)
         if order is not None:
             np.save(order, result.pruned.order)
-    say(f"{args.output}: {result.said} on {result.device.info}")
+    say_done(f"{args.output}: {result.said} on {result.device.info}")
     if result.unseen.splats:
-        say(result.unseen)
+        say_done(result.unseen)
 
 
 def _inputs(args: argparse.Namespace) -> tuple[Scene, list[Camera] | None, Device]:
@@ -92,16 +98,17 @@ def add_prune(commands: Commands) -> None:
 
 def _compact(args: argparse.Namespace) -> None:
     choices: dict[str, Any] = {**stage_choices(args)}
-    _ = stage_options(Compact, args.quality, args.background, args.memory, choices, args.sf_sh)
+    options = stage_options(Compact, args.quality, args.background, args.memory, choices, args.sf_sh)
     scene, cameras, device = _inputs(args)
     with contextlib.closing(Progress()) as progress:
+        cameras = cameras or virtual_cameras(args, scene, progress)
+        tell_what_is_ahead(device, scene, cameras, options)
         result = compact(
-            scene, cameras or virtual_cameras(args, scene, progress),
-            q=args.quality, sf_sh=args.sf_sh, memory=args.memory, background=args.background,
+            scene, cameras, q=args.quality, sf_sh=args.sf_sh, memory=args.memory, background=args.background,
             device=device, progress=progress, cameras_anyway=args.cameras_anyway, **choices,
         )  # fmt: skip
     write_scene(args.output, result.scene, args.to)
-    say(f"{args.output}: {result.said}")
+    say_done(f"{args.output}: {result.said}")
 
 
 def add_compact(commands: Commands) -> None:
@@ -127,28 +134,37 @@ def _refit(args: argparse.Namespace) -> None:
         raise UsageError("--photos needs --cameras, the views that the photographs show")
     cameras = given_cameras(args)
     if args.photos is not None and cameras is not None:
-        GroundTruth(args.photos, within_photographs(cameras), background)
+        missing = GroundTruth(args.photos, within_photographs(cameras), background).missing
+        if missing is not None:
+            note(missing)
     scene, reference = read_scene(args, args.scene), read_scene(args, args.reference)
     check_rendered_alike((str(args.scene), scene), (str(args.reference), reference))
     device = Device(args.device)
     with contextlib.closing(Progress()) as progress:
+        cameras = cameras or virtual_cameras(args, reference, progress)
+        # An encode that does nothing else which takes long.
+        alone = EncodeOptions(memory=as_bytes(args.memory)).changed(prune=False, refit={"steps": args.steps})
+        tell_what_is_ahead(device, scene, cameras, alone)
         result = refit(
-            scene, reference, cameras or virtual_cameras(args, reference, progress),
+            scene, reference, cameras,
             photos=args.photos, steps=args.steps, prior=args.prior, lambda_=args.lam,
             drop=args.drop, memory=args.memory, background=background, device=device, progress=progress,
             cameras_anyway=args.cameras_anyway,
         )  # fmt: skip
     write_scene(args.output, result.scene, args.to)
-    say(f"{args.output}: {len(scene)} splats re-fitted in {result.refitted.steps} steps on {result.device.info}")
+    say_done(f"{args.output}: {len(scene)} splats re-fitted in {result.refitted.steps} steps on {result.device.info}")
     before, after = result.refitted.errors
-    say(
+    say_done(
         f"{result.views} training views: mean squared error {before:.3g} before, {after:.3g} after, "
         f"PSNR {decibels_of(before)} before, {decibels_of(after)} after"
     )
     if result.psnr is not None:
         _tell_of_held_out(result, result.psnr)
     elif args.photos is not None:
-        note("warning: no view is held out, so nobody knows whether the colours fit the photographs too closely")
+        note(
+            "warning: no view is held out, so nobody knows whether the colours fit the photographs too closely",
+            "warning",
+        )
 
 
 def _tell_of_held_out(result: RefittedScene, psnr: tuple[float, float]) -> None:
@@ -157,11 +173,12 @@ def _tell_of_held_out(result: RefittedScene, psnr: tuple[float, float]) -> None:
     reference = result.reference_psnr
     own = "" if reference is None else f"{reference:.2f} dB of the reference, "
     end = f"{own}mean over views"
-    say(f"{result.held_out}: PSNR {before:.2f} dB before, {after:.2f} dB after, {end}")
+    say_done(f"{result.held_out}: PSNR {before:.2f} dB before, {after:.2f} dB after, {end}")
     if reference is not None and after < reference:
         note(
             f"warning: on held-out photographs the result is {reference - after:.2f} dB worse than the reference: "
             "the training photographs are fitted too closely (more --prior, fewer --steps), or too much is gone",
+            "warning",
         )
 
 

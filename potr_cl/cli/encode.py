@@ -9,8 +9,16 @@ from concurrent.futures import Future
 from dataclasses import dataclass
 from typing import Any
 
-from potr_cl.api.encoding import Judge, check_photographs_have_cameras, encode_options, encode_target, proved
+from potr_cl.api.encoding import (
+    Judge,
+    by_photographs,
+    check_photographs_have_cameras,
+    encode_options,
+    encode_target,
+    proved,
+)
 from potr_cl.cli.batch import for_each_scene, jobs
+from potr_cl.cli.forecasts import tell_what_is_ahead
 from potr_cl.cli.guard import read_file
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option
 from potr_cl.cli.outputs import WrittenPage, WrittenPotr, place, writing
@@ -24,23 +32,22 @@ from potr_cl.cli.scenes import (
     size_of_file,
 )
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
-from potr_cl.cli.terminal import note, say, say_document, say_line
+from potr_cl.cli.terminal import note, say_document, say_done, say_line
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
 from potr_cl.errors import DeviceError, UsageError
-from potr_cl.formats.images import Colour, parse_colour
+from potr_cl.formats.images import parse_colour
 from potr_cl.formats.registry import suffixes_read
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.threads import thread_pool
-from potr_cl.model.camera import Camera, test_views, within_photographs
+from potr_cl.model.camera import Camera, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Stopwatch, encode
+from potr_cl.pipeline.encode import Encoded, Stopwatch, encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT, PRESETS, PURPOSE
 from potr_cl.pipeline.search import Target, encode_to_target
 from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.quality.ground_truth import GroundTruth
-from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.report.html import PicturePair, html_report
 from potr_cl.report.summary import encode_report, format_encode_report, search_report
 from potr_cl.stages.refit import Refit
@@ -55,7 +62,7 @@ def _options(args: argparse.Namespace, source_bytes: int | None = None) -> Encod
 
 def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
     """Whether anything may be rendered: to encode, or to judge what was encoded."""
-    wanted = any(stage.asked_for and stage.needs_views for stage in options.stages)
+    wanted = any(s.asked_for and s.needs_views and not s.serves_others for s in options.stages)
     return wanted or not (args.cameras is None or args.no_quality)
 
 
@@ -112,6 +119,8 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
         with writing(args.output) as file:
             if cameras is None and device is not None:
                 cameras = virtual_cameras(args, scene, placing)
+            if device is not None and cameras is not None:
+                tell_what_is_ahead(device, scene, cameras, options, target is not None)
             views = EvaluationViews.of(cameras) if cameras is not None and not args.no_quality else None
             if args.report_view is not None:
                 _ = views and views.named(args.report_view)  # an unknown name is told before the work
@@ -126,20 +135,25 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
         pictures: list[PicturePair] = []
         quality: dict[str, Any] | str = "not judged, as asked"
         if views is not None:
-            quality, pictures = _evaluate(args, scene, candidate, views, encoded.device, opened, watch)
+            quality, pictures = _evaluate(
+                args, scene, candidate, views, encoded.device, opened, watch, shared.ground_truth
+            )
         elif cameras is None:
             quality = "not judged: there are no cameras to look from"
         seconds = placing.seconds | encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
-        report = encode_report(args.scene, scene, args.output, written, encoded, options, search, quality, seconds)
+        photographs = None
         if shared.ground_truth is not None and cameras is not None:
-            used = encoded.device or device or Device(args.device)
-            _evaluate_by_ground_truth(shared.ground_truth, cameras, scene, candidate, used, options.background)
+            photographs = _photographs(args, shared.ground_truth, cameras, (scene, candidate), encoded, device)
+        report = encode_report(
+            args.scene, scene, args.output, written, encoded, options, search, quality, seconds, photographs,
+            args.typed,
+        )  # fmt: skip
         if page is not None:
             page.write(html_report(report, pictures).encode())
     if args.json:
         (say_line if several else say_document)(report)
     else:
-        say(format_encode_report(report))
+        say_done(format_encode_report(report))
 
 
 def _evaluate(
@@ -150,6 +164,7 @@ def _evaluate(
     device: Device | None,
     opened: Future[Device] | None,
     watch: Stopwatch,
+    ground_truth: GroundTruth | None,
 ) -> tuple[dict[str, Any] | str, list[PicturePair]]:
     """The figures, or why there are none: a device that fails now must not take the finished file with it.
 
@@ -158,33 +173,42 @@ def _evaluate(
     watch("evaluate", 0.0)
     try:
         judge = Judge(
-            views, device or (Device(args.device) if opened is None else opened.result()), parse_colour(args.background)
+            views,
+            device or (Device(args.device) if opened is None else opened.result()),
+            parse_colour(args.background),
+            ground_truth,
         )
         return judge(scene, candidate, watch, args.report_view, pictures=args.report is not None)
     except DeviceError as error:
         return f"not judged: {error}", []
 
 
-def _evaluate_by_ground_truth(
+def _photographs(
+    args: argparse.Namespace,
     ground_truth: GroundTruth,
     cameras: list[Camera],
-    scene: Scene,
-    candidate: Scene,
-    device: Device,
-    background: Colour,
-) -> None:
-    """Say what the file gained or lost on photographs that the re-fit has not seen."""
-    views = test_views(cameras)
-    if not views:
-        note("no view is held out: what the photographs gain elsewhere is not known")
-        return
-    before, after = 0.0, 0.0
-    for each in (scene, candidate):
-        with Rasterizer(device, each, background=background) as rasterizer:
-            before, after = after, ground_truth.psnr(rasterizer, views)
-    note(f"{len(views)} held-out photographs: uncompressed {before:.2f} dB, file {after:.2f} dB")
-    if after < before:
-        note(f"warning: on held-out photographs the file is {before - after:.2f} dB worse than the uncompressed scene")
+    scenes: tuple[Scene, Scene],
+    encoded: Encoded,
+    device: Device | None,
+) -> dict[str, Any] | None:
+    """What photographs say; a device that fails now must not take the finished file with it."""
+    try:
+        found = by_photographs(
+            ground_truth, cameras, encoded, scenes, encoded.device or device or Device(args.device),
+            parse_colour(args.background),
+        )  # fmt: skip
+    except DeviceError as error:
+        note(f"not judged by photographs: {error}")
+        return None
+    if found["missing"] is not None:
+        note(found["missing"])
+    if found["file"] < found["uncompressed"] and encoded.photographs is not None and encoded.photographs.kept:
+        lost = found["uncompressed"] - found["file"]
+        note(
+            f"warning: on {found['kind']} photographs the file is {lost:.2f} dB worse than the uncompressed scene",
+            "warning",
+        )
+    return found
 
 
 def add_encode(commands: Commands) -> None:

@@ -10,7 +10,7 @@ from potr_cl.cli.batch import add_to_option, for_each_scene, jobs
 from potr_cl.cli.guard import read_file
 from potr_cl.cli.outputs import WrittenScene, place
 from potr_cl.cli.scenes import add_from_option, add_trust_option, as_file, trust, write_scene
-from potr_cl.cli.terminal import say, say_document
+from potr_cl.cli.terminal import say, say_document, say_done
 from potr_cl.codec.decoder import decode
 from potr_cl.formats.registry import suffixes_read, suffixes_written
 from potr_cl.model.scene import SH_COEFFICIENTS
@@ -30,7 +30,7 @@ def _decode_one(args: argparse.Namespace) -> None:
     decoded = time.perf_counter()
     write_scene(args.output, scene, args.to)
     written = time.perf_counter()
-    say(
+    say_done(
         f"{args.output}: {len(scene)} splats, decoded in {decoded - started:.2f} s, "
         f"written in {written - decoded:.2f} s"
     )

@@ -22,7 +22,7 @@ from potr_cl.cli.outputs import WrittenPicture
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene
-from potr_cl.cli.terminal import note, say, say_document
+from potr_cl.cli.terminal import note, say, say_document, say_done
 from potr_cl.cli.views import read_cameras, warn_of_frame
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import parse_colour
@@ -101,12 +101,12 @@ def _render(args: argparse.Namespace) -> None:
         progress(stage, 0.0)
         for done, _ in enumerate(written_pictures(rasterizer, views, written), 1):
             progress(stage, done / len(views))
-    say(f"{args.output}: {len(views)} image{'s' if len(views) > 1 else ''}, rendered on {device.info}")
+    say_done(f"{args.output}: {len(views)} image{'s' if len(views) > 1 else ''}, rendered on {device.info}")
 
 
 def add_render(commands: Commands) -> None:
     p = commands.add_parser("render", help="pictures (.png) of a scene from its cameras, or from all around")
-    p.add_argument("scene", type=ReadFile, metavar="SCENE", help=".ply or .potr")
+    p.add_argument("scene", type=ReadFile, metavar="SCENE", help="the scene to look at")
     p.add_argument("--cameras", type=ReadCameras, metavar="PATH", help=f"{CAMERAS_HELP}; without, views are placed")
     p.add_argument(
         "-o", "--output", type=WrittenFolder, required=True, metavar="DIR", help="one file a view, named after it"

@@ -1,4 +1,4 @@
-"""Progress on the terminal."""
+"""Progress on the terminal, or in a log."""
 
 from __future__ import annotations
 
@@ -8,35 +8,38 @@ from typing import Any
 
 from tqdm import tqdm
 
-from potr_cl.cli.terminal import note
+from potr_cl.cli.terminal import is_quiet, is_terminal, note
 
 
 class Progress:
-    """A bar with the time left on a terminal; elsewhere a line when a stage begins and ends.
+    """A bar with the time left on a terminal; elsewhere a line when a stage begins and one when it has ended.
 
-    A stage may be interrupted by another and go on.
+    Each stage is told once, however often it is done: a search does some of them for every quality that it tries. A
+    stage may be interrupted by another and go on.
     """
 
     def __init__(self) -> None:
+        self._on_terminal = is_terminal(sys.stderr)
         self._stage = ""
         self._bar: Any = None
         self._began: dict[str, float] = {}
+        self._told: set[str] = set()
+        #: The stage that has come to its end, and its line, while it is not certain that it does not go on.
+        self._ended: tuple[str, str] | None = None
 
     def __call__(self, stage: str, done: float) -> None:
         if stage != self._stage:
-            self.close()
+            self._end_bar()
+            if self._ended is not None and self._ended[0] != stage:
+                self._tell_end()
             self._stage = stage
-            if sys.stderr.isatty():
-                form = "{desc}: {percentage:3.0f}% |{bar}| {elapsed} elapsed, {remaining} left"
-                self._bar = tqdm(total=1.0, initial=done, desc=stage, bar_format=form, leave=False)
-            elif stage not in self._began:
-                note(f"{stage} …")
-            self._began.setdefault(stage, time.perf_counter())
+            self._begin(stage, done)
         if self._bar is not None:
             self._bar.update(done - self._bar.n)
         if done >= 1:
-            self.close()
-            note(f"{stage}: {time.perf_counter() - self._began.pop(stage):.1f} s")
+            self._end_bar()
+            if stage in self._began:
+                self._ended = stage, f"{stage}: {time.perf_counter() - self._began[stage]:.1f} s"
             self._stage = ""
 
     def tell(self, line: str) -> None:
@@ -45,6 +48,28 @@ class Progress:
             note(line)
 
     def close(self) -> None:
+        """Take the bar away, and say what is still to be said."""
+        self._end_bar()
+        self._tell_end()
+
+    def _begin(self, stage: str, done: float) -> None:
+        if self._on_terminal and not is_quiet():
+            form = "{desc}: {percentage:3.0f}% |{bar}| {elapsed} elapsed, {remaining} left"
+            self._bar = tqdm(total=1.0, initial=done, desc=stage, bar_format=form, leave=False)
+        elif stage not in self._began and stage not in self._told:
+            note(f"{stage} …")
+        if stage not in self._told:
+            self._began.setdefault(stage, time.perf_counter())
+
+    def _tell_end(self) -> None:
+        if self._ended is not None:
+            stage, line = self._ended
+            self._ended = None
+            if self._began.pop(stage, None) is not None:
+                self._told.add(stage)
+                self.tell(line)
+
+    def _end_bar(self) -> None:
         if self._bar is not None:
             self._bar.close()
             self._bar = None

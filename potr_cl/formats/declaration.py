@@ -122,8 +122,3 @@ class CameraFormat:
     json_mark: str = ""
     subfolders: tuple[str, ...] = ()
     extra: str | None = None
-
-
-def install_command(extra: str) -> str:
-    """What a user types to get an extra of this package."""
-    return f'pip install "potr-cl[{extra}]"'

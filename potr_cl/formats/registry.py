@@ -14,7 +14,7 @@ from pathlib import Path
 
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.cameras import cameras_json, colmap, transforms
-from potr_cl.formats.declaration import CameraFormat, SceneFormat, SceneLoader, SceneSaver, install_command
+from potr_cl.formats.declaration import CameraFormat, SceneFormat, SceneLoader, SceneSaver
 from potr_cl.formats.levels import without_level
 from potr_cl.formats.scenes import compressed_ply, gltf, ksplat, ply, potr, sog, sog_levels, splat, spz
 
@@ -211,7 +211,7 @@ def extras_needed() -> str:
     clauses = []
     for extra in dict.fromkeys(entry.extra for entry in SCENE_FORMATS if entry.extra is not None):
         suffixes = _scene_suffixes(entry for entry in SCENE_FORMATS if entry.extra == extra)
-        clauses.append(f"{listed(suffixes, 'and')} {'need' if suffixes[1:] else 'needs'} {install_command(extra)}")
+        clauses.append(f"{listed(suffixes, 'and')} {'need' if suffixes[1:] else 'needs'} the extra {extra}")
     return "; ".join(clauses)
 
 
@@ -255,7 +255,7 @@ def _scene_suffixes(formats: Iterable[SceneFormat]) -> list[str]:
 
 
 def _needs(extra: str | None) -> str:
-    return "nothing" if extra is None else f"`{install_command(extra)}`"
+    return "nothing" if extra is None else f"the extra `{extra}`"
 
 
 def _table(head: list[str], rows: list[list[str]]) -> str:

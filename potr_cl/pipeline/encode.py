@@ -24,6 +24,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.pruning.unseen import Unseen
+from potr_cl.stages.refitting.photographs import PhotographChoice
 from potr_cl.stages.refitting.refit import Refitted
 from potr_cl.stages.stage import Interlude, Progress, Stage, State, Workbench
 
@@ -39,6 +40,7 @@ class Encoded:
         pruned: what pruning did; None if it was left out.
         unseen: the splats that no training view sees; None if pruning was left out.
         refitted: what the re-fit of the colours did; None if it was left out.
+        photographs: what held-out photographs say of a fit to photographs; None if none were given.
         device: the device that did the work; not the one that was asked for if that had too little memory. None if no
             stage needed a device.
         seconds: wall time by stage.
@@ -52,6 +54,7 @@ class Encoded:
     pruned: Pruned | None
     unseen: Unseen | None
     refitted: Refitted | None
+    photographs: PhotographChoice | None
     device: Device | None
     seconds: dict[str, float]
     options: EncodeOptions
@@ -187,6 +190,8 @@ class Run:
             return stage.run(state, bench)
         if not state.views or not stage.looks_at(state.scene):
             return state
+        if stage.serves_others and not options.look_at_views(state.scene):
+            return state
 
         def work(device: Device, memory: int | None) -> State:
             return stage.run(state, dataclasses.replace(bench, device=device, memory=memory))
@@ -212,6 +217,7 @@ class Run:
             pruned=state.learnt.get("prune"),
             unseen=state.learnt.get("unseen"),
             refitted=state.learnt.get("refit"),
+            photographs=state.learnt.get("photographs"),
             device=self.device,
             seconds=self._watch.seconds,
             options=self._options,

@@ -136,7 +136,7 @@ class EncodeOptions:
 
     def look_at_views(self, scene: Scene) -> bool:
         """Whether the options ask for a stage that looks at views of this scene."""
-        return any(stage.looks_at(scene) for stage in self.stages)
+        return any(stage.looks_at(scene) for stage in self.stages if not stage.serves_others)
 
     def as_dict(self) -> dict[str, Any]:
         """All choices by name, those of a stage as a mapping of their own; for reports, ready for JSON."""

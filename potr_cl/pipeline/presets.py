@@ -8,6 +8,7 @@ from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Stage
+from potr_cl.stages.views_between import Between
 
 #: The preset that is taken unless another is asked for.
 DEFAULT: Preset = "best"
@@ -15,18 +16,21 @@ DEFAULT: Preset = "best"
 #: The stages of each preset, in their order. A stage with ``on=False`` is only done if the user asks for it.
 PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "best": (
+        Between(),
         Prune(),
         Compact(on=False),
         Refit(steps=8),
         Code(),
     ),
     "fast": (
+        Between(),
         Prune(iterations=16),
         Compact(on=False),
         Refit(steps=4),
         Code(entropy="zstd", zstd_level=9),
     ),
     "paper": (
+        Between(views=0),
         Prune(),
         Compact(),
         Refit(steps=0),

@@ -117,10 +117,11 @@ class Comparison:
 
 
 def find_ground_truth(folder: Path, cameras: Sequence[Camera]) -> dict[str, Path]:
-    """The photograph of each view: the image in ``folder`` that is named after it.
+    """The photograph of each view that has one: the image in ``folder`` that is named after it.
 
     Raises:
-        UsageError: there is no such folder, a view has no photograph or several, or one is not of the camera's size.
+        UsageError: there is no such folder, no view has a photograph, one has several, or one is not of the camera's
+            size.
         DataError: a photograph is damaged.
     """
     found: dict[str, Path] = {}
@@ -128,12 +129,14 @@ def find_ground_truth(folder: Path, cameras: Sequence[Camera]) -> dict[str, Path
     for camera in cameras:
         wanted = folder / camera.name
         if wanted.parent not in listings:
+            if wanted.parent != folder and not wanted.parent.is_dir():
+                continue
             listings[wanted.parent] = _images_by_name(wanted.parent)
         images = listings[wanted.parent].get(stem(wanted.name), [])
         exact = [image for image in images if image.name == wanted.name]
         images = exact or images
         if not images:
-            raise UsageError(f"the folder '{wanted.parent}' has no photograph of view '{camera.name}'")
+            continue
         if len(images) > 1:
             names = ", ".join(image.name for image in images)
             raise UsageError(f"several photographs of view '{camera.name}' in '{wanted.parent}': {names}; keep one")
@@ -145,7 +148,21 @@ def find_ground_truth(folder: Path, cameras: Sequence[Camera]) -> dict[str, Path
                 "photographs and cameras of the same size"
             )
         found[camera.name] = images[0]
+    if cameras and not found:
+        raise UsageError(
+            f"the folder '{folder}' has no photograph of any of the {len(cameras)} views: photographs are named after "
+            f"their views, as '{cameras[0].name}'"
+        )
     return found
+
+
+def missing_photographs(found: Mapping[str, Path], cameras: Sequence[Camera]) -> str | None:
+    """One line that says which views have no photograph; None if each has one."""
+    missing = [camera.name for camera in cameras if camera.name not in found]
+    if not missing:
+        return None
+    which = f"view '{missing[0]}' has" if len(missing) == 1 else f"{len(missing)} views, such as '{missing[0]}', have"
+    return f"{which} no photograph and {'is' if len(missing) == 1 else 'are'} left out"
 
 
 def _images_by_name(folder: Path) -> dict[str, list[Path]]:

@@ -17,6 +17,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
+from potr_cl.host.installation import install_command
 
 #: SSIM's Gaussian window: 11 x 11 pixels, sigma 1.5; the weights from its centre outwards along one axis.
 _RADIUS = 5
@@ -97,7 +98,7 @@ class Lpips:
 
             torchvision = importlib.import_module("torchvision")
         except (ImportError, OSError):  # OSError: a library of torch's is missing
-            raise UsageError('LPIPS is left out: it needs pip install "potr-cl[lpips]"') from None
+            raise UsageError(f"LPIPS is left out: it needs {install_command('lpips')}") from None
         folder = Path(torch.hub.get_dir()) / "checkpoints"
         weights = folder / torchvision.models.VGG16_Weights.IMAGENET1K_V1.url.rsplit("/", 1)[-1]
         if not weights.is_file():

@@ -11,5 +11,5 @@ Every result of the OpenCL kernels is compared with these, by the tests and by t
 - :mod:`potr_cl.reference.captures`: scenes as captures make them, with their cameras;
 - :mod:`potr_cl.reference.frames`: cameras that are in a scene's frame, and such that are not.
 
-Nothing else in the package imports them. The two solvers need scipy, which ``pip install potr-cl[test]`` brings.
+Nothing else in the package imports them. The two solvers need scipy, which the extra ``test`` brings.
 """

@@ -41,6 +41,7 @@ class PicturePair:
         view: its name.
         psnr: decibels; None for identical pictures.
         before, after: (H, W, 3) float32, uncompressed and compressed.
+        photograph: (H, W, 3) float32, what was really there, if there is a photograph.
     """
 
     title: str
@@ -48,6 +49,7 @@ class PicturePair:
     psnr: float | None
     before: FloatArray
     after: FloatArray
+    photograph: FloatArray | None = None
 
 
 def views_to_show(quality: dict[str, Any], chosen: str | None) -> list[tuple[str, dict[str, Any]]]:
@@ -78,10 +80,11 @@ def html_report(report: dict[str, Any], pictures: Sequence[PicturePair]) -> str:
         _section("Where the bytes are", _sizes(report)),
         _section("Pictures", "".join(map(_pair, pictures))) if pictures else "",
         _section("Quality by view", _quality(report["quality"])),
+        _section("Photographs", _photographs(report["photographs"])) if report.get("photographs") else "",
         _section("Pruning", _pruning(report)) if report["pruning"] is not None else "",
         _section("Search", _search(report["search"])) if report.get("search") is not None else "",
         _section("Settings", _settings(report)),
-        _section("Time, device, versions", _circumstances(report)),
+        _section("Command, time, device, versions", _circumstances(report)),
     ]
     title = f"{_text(source['file'])} → {_text(report['file'])}"
     return _PAGE.substitute(title=title, body="\n".join(filter(None, sections)))
@@ -157,8 +160,15 @@ def _pair(pair: PicturePair) -> str:
         "oninput=\"this.parentNode.style.setProperty('--at', this.value + '%')\"></div>\n"
         f"<figcaption>{before} | {after}</figcaption></figure>\n"
         f'<figure><img {size} src="{_data_uri(heat)}" alt="{name}, difference">\n'
-        f"<figcaption>{_text(difference_label(factor))}</figcaption></figure></div>"
+        f"<figcaption>{_text(difference_label(factor))}</figcaption></figure>{_photograph(pair, name, size)}</div>"
     )
+
+
+def _photograph(pair: PicturePair, name: str, size: str) -> str:
+    if pair.photograph is None:
+        return ""
+    shown = f'<img {size} src="{_data_uri(pair.photograph)}" alt="{name}, photograph">'
+    return f"\n<figure>{shown}\n<figcaption>photograph</figcaption></figure>"
 
 
 def _data_uri(picture: FloatArray) -> str:
@@ -185,6 +195,22 @@ def _quality(quality: dict[str, Any] | str) -> str:
     rows.append(["<b>mean</b>", f"<b>{decibels(quality['psnr'])}</b>", "", f"<b>{quality['ssim']:.4f}</b>"])
     said = f"<p>Against {_text(quality['against'])}, judged by {_text(quality['judged_by'])}.</p>"
     return said + _table(["view", "PSNR", "", "SSIM"], rows)
+
+
+def _photographs(photographs: dict[str, Any]) -> str:
+    which = "test views, which no stage has looked at" if photographs["kind"] == "test" else "training views"
+    said = f"<p>PSNR against photographs of {which}.</p>"
+    if photographs["held_out"] is not None:
+        said += f"<p>While encoding: {_text(photographs['held_out']['said'])}.</p>"
+    if photographs["missing"] is not None:
+        said += f"<p>{_text(photographs['missing'])}.</p>"
+
+    def row(name: str, figures: dict[str, float]) -> list[str]:
+        before, after = figures["uncompressed"], figures["file"]
+        return [name, f"{before:.2f} dB", f"{after:.2f} dB", f"{before - after:+.2f} dB"]
+
+    rows = [row(_text(view["name"]), view) for view in photographs["views"]]
+    return said + _table(["view", "uncompressed", "from the file", "lost"], [*rows, row("<b>mean</b>", photographs)])
 
 
 def _pruning(report: dict[str, Any]) -> str:
@@ -290,13 +316,14 @@ def _value(value: Any) -> str:
 
 
 def _circumstances(report: dict[str, Any]) -> str:
+    command = f"<p><code>{_text(report['command'])}</code></p>" if report.get("command") else ""
     times = [[_text(stage), f"{seconds:.1f} s"] for stage, seconds in report["seconds"].items()]
     facts = dict(report["versions"])
     if report["device"] is not None:
         device = report["device"]
         facts = {"device": device["name"], "platform": f"{device['platform']}, {device['version']}"} | facts
     rows = [[_text(name), _text(value)] for name, value in facts.items()]
-    return f'<div class="columns">{_table(["stage", "time"], times)}{_table(["", ""], rows)}</div>'
+    return command + f'<div class="columns">{_table(["stage", "time"], times)}{_table(["", ""], rows)}</div>'
 
 
 _PAGE = Template("""<!DOCTYPE html>

@@ -18,6 +18,7 @@ from potr_cl.pipeline.search import Found, Target
 from potr_cl.plain_text import plain_document
 from potr_cl.quality.compare import Comparison, Figures, mean_view
 from potr_cl.quality.evaluator import EvaluationViews
+from potr_cl.quality.ground_truth import PhotographFigures
 from potr_cl.report.file import file_report
 
 #: Sections of :func:`potr_cl.report.file.file_report` by the property that they belong to, as their names begin.
@@ -36,6 +37,8 @@ def encode_report(
     search: dict[str, Any] | None,
     quality: dict[str, Any] | str,
     seconds: dict[str, float],
+    photographs: dict[str, Any] | None = None,
+    command: str | None = None,
 ) -> dict[str, Any]:
     """The facts of an encode, ready for JSON.
 
@@ -48,6 +51,8 @@ def encode_report(
         search: of :func:`search_report`, where ``options`` were found by a search.
         quality: of :func:`quality_report`, or why it was not judged.
         seconds: wall time by stage, in order; "total" last.
+        photographs: of :func:`photographs_report`, where photographs were fitted to.
+        command: the command line, where there was one.
     """
     contents = file_report(file)
     # The file itself may be gone by now.
@@ -67,6 +72,7 @@ def encode_report(
         "bytes_a_splat": len(file.data) / file.header.splats,
         "properties": _properties(contents["sections"]),
         "quality": quality,
+        "photographs": photographs,
         "pruning": None,
         "unseen": None,
         "search": search,
@@ -74,6 +80,7 @@ def encode_report(
         "parameters": dataclasses.asdict(options.parameters),
         "device": None,
         "seconds": seconds,
+        "command": command,
         "versions": {"potr_cl": __version__, "python": platform.python_version()}
         | {package: version(package) for package in _PACKAGES},
     }
@@ -133,6 +140,31 @@ def quality_report(views: EvaluationViews, comparison: Comparison) -> dict[str, 
     }
 
 
+def photographs_report(encoded: Encoded, missing: str | None, figures: PhotographFigures) -> dict[str, Any]:
+    """What photographs say of an encode that was asked to fit to them.
+
+    Args:
+        encoded: the encode, which knows what held-out photographs said on the way.
+        missing: which views have no photograph, in a line.
+        figures: of the scene and the file.
+    """
+    uncompressed, file = figures.means
+    choice, held_out = encoded.photographs, None
+    if choice is not None:
+        held_out = {**dataclasses.asdict(choice), "kept": choice.kept, "said": str(choice)}
+    return {
+        "held_out": held_out,
+        "missing": missing,
+        "kind": figures.kind,
+        "uncompressed": uncompressed,
+        "file": file,
+        "views": [
+            {"name": name, "uncompressed": before, "file": after}
+            for name, before, after in zip(figures.views, figures.uncompressed, figures.file, strict=True)
+        ],
+    }
+
+
 def decibels(value: float | None) -> str:
     """A PSNR of a report, for people."""
     return "identical" if value is None else f"{value:.2f} dB"
@@ -163,6 +195,17 @@ def format_encode_report(report: dict[str, Any]) -> str:
             f"           mean of {quality['judged_by']}",
             f"           worst view {worst['name']}: PSNR {decibels(worst['psnr'])}, SSIM {worst['ssim']:.4f}",
         ]
+    photographs = report["photographs"]
+    if photographs is not None:
+        held_out = photographs["held_out"]
+        said = [] if held_out is None else [held_out["said"]]
+        which = "test" if photographs["kind"] == "test" else "training"
+        count = len(photographs["views"])
+        said.append(
+            f"PSNR {photographs['uncompressed']:.2f} dB uncompressed, {photographs['file']:.2f} dB from the file, "
+            f"against {count} photograph{'s' if count > 1 else ''} of {which} views"
+        )
+        lines += [f"{'' if place else 'photos':<11}{line}" for place, line in enumerate(said)]
     search = report["search"]
     if search is not None:
         encodes = sum(step["kind"] == "encode" for step in search["tries"])

@@ -11,10 +11,12 @@ from typing import Any
 from potr_cl.codec.geometry import quantise_geometry
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import thread_pool
+from potr_cl.model.camera import Camera
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.refitting.refit import RefitOptions, active_coefficients, refit_colours
-from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
+from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
+from potr_cl.stages.refitting.refit import RefitOptions, Refitted, active_coefficients, refit_colours
+from potr_cl.stages.refitting.targets import GroundTruthTargets, PartlyPhotographed, RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 
@@ -38,7 +40,8 @@ class Refit(Stage):
             that make up for the splats that went.
         at_steps: steps of each of these.
         ground_truth: folder of the views' photographs, named after the views. The colours are then fitted to the
-            photographs instead of the uncompressed scene's pictures.
+            photographs instead of the uncompressed scene's pictures, if photographs that are held out agree that this
+            is better.
 
     Raises:
         UsageError: a value is out of range.
@@ -79,7 +82,8 @@ class Refit(Stage):
         None,
         Flag(
             "--photos",
-            "photographs, named after the views: re-fit to them instead, for truth rather than fidelity",
+            "photographs, named after the views: re-fit to them instead, for truth rather than fidelity, if some that "
+            "are held out are matched better so",
             "DIR",
             Path,
             default="the uncompressed scene's pictures",
@@ -105,7 +109,10 @@ class Refit(Stage):
         return [Interlude(after, RefitOnTheWay(steps=self.at_steps)) for after in times]
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Re-fit the colours, and leave a :class:`potr_cl.stages.refitting.refit.Refitted` in ``learnt``."""
+        """Re-fit the colours, and leave a :class:`potr_cl.stages.refitting.refit.Refitted` in ``learnt``.
+
+        With photographs, also a :class:`potr_cl.stages.refitting.photographs.PhotographChoice` as "photographs".
+        """
         bench.progress("refit", 0.0)
         parameters = bench.parameters
         geometry = state.geometry
@@ -115,26 +122,41 @@ class Refit(Stage):
         decoded = geometry.decoded(state.scene.sh)
         compacted = "compact" in state.learnt
         active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
+        options = RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory)
+        fits = 1 if self.ground_truth is None else 2
+
+        def fitted(views: Sequence[Camera], targets: Targets, number: int) -> Refitted:
+            def progress(done: int, steps: int) -> None:
+                bench.progress("refit", (number + done / steps) / fits)
+
+            return refit_colours(
+                bench.opened, decoded, views, targets, options, active, bench.background, progress
+            )  # fmt: skip
+
         with ExitStack() as stack:
             stack.callback(bench.progress, "refit", 1.0)
-            targets: RenderedTargets | GroundTruthTargets
-            if self.ground_truth is None:
-                rasterizer = stack.enter_context(Rasterizer(bench.opened, state.source, background=bench.background))
-                targets = RenderedTargets(rasterizer, state.views)
-            else:
-                ground_truth = GroundTruth(self.ground_truth, state.views, bench.background)
-                targets = GroundTruthTargets(bench.opened, ground_truth, state.views)
-            refitted = refit_colours(
-                bench.opened,
-                decoded,
-                state.views,
-                targets,
-                RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory),
-                active,
-                bench.background,
-                lambda done, steps: bench.progress("refit", done / steps),
-            )
-        return replace(state.recoloured(refitted.sh), geometry=geometry).having_learnt(self.name, refitted)
+            rasterizer = stack.enter_context(Rasterizer(bench.opened, state.source, background=bench.background))
+            refitted = fitted(state.views, RenderedTargets(rasterizer, state.views), 0)
+            choice = None
+            if self.ground_truth is not None:
+                given, added = state.views[: len(state.views) - state.added], state.views[-state.added :]
+                photographs = GroundTruth(self.ground_truth, given, bench.background)
+                fit_to, judging = hold_out(photographs.of(given))
+                of_photographs = GroundTruthTargets(bench.opened, photographs, fit_to)
+                targets: Targets = of_photographs
+                views = fit_to
+                if state.added:  # nobody photographed these
+                    views = [*fit_to, *added]
+                    targets = PartlyPhotographed(of_photographs, len(fit_to), RenderedTargets(rasterizer, views))
+                to_photographs = fitted(views, targets, 1)
+                psnrs = []
+                for each in (to_photographs, refitted):
+                    with Rasterizer(bench.opened, replace(decoded, sh=each.sh), background=bench.background) as judged:
+                        psnrs.append(photographs.psnr(judged, judging))
+                choice = PhotographChoice(len(judging), *psnrs)
+                refitted = to_photographs if choice.kept else refitted
+        then = replace(state.recoloured(refitted.sh), geometry=geometry).having_learnt(self.name, refitted)
+        return then if choice is None else then.having_learnt("photographs", choice)
 
 
 @dataclass(frozen=True)

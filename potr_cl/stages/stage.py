@@ -57,6 +57,7 @@ class State:
         scene: what is left of it.
         survivors: (n,) int64, ascending: the number in ``source`` of each splat of ``scene``.
         views: the training views; empty if there are no cameras.
+        added: how many of them, the last ones, a stage has put between those that were given.
         geometry: of ``scene`` as a decoder will see it, once a stage has quantised it. A stage that then changes
             anything but colours makes it None again.
         importances: of the splats in each view, for stages that work while splats are being removed; else None.
@@ -70,6 +71,7 @@ class State:
     geometry: Geometry | None = None
     importances: Importances | None = None
     learnt: Mapping[str, Any] = field(default_factory=dict)
+    added: int = 0
 
     @staticmethod
     def of(scene: Scene, views: Sequence[Camera] = ()) -> State:
@@ -130,11 +132,13 @@ class Stage(ABC):
         name: what options and results call it.
         title: heads its options in the help of the command line.
         needs_views: whether it computes on a device, from views. Such a stage is left out if there are no views.
+        serves_others: whether it only prepares what other stages look at. It is left out if none of them does.
     """
 
     name: ClassVar[str]
     title: ClassVar[str]
     needs_views: ClassVar[bool] = True
+    serves_others: ClassVar[bool] = False
 
     on: bool = True
 

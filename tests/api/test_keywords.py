@@ -30,6 +30,8 @@ COMMANDS = ("encode", "prune", "compact", "refit", "decode", "info", "convert", 
 COMMAND_LINE_ONLY = {
     "--help": "Python has its own",
     "--json": "results are objects; SceneComparison.report() and SceneInfo.facts are what it prints",
+    "--quiet": "what a program is told it asks for by progress; warnings are log messages",
+    "--verbose": "as --quiet",
     "--from": "for standard input",
     "--to": "for standard output and folders of scenes",
     "--no-quality": "nothing is judged unless a report is asked for: compare() judges",
@@ -87,6 +89,7 @@ VALUES: dict[str, tuple[list[str], Any]] = {
     "--spz-version": (["3"], 3),
     "--cameras-anyway": ([], True),
     "--unseen": (["drop"], "drop"),
+    "--views-between": (["1"], 1),
     "--memory": (["0.25"], 0.25),
     "--background": (["0.2,0.4,0.8"], (0.2, 0.4, 0.8)),
     "--device": (["{device}"], "{device}"),
@@ -169,7 +172,7 @@ def test_every_option_is_a_keyword(command, flag):
 def files(tmp_path_factory, data) -> dict[str, Path]:
     """What the commands are given: a part of the excerpt, and some of its views, small."""
     folder = tmp_path_factory.mktemp("given")
-    views = json.loads((data / "lego_cameras.json").read_text())
+    views = json.loads((data / "plush_excerpt_cameras.json").read_text())
     tests = [view for view in views if view["split"] == "test"]
     few = [*[view for view in views if view["split"] == "train"][:5], *tests[:2]]
     for number, view in enumerate(few):
@@ -180,7 +183,7 @@ def files(tmp_path_factory, data) -> dict[str, Path]:
         view["width"], view["height"] = round(view["width"] * factor), round(view["height"] * factor)
     cameras = folder / "cameras.json"
     cameras.write_text(json.dumps(few))
-    scene = potr_cl.read_scene(data / "lego_excerpt.ply")
+    scene = potr_cl.read_scene(data / "plush_excerpt.ply")
     scene = scene.subset(np.arange(0, len(scene), 5))
     scene.save(folder / "scene.ply")
     reduced = scene.subset(np.arange(0, len(scene), 2))

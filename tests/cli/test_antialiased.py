@@ -18,12 +18,12 @@ KEEP = ["--no-prune", "--no-compact", "--refit", "off", "--no-quality"]
 
 
 @pytest.fixture
-def paths(tmp_path, data, lego_excerpt):
+def paths(tmp_path, data, plush_excerpt):
     """The excerpt without a mark, the same with one, and its cameras."""
     plain, marked = tmp_path / "plain.ply", tmp_path / "marked.ply"
-    ply.save(plain, lego_excerpt)
-    ply.save(marked, lego_excerpt.rendered(True))
-    return str(plain), str(marked), str(data / "lego_cameras.json")
+    ply.save(plain, plush_excerpt)
+    ply.save(marked, plush_excerpt.rendered(True))
+    return str(plain), str(marked), str(data / "plush_excerpt_cameras.json")
 
 
 def run(*arguments) -> None:
@@ -57,12 +57,12 @@ def test_every_command_that_writes_a_scene(tmp_path, paths, capsys, marked, opti
     assert load_scene(tmp_path / "f.spz").antialiased is expected
 
 
-def test_render(tmp_path, paths, lego_excerpt):
+def test_render(tmp_path, paths, plush_excerpt):
     plain, marked, cameras = paths
     view = load_cameras(cameras)[0]
     wanted = {}
     for kind in (True, False):
-        with Rasterizer(Device(), lego_excerpt.rendered(kind)) as rasterizer:
+        with Rasterizer(Device(), plush_excerpt.rendered(kind)) as rasterizer:
             wanted[kind] = np.clip(rasterizer.render(view)[0], 0, 1)
     assert np.abs(wanted[True] - wanted[False]).max() > 0.05
     for number, (scene, option, kind) in enumerate(

@@ -12,10 +12,10 @@ from potr_cl.reference.frames import MOTIONS, moved
 
 
 @pytest.fixture(scope="module")
-def turned(tmp_path_factory, lego_excerpt) -> Path:
+def turned(tmp_path_factory, plush_excerpt) -> Path:
     """The excerpt as ``splat-transform -r 180,0,0`` leaves it."""
     path = tmp_path_factory.mktemp("frames") / "turned.ply"
-    ply.save(path, moved(lego_excerpt, *MOTIONS["turned by 180 degrees about x"]))
+    ply.save(path, moved(plush_excerpt, *MOTIONS["turned by 180 degrees about x"]))
     return path
 
 
@@ -23,7 +23,7 @@ def turned(tmp_path_factory, lego_excerpt) -> Path:
 def test_what_throws_away_refuses(command, turned, data, tmp_path, capsys):
     output = tmp_path / ("out.potr" if command == "encode" else "out.ply")
     more = ["--reference", str(turned)] if command == "refit" else []
-    cameras = str(data / "lego_cameras.json")
+    cameras = str(data / "plush_excerpt_cameras.json")
     assert main([command, str(turned), "--cameras", cameras, "-o", str(output), *more]) == 2
     said = capsys.readouterr().err.strip().splitlines()[-1]
     for part in ("not seem to be in the scene's frame", "turned by 180 degrees about x", "--cameras-anyway"):
@@ -33,15 +33,23 @@ def test_what_throws_away_refuses(command, turned, data, tmp_path, capsys):
 
 def test_whoever_wants_them_anyway_gets_them(turned, data, tmp_path, capsys):
     output = tmp_path / "out.potr"
-    given = ["--cameras", str(data / "lego_cameras.json"), "--cameras-anyway", "--preset", "fast", "--iterations", "2"]
+    given = [
+        "--cameras",
+        str(data / "plush_excerpt_cameras.json"),
+        "--cameras-anyway",
+        "--preset",
+        "fast",
+        "--iterations",
+        "2",
+    ]
     assert main(["encode", str(turned), "-o", str(output), *given]) == 0
     assert output.exists()
 
 
 @pytest.mark.parametrize("command", ["render", "compare"])
 def test_what_only_looks_warns(command, turned, data, tmp_path, capsys):
-    cameras = ["--cameras", str(data / "lego_cameras.json")]
-    scene = str(data / "lego_excerpt.ply")
+    cameras = ["--cameras", str(data / "plush_excerpt_cameras.json")]
+    scene = str(data / "plush_excerpt.ply")
     if command == "render":
         calls = [[command, each, "--views", "0", "4", "8", "11", "-o", str(tmp_path)] for each in (str(turned), scene)]
     else:

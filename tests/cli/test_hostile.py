@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import json
 import logging
 import os
@@ -30,7 +31,9 @@ ESCAPES = "\x1b]0;title\x07\u202e\r\n\ud800"
 @pytest.fixture
 def scene_path(tmp_path: Path) -> Path:
     path = tmp_path / "scene.ply"
-    ply.save(path, random_scene(20, 0))
+    scene = random_scene(20, 0)
+    # Where the excerpt's cameras look.
+    ply.save(path, dataclasses.replace(scene, means=(0.05 * scene.means + [-0.76, 1.57, 2.78]).astype(np.float32)))
     return path
 
 
@@ -110,7 +113,15 @@ def test_virtual_views_are_bounded(
 def test_devices_that_there_are_not(
     tmp_path: Path, scene_path: Path, capsys: pytest.CaptureFixture[str], data: Path, device: str
 ) -> None:
-    render = ["render", scene_path, "--cameras", data / "lego_cameras.json", "-o", tmp_path / "d", f"--device={device}"]
+    render = [
+        "render",
+        scene_path,
+        "--cameras",
+        data / "plush_excerpt_cameras.json",
+        "-o",
+        tmp_path / "d",
+        f"--device={device}",
+    ]
     code, _, err = outcome(capsys, render)
     assert code == 1
     assert "no OpenCL device fits" in err
@@ -120,13 +131,14 @@ def test_a_forgotten_option_is_one_line(capsys: pytest.CaptureFixture[str]) -> N
     assert outcome(capsys, ["encode", "i.ply"]) == (
         2,
         "",
-        "potr-cl encode: the following arguments are required: -o/--output (see potr-cl encode --help)\n",
+        'potr-cl encode: -o OUT.potr (.potr, a folder, or "-" for standard output) is missing '
+        "(see potr-cl encode --help)\n",
     )
 
 
 def calls(name: str, good: str) -> list[list[str]]:
     """A name in every place of every command that takes one, beside good ones."""
-    cameras = str(ROOT / "tests" / "data" / "lego_cameras.json")
+    cameras = str(ROOT / "tests" / "data" / "plush_excerpt_cameras.json")
     return [
         ["encode", name, "-o", "new.potr"],
         ["encode", good, "-o", name, *KEEP],
@@ -387,7 +399,7 @@ def test_trust_reaches_the_readers(
     for reader in ("cli.scenes.load_scene", "cli.files.decode", "api.describing.load_scene"):
         monkeypatch.setattr(f"potr_cl.{reader}", ask)
     monkeypatch.setattr("potr_cl.codec.decoder.PotrFile.open", ask)
-    cameras = str(ROOT / "tests" / "data" / "lego_cameras.json")
+    cameras = str(ROOT / "tests" / "data" / "plush_excerpt_cameras.json")
     scene, out = str(scene_path), str(tmp_path / "out.ply")
     for command in (
         ["encode", scene, "-o", str(tmp_path / "out.potr"), *KEEP],

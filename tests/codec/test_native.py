@@ -87,8 +87,8 @@ def test_golden_files(path, threads, choose):
 
 @pytest.mark.parametrize("entropy", ["context", "zstd", "npz"])
 @pytest.mark.parametrize("q", [0.1, 0.5, 1.0])
-def test_a_real_scene(lego_excerpt, q, entropy, choose):
-    assert assert_alike(coded(lego_excerpt, q=q, entropy=entropy), choose, 2)
+def test_a_real_scene(plush_excerpt, q, entropy, choose):
+    assert assert_alike(coded(plush_excerpt, q=q, entropy=entropy), choose, 2)
 
 
 @given(
@@ -132,8 +132,8 @@ def test_more_lanes_than_a_group_and_lanes_of_many_steps(choose):
 
 
 @pytest.mark.parametrize("name", ["means", "log_scales", "quaternions", "opacity_logits", "sh"])
-def test_properties_one_by_one(lego_excerpt, name, choose):
-    data = coded(lego_excerpt)
+def test_properties_one_by_one(plush_excerpt, name, choose):
+    data = coded(plush_excerpt)
     found = {}
     for path in PATHS:
         choose(path)

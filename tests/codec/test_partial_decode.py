@@ -19,10 +19,10 @@ OTHERS = ("means", "log_scales", "quaternions", "opacity_logits")
 
 
 @pytest.fixture(scope="module", params=[("best", "context"), ("fast", "zstd"), ("paper", "npz")], ids=lambda p: p[0])
-def coded(request, lego_excerpt):
+def coded(request, plush_excerpt):
     preset, entropy = request.param
     parameters = HyperParameters.from_quality(0.5, preset)
-    return b"".join(code_scene(lego_excerpt, parameters, entropy=EntropyCoder(entropy, 3)).pieces)
+    return b"".join(code_scene(plush_excerpt, parameters, entropy=EntropyCoder(entropy, 3)).pieces)
 
 
 def spoiled(data: bytes, spare) -> bytes:
@@ -67,8 +67,8 @@ def test_positions_and_dc_alone(coded):
     assert np.array_equal(file.sh(0), whole.sh[:, :1])
 
 
-def test_a_degree_that_the_file_does_not_have(lego_excerpt):
-    scene = lego_excerpt.subset(np.arange(50))
+def test_a_degree_that_the_file_does_not_have(plush_excerpt):
+    scene = plush_excerpt.subset(np.arange(50))
     scene = type(scene)(scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh[:, :4])
     data = b"".join(code_scene(scene, HyperParameters.from_quality(0.5, "best")).pieces)
     assert decode(data, sh_degree=3).sh.shape == (50, 4, 3)

@@ -21,11 +21,11 @@ from tests.cases.cameras import assert_same_views, load_or_refuse, nerfstudio, r
 # The same views in different formats ---------------------------------------------------------------------------------
 
 
-def test_lego_excerpt_as_cameras_json_and_as_transforms(data: Path, tmp_path: Path) -> None:
-    shutil.copytree(data / "lego_transforms", tmp_path, dirs_exist_ok=True)
-    expected = load_cameras(data / "lego_cameras.json")
+def test_the_excerpts_views_as_cameras_json_and_as_transforms(data: Path, tmp_path: Path) -> None:
+    shutil.copytree(data / "plush_transforms", tmp_path, dirs_exist_ok=True)
+    expected = load_cameras(data / "plush_excerpt_cameras.json")
     for camera in expected:
-        write_image(tmp_path / "images" / f"{camera.name}.png", 400, 400)
+        write_image(tmp_path / "images" / f"{camera.name}.png", 240, 180)
     loaded = load_cameras(tmp_path)
     assert_same_views(loaded, expected)
     assert len(train_views(loaded)) == 9

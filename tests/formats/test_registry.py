@@ -20,8 +20,9 @@ from hypothesis import strategies as st
 
 from potr_cl import Scene, UsageError, cli, info
 from potr_cl.formats import cameras, load_cameras, load_scene, registry, save_scene, scene_writer, scenes
-from potr_cl.formats.declaration import CameraFormat, SceneFormat, install_command
+from potr_cl.formats.declaration import CameraFormat, SceneFormat
 from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS, listed
+from potr_cl.host.installation import install_command
 from potr_cl.reference.scenes import random_scene
 from tests.cases.cameras import nerfstudio, view, write_json
 from tests.cases.scenes import in_order_of, turned_by
@@ -120,7 +121,7 @@ def test_content_decides_between_formats_of_one_extension(data: Path, tmp_path: 
         next(entry for entry in SCENE_FORMATS if suffix in entry.suffixes) for suffix in (".ply", ".compressed.ply")
     )
     for name in ("a.ply", "a.compressed.ply"):
-        shutil.copy(data / "lego_excerpt.ply", tmp_path / name)
+        shutil.copy(data / "plush_excerpt.ply", tmp_path / name)
         assert registry.reader_of(tmp_path / name) is plain.load
         shutil.copy(data / "foreign" / "degree_0.compressed.ply", tmp_path / name)
         assert registry.reader_of(tmp_path / name) is compressed.load
@@ -202,11 +203,11 @@ def test_a_missing_extra_is_named(entry: SceneFormat | CameraFormat, tmp_path: P
 
 
 @pytest.mark.usefixtures("no_extras")
-def test_a_missing_library_is_named(tmp_path: Path, data: Path, lego_excerpt: Scene) -> None:
-    with pytest.raises(UsageError, match=r"potr-cl\[convert\]"):
+def test_a_missing_library_is_named(tmp_path: Path, data: Path, plush_excerpt: Scene) -> None:
+    with pytest.raises(UsageError, match=re.escape(install_command("convert"))):
         load_scene(data / "foreign" / "degree_3.compressed.ply")
-    with pytest.raises(UsageError, match=r"potr-cl\[convert\]"):
-        scene_writer(tmp_path / "x.compressed.ply")(lego_excerpt)
+    with pytest.raises(UsageError, match=re.escape(install_command("convert"))):
+        scene_writer(tmp_path / "x.compressed.ply")(plush_excerpt)
     assert not list(tmp_path.iterdir())
 
 
@@ -281,8 +282,8 @@ def test_a_format_is_one_line_of_the_table(
         cli.main(["convert", "--help"])
     said = " ".join(capsys.readouterr().out.split())
     assert said.count("or .centres") == 2
-    assert ".centres needs pip install" in said
-    assert "| Centres (`.centres`) | yes | yes | `pip install" in registry.formats_table()
+    assert ".centres needs the extra " in said
+    assert "| Centres (`.centres`) | yes | yes | the extra `centres` |" in registry.formats_table()
 
 
 def test_lists_for_people() -> None:

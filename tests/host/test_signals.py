@@ -121,7 +121,7 @@ def test_a_converter_that_is_told_to_end(tmp_path: Path, data: Path) -> None:
     temporary, target = tmp_path / "temporary", tmp_path / "out.spz"
     temporary.mkdir()
     environment = os.environ | {"TMPDIR": str(temporary)}
-    result = run(program, "convert", data / "lego_excerpt.ply", target, env=environment)
+    result = run(program, "convert", data / "plush_excerpt.ply", target, env=environment)
     assert result.returncode == 143, result.stderr
     assert [path.name for path in tmp_path.iterdir()] == ["temporary"]
     assert not list(temporary.iterdir())

@@ -26,10 +26,10 @@ def plush_views(data: Path) -> list[Camera]:
     return train_views(load_cameras(data / "plush_cameras.json"))
 
 
-def test_every_wrong_frame_of_the_excerpt_is_found(lego_excerpt, lego_excerpt_cameras, plush_views):
-    views = train_views(lego_excerpt_cameras)
+def test_every_wrong_frame_of_the_excerpt_is_found(plush_excerpt, plush_excerpt_cameras, plush_views):
+    views = train_views(plush_excerpt_cameras)
     judged = {
-        what: judge_cameras(scene, cameras) for what, scene, cameras in wrong(lego_excerpt, views, plush_views)
+        what: judge_cameras(scene, cameras) for what, scene, cameras in wrong(plush_excerpt, views, plush_views)
     }  # fmt: skip
     assert len(judged) >= 9
     assert [what for what, each in judged.items() if not each.suspicious] == []
@@ -37,23 +37,23 @@ def test_every_wrong_frame_of_the_excerpt_is_found(lego_excerpt, lego_excerpt_ca
         assert judged[what].motion.name == what
 
 
-def test_wrong_frames_of_the_excerpt_without_directions_are_found(lego_excerpt, lego_excerpt_cameras, plush_views):
-    scene = without_directions(lego_excerpt)
-    for what, other, cameras in wrong(scene, train_views(lego_excerpt_cameras), plush_views):
+def test_wrong_frames_of_the_excerpt_without_directions_are_found(plush_excerpt, plush_excerpt_cameras, plush_views):
+    scene = without_directions(plush_excerpt)
+    for what, other, cameras in wrong(scene, train_views(plush_excerpt_cameras), plush_views):
         assert judge_cameras(other, cameras).suspicious == (what not in NEEDS_DIRECTIONS), what
 
 
 @pytest.mark.parametrize("degree", [3, 0])
-def test_no_right_cameras_of_the_excerpt_are_refused(lego_excerpt, lego_excerpt_cameras, degree):
-    scene = lego_excerpt if degree else without_directions(lego_excerpt)
-    for what, cameras in right(scene, train_views(lego_excerpt_cameras)):
+def test_no_right_cameras_of_the_excerpt_are_refused(plush_excerpt, plush_excerpt_cameras, degree):
+    scene = plush_excerpt if degree else without_directions(plush_excerpt)
+    for what, cameras in right(scene, train_views(plush_excerpt_cameras)):
         assert not judge_cameras(scene, cameras).suspicious, what
 
 
 def test_an_excerpt_of_plush_belongs_to_its_cameras(data, plush_views):
     """Points where the cameras look, in place of splats of the scene: they are nearly nothing of any picture."""
     focus = np.mean([camera.centre + 3 * camera.rotation[2] for camera in plush_views], axis=0)
-    scene = load_scene(data / "lego_excerpt.ply")
+    scene = load_scene(data / "plush_excerpt.ply")
     scene = dataclasses.replace(scene, means=(scene.means + focus).astype(np.float32))
     assert not judge_cameras(without_directions(scene), plush_views).suspicious
 
@@ -104,46 +104,46 @@ def test_a_whole_scene_is_judged_in_well_below_a_second(lego):
         assert time.process_time() - began < 1.5
 
 
-def test_the_same_is_judged_the_same(lego_excerpt, lego_excerpt_cameras):
-    turned = moved(lego_excerpt, *MOTIONS["mirrored along z"])
-    one, two = (judge_cameras(turned, lego_excerpt_cameras) for _ in range(2))
+def test_the_same_is_judged_the_same(plush_excerpt, plush_excerpt_cameras):
+    turned = moved(plush_excerpt, *MOTIONS["mirrored along z"])
+    one, two = (judge_cameras(turned, plush_excerpt_cameras) for _ in range(2))
     assert (one.fit, one.moved, one.gain) == (two.fit, two.moved, two.gain)
 
 
-def test_a_refusal_is_one_line_with_finding_and_ways_out(lego_excerpt, lego_excerpt_cameras):
+def test_a_refusal_is_one_line_with_finding_and_ways_out(plush_excerpt, plush_excerpt_cameras):
     with pytest.raises(UsageError) as caught:
-        require_agreement(moved(lego_excerpt, *MOTIONS["scaled by 0.1"]), lego_excerpt_cameras)
+        require_agreement(moved(plush_excerpt, *MOTIONS["scaled by 0.1"]), plush_excerpt_cameras)
     message = str(caught.value)
     assert "\n" not in message
     for part in ("frame", "see", "was scaled by 0.1", "bring the scene back (scaled by 10)", "--cameras-anyway"):
         assert part in message
-    require_agreement(lego_excerpt, lego_excerpt_cameras)
+    require_agreement(plush_excerpt, plush_excerpt_cameras)
 
 
-def test_views_that_see_nothing_are_refused_however_few(lego_excerpt, lego_excerpt_cameras):
-    away = dataclasses.replace(lego_excerpt_cameras[0], translation=np.array([0.0, 0.0, -50.0]))
-    judged = judge_cameras(lego_excerpt, [away])
+def test_views_that_see_nothing_are_refused_however_few(plush_excerpt, plush_excerpt_cameras):
+    away = dataclasses.replace(plush_excerpt_cameras[0], translation=np.array([0.0, 0.0, -50.0]))
+    judged = judge_cameras(plush_excerpt, [away])
     assert judged.blind
     assert judged.suspicious
     with pytest.raises(UsageError, match=r"see 0 % of the splats.*give the cameras of this scene"):
-        require_agreement(lego_excerpt, [away])
+        require_agreement(plush_excerpt, [away])
 
 
-def test_without_a_camera_there_is_nothing_to_judge(lego_excerpt):
+def test_without_a_camera_there_is_nothing_to_judge(plush_excerpt):
     with pytest.raises(UsageError):
-        judge_cameras(lego_excerpt, [])
+        judge_cameras(plush_excerpt, [])
 
 
 @pytest.mark.parametrize("splats", [1, 2, 50])
-def test_scenes_of_few_and_coinciding_splats(lego_excerpt, lego_excerpt_cameras, splats):
-    few = lego_excerpt.subset(np.zeros(splats, int))
-    assert not judge_cameras(few, lego_excerpt_cameras).suspicious
+def test_scenes_of_few_and_coinciding_splats(plush_excerpt, plush_excerpt_cameras, splats):
+    few = plush_excerpt.subset(np.zeros(splats, int))
+    assert not judge_cameras(few, plush_excerpt_cameras).suspicious
 
 
 @pytest.mark.parametrize("value", [0.0, 1e-30, 1e30, 3e38])
-def test_values_at_the_ends_of_single_precision(lego_excerpt, lego_excerpt_cameras, value):
+def test_values_at_the_ends_of_single_precision(plush_excerpt, plush_excerpt_cameras, value):
     """Whatever is said of them, it is said without an error or a warning."""
-    scene = lego_excerpt.subset(np.arange(40))
+    scene = plush_excerpt.subset(np.arange(40))
     far = np.full_like(scene.means, value)
     far[::2] *= -1
     huge = np.full_like(scene.log_scales, np.log(max(value, 1e-38)))
@@ -152,14 +152,14 @@ def test_values_at_the_ends_of_single_precision(lego_excerpt, lego_excerpt_camer
         dataclasses.replace(scene, log_scales=huge),
         dataclasses.replace(scene, sh=np.full_like(scene.sh, value)),
     ):
-        judge_cameras(other, lego_excerpt_cameras)
+        judge_cameras(other, plush_excerpt_cameras)
 
 
-def test_a_moved_scene_looks_the_same_from_moved_cameras(lego_excerpt):
+def test_a_moved_scene_looks_the_same_from_moved_cameras(plush_excerpt):
     """The float64 colours of the tests' own motion, seen from the place that moved along."""
     axes, direction = MOTIONS["turned by 90 degrees about x"][0], np.array([[0.3, -0.5, 0.8]]) / np.sqrt(0.98)
-    before = np.einsum("dm,kmc->kc", sh_basis(direction, 3), lego_excerpt.sh)
-    after = np.einsum("dm,kmc->kc", sh_basis(direction @ axes.T, 3), moved(lego_excerpt, axes).sh)
+    before = np.einsum("dm,kmc->kc", sh_basis(direction, 3), plush_excerpt.sh)
+    after = np.einsum("dm,kmc->kc", sh_basis(direction @ axes.T, 3), moved(plush_excerpt, axes).sh)
     np.testing.assert_allclose(after, before, atol=1e-5)
 
 

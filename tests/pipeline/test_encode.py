@@ -32,8 +32,8 @@ def device(request):
 
 
 @pytest.fixture(scope="module")
-def views(lego_excerpt_cameras):
-    return [c for c in lego_excerpt_cameras if c.split == "train"][:4]
+def views(plush_excerpt_cameras):
+    return [c for c in plush_excerpt_cameras if c.split == "train"][:4]
 
 
 def psnr(device, a, b, cameras):
@@ -54,31 +54,31 @@ def same(a, b):
     return all(np.array_equal(getattr(a, f.name), getattr(b, f.name)) for f in dataclasses.fields(a))
 
 
-def test_pruning_and_compaction(device, lego_excerpt, views):
-    left, pruned = reduced(lego_excerpt, views, FEW, device)
-    assert len(left) == pruned.kept < 0.9 * len(lego_excerpt)
-    assert ac_sparsity(left.sh, 51) > ac_sparsity(lego_excerpt.sh[pruned.survivors], 51) + 0.1
-    assert psnr(device, lego_excerpt, left, views) > 40
+def test_pruning_and_compaction(device, plush_excerpt, views):
+    left, pruned = reduced(plush_excerpt, views, FEW, device)
+    assert len(left) == pruned.kept < 0.97 * len(plush_excerpt)
+    assert ac_sparsity(left.sh, 51) > ac_sparsity(plush_excerpt.sh[pruned.survivors], 51) + 0.1
+    assert psnr(device, plush_excerpt, left, views) > 40
     # All but the colours comes through untouched.
-    assert np.array_equal(left.means, lego_excerpt.means[pruned.survivors])
+    assert np.array_equal(left.means, plush_excerpt.means[pruned.survivors])
 
 
-def test_each_on_its_own(device, lego_excerpt, views):
-    only_pruned, pruned = reduced(lego_excerpt, views, FEW.changed(compact=False), device)
-    assert same(only_pruned, lego_excerpt.subset(pruned.survivors))
-    compacted, none = reduced(lego_excerpt, views, FEW.changed(prune=False), device)
+def test_each_on_its_own(device, plush_excerpt, views):
+    only_pruned, pruned = reduced(plush_excerpt, views, FEW.changed(compact=False), device)
+    assert same(only_pruned, plush_excerpt.subset(pruned.survivors))
+    compacted, none = reduced(plush_excerpt, views, FEW.changed(prune=False), device)
     assert none is None
-    assert len(compacted) == len(lego_excerpt)
-    assert not np.array_equal(compacted.sh, lego_excerpt.sh)
+    assert len(compacted) == len(plush_excerpt)
+    assert not np.array_equal(compacted.sh, plush_excerpt.sh)
 
 
 @pytest.mark.parametrize("compact_at", [0.0, Compact.at, 1.0])
-def test_a_small_memory_budget_gives_the_same_scene(device, lego_excerpt, views, compact_at):
+def test_a_small_memory_budget_gives_the_same_scene(device, plush_excerpt, views, compact_at):
     results = []
     for memory in (None, 48 * 1600, 0):
         # Views that are made anew each time are swept in full: so must those be that are kept.
         options = FEW.changed(prune={"iterations": 4, "tolerance": 0}, compact={"at": compact_at}, memory=memory)
-        results.append(reduced(lego_excerpt, views, options, device)[0])
+        results.append(reduced(plush_excerpt, views, options, device)[0])
     assert same(results[0], results[1])
     assert same(results[0], results[2])
 
@@ -90,12 +90,12 @@ def test_degree_0_has_nothing_to_compact(device, monkeypatch):
     assert len(left) == 50
 
 
-def test_refits_on_the_way_need_none_at_the_end(device, lego_excerpt, views):
+def test_refits_on_the_way_need_none_at_the_end(device, plush_excerpt, views):
     options = FEW.changed(compact=False, refit={"steps": 0, "at": (0.5,)})
-    left, pruned = reduced(lego_excerpt, views, options, device)
-    assert not np.array_equal(left.sh, lego_excerpt.sh[pruned.survivors])
-    left, pruned = reduced(lego_excerpt, views, options.changed(refit=False), device)
-    assert np.array_equal(left.sh, lego_excerpt.sh[pruned.survivors])
+    left, pruned = reduced(plush_excerpt, views, options, device)
+    assert not np.array_equal(left.sh, plush_excerpt.sh[pruned.survivors])
+    left, pruned = reduced(plush_excerpt, views, options.changed(refit=False), device)
+    assert np.array_equal(left.sh, plush_excerpt.sh[pruned.survivors])
 
 
 def test_nothing_to_do_needs_no_device(monkeypatch):
@@ -104,8 +104,8 @@ def test_nothing_to_do_needs_no_device(monkeypatch):
     encode(random_scene(20, 3), None, EncodeOptions.for_preset("paper", prune=False, compact=False))
 
 
-def test_same_bytes_every_time(device, lego_excerpt, views):
-    files = {b"".join(encode(lego_excerpt, views, FEW, device=device).pieces) for _ in range(3)}
+def test_same_bytes_every_time(device, plush_excerpt, views):
+    files = {b"".join(encode(plush_excerpt, views, FEW, device=device).pieces) for _ in range(3)}
     assert len(files) == 1
 
 
@@ -121,15 +121,15 @@ def test_geometry_of_other_steps_is_not_coded():
     assert len(files) == 1
 
 
-def test_order_names_the_splats_of_the_source(device, lego_excerpt, views):
-    encoded = encode(lego_excerpt, views, FEW.changed(prune={"count": 300}), device=device)
+def test_order_names_the_splats_of_the_source(device, plush_excerpt, views):
+    encoded = encode(plush_excerpt, views, FEW.changed(prune={"count": 300}), device=device)
     assert len(encoded.order) == 300
     assert sorted(encoded.order) == encoded.pruned.survivors.tolist()
 
 
-def test_progress_comes_to_an_end(device, lego_excerpt, views):
+def test_progress_comes_to_an_end(device, plush_excerpt, views):
     seen = []
-    encode(lego_excerpt, views, FEW, lambda stage, done: seen.append((stage, done)), device)
+    encode(plush_excerpt, views, FEW, lambda stage, done: seen.append((stage, done)), device)
     assert [s for s, d in seen if d == 1] == ["prepare views", "compact", "prune", "octree", "quantise and code"]
 
 
@@ -156,6 +156,6 @@ def test_views_that_see_nothing(device):
     "bad",
     [{"compact": {"at": -0.1}}, {"refit": {"at": (1.1,)}}, {"prune": {"iterations": 0}}, {"compact": {"lam": -1}}],
 )
-def test_options_out_of_range(device, lego_excerpt, views, bad):
+def test_options_out_of_range(device, plush_excerpt, views, bad):
     with pytest.raises(UsageError):
-        reduced(lego_excerpt, views, FEW.changed(**bad), device)
+        reduced(plush_excerpt, views, FEW.changed(**bad), device)

@@ -36,8 +36,8 @@ def device():
 
 
 @pytest.fixture(scope="module")
-def cameras(lego_excerpt_cameras):
-    return lego_excerpt_cameras
+def cameras(plush_excerpt_cameras):
+    return plush_excerpt_cameras
 
 
 def psnr(device, scene, file, cameras):
@@ -48,10 +48,10 @@ def psnr(device, scene, file, cameras):
 
 @pytest.mark.parametrize("preset", PRESETS)
 @pytest.mark.parametrize("size", [18_000, 24_000])
-def test_a_size_is_filled_and_not_passed(device, lego_excerpt, cameras, size, preset):
+def test_a_size_is_filled_and_not_passed(device, plush_excerpt, cameras, size, preset):
     lines = []
     options = EncodeOptions.for_preset(preset, prune={"iterations": 6})
-    found = encode_to_target(lego_excerpt, cameras, Target(max_bytes=size), options, device=device, tell=lines.append)
+    found = encode_to_target(plush_excerpt, cameras, Target(max_bytes=size), options, device=device, tell=lines.append)
     file = b"".join(found.encoded.pieces)
     assert 0.98 * size <= len(file) <= size
     assert len(file) == found.encoded.nbytes == round(math.exp(found.value))
@@ -74,30 +74,30 @@ class HalfOpaque(Stage):
 
 
 @pytest.mark.parametrize("place", [0, -2, -1])
-def test_a_stage_of_ones_own_takes_part_in_a_search_as_in_an_encode(device, lego_excerpt, cameras, place):
+def test_a_stage_of_ones_own_takes_part_in_a_search_as_in_an_encode(device, plush_excerpt, cameras, place):
     stages = list(EncodeOptions.for_preset("best", prune={"iterations": 4}, refit={"steps": 3}).stages)
     stages.insert(place, HalfOpaque())
     options = EncodeOptions(stages=tuple(stages))
-    found = encode_to_target(lego_excerpt, cameras, Target(max_bytes=24_000), options, device=device)
+    found = encode_to_target(plush_excerpt, cameras, Target(max_bytes=24_000), options, device=device)
     logits = decode(b"".join(found.encoded.pieces)).opacity_logits
-    changes = logits - lego_excerpt.opacity_logits[found.encoded.order]
+    changes = logits - plush_excerpt.opacity_logits[found.encoded.order]
     assert np.median(changes) == pytest.approx(-1, abs=0.1)  # less than the quantiser's steps
 
 
 @pytest.mark.parametrize("target", [Target(max_bytes=24_000), Target(min_psnr=46)])
-def test_colours_may_be_refitted_in_any_preset(device, lego_excerpt, cameras, target):
+def test_colours_may_be_refitted_in_any_preset(device, plush_excerpt, cameras, target):
     options = FEW.changed(compact=False, refit={"steps": 3, "drop": 1e-10})
-    found = encode_to_target(lego_excerpt, cameras, target, options, device=device)
+    found = encode_to_target(plush_excerpt, cameras, target, options, device=device)
     low, high = target.window
     assert low <= found.value <= high
     assert found.encoded.refitted is not None
 
 
 @pytest.mark.parametrize(("preset", "wanted"), [("paper", 38.0), ("paper", 45.0), ("best", 46.0)])
-def test_a_psnr_is_reached_with_little_to_spare(device, lego_excerpt, cameras, preset, wanted):
+def test_a_psnr_is_reached_with_little_to_spare(device, plush_excerpt, cameras, preset, wanted):
     options = EncodeOptions.for_preset(preset, prune={"iterations": 6})
-    found = encode_to_target(lego_excerpt, cameras, Target(min_psnr=wanted), options, device=device)
-    reached = psnr(device, lego_excerpt, b"".join(found.encoded.pieces), cameras)
+    found = encode_to_target(plush_excerpt, cameras, Target(min_psnr=wanted), options, device=device)
+    reached = psnr(device, plush_excerpt, b"".join(found.encoded.pieces), cameras)
     assert wanted <= reached <= wanted + 0.1
     assert found.value == pytest.approx(reached)
 
@@ -107,11 +107,11 @@ def test_a_psnr_is_reached_with_little_to_spare(device, lego_excerpt, cameras, p
     [("best", Target(max_bytes=size)) for size in (17_000, 22_000, 28_000)]
     + [("fast", Target(min_psnr=psnr)) for psnr in (46, 49)],
 )
-def test_what_is_found_is_what_a_plain_encode_makes(device, lego_excerpt, cameras, preset, target):
+def test_what_is_found_is_what_a_plain_encode_makes(device, plush_excerpt, cameras, preset, target):
     """So it lies on the plain encodes' curve, as far as its parameters are those of one q."""
     options = EncodeOptions.for_preset(preset, prune={"iterations": 6})
-    found = encode_to_target(lego_excerpt, cameras, target, options, device=device)
-    assert encode(lego_excerpt, cameras, found.options, device=device).pieces == found.encoded.pieces
+    found = encode_to_target(plush_excerpt, cameras, target, options, device=device)
+    assert encode(plush_excerpt, cameras, found.options, device=device).pieces == found.encoded.pieces
     plain = options.changed(q=found.options.q)
     free = {"prune": {"delta_mse_max": None}, "code": {"sf_dc": None, "sf_sh": None}}
     assert found.options.changed(**free) == plain.changed(**free)
@@ -122,7 +122,7 @@ def test_what_is_found_is_what_a_plain_encode_makes(device, lego_excerpt, camera
     assert max(colours) == pytest.approx(min(colours))
 
 
-def test_a_rough_encode_comes_first_where_it_saves_time(device, lego_excerpt, cameras):
+def test_a_rough_encode_comes_first_where_it_saves_time(device, plush_excerpt, cameras):
     target = Target(max_bytes=20_000)
     for options, first in (
         (FEW, "encode"),
@@ -131,17 +131,17 @@ def test_a_rough_encode_comes_first_where_it_saves_time(device, lego_excerpt, ca
         (EncodeOptions.for_preset("best", prune={"iterations": 6}, refit={"steps": 2}), "encode"),
         (FEW.changed(prune={"iterations": 48, "on": False}), "encode"),
     ):
-        found = encode_to_target(lego_excerpt, cameras, target, options, device=device)
+        found = encode_to_target(plush_excerpt, cameras, target, options, device=device)
         kinds = [step.kind for step in found.tries]
         assert kinds[0] == first
         assert "scout" not in kinds[1:]
         assert target.inside(found.value)
 
 
-def test_a_try_is_not_what_is_found_by_it(device, lego_excerpt, cameras):
+def test_a_try_is_not_what_is_found_by_it(device, plush_excerpt, cameras):
     """A scout is never the result, nor is the file that a PSNR was judged by."""
     options = EncodeOptions.for_preset("best", prune={"iterations": 6})
-    found = encode_to_target(lego_excerpt, cameras, Target(min_psnr=45), options, device=device)
+    found = encode_to_target(plush_excerpt, cameras, Target(min_psnr=45), options, device=device)
     assert found.tries[0].kind == "scout"
     assert found.value in [step.value for step in found.tries[1:]]
     assert len(found.encoded.order) == found.encoded.pruned.kept
@@ -149,13 +149,13 @@ def test_a_try_is_not_what_is_found_by_it(device, lego_excerpt, cameras):
     assert Coder.CONTEXT in coders
 
 
-def test_without_a_refit_only_the_steps_of_the_quantiser_may_be_of_another_q(device, lego_excerpt, cameras):
+def test_without_a_refit_only_the_steps_of_the_quantiser_may_be_of_another_q(device, plush_excerpt, cameras):
     runs = (
-        encode_to_target(lego_excerpt, cameras, Target(max_bytes=size), FEW, device=device)
+        encode_to_target(plush_excerpt, cameras, Target(max_bytes=size), FEW, device=device)
         for size in range(16_000, 30_000, 1_000)
     )
     found = next(run for run in runs if run.tries[-1].kind == "steps")
-    pruned = encode(lego_excerpt, cameras, FEW.changed(q=found.options.q), device=device).pruned
+    pruned = encode(plush_excerpt, cameras, FEW.changed(q=found.options.q), device=device).pruned
     assert np.array_equal(pruned.survivors, found.encoded.pruned.survivors)
     header = PotrFile.from_bytes(b"".join(found.encoded.pieces)).header
     assert header.sf_ac == found.options.code.sf_sh == pytest.approx(1 + 100 * found.tries[-1].q)
@@ -164,9 +164,9 @@ def test_without_a_refit_only_the_steps_of_the_quantiser_may_be_of_another_q(dev
         assert getattr(found.options.parameters, name) == getattr(parameters, name)
 
 
-def test_the_same_file_every_time(device, lego_excerpt, cameras):
+def test_the_same_file_every_time(device, plush_excerpt, cameras):
     target = Target(max_bytes=20_000)
-    runs = [encode_to_target(lego_excerpt, cameras, target, FEW, device=device) for _ in range(2)]
+    runs = [encode_to_target(plush_excerpt, cameras, target, FEW, device=device) for _ in range(2)]
     assert runs[0].encoded.pieces == runs[1].encoded.pieces
     assert runs[0].tries == runs[1].tries
 
@@ -178,34 +178,34 @@ def test_the_same_file_every_time(device, lego_excerpt, cameras):
             Target(max_bytes=1000),
             "at most 1,000 bytes cannot be reached: quality 0 gives {} bytes, quality 1 gives {} bytes",
         ),
-        (Target(min_psnr=90), "at least 90 dB cannot be reached: quality 0 gives .* dB, quality 1 gives 4.* dB"),
+        (Target(min_psnr=90), "at least 90 dB cannot be reached: quality 0 gives .* dB, quality 1 gives 5.* dB"),
     ],
 )
-def test_targets_out_of_reach(device, lego_excerpt, cameras, target, said):
-    ends = (encode(lego_excerpt, cameras, FEW.changed(q=q), device=device).nbytes for q in (0.0, 1.0))
+def test_targets_out_of_reach(device, plush_excerpt, cameras, target, said):
+    ends = (encode(plush_excerpt, cameras, FEW.changed(q=q), device=device).nbytes for q in (0.0, 1.0))
     with pytest.raises(UnreachableError, match=said.format(*(f"{nbytes:,}" for nbytes in ends))):
-        encode_to_target(lego_excerpt, cameras, target, FEW, device=device)
+        encode_to_target(plush_excerpt, cameras, target, FEW, device=device)
 
 
-def test_targets_that_every_quality_meets(device, lego_excerpt, cameras):
-    best = encode_to_target(lego_excerpt, cameras, Target(max_bytes=10**7), FEW, device=device)
+def test_targets_that_every_quality_meets(device, plush_excerpt, cameras):
+    best = encode_to_target(plush_excerpt, cameras, Target(max_bytes=10**7), FEW, device=device)
     assert best.options.q == 1
-    smallest = encode_to_target(lego_excerpt, cameras, Target(min_psnr=5), FEW, device=device)
+    smallest = encode_to_target(plush_excerpt, cameras, Target(min_psnr=5), FEW, device=device)
     assert smallest.options.q == 0
 
 
-def test_without_cameras_the_quantiser_alone_is_left(lego_excerpt):
+def test_without_cameras_the_quantiser_alone_is_left(plush_excerpt):
     options = FEW.changed(prune=False, compact=False)
-    found = encode_to_target(lego_excerpt, None, Target(max_bytes=25_000), options)
+    found = encode_to_target(plush_excerpt, None, Target(max_bytes=25_000), options)
     assert 24_500 <= found.encoded.nbytes <= 25_000
-    assert len(found.encoded.order) == len(lego_excerpt)
+    assert len(found.encoded.order) == len(plush_excerpt)
     with pytest.raises(UsageError, match="cameras"):
-        encode_to_target(lego_excerpt, None, Target(min_psnr=40), options)
+        encode_to_target(plush_excerpt, None, Target(min_psnr=40), options)
 
 
-def test_what_is_given_stays(device, lego_excerpt, cameras):
+def test_what_is_given_stays(device, plush_excerpt, cameras):
     options = FEW.changed(prune={"count": 500}, code={"sf_scale": 777.0}, memory=0)
-    found = encode_to_target(lego_excerpt, cameras, Target(max_bytes=9_000), options, device=device)
+    found = encode_to_target(plush_excerpt, cameras, Target(max_bytes=9_000), options, device=device)
     assert len(found.encoded.order) == 500
     assert found.options.parameters.sf_scale == 777
     assert 8_820 <= found.encoded.nbytes <= 9_000
@@ -219,29 +219,32 @@ def test_nothing_to_see(device):
     assert found.value == 200
 
 
-def test_colours_may_be_fitted_to_ground_truth(device, lego_excerpt, cameras, tmp_path):
+def test_colours_may_be_fitted_to_ground_truth(device, plush_excerpt, cameras, tmp_path):
     """Which sets a bound to the PSNR against the renders that no quality passes."""
-    with Rasterizer(device, dataclasses.replace(lego_excerpt, sh=lego_excerpt.sh * np.float32(0.9))) as shown:
+    with Rasterizer(device, dataclasses.replace(plush_excerpt, sh=plush_excerpt.sh * np.float32(0.9))) as shown:
         for camera in (camera for camera in cameras if camera.split == "train"):
             with (tmp_path / f"{camera.name}.png").open("wb") as file:
                 write_png(file, to_8_bits(shown.render(camera)[0]))
-    options = EncodeOptions.for_preset("fast", prune={"iterations": 6}, refit={"ground_truth": tmp_path})
+    # Views between would be fitted to renders, which are brighter than these photographs.
+    options = EncodeOptions.for_preset(
+        "fast", between={"views": 0}, prune={"iterations": 6}, refit={"ground_truth": tmp_path}
+    )
     target = Target(min_psnr=42)
-    assert target.inside(encode_to_target(lego_excerpt, cameras, target, options, device=device).value)
+    assert target.inside(encode_to_target(plush_excerpt, cameras, target, options, device=device).value)
     with pytest.raises(UnreachableError, match="quality 1 gives 4"):
-        encode_to_target(lego_excerpt, cameras, Target(min_psnr=55), options, device=device)
+        encode_to_target(plush_excerpt, cameras, Target(min_psnr=55), options, device=device)
 
 
-def test_a_cpu_takes_over(lego_excerpt, cameras, caplog):
+def test_a_cpu_takes_over(plush_excerpt, cameras, caplog):
     """From a device whose memory does not hold the scene's views."""
     skip_without_cpu()
     options = EncodeOptions.for_preset("fast", prune={"iterations": 3})
     target = Target(max_bytes=20_000)
-    wanted = encode_to_target(lego_excerpt, cameras, target, options)
+    wanted = encode_to_target(plush_excerpt, cameras, target, options)
     small = Device()
     small.info = dataclasses.replace(small.info, memory=1 << 20, largest_buffer=1 << 20, kind="gpu")
     with caplog.at_level(logging.WARNING, "potr_cl"):
-        found = encode_to_target(lego_excerpt, cameras, target, options, device=small)
+        found = encode_to_target(plush_excerpt, cameras, target, options, device=small)
     assert found.encoded.pieces == wanted.encoded.pieces
     assert found.encoded.device.info.kind == "cpu"
     assert small.allocated == 0
@@ -255,10 +258,10 @@ def test_bad_targets(bad):
         Target(**bad)
 
 
-def test_every_try_is_called_by_its_name(device, lego_excerpt, cameras):
+def test_every_try_is_called_by_its_name(device, plush_excerpt, cameras):
     lines = []
     options = EncodeOptions.for_preset("best", prune={"iterations": 6})
-    found = encode_to_target(lego_excerpt, cameras, Target(min_psnr=47), options, device=device, tell=lines.append)
+    found = encode_to_target(plush_excerpt, cameras, Target(min_psnr=47), options, device=device, tell=lines.append)
     assert len(lines) == len(found.tries)
     for line, step in zip(lines, found.tries, strict=True):
         assert line == f"{KINDS[step.kind].format(f'{step.q:g}')} {step.value:.2f} dB"

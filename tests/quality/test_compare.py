@@ -37,17 +37,17 @@ BACKGROUND = (0.25, 0.5, 1.0)
 
 
 @pytest.fixture(scope="module")
-def rasterizers(lego_excerpt):
+def rasterizers(plush_excerpt):
     """The excerpt, and the excerpt with other colours."""
     device = Device()
-    s = lego_excerpt
+    s = plush_excerpt
     other = Scene(s.means, s.log_scales, s.quaternions, s.opacity_logits, s.sh * np.float32(0.9))
     return Rasterizer(device, s, background=BACKGROUND), Rasterizer(device, other, background=BACKGROUND)
 
 
 @pytest.fixture(scope="module")
-def views(lego_excerpt_cameras):
-    return [c for c in lego_excerpt_cameras if c.split == "test"]
+def views(plush_excerpt_cameras):
+    return [c for c in plush_excerpt_cameras if c.split == "test"]
 
 
 def comparison(*psnrs):
@@ -213,9 +213,10 @@ def test_ground_truth_missing_or_ambiguous(tmp_path):
     cameras = ring_of_cameras(2)
     with pytest.raises(UsageError, match=r"cannot read the folder of photographs .*nowhere"):
         find_ground_truth(tmp_path / "nowhere", cameras)
-    save(tmp_path / "view_0.png")
-    with pytest.raises(UsageError, match="no photograph of view 'view_1'"):
+    with pytest.raises(UsageError, match=r"no photograph of any of the 2 views: .* as 'view_0'"):
         find_ground_truth(tmp_path, cameras)
+    save(tmp_path / "view_0.png")
+    assert find_ground_truth(tmp_path, cameras) == {"view_0": tmp_path / "view_0.png"}
     save(tmp_path / "view_1.png")
     save(tmp_path / "view_1.jpg")
     with pytest.raises(UsageError, match=r"several photographs of view 'view_1'.*view_1.jpg, view_1.png"):

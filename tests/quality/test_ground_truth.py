@@ -71,9 +71,22 @@ def test_ground_truth_that_are_not_there_or_of_another_size(cameras, folder):
     larger = dataclasses.replace(cameras[0], width=64)
     with pytest.raises(UsageError, match=r"is 32 x 32 pixels, view 'view_0' of the cameras is 64 x 32"):
         GroundTruth(folder, [larger])
-    (folder / "view_3.png").unlink()
-    with pytest.raises(UsageError, match="no photograph of view 'view_3'"):
+    for photograph in folder.iterdir():
+        photograph.unlink()
+    with pytest.raises(UsageError, match=r"no photograph of any of the 6 views: .* as 'view_0'"):
         GroundTruth(folder, cameras)
+
+
+def test_views_without_a_photograph_are_left_out(cameras, folder):
+    assert GroundTruth(folder, cameras).missing is None
+    (folder / "view_3.png").unlink()
+    ground_truth = GroundTruth(folder, cameras)
+    assert [camera.name for camera in ground_truth.of(cameras)] == ["view_0", "view_1", "view_2", "view_4", "view_5"]
+    assert ground_truth.missing == "view 'view_3' has no photograph and is left out"
+    (folder / "view_1.png").unlink()
+    assert GroundTruth(folder, cameras).missing == ("2 views, such as 'view_1', have no photograph and are left out")
+    elsewhere = [*cameras[:1], dataclasses.replace(cameras[1], name="other/view_1")]
+    assert GroundTruth(folder, elsewhere).of(elsewhere) == elsewhere[:1]
 
 
 def test_a_damaged_photograph(device, scene, cameras, folder):

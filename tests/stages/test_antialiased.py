@@ -134,16 +134,16 @@ def test_a_file_keeps_how_its_scene_is_rendered(device, preset, low_pass):
     assert errors[0] < 0.2 * errors[1]
 
 
-def test_encoded_as_antialiased_it_looks_better_than_encoded_as_classic(device, lego_excerpt, lego_excerpt_cameras):
+def test_encoded_as_antialiased_it_looks_better_than_encoded_as_classic(device, plush_excerpt, plush_excerpt_cameras):
     """The same scene at about the same bytes, judged by antialiased pictures of views that no encoder has seen."""
     options = EncodeOptions.for_preset("fast", q=0.5)
-    judged = [view for view in lego_excerpt_cameras if view.split == "test"]
+    judged = [view for view in plush_excerpt_cameras if view.split == "test"]
     found = {}
-    marked = lego_excerpt.rendered(True)
+    marked = plush_excerpt.rendered(True)
     with Rasterizer(device, marked) as rasterizer:
         targets = [rasterizer.render(view)[0] for view in judged]
     for kind in (True, False):
-        encoded = encode(lego_excerpt.rendered(kind), train_views(lego_excerpt_cameras), options, device=device)
+        encoded = encode(plush_excerpt.rendered(kind), train_views(plush_excerpt_cameras), options, device=device)
         back = potr_cl.codec.decoder.PotrFile.from_bytes(b"".join(encoded.pieces)).scene()
         with Rasterizer(device, back.rendered(True)) as rasterizer:
             pictures = [rasterizer.render(view)[0] for view in judged]

@@ -443,18 +443,18 @@ def zeros(sh: NDArray[np.floating]) -> float:
     return float(np.mean(np.concatenate(steps) == 0))
 
 
-def test_real_systems(device: Device, lego_excerpt: Scene, lego_excerpt_cameras: list[Camera]) -> None:
-    views = train_views(lego_excerpt_cameras)
+def test_real_systems(device: Device, plush_excerpt: Scene, plush_excerpt_cameras: list[Camera]) -> None:
+    views = train_views(plush_excerpt_cameras)
     centres = camera_centres(views)
-    weights = measured_weights(device, lego_excerpt, views)
-    dense = np.zeros((len(lego_excerpt), len(views)), np.float32)
-    dense[np.repeat(np.arange(len(lego_excerpt)), np.diff(weights.offsets)), weights.views] = weights.weights
-    some = np.arange(0, len(lego_excerpt), 7)
+    weights = measured_weights(device, plush_excerpt, views)
+    dense = np.zeros((len(plush_excerpt), len(views)), np.float32)
+    dense[np.repeat(np.arange(len(plush_excerpt)), np.diff(weights.offsets)), weights.views] = weights.weights
+    some = np.arange(0, len(plush_excerpt), 7)
     for alpha in (0.9, 1.0):
         options = CompactionOptions(lam=0.1, alpha=alpha)
-        compacted = Compactor(device).compact(lego_excerpt, centres, weights, options)
-        check_optimal(lego_excerpt.subset(some), compacted.subset(some), centres, dense[some], options)
-        assert zeros(compacted.sh) > zeros(lego_excerpt.sh) + 0.2
+        compacted = Compactor(device).compact(plush_excerpt, centres, weights, options)
+        check_optimal(plush_excerpt.subset(some), compacted.subset(some), centres, dense[some], options)
+        assert zeros(compacted.sh) > zeros(plush_excerpt.sh) + 0.15
 
 
 def scaled(camera: Camera, factor: float) -> Camera:
@@ -463,14 +463,14 @@ def scaled(camera: Camera, factor: float) -> Camera:
     return replace(camera, **size, **{name: getattr(camera, name) * factor for name in ("fx", "fy", "cx", "cy")})
 
 
-def test_half_the_resolution_gives_the_same_sparsity(lego_excerpt: Scene, lego_excerpt_cameras: list[Camera]) -> None:
-    """From 800 x 800 to 400 x 400; below, the rasterizer's dilation by 0.3 pixels makes the smallest splats larger."""
+def test_half_the_resolution_gives_the_same_sparsity(plush_excerpt: Scene, plush_excerpt_cameras: list[Camera]) -> None:
+    """From 480 x 360 to 240 x 180; the rasterizer's dilation by 0.3 pixels hardly matters yet."""
     device = Device()
-    views = train_views(lego_excerpt_cameras)
+    views = train_views(plush_excerpt_cameras)
     sparsity = []
     for factor in (2, 1):
-        weights = measured_weights(device, lego_excerpt, [scaled(c, factor) for c in views])
-        sparsity.append(zeros(Compactor(device).compact(lego_excerpt, camera_centres(views), weights).sh))
+        weights = measured_weights(device, plush_excerpt, [scaled(c, factor) for c in views])
+        sparsity.append(zeros(Compactor(device).compact(plush_excerpt, camera_centres(views), weights).sh))
     assert sparsity[1] == pytest.approx(sparsity[0], abs=0.01)
 
 

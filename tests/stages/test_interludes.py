@@ -30,8 +30,8 @@ class Brighter(Stage):
 
 
 @pytest.fixture(scope="module")
-def state(lego_excerpt, lego_excerpt_cameras):
-    return State.of(lego_excerpt, train_views(lego_excerpt_cameras)[:3])
+def state(plush_excerpt, plush_excerpt_cameras):
+    return State.of(plush_excerpt, train_views(plush_excerpt_cameras)[:3])
 
 
 def pruned(state, *interludes):

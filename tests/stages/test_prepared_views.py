@@ -24,14 +24,14 @@ def device(request):
 
 
 @pytest.fixture
-def rasterizer(device, lego_excerpt):
-    with Rasterizer(device, lego_excerpt) as rasterizer:
+def rasterizer(device, plush_excerpt):
+    with Rasterizer(device, plush_excerpt) as rasterizer:
         yield rasterizer
 
 
 @pytest.fixture
-def cameras(lego_excerpt_cameras):
-    return lego_excerpt_cameras[:7]
+def cameras(plush_excerpt_cameras):
+    return plush_excerpt_cameras[:7]
 
 
 def prepare(rasterizer, cameras, budget, progress=None) -> PreparedViews:

@@ -20,8 +20,8 @@ OPTIONS = PruningOptions(2e-6, 8)
 
 
 @pytest.fixture
-def cameras(lego_excerpt_cameras):
-    return [c for c in lego_excerpt_cameras if c.split == "train"][:4]
+def cameras(plush_excerpt_cameras):
+    return [c for c in plush_excerpt_cameras if c.split == "train"][:4]
 
 
 def run(device, scene, cameras, options, sweep=None, on_device=True, after_iteration=None):
@@ -42,10 +42,10 @@ def gpu(request):
 
 
 @pytest.mark.parametrize("decay", [0.8, 0.0])
-def test_the_same_splats_go_as_in_numpy(gpu, lego_excerpt, cameras, decay):
+def test_the_same_splats_go_as_in_numpy(gpu, plush_excerpt, cameras, decay):
     options = dataclasses.replace(OPTIONS, decay=decay)
-    found, sweeps = run(gpu, lego_excerpt, cameras, options)
-    expected, expected_sweeps = run(gpu, lego_excerpt, cameras, options, on_device=False)
+    found, sweeps = run(gpu, plush_excerpt, cameras, options)
+    expected, expected_sweeps = run(gpu, plush_excerpt, cameras, options, on_device=False)
     assert 100 < expected.kept < 1400
     # Rounding may send one splat more or less at the end of a budget.
     assert abs(found.kept - expected.kept) <= 3
@@ -59,12 +59,12 @@ def test_the_same_splats_go_as_in_numpy(gpu, lego_excerpt, cameras, decay):
 
 
 @pytest.mark.one_runtime
-def test_each_iteration_spends_its_budget(gpu, lego_excerpt, cameras):
+def test_each_iteration_spends_its_budget(gpu, plush_excerpt, cameras):
     """Against the rules themselves: what went scores less than what stayed, and just reaches the budget."""
-    found, _ = run(gpu, lego_excerpt, cameras, OPTIONS)
-    with Rasterizer(gpu, lego_excerpt) as rasterizer, RemovalSweep(rasterizer, cameras, SweepOptions()) as removal:
+    found, _ = run(gpu, plush_excerpt, cameras, OPTIONS)
+    with Rasterizer(gpu, plush_excerpt) as rasterizer, RemovalSweep(rasterizer, cameras, SweepOptions()) as removal:
         smoothed = SmoothedEffects(removal, OPTIONS.decay)
-        alive = np.arange(len(lego_excerpt))
+        alive = np.arange(len(plush_excerpt))
         start = 0
         for iteration in range(3):
             delta_mse, importance = smoothed.measure()
@@ -78,8 +78,8 @@ def test_each_iteration_spends_its_budget(gpu, lego_excerpt, cameras):
 
 
 @pytest.mark.one_runtime
-def test_order_and_history_fit_the_iterations(gpu, lego_excerpt, cameras):
-    found, _ = run(gpu, lego_excerpt, cameras, OPTIONS)
+def test_order_and_history_fit_the_iterations(gpu, plush_excerpt, cameras):
+    found, _ = run(gpu, plush_excerpt, cameras, OPTIONS)
     assert np.sort(found.order).tolist() == list(range(1500))
     removed = found.order[: 1500 - found.kept]
     assert (np.diff(found.iteration_of[removed]) >= 0).all()
@@ -88,18 +88,18 @@ def test_order_and_history_fit_the_iterations(gpu, lego_excerpt, cameras):
     assert [step.left for step in found.history] == (1500 - np.cumsum(counts[counts > 0])).tolist()
 
 
-def test_twice_the_same(gpu, lego_excerpt, cameras):
-    one, other = (run(gpu, lego_excerpt, cameras, OPTIONS)[0] for _ in range(2))
+def test_twice_the_same(gpu, plush_excerpt, cameras):
+    one, other = (run(gpu, plush_excerpt, cameras, OPTIONS)[0] for _ in range(2))
     assert one.order.tobytes() == other.order.tobytes()
     assert one.history == other.history
 
 
 @pytest.mark.one_runtime
 @pytest.mark.parametrize("limit", [0.0, 1e9])
-def test_only_improvements_and_everything(gpu, lego_excerpt, cameras, limit):
+def test_only_improvements_and_everything(gpu, plush_excerpt, cameras, limit):
     options = PruningOptions(limit, 3)
-    found, _ = run(gpu, lego_excerpt, cameras, options)
-    expected, _ = run(gpu, lego_excerpt, cameras, options, on_device=False)
+    found, _ = run(gpu, plush_excerpt, cameras, options)
+    expected, _ = run(gpu, plush_excerpt, cameras, options, on_device=False)
     assert found.kept == pytest.approx(expected.kept, abs=2)
     if limit:
         assert found.kept == 1
@@ -116,10 +116,10 @@ def test_nothing_to_remove(gpu):
 
 @pytest.mark.one_runtime
 @pytest.mark.parametrize("tolerance", [-1.0, 0.0, 0.3])
-def test_tiles_are_swept_again_by_the_tolerance(gpu, lego_excerpt, cameras, tolerance):
+def test_tiles_are_swept_again_by_the_tolerance(gpu, plush_excerpt, cameras, tolerance):
     sweep = SweepOptions(tolerance)
-    found, sweeps = run(gpu, lego_excerpt, cameras, OPTIONS, sweep)
-    expected, expected_sweeps = run(gpu, lego_excerpt, cameras, OPTIONS, sweep, on_device=False)
+    found, sweeps = run(gpu, plush_excerpt, cameras, OPTIONS, sweep)
+    expected, expected_sweeps = run(gpu, plush_excerpt, cameras, OPTIONS, sweep, on_device=False)
     assert abs(found.kept - expected.kept) <= 8
     assert sweeps == pytest.approx(expected_sweeps, rel=0.02)
     if tolerance < 0:
@@ -127,7 +127,7 @@ def test_tiles_are_swept_again_by_the_tolerance(gpu, lego_excerpt, cameras, tole
 
 
 @pytest.mark.one_runtime
-def test_host_and_device_take_turns(gpu, lego_excerpt, cameras):
+def test_host_and_device_take_turns(gpu, plush_excerpt, cameras):
     """Reading weights of views or giving new colours in between leaves the device's lists as they should be."""
     seen = []
 
@@ -135,17 +135,17 @@ def test_host_and_device_take_turns(gpu, lego_excerpt, cameras):
         def look(iteration):
             if iteration in (2, 5):
                 seen.append(sum(weights.sum() for _, _, weights in removal.view_importances()))
-                removal.replace_sh(lego_excerpt.sh)
+                removal.replace_sh(plush_excerpt.sh)
 
         return look
 
-    found, _ = run(gpu, lego_excerpt, cameras, OPTIONS, SweepOptions(0.0), after_iteration=looking)
-    plain, _ = run(gpu, lego_excerpt, cameras, OPTIONS, SweepOptions(0.0))
+    found, _ = run(gpu, plush_excerpt, cameras, OPTIONS, SweepOptions(0.0), after_iteration=looking)
+    plain, _ = run(gpu, plush_excerpt, cameras, OPTIONS, SweepOptions(0.0))
     assert len(seen) == 2
     assert found.order.tobytes() == plain.order.tobytes()
 
 
-def test_the_same_without_atomics_on_64_bits(gpu, lego_excerpt, cameras):
+def test_the_same_without_atomics_on_64_bits(gpu, plush_excerpt, cameras):
     class Device32(Device):
         def program(self, source, **defines):
             asked.add(defines.get("INT64_ATOMICS"))
@@ -154,16 +154,16 @@ def test_the_same_without_atomics_on_64_bits(gpu, lego_excerpt, cameras):
             return super().program(source, **defines)
 
     asked: set[int | None] = set()
-    found, _ = run(gpu, lego_excerpt, cameras, OPTIONS)
-    other, _ = run(Device32(gpu.info, family="gpu"), lego_excerpt, cameras, OPTIONS)
+    found, _ = run(gpu, plush_excerpt, cameras, OPTIONS)
+    other, _ = run(Device32(gpu.info, family="gpu"), plush_excerpt, cameras, OPTIONS)
     assert asked & {0, 1}
     assert other.order.tobytes() == found.order.tobytes()
     assert other.history == found.history
 
 
 @pytest.mark.one_runtime
-def test_options_that_only_the_host_knows(gpu, lego_excerpt, cameras):
-    with Rasterizer(gpu, lego_excerpt) as rasterizer:
+def test_options_that_only_the_host_knows(gpu, plush_excerpt, cameras):
+    with Rasterizer(gpu, plush_excerpt) as rasterizer:
         for sweep in (SweepOptions(turns=2), SweepOptions(sample=0.5), SweepOptions(memory=0)):
             with RemovalSweep(rasterizer, cameras, sweep) as removal:
                 assert removal.steering is None

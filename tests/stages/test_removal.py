@@ -118,21 +118,21 @@ def test_alpha_at_the_cap_behind_hundreds_of_layers(device):
     assert np.abs(effect[splats] / true - 1).max() < 1e-3
 
 
-def test_same_bits_every_time(device, lego_excerpt, lego_excerpt_cameras):
+def test_same_bits_every_time(device, plush_excerpt, plush_excerpt_cameras):
     results = []
     for _ in range(3):
-        with sweep(device, lego_excerpt, lego_excerpt_cameras[:3]) as removal:
+        with sweep(device, plush_excerpt, plush_excerpt_cameras[:3]) as removal:
             removal.measure()
             removal.remove(np.arange(0, 1500, 7))
             results.append(np.concatenate(removal.measure()).tobytes())
     assert len(set(results)) == 1
 
 
-def test_sums_kept_over_removals_are_those_of_a_new_sweep(device, lego_excerpt, lego_excerpt_cameras):
+def test_sums_kept_over_removals_are_those_of_a_new_sweep(device, plush_excerpt, plush_excerpt_cameras):
     """Exact totals: tiles that were skipped because nothing changed add up to what sweeping all of them gives."""
-    cameras = lego_excerpt_cameras[:2]
+    cameras = plush_excerpt_cameras[:2]
     few = np.arange(0, 20)
-    with sweep(device, lego_excerpt, cameras) as removal:
+    with sweep(device, plush_excerpt, cameras) as removal:
         removal.measure()
         removal.remove(few)
         skipping = removal.measure()
@@ -145,12 +145,12 @@ def test_sums_kept_over_removals_are_those_of_a_new_sweep(device, lego_excerpt, 
 
 @pytest.mark.one_runtime
 @pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
-def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, lego_excerpt, lego_excerpt_cameras, share):
-    cameras = lego_excerpt_cameras[:4]
+def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, plush_excerpt, plush_excerpt_cameras, share):
+    cameras = plush_excerpt_cameras[:4]
     results = []
     for memory in (None, int(share * 4 * 48 * 1536)):
         with (
-            Rasterizer(device, lego_excerpt) as rasterizer,
+            Rasterizer(device, plush_excerpt) as rasterizer,
             RemovalSweep(rasterizer, cameras, SweepOptions(0, 1, memory)) as removal,
         ):
             kept = removal.cached_views
@@ -164,13 +164,13 @@ def test_a_small_memory_budget_changes_the_time_and_nothing_else(device, lego_ex
 
 
 @pytest.mark.one_runtime
-def test_buffers_too_small_for_all_views_change_nothing(device, lego_excerpt, lego_excerpt_cameras, monkeypatch):
+def test_buffers_too_small_for_all_views_change_nothing(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
     """A device that allows no large buffer has fewer views at a time, and keeps them all."""
-    cameras, results = lego_excerpt_cameras[:7], []
+    cameras, results = plush_excerpt_cameras[:7], []
     for largest in (device.info.largest_buffer, 3 * 12 * cameras[0].width * cameras[0].height):
         monkeypatch.setattr(device, "info", dataclasses.replace(device.info, largest_buffer=largest))
         with (
-            Rasterizer(device, lego_excerpt) as rasterizer,
+            Rasterizer(device, plush_excerpt) as rasterizer,
             RemovalSweep(rasterizer, cameras, SweepOptions(0)) as removal,
         ):
             removal.measure()
@@ -181,10 +181,10 @@ def test_buffers_too_small_for_all_views_change_nothing(device, lego_excerpt, le
 
 
 @pytest.mark.one_runtime
-def test_views_in_turns(device, lego_excerpt, lego_excerpt_cameras):
+def test_views_in_turns(device, plush_excerpt, plush_excerpt_cameras):
     with (
-        Rasterizer(device, lego_excerpt) as rasterizer,
-        RemovalSweep(rasterizer, lego_excerpt_cameras[:4], SweepOptions(-1, turns=2)) as removal,
+        Rasterizer(device, plush_excerpt) as rasterizer,
+        RemovalSweep(rasterizer, plush_excerpt_cameras[:4], SweepOptions(-1, turns=2)) as removal,
     ):
         for _ in range(3):
             removal.measure()
@@ -192,10 +192,10 @@ def test_views_in_turns(device, lego_excerpt, lego_excerpt_cameras):
 
 
 @pytest.mark.one_runtime
-def test_tolerance_saves_sweeps(device, lego_excerpt, lego_excerpt_cameras):
+def test_tolerance_saves_sweeps(device, plush_excerpt, plush_excerpt_cameras):
     sweeps = []
     for tolerance in (-1, 0, 0.05):
-        with sweep(device, lego_excerpt, lego_excerpt_cameras[:2], tolerance) as removal:
+        with sweep(device, plush_excerpt, plush_excerpt_cameras[:2], tolerance) as removal:
             for start in range(4):
                 removal.measure()
                 removal.remove(np.arange(start, 1500, 100))
@@ -204,12 +204,12 @@ def test_tolerance_saves_sweeps(device, lego_excerpt, lego_excerpt_cameras):
     assert sweeps[0] > sweeps[1] > sweeps[2] >= 1
 
 
-def test_tightened_lists_change_no_result(device, lego_excerpt, lego_excerpt_cameras):
+def test_tightened_lists_change_no_result(device, plush_excerpt, plush_excerpt_cameras):
     results, intersections = {}, {}
     for tighten in (False, True):
         with (
-            Rasterizer(device, lego_excerpt) as rasterizer,
-            RemovalSweep(rasterizer, lego_excerpt_cameras[:3], SweepOptions(-1, tighten=tighten)) as removal,
+            Rasterizer(device, plush_excerpt) as rasterizer,
+            RemovalSweep(rasterizer, plush_excerpt_cameras[:3], SweepOptions(-1, tighten=tighten)) as removal,
         ):
             measured = [removal.measure()]
             for start in (0, 3, 5):
@@ -271,7 +271,7 @@ def test_a_removal_lets_pixels_go_on(device):
 
 
 @pytest.mark.one_runtime
-def test_a_random_sample_of_tiles(device, lego_excerpt, lego_excerpt_cameras):
+def test_a_random_sample_of_tiles(device, plush_excerpt, plush_excerpt_cameras):
     """Reproducible, fewer sweeps, every tile when sampling is over."""
     results, sweeps = [], []
     for options in (
@@ -281,8 +281,8 @@ def test_a_random_sample_of_tiles(device, lego_excerpt, lego_excerpt_cameras):
         SweepOptions(0, sample=0.3, sampled=2, seed=1),
     ):
         with (
-            Rasterizer(device, lego_excerpt) as rasterizer,
-            RemovalSweep(rasterizer, lego_excerpt_cameras[:3], options) as removal,
+            Rasterizer(device, plush_excerpt) as rasterizer,
+            RemovalSweep(rasterizer, plush_excerpt_cameras[:3], options) as removal,
         ):
             removal.measure()
             measured = []
@@ -409,15 +409,15 @@ def test_pruning_to_one_splat(device):
 
 
 @pytest.mark.one_runtime
-def test_pruning_keeps_the_picture_better_than_importance(device, lego_excerpt, lego_excerpt_cameras):
-    cameras = [c for c in lego_excerpt_cameras if c.split == "train"][:4]
-    with sweep(device, lego_excerpt, cameras) as removal:
+def test_pruning_keeps_the_picture_better_than_importance(device, plush_excerpt, plush_excerpt_cameras):
+    cameras = [c for c in plush_excerpt_cameras if c.split == "train"][:4]
+    with sweep(device, plush_excerpt, cameras) as removal:
         _, importance = removal.measure()
         pruned = prune(removal, 1500, PruningOptions(0, 12, count=750))
     by_importance = np.sort(np.argsort(importance)[-750:])
 
     def error(kept):
-        with Rasterizer(device, lego_excerpt) as whole, Rasterizer(device, lego_excerpt.subset(kept)) as other:
+        with Rasterizer(device, plush_excerpt) as whole, Rasterizer(device, plush_excerpt.subset(kept)) as other:
             return sum(np.mean((other.render(c)[0] - whole.render(c)[0]) ** 2) for c in cameras)
 
     assert error(pruned.survivors) < 0.5 * error(by_importance)

@@ -21,31 +21,31 @@ def device(request) -> Device:
 
 
 @pytest.fixture(scope="module")
-def half_seen(lego_excerpt: Scene) -> Scene:
+def half_seen(plush_excerpt: Scene) -> Scene:
     """The excerpt, and 300 of its splats again where no camera looks."""
-    beyond = lego_excerpt.subset(np.arange(0, 1500, 5))
-    return together(lego_excerpt, dataclasses.replace(beyond, means=beyond.means + np.float32(30)))
+    beyond = plush_excerpt.subset(np.arange(0, 1500, 5))
+    return together(plush_excerpt, dataclasses.replace(beyond, means=beyond.means + np.float32(30)))
 
 
-def test_they_are_kept_and_told_of(device, half_seen, lego_excerpt, lego_excerpt_cameras):
+def test_they_are_kept_and_told_of(device, half_seen, plush_excerpt, plush_excerpt_cameras):
     options = EncodeOptions.for_preset("fast", prune=FEW)
-    encoded = encode(half_seen, lego_excerpt_cameras, options, device=device)
-    kept = encoded.order[encoded.order >= len(lego_excerpt)]
+    encoded = encode(half_seen, plush_excerpt_cameras, options, device=device)
+    kept = encoded.order[encoded.order >= len(plush_excerpt)]
     assert sorted(kept) == list(range(1500, 1800))
     assert (encoded.unseen.splats, encoded.unseen.of, encoded.unseen.kept) == (300, 1800, True)
     assert 0.1 < encoded.unseen.area < 0.25
     assert "300 splats" in str(encoded.unseen)
     back = decode(b"".join(encoded.pieces))
-    beyond = encoded.order >= len(lego_excerpt)
+    beyond = encoded.order >= len(plush_excerpt)
     assert not back.sh[beyond, 1:].any()
     np.testing.assert_allclose(back.means[beyond], half_seen.means[encoded.order[beyond]], atol=0.2)
 
 
-def test_the_seen_ones_are_pruned_as_without_the_others(device, half_seen, lego_excerpt, lego_excerpt_cameras):
+def test_the_seen_ones_are_pruned_as_without_the_others(device, half_seen, plush_excerpt, plush_excerpt_cameras):
     options = EncodeOptions.for_preset("fast", prune=FEW)
-    alone = encode(lego_excerpt, lego_excerpt_cameras, options, device=device)
-    both = encode(half_seen, lego_excerpt_cameras, options, device=device)
-    assert sorted(both.order[both.order < len(lego_excerpt)]) == sorted(alone.order)
+    alone = encode(plush_excerpt, plush_excerpt_cameras, options, device=device)
+    both = encode(half_seen, plush_excerpt_cameras, options, device=device)
+    assert sorted(both.order[both.order < len(plush_excerpt)]) == sorted(alone.order)
     assert both.pruned.kept == alone.pruned.kept + 300
     assert sorted(both.pruned.order) == list(range(1800))
     np.testing.assert_array_equal(both.pruned.survivors, np.sort(both.order))
@@ -54,9 +54,9 @@ def test_the_seen_ones_are_pruned_as_without_the_others(device, half_seen, lego_
 
 
 @pytest.mark.parametrize("prune", [{"unseen": "drop"}, {"count": 1000}, {"keep": 0.5}])
-def test_they_are_dropped_where_that_is_asked_for_or_exact_numbers_are(device, half_seen, lego_excerpt_cameras, prune):
+def test_they_are_dropped_where_that_is_asked_for_or_exact_numbers_are(device, half_seen, plush_excerpt_cameras, prune):
     options = EncodeOptions.for_preset("fast", prune=FEW | prune)
-    encoded = encode(half_seen, lego_excerpt_cameras, options, device=device)
+    encoded = encode(half_seen, plush_excerpt_cameras, options, device=device)
     assert encoded.order.max() < 1500
     assert (encoded.unseen.splats, encoded.unseen.kept) == (300, False)
 
@@ -67,15 +67,15 @@ def test_another_choice_is_refused():
 
 
 def test_colours_of_seen_splats_are_treated_as_without_the_others(
-    device, half_seen, lego_excerpt, lego_excerpt_cameras
+    device, half_seen, plush_excerpt, plush_excerpt_cameras
 ):
     """The compaction works while splats are being removed: what it did to colours must not be lost."""
     options = EncodeOptions.for_preset("paper", prune=FEW)
-    alone = encode(lego_excerpt, lego_excerpt_cameras, options, device=device)
-    both = encode(half_seen, lego_excerpt_cameras, options, device=device)
+    alone = encode(plush_excerpt, plush_excerpt_cameras, options, device=device)
+    both = encode(half_seen, plush_excerpt_cameras, options, device=device)
     colours = []
     for encoded in (alone, both):
-        seen = np.flatnonzero(encoded.order < len(lego_excerpt))
+        seen = np.flatnonzero(encoded.order < len(plush_excerpt))
         sh = decode(b"".join(encoded.pieces)).sh[seen]
         colours.append(sh[np.argsort(encoded.order[seen])])
     np.testing.assert_array_equal(*colours)

@@ -568,8 +568,8 @@ def run(info: DeviceInfo, folder: Path, name: str, quick: bool, stages: Sequence
 def excerpt(folder: Path) -> Path:
     """The bundled excerpt as a scene's folder."""
     folder.mkdir()
-    shutil.copy(DATA / "lego_excerpt.ply", folder / "point_cloud.ply")
-    shutil.copy(DATA / "lego_cameras.json", folder / "cameras.json")
+    shutil.copy(DATA / "plush_excerpt.ply", folder / "point_cloud.ply")
+    shutil.copy(DATA / "plush_excerpt_cameras.json", folder / "cameras.json")
     return folder
 
 

@@ -26,6 +26,8 @@ def cli_page() -> str:
         "130 interrupted, 143 terminated, 129 the terminal was closed. An output file appears only when it is "
         "whole, and never in the place of an input. Errors are one line on standard error.",
         table(("command", "what it does"), [(f"[`{n}`](#{n})", cell(helps[n])) for n in commands.choices]),
+        "Instead of a command:",
+        *_arguments(parser),
     ]
     for name, command in commands.choices.items():
         parts += [f"## {name}", _sentence(command.description or helps[name]), f"    {_usage(command)}"]
@@ -55,7 +57,7 @@ def _arguments(command: argparse.ArgumentParser) -> Iterator[str]:
     for number, group in enumerate(command._action_groups):
         rows = []
         for action in group._group_actions:
-            if isinstance(action, argparse._HelpAction):
+            if isinstance(action, (argparse._HelpAction, argparse._SubParsersAction)):
                 continue
             text = formatter._expand_help(action) if action.help else ""
             others = [f"`{other.option_strings[-1]}`" for other in alone.get(id(action), ()) if other is not action]

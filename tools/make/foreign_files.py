@@ -32,7 +32,7 @@ def main() -> None:
     folder = DATA / "foreign"
     folder.mkdir(exist_ok=True)
     for name, options in FILES.items():
-        command = [*shlex.split(args.transform), "-w", "-g", "cpu", str(DATA / "lego_excerpt.ply")]
+        command = [*shlex.split(args.transform), "-w", "-g", "cpu", str(DATA / "plush_excerpt.ply")]
         # Options before the output apply to the splats, options of the output anywhere.
         subprocess.run([*command, *options, str(folder / name)], check=True)
 

@@ -21,7 +21,7 @@ from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.scene import Scene
 
 DEFAULT_SCENE = Path(__file__).parents[3] / "shared" / "scenes" / "plush" / "point_cloud.ply"
-EXCERPT = Path(__file__).parents[2] / "tests" / "data" / "lego_excerpt.ply"
+EXCERPT = Path(__file__).parents[2] / "tests" / "data" / "plush_excerpt.ply"
 
 
 def large_scene(like: Scene, splats: int, seed: int = 0, split: bool = False) -> Scene:
@@ -75,7 +75,7 @@ def more_views(like: Sequence[Camera], views: int, width: int, height: int, seed
 
 def cameras_beside(scene: Path) -> Path:
     """The cameras of a scene's file."""
-    return scene.with_name("lego_cameras.json" if scene.resolve() == EXCERPT.resolve() else "cameras.json")
+    return scene.with_name("plush_excerpt_cameras.json" if scene.resolve() == EXCERPT.resolve() else "cameras.json")
 
 
 def main() -> None:

@@ -1,67 +1,129 @@
-"""Cut the small excerpts in tests/data out of the full scenes.
+"""Cut the small excerpts in tests/data out of the scene plush.
 
     python -m tools.make.test_data SCENES
 
-SCENES holds the folders ``lego`` and ``plush``, each with point_cloud.ply and cameras.json, lego with its
-transforms_train.json and transforms_test.json, plush with a COLMAP model in sparse/0. Every run writes the same bytes.
+SCENES holds the folder ``plush`` with point_cloud.ply, cameras.json, and a COLMAP model in sparse/0. Every run writes
+the same bytes. No other scene of ours may be used: plush alone is from photographs under a free licence.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import math
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 import pycolmap
 
+from potr_cl.formats import load_cameras
 from potr_cl.formats.scenes import ply
+from potr_cl.model.camera import Camera, test_views, train_views
+from potr_cl.model.scene import Scene
 
 _DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
 _SPLATS = 1500
-_PLUSH_VIEWS = 17  # three of them test views by the every-8th rule
+#: The brooch at the toy's chest: many small splats of many colours.
+_MIDDLE = np.array([-0.76, 1.57, 2.78])
+_TRAIN_VIEWS, _TEST_VIEWS = 9, 3
+#: Pixels and focal length of the excerpt's views.
+_WIDTH, _HEIGHT, _FOCAL = 240, 180, 750.0
+_VIEWS_OF_THE_WHOLE = 17  # three of them test views by the every-8th rule
 
 
 def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
-    parser.add_argument("scenes", type=Path, help="folder that holds lego and plush")
-    scenes = parser.parse_args().scenes
+    parser.add_argument("scenes", type=Path, help="folder that holds plush")
+    source = parser.parse_args().scenes / "plush"
     _DATA.mkdir(exist_ok=True)
-    _lego_splats(scenes / "lego" / "point_cloud.ply")
-    names = _lego_cameras(scenes / "lego" / "cameras.json")
-    for split in ("train", "test"):
-        _lego_transforms(scenes / "lego" / f"transforms_{split}.json", names)
-    _plush_views(scenes / "plush")
+    excerpt = _splats(source / "point_cloud.ply")
+    views = _views_of_the_excerpt(load_cameras(source / "cameras.json"), excerpt)
+    _write_json(_DATA / "plush_excerpt_cameras.json", [_entry(number, view) for number, view in enumerate(views)])
+    _write_transforms(views)
+    _views_of_the_whole(source)
     print(f"{sum(f.stat().st_size for f in _DATA.rglob('*') if f.is_file())} bytes in {_DATA}")
 
 
-def _lego_splats(source: Path) -> None:
-    """A cube around the middle of the model: neighbours stay neighbours, as an octree expects them."""
+def _splats(source: Path) -> Scene:
+    """A cube: neighbours stay neighbours, as an octree expects them."""
     scene = ply.load(source)
-    distance = np.abs(scene.means - np.median(scene.means, axis=0)).max(axis=1)
-    nearest = np.sort(np.argsort(distance, kind="stable")[:_SPLATS])
-    ply.save(_DATA / "lego_excerpt.ply", scene.subset(nearest))
+    distance = np.abs(scene.means - _MIDDLE).max(axis=1)
+    excerpt = scene.subset(np.sort(np.argsort(distance, kind="stable")[:_SPLATS]))
+    ply.save(_DATA / "plush_excerpt.ply", excerpt)
+    return excerpt
 
 
-def _lego_cameras(source: Path) -> set[str]:
-    """Nine training and three test views, spread over the file."""
-    views = json.loads(source.read_text())
-    train = [view for view in views if view["split"] == "train"]
-    test = [view for view in views if view["split"] == "test"]
-    chosen = train[:: len(train) // 9][:9] + test[:: len(test) // 3][:3]
-    _write_json(_DATA / "lego_cameras.json", chosen)
-    return {view["img_name"] for view in chosen}
+def _views_of_the_excerpt(cameras: Sequence[Camera], excerpt: Scene) -> list[Camera]:
+    """Training and test views that see all of it, spread over those that do.
+
+    They are taken from where the photographs were taken, but turned towards the excerpt, and show little more than it.
+    """
+    seeing = [view for view in map(_turned, cameras) if _sees_all(view, excerpt)]
+    chosen = []
+    for views, count in ((train_views(seeing), _TRAIN_VIEWS), (test_views(seeing), _TEST_VIEWS)):
+        chosen += [views[round(place)] for place in np.linspace(0, len(views) - 1, count)]
+    return chosen
 
 
-def _lego_transforms(source: Path, names: set[str]) -> None:
-    content = json.loads(source.read_text())
-    content["frames"] = [frame for frame in content["frames"] if Path(frame["file_path"]).name in names]
-    _write_json(_DATA / "lego_transforms" / source.name, content)
+def _turned(camera: Camera) -> Camera:
+    forward = _MIDDLE - camera.centre
+    forward /= np.linalg.norm(forward)
+    right = camera.rotation[0] - forward * (camera.rotation[0] @ forward)
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return Camera(
+        name=camera.name, width=_WIDTH, height=_HEIGHT, fx=_FOCAL, fy=_FOCAL, cx=_WIDTH / 2, cy=_HEIGHT / 2,
+        rotation=rotation, translation=-rotation @ camera.centre, split=camera.split,
+    )  # fmt: skip
 
 
-def _plush_views(source: Path) -> None:
-    views = json.loads((source / "cameras.json").read_text())[:_PLUSH_VIEWS]
+def _sees_all(camera: Camera, scene: Scene) -> bool:
+    x, y, z = camera.rotation @ (scene.means.T.astype(float) - camera.centre[:, None])
+    if z.min() <= 0:
+        return False
+    column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+    return bool(column.min() > 0 and column.max() < camera.width and row.min() > 0 and row.max() < camera.height)
+
+
+def _entry(number: int, camera: Camera) -> dict[str, Any]:
+    """As cameras.json of the original implementation has it."""
+    return {
+        "id": number,
+        "img_name": camera.name,
+        "width": camera.width,
+        "height": camera.height,
+        "position": camera.centre.tolist(),
+        "rotation": camera.rotation.T.tolist(),
+        "fx": camera.fx,
+        "fy": camera.fy,
+        "split": camera.split,
+    }
+
+
+def _write_transforms(cameras: Sequence[Camera]) -> None:
+    """The same views as Blender's transforms_train.json and transforms_test.json."""
+    for split in ("train", "test"):
+        views = [camera for camera in cameras if camera.split == split]
+        content = {
+            "camera_angle_x": 2 * math.atan(views[0].width / (2 * views[0].fx)),
+            "frames": [{"file_path": f"./images/{v.name}", "transform_matrix": _blenders(v)} for v in views],
+        }
+        _write_json(_DATA / "plush_transforms" / f"transforms_{split}.json", content)
+
+
+def _blenders(camera: Camera) -> list[list[float]]:
+    """Camera to world with y up and looking along -z."""
+    matrix = np.eye(4)
+    matrix[:3, :3] = camera.rotation.T * [1, -1, -1]
+    matrix[:3, 3] = camera.centre
+    rows: list[list[float]] = matrix.tolist()
+    return rows
+
+
+def _views_of_the_whole(source: Path) -> None:
+    views = json.loads((source / "cameras.json").read_text())[:_VIEWS_OF_THE_WHOLE]
     _write_json(_DATA / "plush_cameras.json", views)
     model = pycolmap.Reconstruction(source / "sparse" / "0")
     names = {view["img_name"] for view in views}

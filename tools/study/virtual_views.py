@@ -157,8 +157,19 @@ def measure(
     true = judge.outcome(own)
     sizes = f"{own[0].width} x {own[0].height}"
     megapixels = sum(c.width * c.height for c in own) / 1e6
+    field = f"{math.degrees(2 * math.atan(own[0].width / (2 * own[0].fx))):.0f}"
     add(
-        folder.name, f"{len(own)} true", sizes, megapixels, 0.0, true.psnr[0], true.seconds, 1.0, true.memory / 1e6, 1.0
+        folder.name,
+        f"{len(own)} true",
+        sizes,
+        field,
+        megapixels,
+        0.0,
+        true.psnr[0],
+        true.seconds,
+        1.0,
+        true.memory / 1e6,
+        1.0,
     )
     for text in views:
         count, size, degrees = (int(number) for number in re.split("[x@]", text))

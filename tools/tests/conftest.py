@@ -1,5 +1,5 @@
 """The scenes of the package's tests."""
 
-from tests.conftest import data, lego, lego_excerpt, lego_excerpt_cameras, plush
+from tests.conftest import data, lego, plush, plush_excerpt, plush_excerpt_cameras
 
-__all__ = ["data", "lego", "lego_excerpt", "lego_excerpt_cameras", "plush"]
+__all__ = ["data", "lego", "plush", "plush_excerpt", "plush_excerpt_cameras"]

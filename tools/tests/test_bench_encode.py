@@ -48,7 +48,7 @@ def test_kernels_and_their_variants(folder):
 
 
 def test_ridge_errors_are_those_of_the_solution():
-    scene = benchmark.load_scene(benchmark.DATA / "lego_excerpt.ply").subset(np.arange(50))
+    scene = benchmark.load_scene(benchmark.DATA / "plush_excerpt.ply").subset(np.arange(50))
     centres, weights = on_a_sphere(30), dense_weights(sparse_weights(50, 30))
     options = CompactionOptions(lam=0.1, alpha=1)
     compacted = Compactor(Device()).compact(scene, centres, weights, options)

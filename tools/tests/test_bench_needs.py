@@ -13,9 +13,9 @@ from tools.bench.needs import Needs, looking_away, more
 
 
 @pytest.fixture(scope="module")
-def needs(lego_excerpt, lego_excerpt_cameras):
-    views = [camera for camera in lego_excerpt_cameras if camera.split == "train"][:2]
-    return Needs(lego_excerpt, views, Device(), repeats=1, iterations=3)
+def needs(plush_excerpt, plush_excerpt_cameras):
+    views = [camera for camera in plush_excerpt_cameras if camera.split == "train"][:2]
+    return Needs(plush_excerpt, views, Device(), repeats=1, iterations=3)
 
 
 @pytest.mark.slow

@@ -19,8 +19,8 @@ def call(monkeypatch, *arguments):
 def test_measure_and_report(monkeypatch, tmp_path, data, capsys):
     scene = tmp_path / "excerpt"
     scene.mkdir()
-    shutil.copy(data / "lego_excerpt.ply", scene / "point_cloud.ply")
-    shutil.copy(data / "lego_cameras.json", scene / "cameras.json")
+    shutil.copy(data / "plush_excerpt.ply", scene / "point_cloud.ply")
+    shutil.copy(data / "plush_excerpt_cameras.json", scene / "cameras.json")
     out = tmp_path / "out.json"
     few = ["--removed", 0.4, 0.6, "--drops", 1e-10, "--iterations", 4, "--most-steps", 4, "--every", 2]
     call(monkeypatch, "measure", scene, "--json", out, *few)

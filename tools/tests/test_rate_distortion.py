@@ -20,8 +20,8 @@ def folder(tmp_path, data):
     """The excerpt as a scene's folder."""
     scene = tmp_path / "excerpt"
     scene.mkdir()
-    shutil.copy(data / "lego_excerpt.ply", scene / "point_cloud.ply")
-    shutil.copy(data / "lego_cameras.json", scene / "cameras.json")
+    shutil.copy(data / "plush_excerpt.ply", scene / "point_cloud.ply")
+    shutil.copy(data / "plush_excerpt_cameras.json", scene / "cameras.json")
     return scene
 
 

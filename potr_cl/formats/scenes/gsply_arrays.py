@@ -8,8 +8,8 @@ from typing import Any
 import numpy as np
 
 from potr_cl.errors import PotrError, UsageError
-from potr_cl.formats.declaration import install_command
 from potr_cl.formats.scenes.scene_files import arranged, cleaned, first_line
+from potr_cl.host.installation import install_command
 from potr_cl.model.scene import Scene
 
 #: Of this package, which brings the library.

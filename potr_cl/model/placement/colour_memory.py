@@ -20,18 +20,44 @@ def remembered(places: F64, shown: list[F32], matter: Matter) -> F64 | None:
     It is the energy of the visible splats' colours towards the place, as a part of what the same splats have towards
     the best places. (Training moves coefficients along the basis functions of its views' directions, so their squared
     deviation, averaged over many splats, follows the density of the views.)
+
+    Args:
+        places: (P, 3) positions in the frame's units.
+        shown: (K,) of each place, what can be seen of each target from there, 0 to 1.
+        matter: of the scene.
     """
-    informative = matter.colours.any(axis=(1, 2))
-    # A function of the first degree alone varies as much away from a view as towards it.
-    if matter.colours.shape[1] < 8 or np.count_nonzero(informative) < _INFORMATIVE:
+    memory = ColourMemory(places, matter)
+    if not memory.tells:
         return None
-    energy = np.stack([_energy(place, matter) for place in places])
-    weights = np.stack(shown) * informative
-    total = np.maximum(weights.sum(axis=1), 1e-6)
-    own = (weights * energy).sum(axis=1) / total
-    best = np.quantile(weights @ energy.T / total[:, None], 0.95, axis=1)
-    remembered: F64 = own / np.maximum(best, 1e-12)
-    return remembered
+    return np.array([memory.of(place, visible) for place, visible in zip(places, shown, strict=True)])
+
+
+class ColourMemory:
+    """What colours remember, measured against some places that they are known, or thought, to be seen from.
+
+    Args:
+        places: (P, 3) positions in the frame's units.
+        matter: of the scene.
+
+    Attributes:
+        tells: whether the colours can tell anything.
+    """
+
+    def __init__(self, places: F64, matter: Matter) -> None:
+        self._matter = matter
+        self._informative = matter.colours.any(axis=(1, 2))
+        # A function of the first degree alone varies as much away from a view as towards it.
+        self.tells = matter.colours.shape[1] >= 8 and np.count_nonzero(self._informative) >= _INFORMATIVE
+        self._energies = np.stack([_energy(place, matter) for place in places]) if self.tells else None
+
+    def of(self, place: F64, shown: F32) -> float:
+        """How well they remember a place, (3,), from where ``shown``, (K,), is seen; see :func:`remembered`."""
+        assert self._energies is not None
+        weights = shown * self._informative
+        total = max(float(weights.sum()), 1e-6)
+        own = float(weights @ _energy(place, self._matter)) / total
+        best = float(np.quantile(self._energies @ weights / total, 0.95))
+        return own / max(best, 1e-12)
 
 
 def _energy(camera_centre: F64, matter: Matter) -> F32:

@@ -137,7 +137,7 @@ def test_comments_do_not_matter(tmp_path, data):
 
 
 def test_a_plain_ply_with_a_comment_about_compression_is_a_plain_one(tmp_path, data):
-    content = (data / "lego_excerpt.ply").read_bytes()
+    content = (data / "plush_excerpt.ply").read_bytes()
     path = tmp_path / "a.ply"
     path.write_bytes(content.replace(b"ply\n", b"ply\ncomment no packed_position\n", 1))
     assert len(load_scene(path)) == 1500

@@ -1,0 +1,58 @@
+"""What is said before long work: on which device it is done, and what it will take."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+from potr_cl.cli.terminal import is_quiet, note
+from potr_cl.errors import DeviceError
+from potr_cl.model.camera import Camera, train_views
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.forecast import forecast
+from potr_cl.pipeline.options import EncodeOptions
+
+#: Splats times views from which on the work may take long enough to be worth a forecast.
+_LONG = 2_000_000
+
+
+def tell_what_is_ahead(
+    device: Device, scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, search: bool = False
+) -> None:
+    """A line with the device and its kernels; and where the work may take long, with roughly its time and memory.
+
+    Args:
+        cameras: of which the training views are looked at.
+        search: whether the encode is repeated to meet a size or a PSNR.
+
+    Raises:
+        UsageError: there is no training view.
+    """
+    if is_quiet():
+        return
+    views = train_views(cameras)
+    note(f"driver: {device.info.platform}, {device.info.version}", "detail")
+    line = f"on {device.info}, kernels for {device.family.upper()}s"
+    if len(scene) * len(views) >= _LONG:
+        try:
+            ahead = forecast(scene, views, options, device, search)
+        except DeviceError as error:
+            note(f"no forecast: {error}", "detail")  # the encode goes on with less memory, or elsewhere
+        else:
+            note(f"one view takes {1000 * ahead.sampled:.1f} ms", "detail")
+            where = "" if device.info.kind == "cpu" else " of the device"
+            line += f"; about {_duration(ahead.seconds)} and {_size(ahead.memory)} of memory{where}"
+    width, height = max((view.width, view.height) for view in views)
+    note(f"{line}: {len(scene):,} splats, {len(views)} views of {width} x {height}")
+
+
+def _duration(seconds: float) -> str:
+    """As roughly as it is known."""
+    for unit, name in ((3600, "h"), (60, "min")):
+        if seconds >= 2 * unit:
+            return f"{seconds / unit:.1f} {name}" if seconds < 10 * unit else f"{seconds / unit:.0f} {name}"
+    return f"{max(seconds, 1):.0f} s"
+
+
+def _size(nbytes: float) -> str:
+    return f"{nbytes / 1e9:.1f} GB" if nbytes >= 1e9 else f"{max(nbytes / 1e6, 1):.0f} MB"

@@ -1,0 +1,134 @@
+"""What an encode will take, before it begins (:func:`forecast`): seconds and bytes, roughly.
+
+Nearly all of the time goes into projecting, sorting and compositing splats, view by view. So a few views are rendered,
+and their mean time, as a unit, is multiplied by what each stage was measured to take in such units. This sees the
+device, the scene and the size of the pictures, and whatever else the machine is doing.
+``python -m tools.bench.forecast`` measures the units, and how far off a forecast is (docs/benchmarks/forecast.md).
+"""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import Family
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.compact import Compact
+from potr_cl.stages.prune import Prune
+from potr_cl.stages.pruning.sweep_options import default_memory
+from potr_cl.stages.refit import Refit
+
+#: Views that are rendered to see how long one takes.
+_SAMPLE = 4
+#: Plain encodes that a search takes the time of.
+_SEARCH = 3
+#: Bytes of the process with its libraries; a splat, on the host and on the device; a pixel, of the picture that a view
+#: is to have; and what is kept of views and besides, as a multiple of these and of what a view's own buffers take.
+_PROCESS, _HOST_SPLAT, _DEVICE_SPLAT, _PIXEL, _VIEWS = 180e6, 1550, 154, 12, 1.02
+
+
+@dataclass(frozen=True)
+class Forecast:
+    """What an encode is expected to take.
+
+    Attributes:
+        seconds: from the first stage to the last; reading, judging and writing come on top.
+        memory: bytes at the peak: the whole process's on a CPU, the device's on a GPU.
+        sampled: seconds of a picture, as measured.
+        pictures: how many pictures' times the stages up to the re-fit are expected to take.
+    """
+
+    seconds: float
+    memory: float
+    sampled: float
+    pictures: float
+
+
+@dataclass(frozen=True)
+class Units:
+    """What stages take.
+
+    Attributes:
+        prepare, prune, compact, refit: once for each training view, as multiples of the time of one picture of the
+            uncompressed scene.
+        iteration, step: a pruning iteration and a step of the re-fit, for each view, besides.
+        once: pictures' times that the re-fit takes besides, whatever the number of views.
+        compact_splat, refit_splat, code_splat: seconds that compaction, the re-fit and the coding take besides, for
+            each splat of the uncompressed scene.
+    """
+
+    prepare: float
+    prune: float
+    iteration: float
+    compact: float
+    refit: float
+    step: float
+    once: float
+    compact_splat: float
+    refit_splat: float
+    code_splat: float
+
+
+#: From tools.bench.forecast for CPUs, and from docs/benchmarks/encode.md for GPUs, where the host does a good part.
+UNITS: dict[Family, Units] = {
+    "cpu": Units(1.0, 3.0, 0.035, 2.0, 4.7, 0.33, 20, 0, 0, 4e-6),
+    "gpu": Units(0.9, 2.0, 0.042, 0, 0, 0.45, 0, 3.5e-6, 1.45e-6, 1.5e-6),
+}
+
+
+def forecast(
+    scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, device: Device, search: bool = False
+) -> Forecast:
+    """Render a few views, and say from their time what an encode will take.
+
+    Args:
+        scene, options, device: of the encode.
+        cameras: its training views, at least one.
+        search: whether the encode is repeated to meet a size or a PSNR.
+
+    Raises:
+        DeviceError: the device cannot render the views.
+    """
+    seconds, nbytes = _view(scene, cameras, options, device)
+    parts = {stage.name: stage for stage in options.stages if stage.asked_for and stage.looks_at(scene)}
+    units = UNITS[device.family]
+    pictures, of_a_splat = len(cameras) * units.prepare, units.code_splat
+    if isinstance(prune := parts.get(Prune.name), Prune):
+        pictures += len(cameras) * (units.prune + units.iteration * prune.iterations)
+    if Compact.name in parts:
+        pictures += len(cameras) * units.compact
+        of_a_splat += units.compact_splat
+    if isinstance(refit := parts.get(Refit.name), Refit):
+        pictures += units.once + len(cameras) * (units.refit + units.step * refit.steps)
+        of_a_splat += units.refit_splat
+    work = pictures * seconds + len(scene) * of_a_splat
+    budget = default_memory(device) if options.memory is None else options.memory
+    memory = len(scene) * _DEVICE_SPLAT + min(len(cameras) * nbytes * _VIEWS, budget)
+    if device.info.kind == "cpu":
+        memory += _PROCESS + len(scene) * _HOST_SPLAT
+    return Forecast(work * (_SEARCH if search else 1), memory, seconds, pictures)
+
+
+def _view(scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, device: Device) -> tuple[float, float]:
+    """Seconds that a picture takes, and bytes of what can be kept of a view: means of a few."""
+    chosen = [cameras[round(place)] for place in np.linspace(0, len(cameras) - 1, min(_SAMPLE, len(cameras)))]
+    seconds, nbytes = [], []
+    with Rasterizer(device, scene, background=options.background) as rasterizer:
+        for number, camera in enumerate([chosen[0], *chosen]):
+            began = time.perf_counter()
+            rasterizer.render_device(camera)
+            device.queue.finish()
+            if number:  # the first time buffers are made
+                seconds.append(time.perf_counter() - began)
+        for camera in chosen:
+            before = device.allocated
+            with rasterizer.prepare_set([camera]):
+                nbytes.append(device.allocated - before + _PIXEL * camera.width * camera.height)
+    return float(np.mean(seconds)), float(np.mean(nbytes))

@@ -1,0 +1,107 @@
+"""Completion in real shells; those that are not installed are left out."""
+
+from __future__ import annotations
+
+import os
+import shutil
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+from potr_cl import cli
+
+pytest.importorskip("shtab", reason="the extra completion is not installed")
+
+
+@pytest.fixture
+def script(tmp_path, capsys):
+    """Writes the script of a shell, and skips the test where there is no such shell."""
+
+    def write(shell: str) -> Path:
+        if shutil.which(shell) is None:
+            pytest.skip(f"{shell} is not installed")
+        with pytest.raises(SystemExit) as ended:
+            cli.main(["--print-completion", shell])
+        assert ended.value.code == 0
+        path = tmp_path / f"completion.{shell}"
+        path.write_text(capsys.readouterr().out)
+        return path
+
+    return write
+
+
+def output(*command: str, cwd: Path) -> str:
+    return subprocess.run(command, cwd=cwd, capture_output=True, text=True, check=True, timeout=60).stdout
+
+
+BASH = """
+source "$1"; shift
+function=$(complete -p potr-cl | sed 's/.*-F \\([^ ]*\\).*/\\1/')
+COMP_WORDS=("$@"); COMP_CWORD=$(($# - 1)); COMPREPLY=()
+$function potr-cl "${COMP_WORDS[COMP_CWORD]}" "${COMP_WORDS[COMP_CWORD-1]}"
+printf '%s\\n' "${COMPREPLY[@]}"
+"""
+
+
+def test_bash(script, tmp_path):
+    path = script("bash")
+    (tmp_path / "scene.potr").touch()
+
+    def completed(*words: str) -> list[str]:
+        return output("bash", "-c", BASH, "bash", str(path), "potr-cl", *words, cwd=tmp_path).split()
+
+    assert completed("enc") == ["encode"]
+    assert completed("encode", "--pres") == ["--preset"]
+    assert completed("encode", "--preset", "") == ["best", "fast", "paper"]
+    assert completed("decode", "sce") == ["scene.potr"]
+
+
+def test_fish(script, tmp_path):
+    path = script("fish")
+    (tmp_path / "scene.potr").touch()
+
+    def completed(line: str) -> list[str]:
+        said = output("fish", "--no-config", "-c", f"source {path}; complete -C '{line}'", cwd=tmp_path)
+        return [each.split("\t")[0] for each in said.splitlines()]
+
+    assert completed("potr-cl enc") == ["encode"]
+    assert "--preset" in completed("potr-cl encode --pres")
+    assert completed("potr-cl encode --preset ") == ["best", "fast", "paper"]
+    assert completed("potr-cl decode sce") == ["scene.potr"]
+
+
+def test_zsh(script, tmp_path):
+    """Which completes on a terminal only."""
+    pty = pytest.importorskip("pty")
+    path = script("zsh")
+    process, terminal = pty.fork()
+    if process == 0:  # the shell
+        os.chdir(tmp_path)
+        os.environ.update(TERM="dumb", PS1="> ", HOME=str(tmp_path))
+        os.execlp("zsh", "zsh", "-f")
+
+    def typed(text: str, wanted: str) -> None:
+        os.write(terminal, text.encode())
+        written, end = "", time.monotonic() + 30
+        while wanted not in written:
+            assert time.monotonic() < end, written
+            written += os.read(terminal, 10_000).decode("utf-8", "replace")
+
+    try:
+        typed("autoload -Uz compinit; compinit -u -d dump\r", "compinit")
+        typed(f"eval \"$(cat '{path}')\"; echo rea''dy\r", "ready")
+        typed("potr-cl enc\t", "encode ")
+        typed("--pres\t", "--preset ")
+        typed("\t\t", "best   fast   paper")
+    finally:
+        os.close(terminal)
+        os.waitpid(process, 0)
+
+
+def test_without_the_library(monkeypatch, capsys):
+    monkeypatch.setitem(sys.modules, "shtab", None)
+    assert cli.main(["--print-completion", "bash"]) == 2
+    assert "needs the library shtab: pip install " in capsys.readouterr().err

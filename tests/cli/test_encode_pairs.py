@@ -1,0 +1,75 @@
+"""Every way to ask for an encode with every way to be told of it."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from potr_cl import cli
+from potr_cl.cli import COMMANDS
+from potr_cl.formats import save_scene
+from potr_cl.reference.scenes import random_scene
+from tests.cli.test_cli import cameras_json
+
+#: What may be asked for, one at a time; {photos} is a folder of photographs.
+ASKED = {
+    "nothing": [],
+    "photos": ["--photos", "{photos}"],
+    "size": ["--max-size", "40kB"],
+    "psnr": ["--min-psnr", "20"],
+    "no pruning": ["--no-prune"],
+    "no re-fit": ["--refit", "off"],
+    "compaction": ["--refit", "off", "--compact"],
+    "nothing that looks": ["--no-prune", "--refit", "off", "--no-compact"],
+    "paper": ["--preset", "paper"],
+    "fast": ["--preset", "fast"],
+    "re-fits on the way": ["--refit-at", "0.5"],
+    "unseen": ["--unseen", "drop"],
+    "antialiased": ["--antialiased", "yes"],
+    "background": ["--background", "white"],
+    "npz": ["--entropy", "npz"],
+}
+QUICK = ("nothing", "photos", "nothing that looks")
+#: And how it is told.
+TOLD = {
+    "summary": [],
+    "json": ["--json"],
+    "not judged": ["--no-quality"],
+    "not judged, json": ["--no-quality", "--json"],
+    "page": ["--report", "{page}"],
+    "page and json": ["--report", "{page}", "--json"],
+}
+
+
+@pytest.fixture(scope="module")
+def given(tmp_path_factory, request):
+    folder = tmp_path_factory.mktemp("pairs")
+    scene, cameras, photos = folder / "scene.ply", cameras_json(folder / "cameras.json"), folder / "photos"
+    save_scene(scene, random_scene(120, 2))
+    assert cli.main(["render", str(scene), "--cameras", str(cameras), "-o", str(photos)]) == 0
+    return {"scene": scene, "cameras": cameras, "photos": photos}
+
+
+@pytest.mark.one_runtime
+@pytest.mark.parametrize("told", TOLD)
+@pytest.mark.parametrize(
+    "asked", [pytest.param(name, marks=[] if name in QUICK else pytest.mark.slow) for name in ASKED]
+)
+def test_every_pair(given, tmp_path, asked, told, capsys):
+    assert "encode" in COMMANDS
+    out, page = tmp_path / "out.potr", tmp_path / "page.html"
+    words = ["encode", str(given["scene"]), "-o", str(out), "--cameras", str(given["cameras"])]
+    words += ["--iterations", "2"] if asked != "no pruning" and asked != "nothing that looks" else []
+    words += [word.format(photos=given["photos"], page=page) for word in [*ASKED[asked], *TOLD[told]]]
+    assert cli.main(words) == 0, capsys.readouterr().err
+    captured = capsys.readouterr()
+    assert out.stat().st_size > 0
+    if "--json" in words:
+        report = json.loads(captured.out)
+        assert report["bytes"] == out.stat().st_size
+        assert (report["photographs"] is None) == (asked != "photos")
+        assert isinstance(report["quality"], str) == (told == "not judged, json")
+    else:
+        assert str(out) in captured.out
+    assert page.exists() == ("--report" in words)

@@ -1,0 +1,236 @@
+"""What the command line says: wrong calls in one line, progress in logs and on terminals, how loud, what colours."""
+
+from __future__ import annotations
+
+import argparse
+import os
+import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from potr_cl import cli
+from potr_cl.cli import command_parser
+from potr_cl.cli.progress import Progress
+from potr_cl.cli.terminal import note, speak
+from potr_cl.formats.scenes import ply
+from potr_cl.reference.scenes import random_scene
+
+ROOT = Path(__file__).parents[2]
+COMMANDS = next(
+    action.choices for action in command_parser()._actions if isinstance(action, argparse._SubParsersAction)
+)
+
+
+@pytest.fixture(autouse=True)
+def _normal_again():
+    yield
+    speak("normal")
+
+
+@pytest.fixture
+def encode(data, tmp_path):
+    """A short encode of the excerpt."""
+    excerpt, cameras = data / "plush_excerpt.ply", data / "plush_excerpt_cameras.json"
+    return ["encode", excerpt, "--cameras", cameras, "-o", tmp_path / "a.potr", "--iterations", "2", "--refit", "1"]
+
+
+def called(capsys, *arguments):
+    code = cli.main([str(argument) for argument in arguments])
+    captured = capsys.readouterr()
+    return code, captured.out, captured.err
+
+
+# Wrong calls
+
+
+@pytest.mark.parametrize(
+    ("call", "said"),
+    [
+        ([], "a command is missing: encode, prune, "),
+        (["encod", "a.ply"], "there is no command 'encod': is encode meant?"),
+        (["a.ply"], "to compress a scene: potr-cl encode a.ply -o OUT.potr"),
+        (["encode"], '-o OUT.potr (.potr, a folder, or "-" for standard output) is missing'),
+        (["encode", "a.ply", "--outptu", "b"], "there is no option '--outptu': is --output OUT.potr meant?"),
+        (["encode", "a.ply", "--camras=b", "-o", "c"], "is --cameras PATH meant?"),
+        (["encode", "a.ply", "--bananas", "-o", "c"], "there is no option '--bananas'"),
+        (["encode", "a.ply", "-o", "c", "-z"], "there is no option '-z'"),
+        (["encode", "a.ply", "-o"], "-o/--output needs a value: OUT.potr (.potr, a folder, or"),
+        (["encode", "a.ply", "-o", "c", "-q", "x"], "-q/--quality is 'x', it must be a number"),
+        (["encode", "a.ply", "-o", "c", "--preset", "bset"], "it must be best, fast or paper; is best meant?"),
+        (["info", "a.potr", "b.ply"], "'b.ply' is one argument too many"),
+        (["info", "a\x1b[31m.ply", "b\x1b[31m.ply"], "'b\\x1b[31m.ply' is one argument too many"),
+        (["--print-completion", "bahs"], "is bash meant?"),
+    ],
+)
+def test_a_wrong_call_is_told_in_one_line(call, said, capsys):
+    with pytest.raises(SystemExit) as ended:
+        cli.main(call)
+    assert ended.value.code == 2
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err.count("\n") == 1
+    assert said in captured.err
+    command = f" {call[0]}" if call and call[0] in COMMANDS else ""
+    assert f"(see potr-cl{command} --help)" in captured.err
+
+
+@pytest.mark.parametrize("name", COMMANDS)
+def test_every_argument_has_help_and_every_command_can_be_quiet(name):
+    command = COMMANDS[name]
+    assert [action.dest for action in command._actions if not action.help] == []
+    flags = {flag for action in command._actions for flag in action.option_strings}
+    assert {"--quiet", "--verbose"} <= flags
+
+
+# How much is said
+
+
+def test_quiet_says_nothing_but_what_was_asked_for(encode, capsys):
+    assert called(capsys, *encode, "--quiet") == (0, "", "")
+    code, out, err = called(capsys, "info", encode[5], "--quiet")
+    assert (code, err) == (0, "")
+    assert "splats" in out
+    code, out, err = called(capsys, *encode, "--quiet", "--json")
+    assert (code, err) == (0, "")
+    assert out.startswith("{")
+    code, out, err = called(capsys, "decode", "nothing.potr", "-o", "a.ply", "--quiet")
+    assert (code, out, err.count("\n")) == (2, "", 1)
+
+
+def test_verbose_says_more(encode, capsys):
+    _, _, normal = called(capsys, *encode)
+    _, _, verbose = called(capsys, *encode, "--verbose")
+    assert "driver: " not in normal
+    assert "driver: " in verbose
+
+
+def test_the_device_is_named_first(encode, capsys):
+    _, _, err = called(capsys, *encode)
+    assert re.match(r"on '.+' \(.+\), kernels for [CG]PUs: 1,500 splats, 9 views of 240 x 180\n", err)
+
+
+def test_a_long_run_says_what_it_will_take(data, tmp_path, capsys):
+    ply.save(tmp_path / "a.ply", random_scene(250_000, 0))
+    cameras = data / "plush_excerpt_cameras.json"
+    encode = ["encode", tmp_path / "a.ply", "--cameras", cameras, "-o", tmp_path / "a.potr"]
+    _, _, err = called(capsys, *encode, "--iterations", "1", "--refit", "off", "--no-quality")
+    assert re.search(r"kernels for [CG]PUs; about [\d.]+ (s|min|h) and [\d.]+ [MG]B of memory", err.splitlines()[0])
+
+
+# Progress
+
+
+def test_a_stage_is_told_once_in_a_log(encode, capsys):
+    _, _, err = called(capsys, *encode, "--max-size", "20k")
+    lines = err.splitlines()
+    for stage in ("prepare views", "prune", "refit", "quantise and code", "evaluate"):
+        assert lines.count(f"{stage} …") == 1, err
+        assert sum(line.startswith(f"{stage}: ") for line in lines) == 1, err
+    assert not re.search("[\x1b\r]", err)
+
+
+def test_a_stage_that_goes_on_is_told_once(capsys):
+    progress = Progress()
+    for stage, done in (
+        ("a", 0), ("a", 0.5), ("b", 0), ("b", 1), ("a", 0.7), ("a", 1), ("a", 0.2), ("a", 1), ("c", 0), ("c", 0.5)
+    ):  # fmt: skip
+        progress(stage, done)
+    progress.close()
+    lines = [re.sub(r"\d+\.\d", "T", line) for line in capsys.readouterr().err.splitlines()]
+    assert lines == ["a …", "b …", "b: T s", "a: T s", "c …"]
+
+
+# Terminals
+
+
+def on_a_terminal(*arguments: object, **variables: str) -> str:
+    """What a command writes to standard error where that is a terminal."""
+    pty = pytest.importorskip("pty")
+    import fcntl
+    import struct
+    import termios
+
+    ours, theirs = pty.openpty()
+    fcntl.ioctl(theirs, termios.TIOCSWINSZ, struct.pack("HHHH", 24, 80, 0, 0))
+    environment = {name: value for name, value in os.environ.items() if name not in ("NO_COLOR", "TERM")}
+    process = subprocess.Popen(
+        [sys.executable, "-m", "potr_cl", *map(str, arguments)],
+        cwd=ROOT, stdin=theirs, stdout=subprocess.DEVNULL, stderr=theirs,
+        env=environment | {"TERM": "xterm"} | variables,
+    )  # fmt: skip
+    os.close(theirs)
+    written = b""
+    try:
+        while part := os.read(ours, 10_000):
+            written += part
+    except OSError:  # Linux's way of saying that the other end is closed
+        pass
+    os.close(ours)
+    process.wait(60)
+    return written.decode()
+
+
+def test_colours_are_for_terminals_that_want_them(capsys):
+    wrong = ["decode", "nothing.potr", "-o", "a.ply"]
+    coloured = on_a_terminal(*wrong)
+    assert coloured.startswith("\x1b[1;31mpotr-cl:\x1b[0m ")
+    for variables in ({"NO_COLOR": "1"}, {"TERM": "dumb"}):
+        plain = on_a_terminal(*wrong, **variables)
+        assert "\x1b" not in plain
+        assert plain.startswith("potr-cl: ")
+    assert "\x1b" not in called(capsys, *wrong)[2]
+
+
+def test_help_has_no_escapes_in_any_version_of_python(monkeypatch, capsys):
+    """Newer ones colour it where they think that it goes to a terminal."""
+    monkeypatch.setenv("FORCE_COLOR", "1")
+    with pytest.raises(SystemExit):
+        cli.main(["encode", "--help"])
+    assert "x1b" not in capsys.readouterr().out
+
+
+def test_a_terminal_gets_a_bar(encode):
+    written = on_a_terminal(*encode)
+    assert "elapsed" in written
+    assert "\r" in written
+    assert "…" not in written
+    assert "\r" not in on_a_terminal(*encode, "--quiet")
+
+
+def test_a_warning_has_its_colour_and_is_said_even_if_quiet(capsys):
+    speak("quiet")
+    note("news")
+    note("warning: too few views", "warning")
+    assert capsys.readouterr().err == "warning: too few views\n"
+
+
+# The end
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
+@pytest.mark.parametrize(("number", "code"), [(signal.SIGINT, 130), (signal.SIGTERM, 143), (signal.SIGHUP, 129)])
+def test_an_encode_that_is_told_to_end_leaves_nothing(encode, tmp_path, number, code):
+    temporary = tmp_path / "temporary"
+    temporary.mkdir()
+    target = tmp_path / "a.potr"
+    target.write_bytes(b"old")
+    long = [*map(str, encode), "--iterations", "2000", "--tolerance", "0", "--report", str(tmp_path / "page.html")]
+    process = subprocess.Popen(
+        [sys.executable, "-m", "potr_cl", *long], cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True,
+        env=os.environ | {"TMPDIR": str(temporary)},
+    )  # fmt: skip
+    assert process.stderr is not None
+    while "prune …" not in (line := process.stderr.readline()):
+        assert line
+    process.send_signal(number)
+    _, err = process.communicate(timeout=60)
+    assert process.returncode == code
+    assert err.count("\n") == 1
+    assert "no file is left half written" in err
+    assert sorted(path.name for path in tmp_path.iterdir()) == ["a.potr", "temporary"]
+    assert target.read_bytes() == b"old"
+    assert list(temporary.iterdir()) == []

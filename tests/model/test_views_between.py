@@ -1,0 +1,122 @@
+"""Views between the training views: where they lie, and where none is added."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.errors import UsageError
+from potr_cl.model.camera import Camera, camera_centres
+from potr_cl.model.views_between import is_between, views_between
+from tests.cases.surfaces import flat_splats, sphere, together
+
+BALL = sphere(4000, 1.0, 0.03)
+
+
+def looking(centre: np.ndarray, at: np.ndarray, number: int = 0) -> Camera:
+    """A camera of 96 x 64 pixels at a place, looking at a point."""
+    forward = (at - centre) / np.linalg.norm(at - centre)
+    right = np.cross(forward, [0.0, 0.1, 1.0])
+    right /= np.linalg.norm(right)
+    rotation = np.stack([right, np.cross(forward, right), forward])
+    return Camera(f"view{number}", 96, 64, 80, 80, 48, 32, rotation, -rotation @ centre)
+
+
+def orbit(count: int, distance: float = 4.0) -> list[Camera]:
+    """Cameras on a circle around the origin, 0.5 above it."""
+    turns = 2 * np.pi * np.arange(count) / count
+    places = np.stack([np.cos(turns), np.sin(turns), np.full(count, 0.5)], axis=1) * distance
+    return [looking(place, np.zeros(3), number) for number, place in enumerate(places)]
+
+
+ORBIT = orbit(12)
+
+
+def test_an_orbit_is_kept():
+    radius = np.linalg.norm(ORBIT[0].centre)
+    added = views_between(BALL, ORBIT, 3, 0.3)
+    assert len(added) > 30
+    distance = np.linalg.norm(camera_centres(added), axis=1)
+    # The chord between two neighbours comes 3 % nearer, and deviates of 0.3 of the way would reach 10 % off.
+    assert np.allclose(distance, radius, rtol=0.005)
+    towards = np.array([-camera.centre / np.linalg.norm(camera.centre) for camera in added])
+    off = np.degrees(np.arccos(np.sum(towards * [camera.rotation[2] for camera in added], axis=1)))
+    assert np.median(off) < 12
+    # They are between the given ones, and not upon them.
+    nearest = np.linalg.norm(camera_centres(added)[:, None] - camera_centres(ORBIT), axis=2).min(axis=1)
+    spacing = np.linalg.norm(ORBIT[0].centre - ORBIT[1].centre)
+    assert np.median(nearest) > 0.15 * spacing
+    assert nearest.max() < 1.5 * spacing
+
+
+def test_a_path_is_kept():
+    wall = flat_splats(
+        np.stack(np.meshgrid(np.linspace(-8, 8, 80), [4.0], np.linspace(-2, 2, 20)), axis=-1).reshape(-1, 3),
+        np.tile([0.0, -1, 0], (1600, 1)),
+        0.1,
+    )
+    path = [looking(np.array([x, 0.0, 0]), np.array([x, 4.0, 0]), i) for i, x in enumerate(np.linspace(-4, 4, 9))]
+    centres = camera_centres(views_between(wall, path, 2, 0.0))
+    assert len(centres) > 10
+    assert np.allclose(centres[:, 1:], 0, atol=1e-9)
+    assert np.abs(centres[:, 0]).max() <= 4
+
+
+def test_they_have_the_intrinsics_of_the_given_ones_and_no_photograph(tmp_path):
+    given = [dataclasses.replace(camera, image_path=tmp_path / "a.png", cx=40 + i) for i, camera in enumerate(ORBIT)]
+    added = views_between(BALL, given, 1)
+    assert {camera.cx for camera in added} <= {camera.cx for camera in given}
+    assert all(camera.image_path is None and camera.split == "train" and is_between(camera) for camera in added)
+    assert not any(is_between(camera) for camera in given)
+    assert len({camera.name for camera in added}) == len(added)
+
+
+def test_the_same_every_time_and_further_rounds_add_to_earlier_ones():
+    two, again = views_between(BALL, ORBIT, 2), views_between(BALL, ORBIT, 2)
+    assert np.array_equal(camera_centres(two), camera_centres(again))
+    one, second = views_between(BALL, ORBIT, 1), views_between(BALL, ORBIT, 1, first=1)
+    assert [camera.name for camera in one + second] == [camera.name for camera in two]
+    assert np.array_equal(camera_centres(one + second), camera_centres(two))
+
+
+def test_none_stands_in_matter():
+    turns = 2 * np.pi * (np.arange(12) + 0.5) / 12
+    posts = np.stack([np.cos(turns), np.sin(turns), np.full(12, 0.5)], axis=1) * 4.0
+    random = np.random.default_rng(1)
+    points = np.repeat(posts, 150, axis=0) + random.normal(0, 0.12, (1800, 3))
+    clutter = flat_splats(points, np.tile([0.0, 0, 1], (1800, 1)), 0.1)
+    scene = together(BALL, clutter)
+    free, guarded = (camera_centres(views_between(each, ORBIT, 12, 0.05)) for each in (BALL, scene))
+
+    def inside(centres: np.ndarray) -> int:
+        return int((np.linalg.norm(centres[:, None] - posts, axis=2).min(axis=1) < 0.15).sum())
+
+    assert inside(free) > 2
+    assert inside(guarded) == 0
+
+
+def test_none_is_added_where_it_would_show_what_no_view_shows():
+    # Two cameras back to back: whoever stands between them and turns sees the sides, which neither of them saw.
+    room = sphere(4000, 5.0, 0.1)
+    pair = [looking(np.array([0.1, 0, 0]), np.array([5.0, 0, 0.1])), looking(np.array([-0.1, 0, 0]), [-5.0, 0.1, 0])]
+    assert len(views_between(room, pair, 8)) <= 4
+
+
+@pytest.mark.parametrize("cameras", [[], ORBIT[:1]])
+def test_nothing_lies_between_fewer_than_two(cameras):
+    assert views_between(BALL, cameras, 3) == []
+
+
+@pytest.mark.parametrize("cameras", [[ORBIT[0]] * 5, [ORBIT[0], dataclasses.replace(ORBIT[0], name="again")]])
+def test_cameras_at_one_place_do_no_harm(cameras):
+    with np.errstate(all="raise", under="ignore"):
+        for camera in views_between(BALL, cameras, 2):
+            assert np.isfinite(camera.translation).all()
+
+
+@pytest.mark.parametrize(("each", "spread"), [(-1, 0.3), (1, -0.1), (1, float("nan")), (1, 11)])
+def test_wrong_numbers(each, spread):
+    with pytest.raises(UsageError, match="views between"):
+        views_between(BALL, ORBIT, each, spread)

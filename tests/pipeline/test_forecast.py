@@ -1,0 +1,67 @@
+"""What an encode will take grows with what there is to do."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import pytest
+
+from potr_cl.model.camera import train_views
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.forecast import forecast
+from potr_cl.pipeline.options import EncodeOptions
+
+
+@pytest.fixture(scope="module")
+def device():
+    device = Device()
+    yield device
+    assert device.allocated == 0
+
+
+@pytest.fixture
+def ahead(device, plush_excerpt, plush_excerpt_cameras):
+    """Forecasts in units of a picture's time, which differs from one call to the next."""
+
+    def of(options: EncodeOptions, views: int = 9, search: bool = False) -> float:
+        found = forecast(plush_excerpt, train_views(plush_excerpt_cameras)[:views], options, device, search)
+        assert found.sampled > 0
+        assert found.memory > 0
+        return found.seconds / found.sampled
+
+    return of
+
+
+def test_more_work_takes_longer(ahead):
+    best = EncodeOptions()
+    whole = ahead(best)
+    assert ahead(best, search=True) > 2 * whole
+    assert ahead(best.changed(prune={"iterations": 480})) > 1.5 * whole
+    assert ahead(best.changed(prune=False)) < 0.9 * whole
+    assert ahead(best.changed(refit={"steps": 80})) > 1.5 * whole
+    assert ahead(best, views=4) < 0.7 * whole
+
+
+def test_memory_is_that_of_views_and_stays_within_the_budget(device, plush_excerpt, plush_excerpt_cameras):
+    views = train_views(plush_excerpt_cameras)
+
+    def memory(cameras, **changes):
+        return forecast(plush_excerpt, cameras, EncodeOptions().changed(**changes), device).memory
+
+    few, many = memory(views), memory(views * 20)
+    assert few < many
+    assert memory(views * 20, memory=0) < few
+    large = [dataclasses.replace(view, width=4 * view.width, height=4 * view.height) for view in views]
+    assert memory(large) > few + 12 * 15 * 9 * 240 * 180
+
+
+def test_half_of_what_takes_the_time_is_seen(device, plush_excerpt, plush_excerpt_cameras):
+    """A coarse bound on a real encode; tools.bench.forecast measures how far off it is."""
+    from potr_cl.pipeline.encode import encode
+
+    options = EncodeOptions.for_preset("best", prune={"iterations": 400, "tolerance": 0.0})
+    views = train_views(plush_excerpt_cameras)
+    encode(plush_excerpt, views, options.changed(prune={"iterations": 2}), device=device)  # compiles
+    expected = forecast(plush_excerpt, views, options, device).seconds
+    took = sum(encode(plush_excerpt, views, options, device=device).seconds.values())
+    assert expected / 20 < took < 20 * expected

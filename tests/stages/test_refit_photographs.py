@@ -1,0 +1,97 @@
+"""A re-fit to photographs is kept where photographs that it has not seen are matched better for it."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.errors import UsageError
+from potr_cl.formats.images import to_8_bits, write_png
+from potr_cl.model.camera import train_views
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
+
+
+@pytest.fixture(scope="module")
+def device():
+    return Device()
+
+
+@pytest.fixture(scope="module")
+def scene():
+    scene = random_scene(200, 1)
+    return dataclasses.replace(scene, log_scales=np.full((200, 3), -2, np.float32))
+
+
+@pytest.fixture(scope="module")
+def cameras():
+    return ring_of_cameras(12, size=48)
+
+
+def photographs(folder, device, scene, cameras, noise=0.0, factor=1.0):
+    """What a camera with that much noise and exposure sees of the scene."""
+    generator = np.random.default_rng(7)
+    with Rasterizer(device, scene) as rasterizer:
+        for camera in cameras:
+            picture = factor * rasterizer.render(camera)[0]
+            picture = picture + generator.normal(0, noise, picture.shape) if noise else picture
+            with (folder / f"{camera.name}.png").open("wb") as file:
+                write_png(file, to_8_bits(picture))
+    return folder
+
+
+def encoded(scene, cameras, device, folder):
+    options = EncodeOptions().changed(prune={"iterations": 2}, refit={"ground_truth": folder})
+    return encode(scene, cameras, options, device=device)
+
+
+def test_photographs_that_agree_with_each_other_are_fitted_to(tmp_path, scene, cameras, device):
+    folder = photographs(tmp_path, device, scene, cameras, factor=0.7)
+    choice = encoded(scene, cameras, device, folder).photographs
+    assert choice.kept
+    assert choice.held_out == 1
+    assert choice.fitted > choice.rendered + 3
+    assert "those fitted to photographs are kept" in str(choice)
+
+
+def test_photographs_of_noise_are_not_fitted_to(tmp_path, scene, cameras, device):
+    """The file is then that of an encode that never heard of photographs."""
+    folder = photographs(tmp_path, device, scene, cameras, noise=0.3)
+    made = encoded(scene, cameras, device, folder)
+    assert not made.photographs.kept
+    assert made.photographs.fitted < made.photographs.rendered
+    plain = encode(scene, cameras, EncodeOptions().changed(prune={"iterations": 2}), device=device)
+    assert plain.photographs is None
+    assert b"".join(made.pieces) == b"".join(plain.pieces)
+
+
+def test_a_view_without_a_photograph_is_left_out(tmp_path, scene, cameras, device):
+    folder = photographs(tmp_path, device, scene, cameras, factor=0.7)
+    (folder / f"{train_views(cameras)[3].name}.png").unlink()
+    assert encoded(scene, cameras, device, folder).photographs.kept
+
+
+def test_one_photograph_is_not_enough(tmp_path, scene, cameras, device):
+    folder = photographs(tmp_path, device, scene, train_views(cameras)[:1])
+    with pytest.raises(UsageError, match="--photos has 1 of the training views: two are needed"):
+        encoded(scene, cameras, device, folder)
+
+
+@pytest.mark.parametrize("number", [2, 3, 7, 8, 9, 100])
+def test_held_out_photographs_are_spread(number):
+    views = ring_of_cameras(number, size=8)
+    fit_to, judging = hold_out(views)
+    assert fit_to
+    assert max(number // 9, 1) <= len(judging) <= number / 8 + 1
+    assert sorted(camera.name for camera in [*fit_to, *judging]) == sorted(camera.name for camera in views)
+
+
+def test_the_choice_says_what_it_is():
+    assert "1 photograph held out" in str(PhotographChoice(1, 20.0, 21.0))
+    assert not PhotographChoice(1, 20.0, 20.0).kept
