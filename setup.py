@@ -12,7 +12,7 @@ from setuptools import Extension, setup
 NATIVE = Path("potr_cl", "codec", "native")
 # Vectors; and each operation on floats rounded by itself, so that every machine decodes the same numbers.
 OPTIONS = ["-std=c11", "-O3", "-ffp-contract=off", "-fno-math-errno", "-fvisibility=hidden"]
-OPTIONS_OF_MSVC = ["/O2", "/fp:precise"]
+OPTIONS_OF_MSVC = ["/std:c11", "/O2", "/fp:precise"]
 
 setup(
     ext_modules=[

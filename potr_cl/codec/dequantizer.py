@@ -13,6 +13,7 @@ from typing import Any, Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec import quantize
 from potr_cl.codec.container import Header
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import native
@@ -87,7 +88,7 @@ class Dequantizer:
                 functions.rotations([x[block], y[block], z[block]], np.atleast_1d(factors), out[block])
             return
         for block, levels in self._blocks([*streams, *needed]):
-            version.dequantize_rotations(levels[:3], levels[3:], factor, out[block])
+            quantize.dequantize_rotations(levels[:3], version.rotation_factors(levels[3:], factor), out[block])
 
     def colours(self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, out: F32) -> None:
         """Levels of Y, Co, Cg of an SH coefficient to R, G, B in ``out`` (3, N).

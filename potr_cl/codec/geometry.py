@@ -55,7 +55,8 @@ class Geometry:
         for axis, levels in enumerate(self.scales):
             log_scales[self.order, axis] = version.dequantize_scales(levels, parameters.sf_scale)
         turned = np.empty((n, 4), np.float32)
-        version.dequantize_rotations(self.rotations, self.scales, parameters.sf_rotation, turned)
+        factors = version.rotation_factors(self.scales, parameters.sf_rotation)
+        quantize.dequantize_rotations(self.rotations, factors, turned)
         quaternions[self.order] = turned
         opacity_logits = np.empty(n, np.float32)
         opacity_logits[self.order] = version.dequantize_opacities(self.opacities, parameters.sf_opacity)

@@ -15,6 +15,8 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec.native.functions import Functions
+from potr_cl.codec.native.library import native
 from potr_cl.errors import DataError
 
 #: The frequencies of a context add up to two to the power of this.
@@ -88,6 +90,9 @@ def encode(sections: Sequence[Tokens]) -> list[tuple[NDArray[np.uint32], bytes]]
     Returns:
         The (L,) states and the words of each, as a :class:`Decoder` takes them.
     """
+    functions = native()
+    if functions is not None:
+        return [_encode_natively(functions, section) for section in sections]
     # The last token is coded first. The sections with the most streams come first, so that those at work are the first.
     ranked = sorted(range(len(sections)), key=lambda i: -len(sections[i].cells))
     steps, lanes = sections[0].cells[0].shape
@@ -141,6 +146,20 @@ def encode(sections: Sequence[Tokens]) -> list[tuple[NDArray[np.uint32], bytes]]
     for k, i in enumerate(ranked):
         coded[i] = (all_states[k * lanes : (k + 1) * lanes].astype(np.uint32), b"".join(reversed(words[k])))
     return [coded[i] for i in range(len(sections))]
+
+
+def _encode_natively(functions: Functions, section: Tokens) -> tuple[NDArray[np.uint32], bytes]:
+    """:func:`encode` of one section by the native path."""
+    bases, frequencies, starts = _tables([section])
+    intervals = (frequencies + starts * (1 << 16)).astype(np.uint32)
+    ends = [*bases[0][1:], len(intervals)]
+    states = np.full(section.cells[0].shape[1], LOWEST, np.uint32)
+    words = []
+    for cells, model in zip(reversed(section.cells), reversed(section.models), strict=True):
+        words.append(
+            functions.encode_stream(np.ascontiguousarray(cells), intervals[bases[0][model] : ends[model]], states)
+        )
+    return states, b"".join(part.astype("<u2", copy=False).tobytes() for part in reversed(words))
 
 
 def _tables(sections: Sequence[Tokens]) -> tuple[list[list[int]], F64, F64]:

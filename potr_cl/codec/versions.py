@@ -87,20 +87,15 @@ class FormatVersion(abc.ABC):
 
     @abc.abstractmethod
     def rotation_factors(self, scales: Sequence[Levels], sf_rotation: float) -> F32:
-        """float32 scale factors of rotations: (N,), or (1,) if all are the same; ``scales`` as of the next."""
-
-    def dequantize_rotations(
-        self, levels: Sequence[Levels], scales: Sequence[Levels], sf_rotation: float, out: F32
-    ) -> None:
-        """Levels of x, y, z to unit quaternions w, x, y, z in ``out`` (N, 4).
+        """Scale factors of the rotations of some splats, for :func:`potr_cl.codec.quantize.dequantize_rotations`.
 
         Args:
-            levels: (N,) each.
             scales: levels of the scales, (N,) for each axis; may be empty unless ``rotations_need_scales``.
             sf_rotation: scale factor.
-            out: float32.
+
+        Returns:
+            float32: (N,), or (1,) if all are the same.
         """
-        quantize.dequantize_rotations(levels, self.rotation_factors(scales, sf_rotation), out)
 
     @abc.abstractmethod
     def quantize_opacities(self, logits: F64, sf_opacity: float) -> Integers:

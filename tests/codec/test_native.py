@@ -141,6 +141,18 @@ def test_properties_one_by_one(plush_excerpt, name, choose):
     assert np.array_equal(found["native"].view(np.uint32), found["numpy"].view(np.uint32))
 
 
+@pytest.mark.parametrize("splats", [1, 255, 257, 1000, 33_000])
+@pytest.mark.parametrize("q", [0.0, 0.5, 1.0])
+def test_the_encoder_writes_the_same_bytes(splats, q, choose):
+    scene = random_scene(min(splats, 700), 2, seed=splats).subset(np.arange(splats) % 700)
+    scene.sh[...] *= np.float32(10)
+    files = set()
+    for path in PATHS:
+        choose(path)
+        files.add(coded(scene, q=q))
+    assert len(files) == 1
+
+
 # The same refusals ----------------------------------------------------------------------------------------------------
 
 
@@ -277,6 +289,16 @@ def test_arrays_of_other_sizes_are_refused(functions):
     out.flags.writeable = False
     with pytest.raises(TypeError, match="read-only"):
         functions.colours([right] * 3, 1.0, out)
+
+
+def test_cells_that_are_not_there_are_refused(functions):
+    cells = np.full((2, 3), 7, np.uint16)
+    with pytest.raises(TypeError, match="cells that are not there"):
+        functions.count_cells([cells], 7)
+    with pytest.raises(TypeError, match="cells that are not there"):
+        functions.encode_stream(cells, np.ones(7, np.uint32), np.full(3, 1 << 16, np.uint32))
+    with pytest.raises(TypeError, match="beyond their alphabet"):
+        functions.cells([], [], 0, np.full((2, 3), 9, np.uint8), 9)
 
 
 def test_tails_and_bits_that_are_too_short_are_refused(functions):

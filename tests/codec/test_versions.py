@@ -58,7 +58,7 @@ class Version3(versions.Version2):
     separate_ac_factor = False
     rotations_need_scales = False
     quantize_rotations = versions.Version1.quantize_rotations
-    dequantize_rotations = versions.Version1.dequantize_rotations
+    rotation_factors = versions.Version1.rotation_factors
 
     def quantize_opacities(self, logits, sf_opacity):
         return np.rint(sf_opacity / (1 + np.exp(-logits))).astype(np.int16)

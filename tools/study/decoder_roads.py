@@ -64,7 +64,7 @@ def compare(results: Results, files: list[Path], devices: list[str], runs: int) 
         Column("context", "ms", ".0f"),
         Column("loading kernels", "ms", ".0f"),
         Column("decoding, best", "ms", ".1f"),
-        Column("best", "ns a token", ".2f"),
+        Column("a token", "ns", ".2f"),
         Column("least processor time", "ms", ".1f"),
     )
     functions = native()

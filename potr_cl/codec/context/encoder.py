@@ -13,6 +13,7 @@ from potr_cl.codec.context.fitting import cells_of, fit_model, fit_weights, rece
 from potr_cl.codec.context.lanes import Lanes, to_residuals
 from potr_cl.codec.context.model import CHANNELS, HEAD, LARGEST_SIZE, write_description
 from potr_cl.codec.context.tokens import SIZES, Bits, tokenise
+from potr_cl.codec.native.library import native
 from potr_cl.host.threads import Run
 
 I32 = NDArray[np.int32]
@@ -98,8 +99,8 @@ def encode(
     report(0.5)
     sections = [draft for chain in coded for draft in chain]
     finished = list(run(lambda draft: _finish(draft, layout), sections))
-    # With few lanes a step's calls take longer than its work; with many, what they work on must fit a cache.
-    few = layout.lanes.number < batches.many_lanes
+    # With few lanes a step's calls of NumPy take longer than its work; with many, what they work on must fit a cache.
+    few = layout.lanes.number < batches.many_lanes and native() is None
     parts = [finished] if few and finished else [[each] for each in finished]
     words = [pair for part in run(rans.encode, [[tokens for tokens, _ in part] for part in parts]) for pair in part]
     for draft, (_, head), (states, rest) in zip(sections, finished, words, strict=True):

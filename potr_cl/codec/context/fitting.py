@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec import rans
 from potr_cl.codec.context.model import CHANNELS, LARGEST_SIZE, MOST_CONTEXTS, TERMS, Model
+from potr_cl.codec.native.library import native
 
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
@@ -29,6 +30,9 @@ _FREQUENCY_BITS = 7
 
 def recent_sizes(sizes: I32) -> I32:
     """About 8 times the mean size of a lane's last splats, before each; all are (streams, steps, lanes)."""
+    functions = native()
+    if functions is not None:
+        return functions.recent_sizes(sizes)
     recent = np.empty_like(sizes)
     recent[:, 0] = 0
     twice = sizes << 1
@@ -89,6 +93,9 @@ def cells_of(terms: list[I32], weights: NDArray[np.int16], tokens: U8, alphabet:
         block: sizes worked on at a time.
     """
     used = [(term, np.int32(w)) for term, w in zip(terms, [*weights[: len(terms) - 1], weights[-2]], strict=True) if w]
+    functions = native()
+    if functions is not None:
+        return functions.cells([t for t, _ in used], [int(w) for _, w in used], int(weights[-1]), tokens, alphabet)
     cells = np.empty(tokens.shape, np.uint16)
     rows = max(block // tokens.shape[1], 1)
     for start in range(0, len(tokens), rows):
@@ -113,9 +120,14 @@ def fit_model(streams: list[U16], idle: I64, alphabet: int) -> Model:
         alphabet: of the cells.
     """
     cells = (LARGEST_SIZE + 1) * alphabet
-    counts = np.zeros(cells, np.int64)
+    functions = native()
+    if functions is None:
+        counts = np.zeros(cells, np.int64)
+        for stream in streams:
+            counts += np.bincount(stream.ravel(), minlength=cells)
+    else:
+        counts = functions.count_cells(streams, cells)
     for stream in streams:
-        counts += np.bincount(stream.ravel(), minlength=cells)
         counts -= np.bincount(stream.ravel()[idle], minlength=cells)
     by_size = counts.reshape(-1, alphabet)
     used = np.flatnonzero(by_size.any(axis=1))

@@ -53,6 +53,10 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
         _NUMBER,
         [_POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _POINTER, _WORD, _WORD, _NUMBER, *[_POINTER] * 6, _WORD],
     ),
+    "potr_encode_recent": (None, [_POINTER, _SIZE, _SIZE, _POINTER]),
+    "potr_encode_cells": (None, [_POINTER, _SIZE, _POINTER, _POINTER, _SIZE, ctypes.c_int32, _POINTER]),
+    "potr_encode_count": (None, [_POINTER, _SIZE, _POINTER]),
+    "potr_encode_stream": (_SIZE, [_POINTER, _SIZE, _SIZE, _POINTER, _POINTER, _POINTER]),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
 }
 #: Those that there are for several kinds of integers, by what their names begin with.
@@ -275,6 +279,74 @@ class Functions:
             raise TypeError("the native path was given fewer bits than tokens ask for")
         return values
 
+    def recent_sizes(self, sizes: I32) -> I32:
+        """About 8 times the mean size of a lane's last splats, before each; both (streams, steps, lanes)."""
+        steps, lanes = sizes.shape[1:]
+        recent = np.empty_like(sizes)
+        for before, after in zip(sizes, recent, strict=True):
+            self._c["potr_encode_recent"](
+                _address(before, np.int32, steps * lanes), steps, lanes, _address(after, np.int32, steps * lanes, True)
+            )
+        return recent
+
+    def cells(self, terms: Sequence[I32], weights: Sequence[int], constant: int, tokens: U8, alphabet: int) -> U16:
+        """(steps, lanes) expected size · alphabet + token.
+
+        Args:
+            terms: of the expectation, (steps, lanes) each; weights: one each.
+            constant: added to them.
+            tokens: (steps, lanes), below the alphabet.
+            alphabet: at most 255.
+        """
+        if len(terms) != len(weights) or not 0 < alphabet < 256 or int(tokens.max()) >= alphabet:
+            raise TypeError("the native path was given tokens beyond their alphabet")
+        where = np.array([_address(term, np.int32, tokens.size) for term in terms], np.uintp)
+        factors = np.array([*weights, constant], np.int32)
+        cells = np.empty(tokens.shape, np.uint16)
+        self._c["potr_encode_cells"](
+            _address(where, np.uintp, len(terms)),
+            len(terms),
+            _address(factors, np.int32, len(terms) + 1),
+            _address(tokens, np.uint8, tokens.size),
+            tokens.size,
+            alphabet,
+            _address(cells, np.uint16, tokens.size, True),
+        )
+        return cells
+
+    def count_cells(self, streams: Sequence[U16], size: int) -> I64:
+        """(size,) how often each cell occurs in some streams, all below ``size``."""
+        counts = np.zeros(size, np.int64)
+        for cells in streams:
+            self._c["potr_encode_count"](
+                _address(_below(cells, size), np.uint16, cells.size), cells.size, _address(counts, np.int64, size, True)
+            )
+        return counts
+
+    def encode_stream(self, cells: U16, intervals: U32, states: U32) -> U16:
+        """Range code a stream, the last one first.
+
+        Args:
+            cells: (steps, lanes), below the length of ``intervals``.
+            intervals: of each cell: frequency + 65536 · the sum of those below; frequencies of cells that occur are
+                not 0. A lane without a splat has a cell of frequency 4096.
+            states: (lanes,), brought up to date.
+
+        Returns:
+            The words, in the order in which a decoder takes them.
+        """
+        steps, lanes = cells.shape
+        words = np.empty(cells.size, np.uint16)
+        number = self._c["potr_encode_stream"](
+            _address(_below(cells, len(intervals)), np.uint16, cells.size),
+            steps,
+            lanes,
+            _address(intervals, np.uint32, len(intervals)),
+            _address(states, np.uint32, lanes, True),
+            _address(words, np.uint16, cells.size, True),
+        )
+        return words[cells.size - number :]
+
     # ---------------------------------------------------------------------------------------------- octree
 
     def octree_levels(self, occupancy: U8, several: U8, depth: int, crowded_root: bool) -> Tree | None:
@@ -429,6 +501,13 @@ class Functions:
             return kind, list(levels)
         numbers = [self.widened(level, True) if level.dtype == np.uint8 else level for level in levels]
         return kind, [number.astype(_KINDS[kind], copy=False) for number in numbers]
+
+
+def _below(cells: U16, size: int) -> U16:
+    """The cells, if they are below a size."""
+    if int(cells.max(initial=0)) >= size:
+        raise TypeError("the native path was given cells that are not there")
+    return cells
 
 
 def _kind(levels: NDArray[Any]) -> str:

@@ -9,11 +9,16 @@
 #ifndef POTR_NATIVE_H
 #define POTR_NATIVE_H
 
+#include <float.h>
 #include <stddef.h>
 #include <stdint.h>
 
 #if defined(__BYTE_ORDER__) && __BYTE_ORDER__ != __ORDER_LITTLE_ENDIAN__
 #error "the native path is for little-endian machines; without it the package works all the same"
+#endif
+
+#if FLT_EVAL_METHOD != 0
+#error "floats are computed in more digits than they have here, which makes other numbers of the same file"
 #endif
 
 #if defined(_MSC_VER)

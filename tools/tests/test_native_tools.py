@@ -1,0 +1,90 @@
+"""The tools that compile, attack and measure the compiled part of the decoder."""
+
+from __future__ import annotations
+
+import json
+import os
+import shutil
+import subprocess
+import sys
+from pathlib import Path
+
+import pytest
+
+from tools.make.native import compile_library
+from tools.results import ROOT
+from tools.stress import native as stress
+
+COMPILER = shutil.which("cc")
+needs_compiler = pytest.mark.skipif(COMPILER is None, reason="there is no C compiler")
+
+#: Tells C of one number more than there is.
+BEYOND = """
+import ctypes, sys
+import numpy as np
+library = ctypes.CDLL(sys.argv[1])
+levels, table, out = np.zeros(5, np.uint8), np.zeros(256, np.float32), np.zeros(5 + int(sys.argv[2]), np.float32)
+where = [array.ctypes.data_as(ctypes.c_void_p) for array in (levels, table, out)]
+size = ctypes.c_size_t
+library.potr_look_up_narrow(where[0], size(5 + int(sys.argv[2])), where[1], size(256), where[2], size(1))
+"""
+
+
+def run(program, *arguments, **environment):
+    return subprocess.run(
+        [sys.executable, *program, *map(str, arguments)], capture_output=True, text=True, cwd=ROOT, check=False,
+        env={**os.environ, **environment},
+    )  # fmt: skip
+
+
+@needs_compiler
+def test_the_sanitizer_sees_one_byte_beyond(tmp_path):
+    library = tmp_path / "sanitized.so"
+    compile_library(library, sanitize=True)
+    environment = {
+        "LD_PRELOAD": stress._runtime(None), "ASAN_OPTIONS": "detect_leaks=0", "PYTHONMALLOC": "malloc",
+    }  # fmt: skip
+    assert run(["-c", BEYOND], library, 0, **environment).returncode == 0
+    beyond = run(["-c", BEYOND], library, 1, **environment)
+    assert beyond.returncode != 0
+    assert "heap-buffer-overflow" in beyond.stderr
+
+
+@needs_compiler
+@pytest.mark.slow
+def test_changed_files_are_read_alike(tmp_path):
+    """A short attack, and the figures that it keeps."""
+    command = ["-m", "tools.stress.native", "--count", 60, "--processes", 1, "--json", tmp_path / "native.json"]
+    first = run(map(str, command))
+    assert first.returncode == 0, first.stderr
+    second = run(map(str, [*command, "--continue"]))
+    assert second.returncode == 0, second.stderr
+    table = json.loads(Path(tmp_path, "native.json").read_text())["native"]
+    files, read, refused, compared, findings = table["rows"][-1][:5]
+    assert (files, compared, findings) == (120, 120, 0)
+    assert read + refused == files
+    assert read > 0 < refused
+
+
+def test_a_file_of_a_seed_is_always_the_same():
+    files = [stress.changed_file(3, number) for number in range(40)]
+    assert files == [stress.changed_file(3, number) for number in range(40)]
+    assert len(set(files)) > 30
+
+
+@pytest.mark.slow
+def test_what_a_decode_takes_is_measured(tmp_path):
+    """On a small scene; NumPy and the native path, wherever there is one."""
+    from potr_cl.codec.native.library import native
+
+    if native() is None:
+        pytest.skip("the compiled library is not there")
+    result = run(
+        ["-m", "tools.bench.decode"], "--splats", 3000, "--runs", 2, "--part", "speed", "--part", "memory", "--json",
+        tmp_path / "decode.json",
+    )  # fmt: skip
+    assert result.returncode == 0, result.stderr
+    tables = json.loads(Path(tmp_path, "decode.json").read_text())
+    assert {row[0] for row in tables["speed"]["rows"]} == {"3000-best", "3000-fast"}
+    assert all(value > 0 for row in tables["speed"]["rows"] for value in row[3:])
+    assert all(row[3] > 0.5 for row in tables["memory"]["rows"])
