@@ -15,6 +15,8 @@ from pathlib import Path
 
 import pytest
 
+from potr_cl import Scene
+
 ROOT = Path(__file__).parents[1]
 EXAMPLES = ROOT / "examples"
 NOTEBOOKS = sorted(EXAMPLES.glob("*.ipynb"))
@@ -66,10 +68,12 @@ def test_the_code_of_the_page_runs(clone):
     assert {"excerpt.potr", "report.html", "worst.png", "pictures"} <= {path.name for path in clone.iterdir()}
 
 
-def cells(notebook: Path) -> Iterator[str]:
+def cells(notebook: Path) -> Iterator[tuple[str, str]]:
+    """The code of each cell, and the text that its last expression shows in the committed file, "" for none."""
     for cell in json.loads(notebook.read_text("utf-8"))["cells"]:
         if cell["cell_type"] == "code":
-            yield "".join(cell["source"])
+            shown = ["".join(output.get("data", {}).get("text/plain", [])) for output in cell["outputs"]]
+            yield "".join(cell["source"]), "".join(shown)
 
 
 @pytest.mark.slow
@@ -78,12 +82,14 @@ def test_a_notebooks_code_runs(notebook, clone, monkeypatch):
     """Without Jupyter: what its last expressions would show is made."""
     monkeypatch.chdir(clone / "examples")
     names: dict[str, object] = {"__name__": "__main__"}
-    for code in cells(notebook):
+    for code, committed in cells(notebook):
         run(code, names, notebook.name)
         last = code.strip().splitlines()[-1]
         if re.fullmatch(r"\w+", last):
             shown = names[last]
             assert shown._repr_png_().startswith(b"\x89PNG") if hasattr(shown, "_repr_png_") else repr(shown)
+            if isinstance(shown, Scene):  # what is computed depends on the device
+                assert repr(shown) == committed, "the outputs are of another scene: run the notebook anew"
 
 
 @pytest.mark.slow
@@ -143,7 +149,7 @@ def test_compress_folder(clone):
         (folder / name).symlink_to(clone / "tests" / "data" / "plush_excerpt.ply")
     (folder / "broken.ply").write_bytes(b"ply\nnot one\n")
     done = subprocess.run(
-        [sys.executable, "examples/compress_folder.py", "scenes", "out", "--max-size", "20kB", "--preset", "fast"],
+        [sys.executable, "examples/compress_folder.py", "scenes", "out", "--max-size", "45kB", "--preset", "fast"],
         capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert done.returncode == 1, "one scene was damaged"
@@ -151,11 +157,11 @@ def test_compress_folder(clone):
         "a.potr",
         "inner/b.potr",
     ]
-    assert all(path.stat().st_size <= 20_000 for path in (clone / "out").rglob("*.potr"))
+    assert all(path.stat().st_size <= 45_000 for path in (clone / "out").rglob("*.potr"))
     assert "broken.ply" in done.stderr
     assert "Traceback" not in done.stderr
     again = subprocess.run(
-        [sys.executable, "examples/compress_folder.py", "scenes", "out", "--max-size", "20kB"],
+        [sys.executable, "examples/compress_folder.py", "scenes", "out", "--max-size", "45kB"],
         capture_output=True, text=True, check=False, env={**os.environ, "PYTHONPATH": str(ROOT)},
     )  # fmt: skip
     assert again.stdout.count("is there already") == 2

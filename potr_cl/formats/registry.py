@@ -7,6 +7,7 @@ Reading, writing, error messages, the help of the command line and docs/formats.
 from __future__ import annotations
 
 import contextlib
+import os
 import zlib
 from collections.abc import Iterable, Sequence
 from pathlib import Path
@@ -62,8 +63,9 @@ def format_of(path: Path) -> SceneFormat:
         UsageError: no format has this name or extension.
     """
     plain = without_level(path)
+    # os.path and not pathlib: what cannot be looked at, as a name that is too long, is left to the reader to refuse.
     for entry in SCENE_FORMATS:
-        if any(plain.name.lower() == name or (plain / name).is_file() for name in entry.names):
+        if any(plain.name.lower() == name or os.path.isfile(plain / name) for name in entry.names):
             return entry
     extension = path.suffix.lower()
     having_it = [entry for entry in SCENE_FORMATS if extension in entry.extensions]
@@ -74,7 +76,7 @@ def format_of(path: Path) -> SceneFormat:
         if entry.recognises is None:
             return entry
     names = listed([name for entry in SCENE_FORMATS for name in entry.names])
-    if path.is_dir():
+    if os.path.isdir(path):
         raise UsageError(f"the folder '{path}' holds no scene that can be read as a folder: it has no {names}")
     raise UsageError(f"'{path}': unknown kind of scene, expected a {suffixes_read()} file, or a folder with {names}")
 

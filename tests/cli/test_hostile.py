@@ -10,6 +10,7 @@ import subprocess
 import sys
 from collections.abc import Sequence
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -33,6 +34,14 @@ def scene_path(tmp_path: Path) -> Path:
     scene = random_scene(20, 0)
     # Where the excerpt's cameras look.
     ply.save(path, dataclasses.replace(scene, means=(0.05 * scene.means + [-0.76, 1.57, 2.78]).astype(np.float32)))
+    return path
+
+
+@pytest.fixture
+def potr_path(tmp_path: Path) -> Path:
+    path = tmp_path / "a.potr"
+    parameters = HyperParameters.from_quality(0.5, "paper")
+    path.write_bytes(b"".join(code_scene(random_scene(20, 0), parameters).pieces))
     return path
 
 
@@ -240,7 +249,7 @@ def test_names_in_a_ply_do_no_harm(tmp_path: Path, capsys: pytest.CaptureFixture
 def test_errors_that_nobody_foresaw_are_one_line(
     scene_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
 ) -> None:
-    def fail(_path: object) -> None:
+    def fail(_path: object, **_keywords: object) -> None:
         raise RuntimeError(f"{ESCAPES}{'x' * 60_000}")
 
     monkeypatch.setattr("potr_cl.cli.scenes.load_scene", fail)
@@ -280,7 +289,7 @@ def test_a_scene_that_does_not_fit_the_memory(
 ) -> None:
     for error in (MemoryError(), OSError(12, "Cannot allocate memory"), ImportError("failed to map segment")):
 
-        def fail(_path: object, error: Exception = error) -> None:
+        def fail(_path: object, error: Exception = error, **_keywords: object) -> None:
             raise error
 
         monkeypatch.setattr("potr_cl.cli.scenes.load_scene", fail)
@@ -288,6 +297,7 @@ def test_a_scene_that_does_not_fit_the_memory(
         said = capsys.readouterr().err
         assert said.count("\n") == 1
         assert said.startswith("potr-cl: ")
+        assert (str(error.args[-1]) if error.args else "not enough memory for this scene") in said
 
 
 # ------------------------------------------------------------------------------------------ what was made is proved
@@ -356,8 +366,8 @@ def test_a_scene_that_is_removed_meanwhile(
     size = scene_path.stat().st_size
     load = cli.scenes.load_scene
 
-    def load_and_remove(path: Path) -> object:
-        scene = load(path)
+    def load_and_remove(path: Path, **keywords: Any) -> object:
+        scene = load(path, **keywords)
         path.unlink()
         return scene
 
@@ -374,7 +384,11 @@ def test_a_scene_that_is_removed_meanwhile(
 
 
 def test_trust_reaches_the_readers(
-    tmp_path: Path, scene_path: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+    tmp_path: Path,
+    scene_path: Path,
+    potr_path: Path,
+    capsys: pytest.CaptureFixture[str],
+    monkeypatch: pytest.MonkeyPatch,
 ) -> None:
     asked = []
 
@@ -382,14 +396,16 @@ def test_trust_reaches_the_readers(
         asked.append(keywords)
         raise PotrError("enough")
 
-    for reader in ("scenes.load_scene", "files.decode", "files.PotrFile.open"):
-        monkeypatch.setattr(f"potr_cl.cli.{reader}", ask)
+    for reader in ("cli.scenes.load_scene", "cli.files.decode", "api.describing.load_scene"):
+        monkeypatch.setattr(f"potr_cl.{reader}", ask)
+    monkeypatch.setattr("potr_cl.codec.decoder.PotrFile.open", ask)
     cameras = str(ROOT / "tests" / "data" / "plush_excerpt_cameras.json")
     scene, out = str(scene_path), str(tmp_path / "out.ply")
     for command in (
         ["encode", scene, "-o", str(tmp_path / "out.potr"), *KEEP],
         ["decode", scene, "-o", out],
         ["info", scene],
+        ["info", str(potr_path)],
         ["convert", scene, out],
         ["prune", scene, "-o", out],
         ["compact", scene, "-o", out],
@@ -400,7 +416,7 @@ def test_trust_reaches_the_readers(
         asked.clear()
         assert cli.main(command) == 1
         assert cli.main([*command, "--trust"]) == 1
-        assert asked == [{}, {"trust": True}], command[0]
+        assert [keywords.get("trust", False) for keywords in asked] == [False, True], command[0]
     capsys.readouterr()
 
 
@@ -414,14 +430,6 @@ def run(shell: str, *arguments: object, **environment: str) -> subprocess.Comple
         ["sh", "-c", shell, "sh", *command],
         cwd=ROOT, env=os.environ | environment, capture_output=True, text=True, timeout=60, check=False,
     )  # fmt: skip
-
-
-@pytest.fixture
-def potr_path(tmp_path: Path) -> Path:
-    path = tmp_path / "a.potr"
-    parameters = HyperParameters.from_quality(0.5, "paper")
-    path.write_bytes(b"".join(code_scene(random_scene(20, 0), parameters).pieces))
-    return path
 
 
 needs_posix = pytest.mark.skipif(not Path("/dev/full").exists(), reason="no /dev/full on this system")

@@ -18,7 +18,7 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from potr_cl import Scene, UsageError, cli
+from potr_cl import Scene, UsageError, cli, info
 from potr_cl.formats import cameras, load_cameras, load_scene, registry, save_scene, scene_writer, scenes
 from potr_cl.formats.declaration import CameraFormat, SceneFormat
 from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS, listed
@@ -156,6 +156,15 @@ def test_a_file_that_is_gone_or_is_none(suffix: str, tmp_path: Path) -> None:
     (tmp_path / f"folder{suffix}").mkdir()
     with pytest.raises(UsageError, match=r"directory|not a regular file"):
         load_scene(tmp_path / f"folder{suffix}")
+
+
+@pytest.mark.parametrize("suffix", [suffix for entry in SCENE_FORMATS for suffix in entry.suffixes])
+def test_a_name_longer_than_a_file_system_takes(suffix: str, tmp_path: Path) -> None:
+    path = tmp_path / ("x" * 300 + suffix)
+    with pytest.raises(UsageError, match=r"cannot (open|read)"):
+        load_scene(path)
+    with pytest.raises(UsageError, match=r"cannot (open|read)"):
+        info(path)
 
 
 # Extras --------------------------------------------------------------------------------------------------------------

@@ -58,13 +58,13 @@ def test_changes_reach_the_stage_that_they_name():
 def test_what_there_is_not_is_named(changes, says):
     with pytest.raises(UsageError, match=says):
         EncodeOptions.for_preset("best", **changes)
-    with pytest.raises(UsageError, match="preset 'worst' is unknown: choose one of best, fast, paper"):
+    with pytest.raises(UsageError, match="preset 'worst' is unknown: choose one of best, smallest, fast, paper"):
         EncodeOptions.for_preset("worst")
 
 
 def test_a_stage_that_only_other_presets_have(monkeypatch):
     monkeypatch.setitem(PRESETS, "fast", tuple(s for s in PRESETS["fast"] if s.name != "prune"))
-    with pytest.raises(UsageError, match="preset 'fast' has no stage 'prune': it is in best, paper"):
+    with pytest.raises(UsageError, match="preset 'fast' has no stage 'prune': it is in best, smallest, paper"):
         EncodeOptions.for_preset("fast", prune={"iterations": 7})
 
 

@@ -3,9 +3,11 @@
     python -m tools.stress.signals [--moments N] [--seed SEED] [--command NAME …] [--json FILE]
 
 Each moment starts a command on a small scene and sends SIGKILL, SIGINT, SIGTERM or SIGHUP: at a time that is drawn at
-random from its usual run, or as soon as it has a file open in the folder of its output. Afterwards every input must be
-what it was, each output absent or the old one or the whole new one, no other file may be in its folder or in the
-temporary one (but after SIGKILL), and the command must have exited with 130, 143 or 129, without a traceback.
+random from its usual run, or as soon as it has a file open in the folder of its output. Times are those of the
+processor: on a machine that is busy with other things a run may last many times as long as the one before. Afterwards
+every input must be what it was, each output absent or the old one or the whole new one, no other file may be in its
+folder or in the temporary one (but after SIGKILL), and the command must have exited with 130, 143 or 129, without a
+traceback.
 
 A signal that comes before the program's first lines have run, or after its last, meets the interpreter, which ends as
 it likes: such moments are told by /proc and counted apart; what is on the disk is checked all the same. Linux only.
@@ -49,12 +51,14 @@ _COLUMNS = (
 
 @dataclasses.dataclass
 class Usual:
-    """An undisturbed run: seconds, the hashes of what it wrote, and what it keeps in the temporary folder on purpose.
+    """An undisturbed run: seconds, those of the processor in it, the hashes of what it wrote, and what it keeps in the
+    temporary folder on purpose.
 
     That is the list of OpenCL drivers that :mod:`potr_cl.opencl.loader` makes once for a user.
     """
 
     seconds: float
+    processor_seconds: float
     outputs: dict[str, str]
     kept: set[str]
 
@@ -98,17 +102,17 @@ def run_usually(folder: Path, command: Command) -> Usual:
     """
     for _ in range(2):
         _clear(folder)
-        began = time.monotonic()
+        began, used = time.monotonic(), _of_children()
         done = subprocess.run(
             command.argv(), cwd=folder, env=environment(folder), capture_output=True, text=True, check=False
         )
-        seconds = time.monotonic() - began
+        seconds, processor_seconds = time.monotonic() - began, _of_children() - used
         written = hashes(folder / "out")
         kept = _temporary(folder)
         unknown = [name for name in kept if not name.startswith("potr_cl_icd_")]
         if done.returncode != 0 or set(written) != set(command.outputs) or unknown:
             raise RuntimeError(f"{command.name} fails, or leaves files: {sorted(written)} {unknown}\n{done.stderr}")
-    return Usual(seconds, written, kept)
+    return Usual(seconds, processor_seconds, written, kept)
 
 
 def try_moment(
@@ -126,7 +130,7 @@ def try_moment(
     for name in old:
         (folder / "out" / name).write_bytes(_OLD)
     waits_for_file = rng.random() < 0.35
-    moment = rng.random() * (0.02 if waits_for_file else usual.seconds * 1.02)
+    moment = rng.random() * (0.02 if waits_for_file else usual.processor_seconds * 1.02)
     process = subprocess.Popen(
         command.argv(), cwd=folder, env=environment(folder), stdin=subprocess.DEVNULL, stdout=subprocess.DEVNULL,
         stderr=subprocess.PIPE, start_new_session=True,
@@ -134,7 +138,9 @@ def try_moment(
     try:
         if waits_for_file:
             counts["writing"] += _wait_for_file(folder, process, set(old))
-        time.sleep(moment)
+            time.sleep(moment)
+        else:
+            _wait_for_work(process, moment)
         ready = _handles(process.pid, signal.SIGTERM)
         process.send_signal(number)
         try:
@@ -219,6 +225,28 @@ def _wait_for_file(folder: Path, process: subprocess.Popen[bytes], there: set[st
             return True
         time.sleep(0.0005)
     return False
+
+
+def _wait_for_work(process: subprocess.Popen[bytes], seconds: float) -> None:
+    """Wait until a process has had the processors for so long, or has ended."""
+    while process.poll() is None and _used(process.pid) < seconds:
+        time.sleep(0.0005)
+
+
+def _used(pid: int) -> float:
+    """Seconds of processor time that a process has had, in steps of some milliseconds; 0 where it is gone."""
+    try:
+        status = Path(f"/proc/{pid}/stat").read_text()
+    except OSError:
+        return 0.0
+    fields = status.rpartition(")")[2].split()  # the name in brackets before may hold spaces
+    return (int(fields[11]) + int(fields[12])) / os.sysconf("SC_CLK_TCK")
+
+
+def _of_children() -> float:
+    """Seconds of processor time of all processes that were started here and have ended."""
+    times = os.times()
+    return times.children_user + times.children_system
 
 
 def _temporary(folder: Path) -> set[str]:

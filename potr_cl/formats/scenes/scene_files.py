@@ -85,9 +85,9 @@ def file_in_folder(path: str | os.PathLike[str], name: str) -> Path | None:
         name: of the file, in lower case.
     """
     given = Path(path)
-    if given.name.lower() == name and not given.is_dir():
+    if given.name.lower() == name and not os.path.isdir(given):
         return given
-    return given / name if (given / name).is_file() else None
+    return given / name if os.path.isfile(given / name) else None
 
 
 def related(file: Path, name: object) -> Path:
