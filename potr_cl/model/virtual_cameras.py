@@ -31,14 +31,14 @@ F32 = NDArray[np.float32]
 
 #: Training views that are placed unless told otherwise. Each costs time and memory for every splat, hardly less if it
 #: is small: so they are few and wide, and large scenes get fewer.
-FEWEST, MOST = 64, 96
-_SPLATS_TIMES_VIEWS = 50_000_000
+FEWEST, MOST = 86, 128
+_SPLATS_TIMES_VIEWS = 67_000_000
 #: Pixels of all of them together, and along a side of each.
-_PIXELS = 47_000_000
-_SMALLEST, _LARGEST = 500, 860
+_PIXELS = 46_080_000
+_SMALLEST, _LARGEST = 500, 740
 #: Degrees from side to side. A wide view shows a splat together with more of the others, so that fewer views show each
 #: splat from as many directions.
-FIELD = 80.0
+FIELD = 65.0
 #: What may be asked for: no more views than places are tried, no wider ones than are rendered.
 _MOST_ASKED, _WIDEST_ASKED = 4000, 16384
 #: What the names of virtual cameras begin with.
@@ -57,9 +57,9 @@ def place_cameras(
 
     Args:
         scene: clean, at least one splat.
-        count: training views; by default 64 to 96, the fewer the more splats there are. An eighth as many test views,
+        count: training views; by default 86 to 128, the fewer the more splats there are. An eighth as many test views,
             which lie among them, come on top.
-        size: of their square images, in pixels; by default 700 to 860, the smaller the more views there are.
+        size: of their square images, in pixels; by default 600 to 740, the smaller the more views there are.
         field: of view from side to side, in degrees; less where the renderer's near plane would cut a small scene off.
 
     Returns:

@@ -24,6 +24,7 @@ from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.sweep_options import default_memory
 from potr_cl.stages.refit import Refit
+from potr_cl.stages.views_between import Between
 
 #: Views that are rendered to see how long one takes.
 _SAMPLE = 4
@@ -60,8 +61,8 @@ class Units:
             uncompressed scene.
         iteration, step: a pruning iteration and a step of the re-fit, for each view, besides.
         once: pictures' times that the re-fit takes besides, whatever the number of views.
-        compact_splat, refit_splat, code_splat: seconds that compaction, the re-fit and the coding take besides, for
-            each splat of the uncompressed scene.
+        compact_splat, refit_splat, code_splat, trial_splat: seconds that compaction, the re-fit, the coding and the
+            trial of views between the views take besides, for each splat of the uncompressed scene.
     """
 
     prepare: float
@@ -74,13 +75,16 @@ class Units:
     compact_splat: float
     refit_splat: float
     code_splat: float
+    trial_splat: float
 
 
 #: From tools.bench.forecast for CPUs, and from docs/benchmarks/encode.md for GPUs, where the host does a good part.
 UNITS: dict[Family, Units] = {
-    "cpu": Units(1.0, 3.0, 0.035, 2.0, 4.7, 0.33, 20, 0, 0, 4e-6),
-    "gpu": Units(0.9, 2.0, 0.042, 0, 0, 0.45, 0, 3.5e-6, 1.45e-6, 1.5e-6),
+    "cpu": Units(1.0, 3.0, 0.035, 2.0, 4.7, 0.33, 20, 0, 0, 4e-6, 30e-6),
+    "gpu": Units(0.9, 2.0, 0.042, 0, 0, 0.45, 0, 3.5e-6, 1.45e-6, 1.5e-6, 12e-6),
 }
+#: Views that a trial adds for each training view, at most: nobody knows before.
+_ADDED: dict[Family, float] = {"cpu": 0.5, "gpu": 2}
 
 
 def forecast(
@@ -99,18 +103,23 @@ def forecast(
     seconds, nbytes = _view(scene, cameras, options, device)
     parts = {stage.name: stage for stage in options.stages if stage.asked_for and stage.looks_at(scene)}
     units = UNITS[device.family]
-    pictures, of_a_splat = len(cameras) * units.prepare, units.code_splat
+    views, of_a_splat = float(len(cameras)), units.code_splat
+    if isinstance(between := parts.get(Between.name), Between):
+        views *= 1 + (_ADDED[device.family] if between.views is None else between.views)
+        of_a_splat += 0 if between.views is not None else units.trial_splat
+    pictures = views * units.prepare
     if isinstance(prune := parts.get(Prune.name), Prune):
-        pictures += len(cameras) * (units.prune + units.iteration * prune.iterations)
+        pictures += views * (units.prune + units.iteration * prune.iterations)
     if Compact.name in parts:
-        pictures += len(cameras) * units.compact
+        pictures += views * units.compact
         of_a_splat += units.compact_splat
     if isinstance(refit := parts.get(Refit.name), Refit):
-        pictures += units.once + len(cameras) * (units.refit + units.step * refit.steps)
+        pictures += units.once + views * (units.refit + units.step * refit.steps)
+        pictures += len(refit.at) * views * (units.refit + units.step * refit.at_steps)
         of_a_splat += units.refit_splat
     work = pictures * seconds + len(scene) * of_a_splat
     budget = default_memory(device) if options.memory is None else options.memory
-    memory = len(scene) * _DEVICE_SPLAT + min(len(cameras) * nbytes * _VIEWS, budget)
+    memory = len(scene) * _DEVICE_SPLAT + min(views * nbytes * _VIEWS, budget)
     if device.info.kind == "cpu":
         memory += _PROCESS + len(scene) * _HOST_SPLAT
     return Forecast(work * (_SEARCH if search else 1), memory, seconds, pictures)

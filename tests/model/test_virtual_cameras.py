@@ -88,13 +88,13 @@ def test_an_object_is_seen_from_all_sides(around_ball):
 
 
 def test_names_and_splits(around_ball):
-    assert (len(train_views(around_ball)), len(test_views(around_ball))) == (96, 12)
-    assert len({c.name for c in around_ball}) == 108
-    assert {(c.width, c.height) for c in around_ball} == {(700, 700)}
+    assert (len(train_views(around_ball)), len(test_views(around_ball))) == (128, 16)
+    assert len({c.name for c in around_ball}) == 144
+    assert {(c.width, c.height) for c in around_ball} == {(600, 600)}
     assert is_virtual(around_ball)
     assert not is_virtual([])
     assert not is_virtual([dataclasses.replace(around_ball[0], name="photo")])
-    assert describe(around_ball).startswith("96 virtual views and 12 to judge by placed ")
+    assert describe(around_ball).startswith("128 virtual views and 16 to judge by placed ")
     few = place_cameras(BALL, 5, 64)
     assert [c.split for c in few] == ["train"] * 5
     assert few[0].width == 64
