@@ -121,7 +121,7 @@ def test_standpoints(around_ball):
     given = [dataclasses.replace(c, name="photo") for c in around_ball]
     assert np.array_equal(standpoints(given, BALL.means), camera_centres(given))
     places = standpoints(around_ball, BALL.means)
-    assert places.shape == (108, 4, 3)
+    assert places.shape == (144, 4, 3)
     assert np.allclose(places.mean(axis=1), camera_centres(around_ball))
     away = np.linalg.norm(places - camera_centres(around_ball)[:, None], axis=2)
     assert np.allclose(away, away[:, :1])
