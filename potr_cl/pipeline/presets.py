@@ -48,7 +48,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
 #: What each preset is for, in a line.
 PURPOSE: dict[Preset, str] = {
     "best": "colours re-fitted together, steps of equal worth, the context coder: a small file in little time",
-    "smallest": "as best, with views between the training views and re-fits while pruning: takes 2 to 5 times as long",
+    "smallest": "as best, with views between the training views and re-fits while pruning: takes 3 to 5 times as long",
     "fast": "as best, in fewer iterations and steps, with zstd 9: encodes and decodes faster",
     "paper": "what the paper does: colours compacted splat by splat, its steps",
 }
