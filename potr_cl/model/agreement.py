@@ -44,6 +44,9 @@ _ALONE, _FALL = 5.0, 1.5
 _AS_WELL = 0.35
 #: Part of a scene's splats that views must see at least, whatever the rest.
 _LEAST_SEEN = 0.005
+#: Cameras that see so much of the splats look at the scene, whatever else fits better, if the colours know so many of
+#: the views, or if the scene is so small in the pictures that it may be a part of what was photographed.
+_WHOLE, _WELL_KNOWN, _SMALL_PART = 0.95, 0.9, 0.05
 #: The least that a view can count for: it sees nothing.
 _NOTHING = 1e-3
 #: From which :attr:`~potr_cl.model.sightings.Sights.remembered` on the colours know a view, and how much that counts.
@@ -160,6 +163,8 @@ def judge_cameras(scene: Scene, cameras: Sequence[Camera]) -> Judgement:
     if found is None:
         return Judgement(views, fit)
     motion, moved = found
+    if _looked_at(fit) and (motion.fitted or motion.scale == 1):
+        return Judgement(views, fit)
     return Judgement(views, fit, motion, moved, _needed(motion, views))
 
 
@@ -196,6 +201,15 @@ def _fit(sights: Sights) -> Fit:
         known=known,
         size=size,
     )
+
+
+def _looked_at(fit: Fit) -> bool:
+    """Whether the cameras see the whole scene and nothing speaks against them: other axes or places prove nothing then.
+
+    So it is with a part that was cut out of a scene: seen from the middle it would fill more of the pictures.
+    """
+    known = fit.known is not None and fit.known >= _WELL_KNOWN
+    return fit.seen >= _WHOLE and (known or fit.covered < _SMALL_PART)
 
 
 def _best_motion(at: Sample, cameras: Poses, fit: Fit) -> tuple[Motion, Fit] | None:
