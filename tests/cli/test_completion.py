@@ -55,7 +55,7 @@ def test_bash(script, tmp_path):
 
     assert completed("enc") == ["encode"]
     assert completed("encode", "--pres") == ["--preset"]
-    assert completed("encode", "--preset", "") == ["best", "fast", "paper"]
+    assert completed("encode", "--preset", "") == ["best", "smallest", "fast", "paper"]
     assert completed("decode", "sce") == ["scene.potr"]
 
 
@@ -69,7 +69,7 @@ def test_fish(script, tmp_path):
 
     assert completed("potr-cl enc") == ["encode"]
     assert "--preset" in completed("potr-cl encode --pres")
-    assert completed("potr-cl encode --preset ") == ["best", "fast", "paper"]
+    assert completed("potr-cl encode --preset ") == ["best", "smallest", "fast", "paper"]
     assert completed("potr-cl decode sce") == ["scene.potr"]
 
 

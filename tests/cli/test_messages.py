@@ -60,7 +60,7 @@ def called(capsys, *arguments):
         (["encode", "a.ply", "-o", "c", "-z"], "there is no option '-z'"),
         (["encode", "a.ply", "-o"], "-o/--output needs a value: OUT.potr (.potr, a folder, or"),
         (["encode", "a.ply", "-o", "c", "-q", "x"], "-q/--quality is 'x', it must be a number"),
-        (["encode", "a.ply", "-o", "c", "--preset", "bset"], "it must be best, fast or paper; is best meant?"),
+        (["encode", "a.ply", "-o", "c", "--preset", "bset"], "must be best, smallest, fast or paper; is best meant?"),
         (["info", "a.potr", "b.ply"], "'b.ply' is one argument too many"),
         (["info", "a\x1b[31m.ply", "b\x1b[31m.ply"], "'b\\x1b[31m.ply' is one argument too many"),
         (["--print-completion", "bahs"], "is bash meant?"),
