@@ -140,6 +140,6 @@ def test_encode_and_refit_to_bent_photographs(captured: Path, capsys: pytest.Cap
     scene, cameras, photos = str(captured / "a.ply"), str(captured / "transforms.json"), str(captured / "images")
     encode = ["encode", scene, "-o", str(captured / "a.potr"), "--cameras", cameras, "--iterations", "3"]
     assert cli.main([*encode, "--photos", photos, "--refit", "2"]) == 0
-    assert "photographs of test views" in capsys.readouterr().out
+    assert "photograph of test views" in capsys.readouterr().out
     refit = ["refit", scene, "--reference", scene, "--cameras", cameras, "--photos", photos, "--steps", "2"]
     assert cli.main([*refit, "-o", str(captured / "b.ply")]) == 0
