@@ -30,7 +30,7 @@ def main() -> int:
     parser.add_argument("scenes", type=Path)
     parser.add_argument("out", type=Path)
     parser.add_argument("--max-size", help="of each file, such as 8MB; else quality 0.5")
-    parser.add_argument("--preset", default="best", choices=("best", "fast", "paper"))
+    parser.add_argument("--preset", default="best", choices=("best", "smallest", "fast", "paper"))
     args = parser.parse_args()
     device = Device()  # opened once, so that its kernels are built once
     failed = 0
