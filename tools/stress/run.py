@@ -162,6 +162,8 @@ def projected(case: Case, rng: np.random.Generator | None = None) -> reference.P
         opacity_logits=logits,
         sh=sh,
         sh_degree=scene.sh_degree,
+        antialiased=scene.antialiased,
+        low_pass=scene.low_pass,
     )
     with np.errstate(all="ignore"):
         return reference.project(cast(Scene, stand_in), view, case.rules)
