@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import dataclasses
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -12,7 +11,7 @@ from typing import Any
 import numpy as np
 
 from potr_cl.formats import load_cameras, load_scene
-from potr_cl.model.camera import Camera
+from potr_cl.model.camera import Camera, resized
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import Run, Stopwatch
@@ -75,17 +74,7 @@ def pictures(device: Device, scene: Scene, views: Sequence[Camera]) -> list[Floa
 def scaled(camera: Camera, factor: float) -> Camera:
     """The same view at another resolution, at least one pixel; its photograph does not fit any more."""
     width, height = max(int(camera.width * factor), 1), max(int(camera.height * factor), 1)
-    across, down = width / camera.width, height / camera.height
-    return dataclasses.replace(
-        camera,
-        width=width,
-        height=height,
-        fx=camera.fx * across,
-        fy=camera.fy * down,
-        cx=camera.cx * across,
-        cy=camera.cy * down,
-        image_path=None,
-    )
+    return resized(camera, width, height)
 
 
 def best_of(repeats: int, work: Callable[[], Any]) -> float:

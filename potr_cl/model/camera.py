@@ -83,6 +83,21 @@ class Camera:
         return -self.rotation.T @ self.translation
 
 
+def resized(camera: Camera, width: int, height: int) -> Camera:
+    """The same view in another number of pixels; a photograph of it does not fit any more."""
+    across, down = width / camera.width, height / camera.height
+    return replace(
+        camera,
+        width=width,
+        height=height,
+        fx=camera.fx * across,
+        fy=camera.fy * down,
+        cx=camera.cx * across,
+        cy=camera.cy * down,
+        image_path=None,
+    )
+
+
 def train_views(cameras: Sequence[Camera]) -> list[Camera]:
     """The views that the encoder may look at.
 

@@ -139,7 +139,8 @@ class Refit(Stage):
             refitted = fitted(state.views, RenderedTargets(rasterizer, state.views), 0)
             choice = None
             if self.ground_truth is not None:
-                given, added = state.views[: len(state.views) - state.added], state.views[-state.added :]
+                first_added = len(state.views) - state.added
+                given, added = state.views[:first_added], state.views[first_added:]
                 photographs = GroundTruth(self.ground_truth, given, bench.background)
                 fit_to, judging = hold_out(photographs.of(given))
                 of_photographs = GroundTruthTargets(bench.opened, photographs, fit_to)

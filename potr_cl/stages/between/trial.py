@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.model.camera import Camera, camera_centres
+from potr_cl.model.camera import Camera, camera_centres, resized
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.views_between import views_between
 from potr_cl.quality.metrics import psnr
@@ -121,14 +121,4 @@ def _small(camera: Camera) -> Camera:
     """The same view with at most so many pixels a side, whole ones."""
     factor = min(_SIDE / max(camera.width, camera.height), 1.0)
     width, height = max(round(camera.width * factor), 1), max(round(camera.height * factor), 1)
-    across, down = width / camera.width, height / camera.height
-    return dataclasses.replace(
-        camera,
-        width=width,
-        height=height,
-        fx=camera.fx * across,
-        fy=camera.fy * down,
-        cx=camera.cx * across,
-        cy=camera.cy * down,
-        image_path=None,
-    )
+    return resized(camera, width, height)
