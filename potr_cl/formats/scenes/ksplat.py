@@ -18,7 +18,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.scene_files import cleaned, log_of_scales, logits, opened
+from potr_cl.formats.scenes.scene_files import cleaned, log_of_scales, logits, opened, unfilled
 from potr_cl.formats.scenes.splat import colours
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
@@ -93,13 +93,8 @@ def _read(path: str | os.PathLike[str], data: bytes) -> Scene:
     if count == 0:
         raise DataError(f"'{path}' holds no splat")
     coefficients = SH_COEFFICIENTS[max(section.degree for section in sections)]
-    scene = Scene(
-        np.empty((count, 3), np.float32),
-        np.empty((count, 3), np.float32),
-        np.empty((count, 4), np.float32),
-        np.empty(count, np.float32),
-        np.zeros((count, coefficients, 3), np.float32),
-    )
+    scene = unfilled(count, coefficients)
+    scene.sh[:] = 0  # sections may be of lower degrees
     # Zero is what writers leave where they have no bounds.
     bounds = np.float32(low or -_SH_BOUND), np.float32(high or _SH_BOUND)
     start = 0

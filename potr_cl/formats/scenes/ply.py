@@ -19,7 +19,7 @@ from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.filter_3d import FILTER_3D, folded
 from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
-from potr_cl.formats.scenes.scene_files import NO_EXTENT, cleaned
+from potr_cl.formats.scenes.scene_files import NO_EXTENT, cleaned, unfilled
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
 
@@ -172,13 +172,7 @@ def _read(path: str | os.PathLike[str], stream: io.FileIO, size: int) -> Scene:
     if scales < 3:
         _log.warning("'%s' has two scales a splat (2DGS): the third is read as 1e-9 unit, along the third axis", path)
 
-    scene = Scene(
-        np.empty((count, 3), dtype=np.float32),
-        np.empty((count, 3), dtype=np.float32),
-        np.empty((count, 4), dtype=np.float32),
-        np.empty(count, dtype=np.float32),
-        np.empty((count, 1 + kept // 3, 3), dtype=np.float32),
-    )
+    scene = unfilled(count, 1 + kept // 3)
     columns = _columns(scene, rest // 3)
     if scales < 3:
         columns.pop("scale_2")[:] = NO_EXTENT

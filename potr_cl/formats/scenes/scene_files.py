@@ -112,6 +112,17 @@ def shown(value: object) -> str:
     return said if len(said) <= _LONGEST_SAID else said[:_LONGEST_SAID] + "…"
 
 
+def unfilled(splats: int, coefficients: int) -> Scene:
+    """A scene of so many splats and SH coefficients a channel, whose arrays the reader of a format fills."""
+    return Scene(
+        np.empty((splats, 3), np.float32),
+        np.empty((splats, 3), np.float32),
+        np.empty((splats, 4), np.float32),
+        np.empty(splats, np.float32),
+        np.empty((splats, coefficients, 3), np.float32),
+    )
+
+
 def joined(scenes: list[Scene]) -> Scene:
     """Scenes as one; those of a lower SH degree get coefficients of zero.
 

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, cleaned, file_in_folder, opened, reading, related
+from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, cleaned, file_in_folder, opened, reading, related, unfilled
 from potr_cl.model.claims import check_claim
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
@@ -209,13 +209,7 @@ class Sog:
         for name, images in (("means", 2), ("quats", 1), ("scales", 1), ("sh0", 1)):
             for index in range(images):
                 self._check_pixels(name, index)
-        scene = Scene(
-            np.empty((count, 3), np.float32),
-            np.empty((count, 3), np.float32),
-            np.empty((count, 4), np.float32),
-            np.empty(count, np.float32),
-            np.empty((count, coefficients, 3), np.float32),
-        )
+        scene = unfilled(count, coefficients)
         self._fill_means(scene.means)
         quaternions, scales = self._pixels("quats", 0), self._pixels("scales", 0)
         book = self._codebook("scales")

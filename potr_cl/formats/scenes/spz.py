@@ -22,7 +22,7 @@ from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.codec.quantize import canonical_rotations
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, arranged, cleaned, opened, tell_of_low_pass
+from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, arranged, cleaned, opened, tell_of_low_pass, unfilled
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.claims import check_claim
@@ -275,13 +275,7 @@ def _unpacked(header: _Header, properties: list[bytes | memoryview]) -> Scene:
     positions, opacities, colours, scales, rotations, rest = (
         np.frombuffer(part, np.uint8).reshape(count, -1) for part in properties
     )
-    scene = Scene(
-        np.empty((count, 3), np.float32),
-        np.empty((count, 3), np.float32),
-        np.empty((count, 4), np.float32),
-        np.empty(count, np.float32),
-        np.empty((count, coefficients, 3), np.float32),
-    )
+    scene = unfilled(count, coefficients)
     byte = np.arange(256).astype(np.float32)
     least = np.float32(1e-6)
     opacity = np.clip(byte / np.float32(255), least, np.float32(1) - least)
