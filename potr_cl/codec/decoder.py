@@ -35,6 +35,8 @@ from potr_cl.model.scene import SH_COEFFICIENTS, Scene
 _MOST_THREADS = 16
 #: Coefficients and other properties whose integers may wait for a thread to make values of them.
 _MOST_WAITING = 6
+#: Bytes of stored integers, for each splat, that all threads together may have unpacked: half a decoded splat.
+_MOST_UNPACKED = 120
 
 _EMPTY = np.empty(0, np.uint8)
 
@@ -186,7 +188,7 @@ class PotrFile:
                 (self._contextual(Property.SCALE) or self._contextual(Property.ROTATION), shapes),
                 (self._contextual(Property.OPACITY), opacities),
             ]
-            means = self._run(jobs, threads or min(os.cpu_count() or 1, _MOST_THREADS))
+            means = self._run(jobs, min(threads or min(os.cpu_count() or 1, _MOST_THREADS), self._threads_in_memory()))
         except MemoryError:
             needed = header.splats * (11 + 3 * self._coefficients(sh_degree)) * 4
             raise DataError(f"the scene needs {needed / 1e9:.1f} GB of memory, more than there is") from None
@@ -257,6 +259,11 @@ class PotrFile:
             history,
             section.name,
         )
+
+    def _threads_in_memory(self) -> int:
+        """How many threads may unpack three streams each: real files' integers are narrow enough for all threads."""
+        widest = max((section.planes for section in self.header.sections), default=0)
+        return max(1, _MOST_UNPACKED // (3 * max(widest, 1)))
 
     def _streams(self, prop: Property, indices: range | None = None) -> list[IntegerStream]:
         """Some streams of one integer a splat, all of a property's by default."""
