@@ -10,7 +10,7 @@ import stat
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,12 +18,14 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import container, metadata, octree, sections
+from potr_cl.codec.bundled_scene import BundledScene
 from potr_cl.codec.byte_planes import PlaneStream, unpack_integers
 from potr_cl.codec.container import Header
 from potr_cl.codec.context.decoder import Reader, Stream
 from potr_cl.codec.context.lanes import Lanes
 from potr_cl.codec.context.model import Sizes
 from potr_cl.codec.dequantizer import Dequantizer, IntegerStream
+from potr_cl.codec.native.bundles import SceneArrays
 from potr_cl.codec.native.library import native
 from potr_cl.codec.sections import Coder, Property, Section
 from potr_cl.codec.versions import VERSIONS, FormatVersion
@@ -131,12 +133,16 @@ class PotrFile:
     def log_scales(self) -> NDArray[np.float32]:
         """(N, 3) float32 natural logarithms of standard deviations. Raises DataError if damaged."""
         out = np.empty((self.header.splats, 3), np.float32)
+        if self._bundled:
+            return _done(self._bundled, SceneArrays(out, None, None, None), out)
         self._dequantizer.scales(self._streams(Property.SCALE), out)
         return out
 
     def quaternions(self) -> NDArray[np.float32]:
         """(N, 4) float32 unit quaternions w, x, y, z. Raises DataError if damaged."""
         out = np.empty((self.header.splats, 4), np.float32)
+        if self._bundled:
+            return _done(self._bundled, SceneArrays(None, out, None, None), out)
         scales = self._streams(Property.SCALE) if self._version.rotations_need_scales else []
         self._dequantizer.rotations(self._streams(Property.ROTATION), scales, out)
         return out
@@ -144,6 +150,8 @@ class PotrFile:
     def opacity_logits(self) -> NDArray[np.float32]:
         """(N,) float32 logits. Raises DataError if damaged."""
         out = np.empty(self.header.splats, np.float32)
+        if self._bundled:
+            return _done(self._bundled, SceneArrays(None, None, out, None), out)
         self._decode_opacities(out, _now)
         return out
 
@@ -158,6 +166,8 @@ class PotrFile:
             DataError: damaged.
         """
         planar = self._empty_sh(degree)
+        if self._bundled:
+            return _done(self._bundled, SceneArrays(None, None, None, planar), planar).transpose(2, 0, 1)
         for _, job in self._sh_jobs(planar):
             job(_now)
         return planar.transpose(2, 0, 1)
@@ -180,6 +190,11 @@ class PotrFile:
             log_scales = np.empty((header.splats, 3), np.float32)
             quaternions = np.empty((header.splats, 4), np.float32)
             opacity_logits = np.empty(header.splats, np.float32)
+            if self._bundled:
+                arrays = SceneArrays(log_scales, quaternions, opacity_logits, planar)
+                means = self._run_bundles(self._bundled, arrays, threads or min(os.cpu_count() or 1, _MOST_THREADS))
+                sh = planar.transpose(2, 0, 1)
+                return Scene(means, log_scales, quaternions, opacity_logits, sh, header.antialiased, header.low_pass)
             shapes: _Job = partial(self._decode_shapes, log_scales, quaternions)
             opacities: _Job = partial(self._decode_opacities, opacity_logits)
             # The longest first: a pool that ends with a long one ends late.
@@ -230,7 +245,21 @@ class PotrFile:
                         raise error
             return means.result()
 
+    def _run_bundles(self, scene: BundledScene, arrays: SceneArrays, threads: int) -> NDArray[np.float32]:
+        """Fill some arrays, and decode the centres."""
+        with thread_pool(threads) as pool:
+            means = pool.submit(self.means)
+            for other in [pool.submit(job) for job in scene.jobs(arrays, threads)]:
+                other.result()
+            return means.result()
+
     # ------------------------------------------------------------------------------------------ inside
+
+    @cached_property
+    def _bundled(self) -> BundledScene | None:
+        """The splats of a file of coder BUNDLES, None for others."""
+        section = self.header.find(Property.OPACITY)
+        return BundledScene(self.header, self.data) if section and section.coder == Coder.BUNDLES else None
 
     @property
     def _version(self) -> FormatVersion:
@@ -295,7 +324,9 @@ class PotrFile:
         return SH_COEFFICIENTS[self.header.sh_degree if degree is None else min(degree, self.header.sh_degree)]
 
     def _empty_sh(self, degree: int | None) -> NDArray[np.float32]:
-        return np.empty((self._coefficients(degree), 3, self.header.splats), np.float32)
+        shape = (self._coefficients(degree), 3, self.header.splats)
+        # Bundles fill in only what is not 0.
+        return np.zeros(shape, np.float32) if self._bundled else np.empty(shape, np.float32)
 
     def _sh_jobs(self, planar: NDArray[np.float32]) -> list[tuple[bool, _Job]]:
         """What decodes M SH coefficients into ``planar`` (M, 3, N), and whether it takes the context coder."""
@@ -328,6 +359,12 @@ class PotrFile:
 _Submit = Callable[[Callable[[], None]], None]
 #: Decodes some of a file.
 _Job = Callable[[_Submit], None]
+
+
+def _done(scene: BundledScene, arrays: SceneArrays, out: NDArray[np.float32]) -> NDArray[np.float32]:
+    for job in scene.jobs(arrays, 1):
+        job()
+    return out
 
 
 def _now(work: Callable[[], None]) -> None:

@@ -33,6 +33,17 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_encode_cells": (None, [_POINTER, _SIZE, _POINTER, _POINTER, _SIZE, ctypes.c_int32, _POINTER]),
     "potr_encode_count": (None, [_POINTER, _SIZE, _POINTER]),
     "potr_encode_stream": (_SIZE, [_POINTER, _SIZE, _SIZE, _POINTER, _POINTER, _POINTER]),
+    "potr_bundles_table": (_NUMBER, [_POINTER, _SIZE, _SIZE, _POINTER, _POINTER]),
+    "potr_bundles_work": (_SIZE, []),
+    "potr_bundles_begin": (None, [_POINTER]),
+    "potr_bundles_levels": (_NUMBER, [_POINTER, _WORD, _NUMBER, _NUMBER, *[_POINTER] * 3]),
+    "potr_bundles_values": (_NUMBER, [_POINTER, _WORD, _NUMBER, _NUMBER, *[_POINTER] * 3]),
+    "potr_bundles_encoding": (_SIZE, []),
+    "potr_bundles_survey": (None, [_POINTER, _WORD, _POINTER, _POINTER, _WORD, _POINTER, _POINTER]),
+    "potr_bundles_count": (None, [_POINTER, _WORD, *[_POINTER] * 3]),
+    "potr_bundles_code": (_SIZE, [_POINTER, _WORD, *[_POINTER] * 3, _SIZE, *[_POINTER] * 3]),
+    "potr_bundles_grouping": (_SIZE, []),
+    "potr_bundles_contexts": (_SIZE, [_POINTER, _SIZE, *[_POINTER] * 4]),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
 }
 #: Those that there are for several kinds of integers, by what their names begin with.
