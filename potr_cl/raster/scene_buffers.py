@@ -21,7 +21,7 @@ SPLAT_GROUP = 256
 _UPLOADED = 1 << 18
 
 #: Larger standard deviations, in world units, are replaced by this. Nobody can see a difference, and nothing overflows.
-_LARGEST_SCALE = 1e12
+LARGEST_SCALE = 1e12
 
 
 class SceneBuffers(Owner):
@@ -75,7 +75,7 @@ class SceneBuffers(Owner):
         length[nothing] = 1
         quaternions /= length
         quaternions[nothing] = (1.0, 0.0, 0.0, 0.0)
-        scales = np.minimum(np.exp(np.minimum(scene.log_scales.astype(np.float64), 100)), _LARGEST_SCALE)
+        scales = np.minimum(np.exp(np.minimum(scene.log_scales.astype(np.float64), 100)), LARGEST_SCALE)
         logits = scene.opacity_logits.astype(np.float64)
         # log(sigmoid(logit)): logaddexp says the same, and takes eight times as long.
         log2_opacities = (np.minimum(logits, 0) - np.log1p(np.exp(-np.abs(logits)))) / np.log(2)
