@@ -13,6 +13,7 @@ from __future__ import annotations
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 
@@ -35,6 +36,8 @@ _LEAST_LOGIT, _GREATEST_LOGIT = -5.5, 16.0
 #: Differences are multiplied by a power of two while they are summed up, so that they are about this large.
 _USUAL_DIFFERENCE = 1 / 8
 _LARGEST_UNIT = 2.0**20
+#: Of the first step, means in pixels.
+RATES = Rates(means=0.05, log_scales=5e-3, quaternions=2e-3, opacity_logits=2e-2, dc=5e-3, ac=5e-4)
 
 
 @dataclass(frozen=True)
@@ -59,7 +62,7 @@ class FitOptions:
     batch: int = 4
     rounds: int = 10
     patience: int = 3
-    rates: Rates = Rates(means=0.05, log_scales=5e-3, quaternions=2e-3, opacity_logits=2e-2, dc=5e-3, ac=5e-4)
+    rates: Rates = RATES
     last: float = 0.1
     seed: int = 0
     memory: int | None = None
@@ -97,11 +100,31 @@ class Fitted:
         before, after = (-10 * math.log10(max(error, 1e-20)) for error in (self.errors[0], min(self.errors)))
         return before, after
 
+    @property
+    def facts(self) -> dict[str, Any]:
+        """All but the scene, by name."""
+        return {"steps": self.steps, "kept": self.kept, "held_out": self.held_out, "errors": list(self.errors)}
+
     def __str__(self) -> str:
         before, after = self.psnr
         views = f"{self.held_out} view{'s' if self.held_out > 1 else ''} held out"
+        steps = f"{self.kept} of {self.steps} steps are kept"
+        return f"{steps}: PSNR {before:.2f} dB before, {after:.2f} dB after, {views}"
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """That a fit was left out, because there are too few views for any to be held out."""
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """None."""
+        return {}
+
+    def __str__(self) -> str:
         return (
-            f"{self.kept} of {self.steps} steps of the fit are kept: {views}, {before:.2f} dB before, {after:.2f} after"
+            "the fit was left out: it needs two training views or more, because one of them is held out and tells "
+            "whether it helps"
         )
 
 
@@ -138,7 +161,7 @@ def fit_scene(
     options = options or FitOptions()
     fit_to, held_out = share_out(len(cameras) - added, added)
     if not held_out:
-        raise UsageError("a fit needs two training views or more: one of them is held out, and tells whether it helps")
+        raise UsageError("a fit needs two training views or more: one of them is held out and tells whether it helps")
     free = device.info.memory - device.allocated
     with (
         PictureDerivatives(device, scene, background=background) as derivatives,
