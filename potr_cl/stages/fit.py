@@ -92,7 +92,7 @@ class Fit(Stage):
                 options,
                 state.added,
                 bench.background,
-                lambda done, steps, _error: bench.progress("fit", 0.99 * done / steps),
+                lambda done, steps: bench.progress("fit", 0.99 * done / steps),
             )
         bench.progress("fit", 1.0)
         return dataclasses.replace(state, scene=fitted.scene, geometry=None).having_learnt(self.name, fitted)

@@ -10,6 +10,7 @@ The targets are pictures of the uncompressed scene, so any number of views betwe
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
@@ -28,6 +29,8 @@ from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import batches, pixel_size, share_out
 from potr_cl.stages.refitting.targets import Targets
 
+logger = logging.getLogger("potr_cl")
+
 #: Part of the device's memory not yet taken that the targets may take unless the caller says how much.
 _SHARE = 0.25
 #: The opacity below which a splat is not drawn is 1/255, of logit -5.54: none falls so far that nothing can bring it
@@ -37,7 +40,7 @@ _LEAST_LOGIT, _GREATEST_LOGIT = -5.5, 16.0
 _USUAL_DIFFERENCE = 1 / 8
 _LARGEST_UNIT = 2.0**20
 #: Of the first step, means in pixels.
-RATES = Rates(means=0.05, log_scales=5e-3, quaternions=2e-3, opacity_logits=2e-2, dc=5e-3, ac=5e-4)
+RATES = Rates(means=0.01, log_scales=5e-3, quaternions=2e-3, opacity_logits=2e-2, dc=5e-3, ac=5e-4)
 
 
 @dataclass(frozen=True)
@@ -97,8 +100,7 @@ class Fitted:
     @property
     def psnr(self) -> tuple[float, float]:
         """Of the held-out views before and after, in decibels."""
-        before, after = (-10 * math.log10(max(error, 1e-20)) for error in (self.errors[0], min(self.errors)))
-        return before, after
+        return _decibels(self.errors[0]), _decibels(min(self.errors))
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -128,8 +130,8 @@ class LeftOut:
         )
 
 
-#: Called with the steps done, their greatest number, and the mean squared error of the held-out views by now.
-FitProgress = Callable[[int, int, float], None]
+#: Called with the steps done, and their greatest number.
+FitProgress = Callable[[int, int], None]
 
 
 def fit_scene(
@@ -141,6 +143,7 @@ def fit_scene(
     added: int = 0,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: FitProgress | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> Fitted:
     """Fit all parameters of a scene to pictures of some views.
 
@@ -152,7 +155,8 @@ def fit_scene(
         options: of the fit.
         added: how many of the views, the last ones, lie between those that were given: they are never held out.
         background: R, G, B behind the scene.
-        progress: told of each round, and of some steps between.
+        progress: called after each step.
+        tell: called with a line for each round.
 
     Raises:
         UsageError: there are fewer than two given views, so that none can be held out.
@@ -173,7 +177,7 @@ def fit_scene(
         judges = _Judges(rasterizer, [cameras[number] for number in held_out], [pictures.download(n) for n in held_out])
         with Adam(device, scene, rasterizer.parameters, derivatives.columns, _limits(scene)) as adam:
             fit = _Fit(options, derivatives, adam, pictures, judges, cameras)
-            return fit.run(fit_to, pixel_size(scene, cameras), progress)
+            return fit.run(fit_to, pixel_size(scene, cameras), progress, tell or logger.debug)
 
 
 class _Judges:
@@ -215,7 +219,9 @@ class _Fit:
         self._options, self._derivatives, self._adam = options, derivatives, adam
         self._pictures, self._judges, self._cameras = pictures, judges, cameras
 
-    def run(self, fit_to: Sequence[int], pixel: float, progress: FitProgress | None) -> Fitted:
+    def run(
+        self, fit_to: Sequence[int], pixel: float, progress: FitProgress | None, tell: Callable[[str], None]
+    ) -> Fitted:
         options = self._options
         errors = [self._judges.error()]
         kept = done = since = 0
@@ -227,8 +233,10 @@ class _Fit:
                 self._step(next(order), unit, self._rates(done, pixel))
                 done += 1
                 if progress is not None:
-                    progress(done, options.steps, errors[-1])
+                    progress(done, options.steps)
             errors.append(self._judges.error())
+            now, first = _decibels(errors[-1]), _decibels(errors[0])
+            tell(f"fit: {done} steps, held-out views {now:.2f} dB, {first:.2f} dB at first")
             if errors[-1] < min(errors[:-1]):
                 self._adam.keep()
                 kept, since = done, 0
@@ -254,6 +262,11 @@ class _Fit:
             dc=left * rates.dc,
             ac=left * rates.ac,
         )
+
+
+def _decibels(error: float) -> float:
+    """The PSNR of a mean squared error of colours from 0 to 1."""
+    return -10 * math.log10(max(error, 1e-20))
 
 
 def _limits(scene: Scene) -> Limits:
