@@ -21,19 +21,22 @@ FOLDERS: dict[str, set[str]] = {
     "opencl": {"errors", "host"},
     "raster": {"errors", "host", "model", "opencl"},
     "codec": {"errors", "host", "model"},
+    "ondevice": {"errors", "host", "model", "opencl", "raster", "codec"},
     "formats": {"errors", "host", "model", "codec"},
     "quality": {"errors", "host", "model", "opencl", "raster", "formats"},
     "stages": {"errors", "host", "model", "opencl", "raster", "codec", "quality"},
-    "pipeline": {"errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality"},
+    "pipeline": {
+        "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages", "quality",
+    },
     "report": {"plain_text", "errors", "host", "model", "opencl", "codec", "formats", "quality", "pipeline"},
     "reference": {"errors", "model", "opencl", "raster", "stages"},
     "api": {
-        "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality",
-        "pipeline", "report",
+        "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages",
+        "quality", "pipeline", "report",
     },
     "cli": {
-        "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality",
-        "pipeline", "report", "api",
+        "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages",
+        "quality", "pipeline", "report", "api",
     },
 }  # fmt: skip
 #: They offer the whole package under short names, and start it.

@@ -5,7 +5,7 @@ from __future__ import annotations
 import contextlib
 import os
 import time
-from collections.abc import Callable, Collection, Sequence
+from collections.abc import Callable, Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -24,13 +24,14 @@ from potr_cl.api.inputs import (
 )
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.quantize import Preset
-from potr_cl.errors import DataError, PotrError, UsageError
+from potr_cl.errors import DataError, DeviceError, PotrError, UsageError
 from potr_cl.formats.images import Colour
 from potr_cl.formats.registry import refuse_other_than_potr
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.virtual_cameras import place_cameras
+from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.amounts import as_bytes, size_in_bytes
 from potr_cl.pipeline.encode import Encoded, Stopwatch
@@ -42,6 +43,7 @@ from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Found, Target
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth, judge_by_photographs
+from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.report.html import PicturePair, html_report, views_to_show
 from potr_cl.report.summary import encode_report, photographs_report, quality_report, search_report
 from potr_cl.stages.refit import Refit
@@ -139,7 +141,8 @@ def encode(
             encoded = found.encoded
         if file is None and page is None:
             return encoded
-        written, candidate = proved(encoded, trust)
+        judged_on = None if judging is None else encoded.device or opened
+        written, candidate = stack.enter_context(proved(encoded, trust, judged_on))
         if file is not None:
             file.write(written.data)
         if page is not None:
@@ -239,14 +242,32 @@ def check_photographs_have_cameras(options: EncodeOptions, cameras: bool) -> Non
         raise UsageError("--photos needs --cameras, the views that the photographs show, and a re-fit")
 
 
-def proved(encoded: Encoded, trust: bool = False) -> tuple[PotrFile, Scene]:
+@contextlib.contextmanager
+def proved(encoded: Encoded, trust: bool = False, device: Device | None = None) -> Iterator[tuple[PotrFile, Drawable]]:
     """The file that was made and the scene that a decoder makes of it.
+
+    Args:
+        encoded: that made it.
+        trust: as of :func:`encode`.
+        device: on which the scene will be looked at: it is decoded there, if there is room, and lies there for as long
+            as the context lasts. None: the scene is an ordinary one.
 
     Raises:
         PotrError: no decoder takes it.
     """
+    with contextlib.ExitStack() as stack:
+        file, candidate = _decoded(encoded, trust, device)
+        if isinstance(candidate, SceneBuffers):
+            stack.enter_context(candidate)
+        yield file, candidate
+
+
+def _decoded(encoded: Encoded, trust: bool, device: Device | None) -> tuple[PotrFile, Drawable]:
     try:
         file = PotrFile.from_bytes(encoded.data, **({"trust": True} if trust else {}))
+        if device is not None:
+            with contextlib.suppress(DeviceError):  # the file is sound all the same
+                return file, decode_to_device(file, device)
         return file, file.scene()
     except DataError as error:
         raise PotrError(
@@ -259,7 +280,7 @@ def by_photographs(
     ground_truth: GroundTruth,
     cameras: Sequence[Camera],
     encoded: Encoded,
-    scenes: tuple[Scene, Scene],
+    scenes: tuple[Scene, Drawable],
     device: Device,
     background: Colour,
 ) -> dict[str, Any]:
@@ -285,13 +306,13 @@ class Judge:
     ground_truth: GroundTruth | None = None
 
     def __call__(
-        self, scene: Scene, candidate: Scene, watch: Stopwatch, chosen: str | None = None, pictures: bool = False
+        self, scene: Scene, candidate: Drawable, watch: Stopwatch, chosen: str | None = None, pictures: bool = False
     ) -> tuple[dict[str, Any], list[PicturePair]]:
         """The figures, and pictures for a report.
 
         Args:
             scene: uncompressed.
-            candidate: as a decoder sees it.
+            candidate: as a decoder sees it; where it is on a device, that is the judge's.
             watch: told how far the stage "evaluate" is.
             chosen: a view to show besides the worst and the median one.
             pictures: whether to make any.

@@ -49,6 +49,7 @@ from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Target
 from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.html import PicturePair, html_report
 from potr_cl.report.summary import encode_report, format_encode_report, search_report
 from potr_cl.stages.refit import Refit
@@ -130,7 +131,9 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
             else:
                 found = encode_to_target(scene, cameras, target, options, progress, device, progress.tell)
                 encoded, options, search = found.encoded, found.options, search_report(target, found)
-            written, candidate = proved(encoded, args.trust)  # what cannot be decoded must not replace what can
+            judged_on = None if views is None else encoded.device
+            # What cannot be decoded must not replace what can.
+            written, candidate = stack.enter_context(proved(encoded, args.trust, judged_on))
             file.write(written.data)
         watch = Stopwatch(progress)
         pictures: list[PicturePair] = []
@@ -160,7 +163,7 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
 def _evaluate(
     args: argparse.Namespace,
     scene: Scene,
-    candidate: Scene,
+    candidate: Drawable,
     views: EvaluationViews,
     device: Device | None,
     opened: Future[Device] | None,
@@ -188,7 +191,7 @@ def _photographs(
     args: argparse.Namespace,
     ground_truth: GroundTruth,
     cameras: list[Camera],
-    scenes: tuple[Scene, Scene],
+    scenes: tuple[Scene, Drawable],
     encoded: Encoded,
     device: Device | None,
 ) -> dict[str, Any] | None:

@@ -22,10 +22,11 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from potr_cl.codec.decoder import decode
+from potr_cl.codec.decoder import PotrFile
 from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
+from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, cameras_or_virtual
 from potr_cl.pipeline.fallback import on_device
@@ -348,9 +349,10 @@ class _Search:
             value = math.log(encoded.nbytes)
         else:
             encoded = None
-            pieces = self._code(reduced, options.changed(code=_QUICK_CODER)).pieces
+            file = PotrFile.from_bytes(self._code(reduced, options.changed(code=_QUICK_CODER)).data, trust=True)
             self._watch("evaluate tries", 0.0)
-            value = min(self._evaluator.psnr(decode(b"".join(pieces), trust=True)), _IDENTICAL)
+            with decode_to_device(file, self._evaluator.device) as candidate:
+                value = min(self._evaluator.psnr(candidate), _IDENTICAL)
             self._watch("evaluate tries", 1.0)
         self._tries.append(Try(kind, q, value))
         self._tell(f"{KINDS[kind].format(f'{q:g}')} {self._target.describe(value)}")

@@ -30,7 +30,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner, Scratch
 from potr_cl.raster.launcher import launcher_for
 from potr_cl.raster.rules import INRIA, LEAST_COMPENSATION, RasterRules
-from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
+from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, uploaded
 from potr_cl.raster.view_set import View, ViewSet
 
 #: Least room for intersections before anything is known of a view, and as a multiple of the splats.
@@ -42,7 +42,8 @@ class Rasterizer(Owner):
 
     Args:
         device: to render on.
-        scene: to render; copied to the device, later changes of its arrays are not seen.
+        scene: to render; copied to the device, later changes of its arrays are not seen. Or one that lies on the device
+            already, which stays the caller's.
         rules: of the rasterizer to follow.
         background: R, G, B behind everything.
 
@@ -52,13 +53,13 @@ class Rasterizer(Owner):
         stride: N rounded up; buffers that hold one value for each splat have this length.
 
     Raises:
-        DeviceError: the scene does not fit, or the kernels cannot be built.
+        DeviceError: the scene does not fit or lies on another device, or the kernels cannot be built.
     """
 
     def __init__(
         self,
         device: Device,
-        scene: Scene,
+        scene: Drawable,
         rules: RasterRules = INRIA,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
@@ -66,7 +67,15 @@ class Rasterizer(Owner):
         self.rules = rules
         self.background = background
         with device.all_or_nothing():
-            self._scene = SceneBuffers(device, scene)
+            if isinstance(scene, SceneBuffers):
+                if scene.device is not device:
+                    raise DeviceError(
+                        f"the scene lies on {scene.device.info}, which was opened apart from {device.info}"
+                    )
+                self._scene, self._own = scene, []
+            else:
+                self._scene = uploaded(device, scene)
+                self._own = [self._scene]
             self._launcher = launcher_for(device, rules)
             self._projection = device.shared_kernel(
                 "raster/project.cl",
@@ -75,7 +84,7 @@ class Rasterizer(Owner):
                 SH_COUNT=self._scene.sh_count,
                 NEAR=float(rules.near),
                 SQUARE_EXTENT=int(rules.square_extent),
-                **_filter_macros(scene),
+                **_filter_macros(self._scene),
             )
         self._bounds = Scratch(device, "the projected splats' bounds")
         self._counts = Scratch(device, "the tile counts")
@@ -297,7 +306,7 @@ class Rasterizer(Owner):
     def close(self) -> None:
         if self._frame is not None:
             self._frame.close()
-        for owner in (self._scene, self._bounds, self._counts, self._keys, self._image, self._transmittance):
+        for owner in (*self._own, self._bounds, self._counts, self._keys, self._image, self._transmittance):
             owner.close()
 
 
@@ -321,7 +330,7 @@ def render(
         return rasterizer.render(camera)
 
 
-def _filter_macros(scene: Scene) -> dict[str, float]:
+def _filter_macros(scene: SceneBuffers) -> dict[str, float]:
     """Macros of the projection that an antialiased scene needs; the kernel of classic ones has no trace of it."""
     if not scene.antialiased:
         return {}
