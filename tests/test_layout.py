@@ -24,19 +24,18 @@ FOLDERS: dict[str, set[str]] = {
     "ondevice": {"errors", "host", "model", "opencl", "raster", "codec"},
     "formats": {"errors", "host", "model", "codec"},
     "quality": {"errors", "host", "model", "opencl", "raster", "formats"},
-    "stages": {"errors", "host", "model", "opencl", "raster", "codec", "quality"},
-    "pipeline": {
-        "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages", "quality",
-    },
+    "outputs": {"errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats"},
+    "stages": {"errors", "host", "model", "opencl", "raster", "codec", "quality", "outputs"},
+    "pipeline": {"errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality", "outputs"},
     "report": {"plain_text", "errors", "host", "model", "opencl", "codec", "formats", "quality", "pipeline"},
     "reference": {"errors", "model", "opencl", "raster", "stages"},
     "api": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages",
-        "quality", "pipeline", "report",
+        "quality", "pipeline", "report", "outputs",
     },
     "cli": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages",
-        "quality", "pipeline", "report", "api",
+        "quality", "pipeline", "report", "api", "outputs",
     },
 }  # fmt: skip
 #: They offer the whole package under short names, and start it.

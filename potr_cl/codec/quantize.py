@@ -293,9 +293,14 @@ def canonical_rotations(quaternions: F32, log_scales: F32, order: NDArray[np.int
     order = np.arange(len(quaternions)) if order is None else order
     if functions is not None:
         imaginary, turned = np.empty((len(order), 3)), np.empty((len(order), 3), np.float32)
-        rows = (np.ascontiguousarray(each, np.float32) for each in (quaternions, log_scales))
         functions.quantising.canonical(
-            *rows, np.ascontiguousarray(order), _CONJUGATES, _PERMUTATIONS.astype(np.uint8), imaginary, turned
+            np.ascontiguousarray(quaternions, np.float32),
+            np.ascontiguousarray(log_scales, np.float32),
+            np.ascontiguousarray(order, np.int64),
+            _CONJUGATES,
+            _PERMUTATIONS.astype(np.uint8),
+            imaginary,
+            turned,
         )
         return imaginary, turned
     log_scales = log_scales[order]

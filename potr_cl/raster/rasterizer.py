@@ -27,7 +27,7 @@ from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import LOW_PASS, FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Owner, Scratch
+from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.raster.launcher import launcher_for
 from potr_cl.raster.rules import INRIA, LEAST_COMPENSATION, RasterRules
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, uploaded
@@ -72,10 +72,11 @@ class Rasterizer(Owner):
                     raise DeviceError(
                         f"the scene lies on {scene.device.info}, which was opened apart from {device.info}"
                     )
-                self._scene, self._own = scene, []
+                self._scene, self._owns = scene, False
             else:
-                self._scene = uploaded(device, scene)
-                self._own = [self._scene]
+                self._scene, self._owns = uploaded(device, scene), True
+            self._sh = self._scene.sh
+            self._other_sh = Memory(device)
             self._launcher = launcher_for(device, rules)
             self._projection = device.shared_kernel(
                 "raster/project.cl",
@@ -228,15 +229,25 @@ class Rasterizer(Owner):
         """Enqueue only the projection of prepared views; with other SH, or into other buffers, if these are given."""
         self._enqueue_project(views, self._room_for_bounds(views), sh, shapes, colours)
 
-    def replace_sh(self, sh: FloatArray) -> cl.Buffer:
+    @property
+    def sh(self) -> cl.Buffer:
+        """The SH coefficients that splats have now, as :class:`~potr_cl.raster.scene_buffers.SceneBuffers` has them."""
+        return self._sh
+
+    def replace_sh(self, sh: FloatArray) -> cl.Buffer | None:
         """Give the scene other SH coefficients, (N, M, 3) float32 of the same degree.
 
         Views that were prepared before keep their colours until they are projected again.
 
         Returns:
-            The buffer of the former coefficients, which is the caller's to free.
+            The buffer of the former coefficients, which is the caller's to free; None if they are those of a scene that
+            lay on the device already, and stay there.
         """
-        return self._scene.replace_sh(sh)
+        former = self._sh
+        self._sh = self._scene.other_sh(self._other_sh, sh)
+        if former is not self._scene.sh:
+            return self._other_sh.release(former)
+        return self._scene.release_sh() if self._owns else None
 
     def _room_for_bounds(self, views: ViewSet) -> cl.Buffer:
         self._bounds.reserve(8 * self.stride * len(views.views))
@@ -258,7 +269,7 @@ class Rasterizer(Owner):
     ) -> None:
         self._projection.bind(
             **self._scene.geometry,
-            sh=self._scene.sh if sh is None else sh,
+            sh=self._sh if sh is None else sh,
             views=views.table,
             shapes=views.shapes if shapes is None else shapes,
             colours=views.colours if colours is None else colours,
@@ -306,7 +317,15 @@ class Rasterizer(Owner):
     def close(self) -> None:
         if self._frame is not None:
             self._frame.close()
-        for owner in (*self._own, self._bounds, self._counts, self._keys, self._image, self._transmittance):
+        for owner in (
+            *([self._scene] if self._owns else []),
+            self._other_sh,
+            self._bounds,
+            self._counts,
+            self._keys,
+            self._image,
+            self._transmittance,
+        ):
             owner.close()
 
 

@@ -131,27 +131,36 @@ class SceneBuffers(Owner):
                 is_blocking=True,
             )
 
-    def write_sh(self, sh: FloatArray) -> None:
-        """Set the SH coefficients, (N, M, 3) float32 of any strides."""
+    def write_sh(self, parameter: cl.Buffer, sh: FloatArray) -> None:
+        """Set SH coefficients, (N, M, 3) float32 of any strides.
+
+        Args:
+            parameter: ``sh``, or a buffer of :meth:`other_sh`.
+            sh: the coefficients.
+        """
         planar = sh.transpose(1, 2, 0)
         if planar.flags.c_contiguous and planar.dtype == np.float32:  # as a decoder leaves them
-            self.write_columns(self.sh, 0, planar.reshape(3 * self.sh_count, self.splats))
+            self.write_columns(parameter, 0, planar.reshape(3 * self.sh_count, self.splats))
         else:
-            self.write_rows(self.sh, sh.reshape(self.splats, -1), "the SH coefficients")
+            self.write_rows(parameter, sh.reshape(self.splats, -1), "the SH coefficients")
 
-    def replace_sh(self, sh: FloatArray) -> cl.Buffer:
-        """Replace the SH coefficients by others, (N, M, 3) float32 of the same degree.
+    def other_sh(self, memory: Memory, sh: FloatArray) -> cl.Buffer:
+        """Other SH coefficients for the same splats, (N, M, 3) float32 of the same degree, in a buffer like ``sh``.
 
-        Returns:
-            The buffer of the former ones, which is the caller's to free.
+        Args:
+            memory: that owns the buffer.
+            sh: the coefficients.
         """
-        former = self.sh
-        self.sh = self._columns(3 * self.sh_count, 0, "the SH coefficients")
-        self.write_sh(sh)
-        return self._memory.release(former)
+        buffer = self._columns(3 * self.sh_count, 0, "the SH coefficients", memory)
+        self.write_sh(buffer, sh)
+        return buffer
 
-    def _columns(self, number: int, value: float, what: str) -> cl.Buffer:
-        buffer = self._memory.allocate(4 * number * self.stride, what)
+    def release_sh(self) -> cl.Buffer:
+        """The buffer ``sh``, which is the caller's to free from now on."""
+        return self._memory.release(self.sh)
+
+    def _columns(self, number: int, value: float, what: str, memory: Memory | None = None) -> cl.Buffer:
+        buffer = (memory or self._memory).allocate(4 * number * self.stride, what)
         cl.enqueue_fill_buffer(self.device.queue, buffer, np.float32(value), 0, 4 * number * self.stride)
         return buffer
 
@@ -175,7 +184,7 @@ def uploaded(device: Device, scene: Scene) -> SceneBuffers:
         buffers.write_rows(buffers.scales, activated_scales(scene.log_scales), "the scales")
         buffers.write_rows(buffers.quaternions, unit_quaternions(scene.quaternions), "the rotations")
         buffers.write_rows(buffers.log2_opacities, log2_opacities(scene.opacity_logits)[:, None], "the opacities")
-        buffers.write_sh(scene.sh)
+        buffers.write_sh(buffers.sh, scene.sh)
     except BaseException:
         buffers.close()
         raise
