@@ -24,6 +24,7 @@ from potr_cl.model.virtual_cameras import is_virtual, place_cameras
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
@@ -139,6 +140,8 @@ def encode(
     progress: Progress | None = None,
     device: Device | None = None,
     antialiased: bool | None = None,
+    kept: KeptScene | None = None,
+    in_frame: bool = False,
 ) -> Encoded:
     """Encode a scene.
 
@@ -151,6 +154,8 @@ def encode(
         device: computes; by default the best one there is. If its memory is too small, less is kept in it, and if that
             is not enough, a CPU does the work. A warning says so.
         antialiased: whether to take it as an antialiased scene; None: as what it says that it is.
+        kept: the scene on the device, if it will be needed there afterwards.
+        in_frame: whether :func:`check_frame` has found the cameras to be in the scene's frame.
 
     Raises:
         UsageError: options out of range, cameras without a training view, or cameras that are probably not in the
@@ -162,9 +167,13 @@ def encode(
     scene = scene.rendered(antialiased)
     tell_losses(scene, options)
     watch = Stopwatch(progress)
-    cameras = cameras_or_virtual(scene, cameras, options, watch)
-    run = Run(options, watch, device)
-    return run.finished(run.stages(State.of(scene, train_views(cameras) if cameras else [])))
+    cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame)
+    with ExitStack() as stack:
+        if kept is None and cameras and options.look_at_views(scene):
+            device = device or Device()
+            kept = stack.enter_context(KeptScene(device, scene))
+        run = Run(options, watch, device, kept)
+        return run.finished(run.stages(State.of(scene, train_views(cameras) if cameras else [])))
 
 
 def tell_losses(scene: Scene, options: EncodeOptions) -> None:
@@ -175,7 +184,11 @@ def tell_losses(scene: Scene, options: EncodeOptions) -> None:
 
 
 def cameras_or_virtual(
-    scene: Scene, cameras: Sequence[Camera] | None, options: EncodeOptions, watch: Stopwatch
+    scene: Scene,
+    cameras: Sequence[Camera] | None,
+    options: EncodeOptions,
+    watch: Stopwatch,
+    in_frame: bool = False,
 ) -> Sequence[Camera] | None:
     """The cameras; or virtual ones, if there are none and a stage needs views.
 
@@ -184,7 +197,7 @@ def cameras_or_virtual(
     Raises:
         UsageError: the training views are probably not in the scene's frame; but with ``options.cameras_anyway``.
     """
-    check_frame(scene, cameras, options.cameras_anyway)
+    check_frame(scene, cameras, options.cameras_anyway or in_frame)
     if cameras is None and options.look_at_views(scene):
         watch("place cameras", 0.0)
         cameras = place_cameras(scene)
@@ -211,14 +224,17 @@ class Run:
         options: the stages, and what they all share.
         watch: keeps the time and passes the progress on.
         device: the first to be tried; by default the best one there is, opened when a stage needs it.
+        kept: the uncompressed scene on that device.
 
     Attributes:
         device: the one on which the last stage ran that needs views; None if none did.
     """
 
-    def __init__(self, options: EncodeOptions, watch: Stopwatch, device: Device | None = None) -> None:
+    def __init__(
+        self, options: EncodeOptions, watch: Stopwatch, device: Device | None = None, kept: KeptScene | None = None
+    ) -> None:
         self.device: Device | None = None
-        self._options, self._watch, self._given = options, watch, device
+        self._options, self._watch, self._given, self._kept = options, watch, device, kept
 
     def stages(self, state: State, only: Sequence[type[Stage]] | None = None) -> State:
         """Run the stages, or some of them, in their order.
@@ -242,6 +258,7 @@ class Run:
             metadata=lambda last: _metadata(last, options),
             progress=self._watch,
             output=options.output,
+            kept=self._kept,
         )
         if not stage.asked_for:
             return state

@@ -13,7 +13,7 @@ import numpy as np
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import Colour
 from potr_cl.model.camera import Camera, test_views, train_views
-from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.scene import FloatArray
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
@@ -92,7 +92,7 @@ class Evaluator(Owner):
         DeviceError: the scene does not fit the device.
     """
 
-    def __init__(self, device: Device, scene: Scene, views: EvaluationViews, background: Colour) -> None:
+    def __init__(self, device: Device, scene: Drawable, views: EvaluationViews, background: Colour) -> None:
         self.views = views
         self.device = device
         self._background = background
