@@ -11,7 +11,8 @@ from numpy.typing import NDArray
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.scene_buffers import LARGEST_SCALE, SPLAT_GROUP, SceneBuffers
+from potr_cl.raster.activation import LARGEST_SCALE
+from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
 from potr_cl.stages.fitting.derivatives import Columns
 
 #: How fast the moments forget (Kingma and Ba, 2015).
