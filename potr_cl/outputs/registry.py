@@ -11,10 +11,12 @@ from potr_cl.formats.registry import listed, stem_of_scene, suffix_of_name, writ
 from potr_cl.outputs.output import Output
 from potr_cl.outputs.ply import Ply
 from potr_cl.outputs.potr import Potr
+from potr_cl.outputs.spz import Spz
 
 #: In the order in which people are told of them; the first is the usual one.
 OUTPUTS: tuple[type[Output], ...] = (
     Potr,
+    Spz,
     Ply,
 )
 
@@ -36,7 +38,7 @@ def output_of(path: Path, **choices: Any) -> Output:
     given = {name: value for name, value in choices.items() if value is not None}
     for name in given:
         if name not in kind.__dataclass_fields__:
-            raise UsageError(f"'{path}': there is no {name.replace('_', '-')} to choose for {kind.format.name}")
+            raise UsageError(f"'{path}': {kind.format.name} has no {name} to choose")
     return kind(**given)
 
 
