@@ -90,8 +90,11 @@ class Spz(Output):
         return SpzRounded(parameters, order, seen, None, bits, tuple(properties))
 
     def _positions(self, scene: Scene, tolerance: NDArray[np.float64]) -> tuple[int, NDArray[np.int64]]:
-        """Fractional bits and positions in their steps; each is a multiple of a power of two that it can do with."""
-        step = np.floor(np.log2(2 * np.maximum(tolerance, 1e-30)))
+        """Fractional bits and positions in their steps; each is a multiple of a power of two that it can do with.
+
+        ``tolerance`` is how far a centre may move: half the diagonal of a cube of steps.
+        """
+        step = np.floor(np.log2(2 / np.sqrt(3) * np.maximum(tolerance, 1e-30)))
         largest = float(np.abs(scene.means).max())
         room = int(np.floor(np.log2(spz_values.POSITION_LIMIT / max(largest, 1e-30))))
         most = min(room, spz_values.MOST_FRACTIONAL_BITS)
