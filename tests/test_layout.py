@@ -24,17 +24,18 @@ FOLDERS: dict[str, set[str]] = {
     "clustering": {"errors", "model", "opencl"},
     "formats": {"errors", "host", "model", "opencl", "codec", "clustering"},
     "quality": {"errors", "host", "model", "opencl", "raster", "formats"},
-    "stages": {"errors", "host", "model", "opencl", "raster", "codec", "quality"},
-    "pipeline": {"errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality"},
+    "outputs": {"errors", "host", "model", "opencl", "raster", "codec", "formats"},
+    "stages": {"errors", "host", "model", "opencl", "raster", "codec", "quality", "outputs"},
+    "pipeline": {"errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality", "outputs"},
     "report": {"plain_text", "errors", "host", "model", "opencl", "codec", "formats", "quality", "pipeline"},
     "reference": {"errors", "model", "opencl", "raster", "stages"},
     "api": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality",
-        "pipeline", "report",
+        "pipeline", "report", "outputs",
     },
     "cli": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality",
-        "pipeline", "report", "api",
+        "pipeline", "report", "api", "outputs",
     },
 }  # fmt: skip
 #: They offer the whole package under short names, and start it.
