@@ -1,4 +1,4 @@
-/* The nearest centre of each point, for CPUs: a block of LANES points a work-item, each centre against all of them.
+/* The best centre of each point, for CPUs: a block of LANES points a work-item, each centre against all of them.
 
    Macros: WIDTH (floats of a row of points and of centres, a multiple of 4; unused ones are 0), LANES. */
 
@@ -9,7 +9,7 @@
 #define SIDE 4
 
 /* order: the points of each block, NO_POINT beyond the last. cells: of each block. runs_of: of each cell, where its
-   runs begin in `runs`, with the end of the last behind. labels, scores: by point; scores are |c|² / 2 - x c. */
+   runs begin in `runs`, with the end of the last behind. labels, scores: by point; the score is the least bias + x c. */
 kernel void nearest(
     global const float *points,
     global const uint *order,
@@ -17,7 +17,7 @@ kernel void nearest(
     global const uint *runs_of,
     global const uint *runs,
     global const float *centres,
-    global const float *half_norms,
+    global const float *biases,
     global uint *labels,
     global float *scores)
 {
@@ -42,18 +42,17 @@ kernel void nearest(
             global const float *rows[SIDE];
             for (int k = 0; k < SIDE; ++k) {
                 const uint centre = min(first + k, end - 1);
-                sums[k] = (vfloat)(half_norms[centre]);
+                sums[k] = (vfloat)(biases[centre]);
                 rows[k] = centres + (size_t)centre * WIDTH;
             }
             for (int d = 0; d < WIDTH; ++d) {
-                const vfloat minus = -x[d];
                 for (int k = 0; k < SIDE; ++k)
-                    sums[k] = MAD(minus, (vfloat)(rows[k][d]), sums[k]);
+                    sums[k] = MAD(x[d], (vfloat)(rows[k][d]), sums[k]);
             }
             for (int k = 0; k < SIDE; ++k) {
-                const vint nearer = sums[k] < least;
-                least = nearer ? sums[k] : least;
-                label = nearer ? (vint)((int)min(first + k, end - 1)) : label;
+                const vint better = sums[k] < least;
+                least = better ? sums[k] : least;
+                label = better ? (vint)((int)min(first + k, end - 1)) : label;
             }
         }
     }

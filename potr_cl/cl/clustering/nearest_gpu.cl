@@ -1,4 +1,4 @@
-/* The nearest centre of each point, for GPUs: a block of GROUP points a work-group, a point a work-item. The group
+/* The best centre of each point, for GPUs: a block of GROUP points a work-group, a point a work-item. The group
    brings some centres at a time into local memory, and each work-item compares its point with them.
 
    Macros: WIDTH (floats of a row of points and of centres, a multiple of 4; unused ones are 0), GROUP. */
@@ -9,7 +9,7 @@
 #define TILE 64
 
 /* order: the points of each block, NO_POINT beyond the last. cells: of each block. runs_of: of each cell, where its
-   runs begin in `runs`, with the end of the last behind. labels, scores: by point; scores are |c|² / 2 - x c. */
+   runs begin in `runs`, with the end of the last behind. labels, scores: by point; the score is the least bias + x c. */
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void nearest(
     global const float *points,
     global const uint *order,
@@ -17,12 +17,12 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void nearest(
     global const uint *runs_of,
     global const uint *runs,
     global const float *centres,
-    global const float *half_norms,
+    global const float *biases,
     global uint *labels,
     global float *scores)
 {
     local float4 rows[TILE * WIDTH / 4];
-    local float halves[TILE];
+    local float offsets[TILE];
     const size_t block = get_group_id(0);
     const uint item = get_local_id(0);
     const uint member = order[block * GROUP + item];
@@ -41,13 +41,13 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1))) void nearest(
             for (uint i = item; i < count * (WIDTH / 4); i += GROUP)
                 rows[i] = vload4((size_t)first * (WIDTH / 4) + i, centres);
             for (uint i = item; i < count; i += GROUP)
-                halves[i] = half_norms[first + i];
+                offsets[i] = biases[first + i];
             barrier(CLK_LOCAL_MEM_FENCE);
             for (uint k = 0; k < count; ++k) {
                 float4 sum = (float4)(0.0f);
                 for (int d = 0; d < WIDTH / 4; ++d)
                     sum += x[d] * rows[k * (WIDTH / 4) + d];
-                const float score = halves[k] - ((sum.x + sum.y) + (sum.z + sum.w));
+                const float score = offsets[k] + ((sum.x + sum.y) + (sum.z + sum.w));
                 if (score < least) {
                     least = score;
                     label = first + k;

@@ -43,7 +43,7 @@ from potr_cl.formats.scenes.sog_images import (
     write_folder,
 )
 from potr_cl.formats.scenes.sog_palette import areas, palette_of
-from potr_cl.formats.scenes.sog_steps import quantised
+from potr_cl.formats.scenes.sog_steps import opacity_logits, quantised, unpacked_means, unpacked_rotations
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.claims import check_claim
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
@@ -52,7 +52,6 @@ from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 _DESCRIPTION_BYTES = 1 << 22
 #: Others take memory that an archive's size does not bound.
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_LEAST_OPACITY = np.float32(1e-6)
 #: Splats worked on at a time: the temporaries stay small.
 _BLOCK = 1 << 16
 
@@ -252,12 +251,11 @@ class Sog:
         quaternions, scales = self._pixels("quats", 0), self._pixels("scales", 0)
         book = self._codebook("scales")
         for block in self._blocks():
-            scene.quaternions[block] = _smallest_three(quaternions[block])
+            scene.quaternions[block] = unpacked_rotations(quaternions[block])
             scene.log_scales[block] = book.take(scales[block, :3])
         del quaternions, scales
         colours, book = self._pixels("sh0", 0), self._codebook("sh0")
-        opacity = np.clip(np.arange(256).astype(np.float32) / np.float32(255), _LEAST_OPACITY, 1 - _LEAST_OPACITY)
-        logits = natural_logarithm(opacity / (1 - opacity))
+        logits = opacity_logits()
         for block in self._blocks():
             scene.sh[block, 0] = book.take(colours[block, :3])
             scene.opacity_logits[block] = logits.take(colours[block, 3])
@@ -268,12 +266,10 @@ class Sog:
     def _fill_means(self, means: FloatArray) -> None:
         low, high = self._pixels("means", 0), self._pixels("means", 1)
         least, most = (np.array(self._numbers("means", key, 3), np.float32) for key in ("mins", "maxs"))
-        extent = np.where(most == least, np.float32(1), most - least)
         for block in self._blocks():
             steps = low[block, :3] | high[block, :3].astype(np.uint16) << np.uint16(8)
-            logarithms = least + extent * (steps.astype(np.float32) * np.float32(1 / 65535))
             with np.errstate(over="ignore"):  # such a splat is dropped
-                means[block] = np.copysign(np.expm1(np.abs(logarithms), dtype=np.float64), logarithms)
+                means[block] = unpacked_means(steps, least, most)
 
     def _fill_rest(self, rest: FloatArray) -> None:
         part, coefficients = self._meta["shN"], rest.shape[1]
@@ -353,19 +349,6 @@ def webp_size(data: bytes) -> tuple[int, int] | None:
     if kind == b"VP8 ":
         return int.from_bytes(head[26:28], "little") & 0x3FFF, int.from_bytes(head[28:30], "little") & 0x3FFF
     return None
-
-
-def _smallest_three(pixels: U8) -> FloatArray:
-    """Quaternions w, x, y, z; no rotation where a pixel holds none."""
-    stored = ((pixels[:, :3].astype(np.float32) / np.float32(255)) * 2 - 1) * np.float32(np.sqrt(0.5))
-    squares = stored * stored
-    left = 1 - (squares[:, 0] + squares[:, 1] + squares[:, 2])
-    largest = np.maximum(pixels[:, 3].astype(np.intp) - FIRST_TAG, 0)
-    quaternions = np.empty((len(pixels), 4), np.float32)
-    np.put_along_axis(quaternions, OTHER_PARTS[largest], stored, axis=1)
-    np.put_along_axis(quaternions, largest[:, None], np.sqrt(np.maximum(left, 0))[:, None], axis=1)
-    quaternions[pixels[:, 3] < FIRST_TAG] = (1, 0, 0, 0)
-    return quaternions
 
 
 def _whole(value: Any) -> int:

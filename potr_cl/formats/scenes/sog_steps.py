@@ -6,14 +6,16 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.clustering.codebook import codebook, nearest
+from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.codec.quantize import canonical_rotations
-from potr_cl.formats.scenes.sog_images import CODEBOOK, FIRST_TAG, U8, Palette, SogImages
+from potr_cl.formats.scenes.sog_images import CODEBOOK, FIRST_TAG, OTHER_PARTS, U8, Palette, SogImages
 from potr_cl.model.scene import FloatArray, Scene
 
 #: Of positions, whose logarithms have 16 bits.
 STEPS = 65535
 #: Splats worked on at a time: the temporaries stay small.
 _BLOCK = 1 << 16
+_LEAST_OPACITY = np.float32(1e-6)
 
 
 def quantised(scene: Scene, palette: Palette | None, weights: NDArray[np.float64] | None = None) -> SogImages:
@@ -64,9 +66,36 @@ def position_steps(logarithms: NDArray[np.float64], least: FloatArray, most: Flo
     return np.clip(np.rint((logarithms - least) / extent * STEPS), 0, STEPS).astype(np.uint16)
 
 
+def unpacked_means(steps: NDArray[np.uint16], least: FloatArray, most: FloatArray) -> FloatArray:
+    """(n, 3) float32 positions of steps (n, 3), infinite where single precision cannot hold them."""
+    extent = np.where(most == least, np.float32(1), most - least)
+    logarithms = least + extent * (steps.astype(np.float32) * np.float32(1 / STEPS))
+    means = np.copysign(np.expm1(np.abs(logarithms), dtype=np.float64), logarithms)
+    return means.astype(np.float32)
+
+
 def packed_rotations(imaginary: NDArray[np.float64]) -> U8:
     """(N, 4) uint8 of unit quaternions whose real part is the largest, from their imaginary parts, (N, 3)."""
     packed = np.empty((len(imaginary), 4), np.uint8)
     packed[:, :3] = np.clip(np.rint((imaginary * np.sqrt(2) + 1) * 127.5), 0, 255)
     packed[:, 3] = FIRST_TAG
     return packed
+
+
+def unpacked_rotations(pixels: U8) -> FloatArray:
+    """(n, 4) float32 quaternions w, x, y, z of pixels (n, 4); no rotation where a pixel holds none."""
+    stored = ((pixels[:, :3].astype(np.float32) / np.float32(255)) * 2 - 1) * np.float32(np.sqrt(0.5))
+    squares = stored * stored
+    left = 1 - (squares[:, 0] + squares[:, 1] + squares[:, 2])
+    largest = np.maximum(pixels[:, 3].astype(np.intp) - FIRST_TAG, 0)
+    quaternions = np.empty((len(pixels), 4), np.float32)
+    np.put_along_axis(quaternions, OTHER_PARTS[largest], stored, axis=1)
+    np.put_along_axis(quaternions, largest[:, None], np.sqrt(np.maximum(left, 0))[:, None], axis=1)
+    quaternions[pixels[:, 3] < FIRST_TAG] = (1, 0, 0, 0)
+    return quaternions
+
+
+def opacity_logits() -> FloatArray:
+    """(256,) float32, the logit of each opacity; those of 0 and 1 are what eight bits cannot tell from them."""
+    opacities = np.clip(np.arange(256).astype(np.float32) / np.float32(255), _LEAST_OPACITY, 1 - _LEAST_OPACITY)
+    return natural_logarithm(opacities / (1 - opacities))
