@@ -179,8 +179,19 @@ class Version2(FormatVersion):
         return quantize.dequantize_logits(levels, sf_opacity)
 
 
+class Version3(Version2):
+    """Not final: no preset writes it yet. It will have another entropy coder, and steps of colours that fit each splat.
+
+    Its quantiser is version 2's so far. What it does with colours may depend on the levels of scales and opacities,
+    which are decoded before them.
+    """
+
+    number = 3
+
+
 #: All versions that are read, by their number.
 VERSIONS: dict[int, FormatVersion] = {
     1: Version1(),
     2: Version2(),
+    3: Version3(),
 }

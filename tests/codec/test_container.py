@@ -164,7 +164,7 @@ LIES = {
     "half a header": (lambda d: d[:130], "truncated"),
     "cut": (lambda d: d[:-1], "truncated"),
     "longer": (lambda d: d + b"x", "followed by"),
-    "future version": (lambda d: changed(d, 8, "<H", 3), "update potr_cl"),
+    "future version": (lambda d: changed(d, 8, "<H", 1000), "update potr_cl"),
     "version 2 with version 1's reserved bytes": (lambda d: changed(d, 8, "<H", 2), "scale factor"),
     "coder of version 2": (lambda d: changed(d, 122, "<B", 3), "coder 3"),
     "version 0": (lambda d: changed(d, 8, "<H", 0), "unknown"),
