@@ -27,6 +27,7 @@ from potr_cl.stages.pruning.unseen import Unseen
 from potr_cl.stages.refitting.photographs import PhotographChoice
 from potr_cl.stages.refitting.refit import Refitted
 from potr_cl.stages.stage import Interlude, Progress, Stage, State, Workbench
+from potr_cl.stages.views_between import Added
 
 
 @dataclass(frozen=True)
@@ -41,6 +42,7 @@ class Encoded:
         unseen: the splats that no training view sees; None if pruning was left out.
         refitted: what the re-fit of the colours did; None if it was left out.
         photographs: what held-out photographs say of a fit to photographs; None if none were given.
+        between: the views between the training views that were looked at; None if nobody asked for any.
         device: the device that did the work; not the one that was asked for if that had too little memory. None if no
             stage needed a device.
         seconds: wall time by stage.
@@ -55,6 +57,7 @@ class Encoded:
     unseen: Unseen | None
     refitted: Refitted | None
     photographs: PhotographChoice | None
+    between: Added | None
     device: Device | None
     seconds: dict[str, float]
     options: EncodeOptions
@@ -218,6 +221,7 @@ class Run:
             unseen=state.learnt.get("unseen"),
             refitted=state.learnt.get("refit"),
             photographs=state.learnt.get("photographs"),
+            between=state.learnt.get("between"),
             device=self.device,
             seconds=self._watch.seconds,
             options=self._options,
