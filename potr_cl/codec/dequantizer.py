@@ -16,7 +16,7 @@ from numpy.typing import NDArray
 from potr_cl.codec import quantize
 from potr_cl.codec.bundles.levels import Levels
 from potr_cl.codec.container import Header
-from potr_cl.codec.native.bundles import SceneArrays
+from potr_cl.codec.native.bundles import ValueArrays
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import native
 from potr_cl.codec.versions import FormatVersion
@@ -121,7 +121,7 @@ class Dequantizer:
                 channels = _wider(parts)
             _to_rgb(channels, factor, out[:, block])
 
-    def of_levels(self, levels: Levels, arrays: SceneArrays) -> None:
+    def of_levels(self, levels: Levels, arrays: ValueArrays) -> None:
         """The values of some splats' levels, by NumPy, into the arrays that there are, of all of the file's splats."""
         version, header = self.version, self.header
         own = slice(levels.start, levels.stop)

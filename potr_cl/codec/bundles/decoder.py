@@ -13,7 +13,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.bundles.description import Fitted
 from potr_cl.codec.bundles.layout import BUNDLE, LANES, Bundles, Layout
-from potr_cl.codec.bundles.levels import Items, Levels
+from potr_cl.codec.bundles.levels import Items, Levels, joined
 from potr_cl.codec.bundles.ranges import Words, decode_stream
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Key, Section
 from potr_cl.codec.bundles.streams import band, differences, streams_of
@@ -93,7 +93,8 @@ class Reader:
         """
         file = self.bundled_file(wanted)
         if file is not None:
-            return _levels_of(self, file, first, last, wanted)
+            work = file.work()
+            return joined([_levels_of(self, file, bundle, wanted, work) for bundle in range(first, last)])
         run = _Run(self, first, last)
         for key in wanted.keys:
             run.decode(key)
@@ -233,35 +234,23 @@ class _Run:
         self.levels.ac.append(Items(splat, which + first, channels))
 
 
-def _levels_of(reader: Reader, file: BundledFile, first: int, last: int, wanted: Wanted) -> Levels:
-    """:meth:`Reader.levels` by the native path."""
-    work = file.work()
-    parts = []
-    for bundle in range(first, last):
-        said, number, found = file.integers(bundle, wanted.sections, wanted.rotations, work)
-        check_said(reader, said, number)
-        parts.append(found)
-    starts = BUNDLE * np.arange(len(parts))
-    levels = Levels(first * BUNDLE, min(last * BUNDLE, reader.bundles.splats))
-    levels.opacities = np.concatenate([part.opacities for part in parts])
+def _levels_of(reader: Reader, file: BundledFile, bundle: int, wanted: Wanted, work: NDArray[np.uint8]) -> Levels:
+    """A bundle's levels by the native path."""
+    said, number, found = file.integers(bundle, wanted.sections, wanted.rotations, work)
+    check_said(reader, said, number)
+    levels = Levels(bundle * BUNDLE, min((bundle + 1) * BUNDLE, reader.bundles.splats), found.opacities)
     if wanted.sections > 1:
-        levels.scales = list(np.concatenate([part.scales for part in parts], axis=1))
+        levels.scales = list(found.scales)
     if wanted.sections > 2:
-        levels.dc = list(np.concatenate([part.dc for part in parts], axis=1))
+        levels.dc = list(found.dc)
     if wanted.rotations:
-        levels.rotations = list(np.concatenate([part.rotations for part in parts], axis=1))
-    for k in range(wanted.sections - 3):
-        if reader.section(MAIN[3 + k]) is None:
-            continue
-        of_degree = [slice(sum(part.items[:k]), sum(part.items[: k + 1])) for part in parts]
-        each = list(zip(parts, of_degree, starts, strict=True))
-        levels.ac.append(
-            Items(
-                np.concatenate([part.splats[own].astype(np.int64) + start for part, own, start in each]),
-                np.concatenate([part.coefficients[own].astype(np.int64) for part, own, _ in each]),
-                np.concatenate([part.channels[:, own] for part, own, _ in each], axis=1),
-            )
-        )
+        levels.rotations = list(found.rotations)
+    ends = np.cumsum((0, *found.items))
+    for k, key in enumerate(MAIN[3 : wanted.sections]):
+        if reader.section(key) is not None:
+            own = slice(ends[k], ends[k + 1])
+            splats = found.splats[own].astype(np.int64)
+            levels.ac.append(Items(splats, found.coefficients[own].astype(np.int64), found.channels[:, own]))
     return levels
 
 

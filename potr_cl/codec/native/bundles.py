@@ -129,20 +129,20 @@ class SectionWords:
 
 
 @dataclass(frozen=True)
-class SceneArrays:
+class ValueArrays:
     """Where the values of a file's N splats go, float32 and contiguous; None for what is not asked for.
 
     Attributes:
         log_scales: (N, 3).
         quaternions: (N, 4).
         logits: (N,).
-        sh: (M, 3, N), which holds zeros but for M = 0.
+        sh: (M, 3, N), which holds zeros.
     """
 
-    log_scales: F32 | None
-    quaternions: F32 | None
-    logits: F32 | None
-    sh: F32 | None
+    log_scales: F32 | None = None
+    quaternions: F32 | None = None
+    logits: F32 | None = None
+    sh: F32 | None = None
 
 
 @dataclass(frozen=True)
@@ -299,7 +299,7 @@ class BundledFile:
         return said, section.value, found
 
     def values(
-        self, bundle: int, sections: int, rotations: bool, work: U8, arrays: SceneArrays, tables: Tables
+        self, bundle: int, sections: int, rotations: bool, work: U8, arrays: ValueArrays, tables: Tables
     ) -> tuple[int, int]:
         """Decode a bundle to values, as :meth:`integers` does to integers.
 

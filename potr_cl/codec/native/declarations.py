@@ -44,6 +44,10 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_bundles_code": (_SIZE, [_POINTER, _WORD, *[_POINTER] * 3, _SIZE, *[_POINTER] * 3]),
     "potr_bundles_grouping": (_SIZE, []),
     "potr_bundles_contexts": (_SIZE, [_POINTER, _SIZE, *[_POINTER] * 4]),
+    "potr_nearest": (None, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER]),
+    "potr_canonical": (None, [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _POINTER, _POINTER, _POINTER]),
+    "potr_ycocg_columns": (None, [_POINTER, _SIZE, _SIZE, _SIZE, _POINTER]),
+    "potr_nonzero_levels": (_NUMBER, [_POINTER, _SIZE, _SIZE, ctypes.c_double, ctypes.c_double, _POINTER]),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
 }
 #: Those that there are for several kinds of integers, by what their names begin with.

@@ -18,6 +18,7 @@ from potr_cl.codec.native.arrays import KINDS, address, addresses, kind_of
 from potr_cl.codec.native.bundles import BundledFile, SectionWords
 from potr_cl.codec.native.bundles_encode import BundleEncoder
 from potr_cl.codec.native.declarations import declared
+from potr_cl.codec.native.quantising import Quantising
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -58,12 +59,16 @@ class Functions:
     Args:
         library: to take the functions from.
 
+    Attributes:
+        quantising: those of the encoder that are about splats, and not about integers.
+
     Raises:
         AttributeError: one is missing.
     """
 
     def __init__(self, library: ctypes.CDLL) -> None:
         self._c = declared(library)
+        self.quantising = Quantising(self._c)
 
     def bundled_file(self, splats: int, sections: Mapping[int, SectionWords]) -> BundledFile:
         """Sections of coder 4, as :class:`potr_cl.codec.native.bundles.BundledFile` takes them."""
