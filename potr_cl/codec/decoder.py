@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from dataclasses import dataclass
 from functools import partial
@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec import container, metadata, octree, sections
 from potr_cl.codec.byte_planes import PlaneStream, unpack_integers
+from potr_cl.codec.colour_factors import ColourFactors, Once
 from potr_cl.codec.container import Header
 from potr_cl.codec.context.decoder import Reader, Stream
 from potr_cl.codec.context.lanes import Lanes
@@ -26,6 +27,7 @@ from potr_cl.codec.context.model import Sizes
 from potr_cl.codec.dequantizer import Dequantizer, IntegerStream
 from potr_cl.codec.native.library import native
 from potr_cl.codec.sections import Coder, Property, Section
+from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.threads import thread_pool
@@ -144,7 +146,7 @@ class PotrFile:
     def opacity_logits(self) -> NDArray[np.float32]:
         """(N,) float32 logits. Raises DataError if damaged."""
         out = np.empty(self.header.splats, np.float32)
-        self._decode_opacities(out, _now)
+        self._decode_opacities(out, _Shared(self), _now)
         return out
 
     def sh(self, degree: int | None = None) -> NDArray[np.float32]:
@@ -158,9 +160,19 @@ class PotrFile:
             DataError: damaged.
         """
         planar = self._empty_sh(degree)
-        for _, job in self._sh_jobs(planar):
+        for _, job in self._sh_jobs(planar, _Shared(self)):
             job(_now)
         return planar.transpose(2, 0, 1)
+
+    def colour_steps(self) -> ColourSteps | None:
+        """What fits the steps of colours to each splat; None if all are the same.
+
+        Raises:
+            DataError: damaged.
+        """
+        if self.header.find(Property.STEPS) is None:
+            return None
+        return ColourSteps.from_bytes(self._raw(Property.STEPS).tobytes(), self.header.splats)
 
     def scene(self, threads: int = 0, sh_degree: int | None = None) -> Scene:
         """Decode everything, or all but some SH coefficients.
@@ -180,11 +192,12 @@ class PotrFile:
             log_scales = np.empty((header.splats, 3), np.float32)
             quaternions = np.empty((header.splats, 4), np.float32)
             opacity_logits = np.empty(header.splats, np.float32)
-            shapes: _Job = partial(self._decode_shapes, log_scales, quaternions)
-            opacities: _Job = partial(self._decode_opacities, opacity_logits)
+            shared = _Shared(self)
+            shapes: _Job = partial(self._decode_shapes, log_scales, quaternions, shared)
+            opacities: _Job = partial(self._decode_opacities, opacity_logits, shared)
             # The longest first: a pool that ends with a long one ends late.
             jobs = [
-                *self._sh_jobs(planar),
+                *self._sh_jobs(planar, shared),
                 (self._contextual(Property.SCALE) or self._contextual(Property.ROTATION), shapes),
                 (self._contextual(Property.OPACITY), opacities),
             ]
@@ -255,7 +268,7 @@ class PotrFile:
             section.integers // section.streams,
             section.streams,
             sections.is_signed(section.kind),
-            sections.is_predicted(section.kind, section.index),
+            sections.is_predicted(section.kind, section.index) and not self._version.colour_steps,
             history,
             section.name,
         )
@@ -279,14 +292,14 @@ class PotrFile:
         return Dequantizer(self.header, self._version)
 
     def _decode_shapes(
-        self, log_scales: NDArray[np.float32], quaternions: NDArray[np.float32], submit: _Submit
+        self, log_scales: NDArray[np.float32], quaternions: NDArray[np.float32], shared: _Shared, submit: _Submit
     ) -> None:
-        scales = self._streams(Property.SCALE)
+        scales = shared.scales.get()
         submit(partial(self._dequantizer.scales, scales, log_scales))
         submit(partial(self._dequantizer.rotations, self._streams(Property.ROTATION), scales, quaternions))
 
-    def _decode_opacities(self, out: NDArray[np.float32], submit: _Submit) -> None:
-        submit(partial(self._dequantizer.opacities, self._streams(Property.OPACITY)[0], out))
+    def _decode_opacities(self, out: NDArray[np.float32], shared: _Shared, submit: _Submit) -> None:
+        submit(partial(self._dequantizer.opacities, shared.opacities.get(), out))
 
     def _coefficients(self, degree: int | None) -> int:
         """How many there are up to a degree, which need not be in the file."""
@@ -297,31 +310,65 @@ class PotrFile:
     def _empty_sh(self, degree: int | None) -> NDArray[np.float32]:
         return np.empty((self._coefficients(degree), 3, self.header.splats), np.float32)
 
-    def _sh_jobs(self, planar: NDArray[np.float32]) -> list[tuple[bool, _Job]]:
+    def _sh_jobs(self, planar: NDArray[np.float32], shared: _Shared) -> list[tuple[bool, _Job]]:
         """What decodes M SH coefficients into ``planar`` (M, 3, N), and whether it takes the context coder."""
         stop = 3 * len(planar)
         contextual = [s for s in self.header.sections if s.kind == Property.SH and s.coder == Coder.CONTEXT]
         chained = [s for s in contextual if 0 < s.index < stop]
         in_chain = {s.index // 3 + m for s in chained for m in range(s.streams // 3)}
         alone = [m for m in range(len(planar)) if m not in in_chain]
-        jobs: list[tuple[bool, _Job]] = [(True, partial(self._decode_chain, chained, planar))] if chained else []
+        jobs: list[tuple[bool, _Job]] = (
+            [(True, partial(self._decode_chain, chained, planar, shared))] if chained else []
+        )
         return jobs + [
-            (self._contextual(Property.SH, 3 * m), partial(self._decode_coefficient, m, planar[m])) for m in alone
+            (self._contextual(Property.SH, 3 * m), partial(self._decode_coefficient, m, planar[m], shared))
+            for m in alone
         ]
 
-    def _decode_chain(self, chain: list[Section], planar: NDArray[np.float32], submit: _Submit) -> None:
+    def _decode_chain(
+        self, chain: list[Section], planar: NDArray[np.float32], shared: _Shared, submit: _Submit
+    ) -> None:
         """AC coefficients whose contexts are made of those before."""
         history = Sizes(Lanes(self.header.splats))
         for section in sorted(chain, key=lambda s: s.index):
             streams = self._context_streams(section, history)
             for m, channels in enumerate(zip(streams, streams, streams, strict=True), start=section.index // 3):
-                submit(partial(self._dequantizer.colours, channels, m, False, planar[m]))
+                submit(partial(self._dequantise_colours, channels, m, planar[m], shared))
 
-    def _decode_coefficient(self, m: int, out: NDArray[np.float32], submit: _Submit) -> None:
+    def _decode_coefficient(self, m: int, out: NDArray[np.float32], shared: _Shared, submit: _Submit) -> None:
         """One SH coefficient into ``out`` (3, N): R, G, B."""
         streams = self._streams(Property.SH, range(3 * m, 3 * m + 3))
-        differences = m == 0 and not self._contextual(Property.SH)
-        submit(partial(self._dequantizer.colours, streams, m, differences, out))
+        submit(partial(self._dequantise_colours, streams, m, out, shared))
+
+    def _dequantise_colours(
+        self, streams: Sequence[IntegerStream], m: int, out: NDArray[np.float32], shared: _Shared
+    ) -> None:
+        fitting = shared.factors.get()
+        if m > 0:
+            self._dequantizer.colours(streams, fitting.ac, False, out)
+        elif self._version.colour_steps:
+            self._dequantizer.predicted_colours(streams, fitting.classes, fitting.dc, out)
+        else:
+            self._dequantizer.colours(streams, fitting.dc, not self._contextual(Property.SH), out)
+
+
+class _Shared:
+    """What more than one of a file's properties is made of; any thread may ask for it.
+
+    Args:
+        file: that is decoded.
+
+    Attributes:
+        scales, opacities: their streams.
+        factors: what colours are made with.
+    """
+
+    def __init__(self, file: PotrFile) -> None:
+        self.scales = Once(lambda: file._streams(Property.SCALE))
+        self.opacities = Once(lambda: file._streams(Property.OPACITY)[0])
+        self.factors = Once(
+            lambda: ColourFactors.of(file.header, file.colour_steps(), self.scales.get, self.opacities.get)
+        )
 
 
 #: Takes what needs no more than what is at hand, to be done now or by another thread.

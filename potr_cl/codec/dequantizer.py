@@ -17,9 +17,11 @@ from potr_cl.codec import quantize
 from potr_cl.codec.container import Header
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import native
+from potr_cl.codec.steps.prediction import from_residuals
 from potr_cl.codec.versions import FormatVersion
 
 F32 = NDArray[np.float32]
+I8 = NDArray[np.int8]
 
 #: Splats worked on at a time: few enough that temporaries stay in a cache, many enough that threads seldom wait.
 _BLOCK = 1 << 15
@@ -90,22 +92,41 @@ class Dequantizer:
         for block, levels in self._blocks([*streams, *needed]):
             quantize.dequantize_rotations(levels[:3], version.rotation_factors(levels[3:], factor), out[block])
 
-    def colours(self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, out: F32) -> None:
+    def predicted_colours(self, streams: Sequence[IntegerStream], classes: I8, factors: F32, out: F32) -> None:
+        """Residuals of DC's levels of Y, Co, Cg to R, G, B in ``out`` (3, N).
+
+        Args:
+            streams: three, of what the prediction in reconstructed units has left.
+            classes: (N,) of the steps.
+            factors: float32 (N,), or (1,) for all the same: the scale factors.
+            out: float32.
+        """
+        splats = self.header.splats
+        residuals = np.stack([stream.part(0, splats).astype(np.int64) for stream in streams])
+        levels = from_residuals(residuals, classes)
+        functions = native()
+        if functions is not None:
+            functions.colours(list(levels), factors, out)
+            return
+        for start in range(0, splats, _BLOCK):
+            block = slice(start, start + _BLOCK)
+            _to_rgb(list(levels[:, block]), _part(factors, block), out[:, block])
+
+    def colours(self, streams: Sequence[IntegerStream], factors: F32, differences: bool, out: F32) -> None:
         """Levels of Y, Co, Cg of an SH coefficient to R, G, B in ``out`` (3, N).
 
         Args:
             streams: three.
-            coefficient: 0 for DC.
+            factors: float32 (N,), or (1,) for all the same: the scale factors.
             differences: whether integers are the differences of levels of splats that follow each other.
             out: float32.
         """
-        factor = self.header.sf_dc if coefficient == 0 else self.header.sf_ac
         functions = native()
         if functions is not None:
             levels = [stream.joined for stream in streams]
             if differences:
                 levels = [_summed(functions, level) for level in levels]
-            functions.colours(levels, float(np.float32(factor)), out)
+            functions.colours(levels, factors, out)
             return
         last = [0, 0, 0]
         for block, parts in self._blocks(streams):
@@ -117,7 +138,7 @@ class Dequantizer:
                     last[c] = channel[-1]
             else:
                 channels = _wider(parts)
-            _to_rgb(channels, factor, out[:, block])
+            _to_rgb(channels, _part(factors, block), out[:, block])
 
     def _blocks(self, streams: Sequence[IntegerStream]) -> Iterator[tuple[slice, list[NDArray[np.integer]]]]:
         """The integers of some streams side by side, block by block."""
@@ -149,9 +170,12 @@ def _wider(levels: list[NDArray[np.integer]]) -> list[NDArray[Any]]:
     return [level.astype(dtype) for level in levels]
 
 
-def _to_rgb(channels: list[NDArray[Any]], factor: float, out: F32) -> None:
+def _part(factors: F32, block: slice) -> F32:
+    return factors if len(factors) == 1 else factors[block]
+
+
+def _to_rgb(channels: list[NDArray[Any]], divisor: F32, out: F32) -> None:
     """Levels of Y, Co, Cg to R, G, B in ``out`` (3, n)."""
-    divisor = np.float32(factor)
     y, co, cg = channels
     r = y - cg
     np.divide(r + co, divisor, out=out[0], dtype=np.float32, casting="unsafe")

@@ -349,8 +349,8 @@ def to_ycocg(rgb: F64) -> tuple[F64, F64, F64]:
     return r * 0.25 + half + b * 0.25, (r - b) * 0.5, half - (r + b) * 0.25
 
 
-def quantize_sh(values: F64, sf_sh: float) -> Integers:
-    """One channel of one SH coefficient (YCoCg) to levels, in steps of 1 / SF."""
+def quantize_sh(values: F64, sf_sh: float | F32) -> Integers:
+    """One channel of one SH coefficient (YCoCg) to levels, in steps of 1 / SF, which may be one a splat."""
     return _to_levels(values, sf_sh, "SH coefficient")
 
 

@@ -41,6 +41,8 @@ class FormatVersion(abc.ABC):
         absolute_leaf_levels: whether tail lengths are levels of the octree, chosen by the tolerance alone
             (``absolute`` of :func:`potr_cl.codec.octree.build`).
         rotations_need_scales: whether rotations can be dequantised only with the levels of the scales at hand.
+        colour_steps: whether a file may give each splat the steps of its colours (:mod:`potr_cl.codec.steps`), so that
+            colours are dequantised with the levels of scales and opacities at hand, and predicted as values.
     """
 
     number: ClassVar[int]
@@ -48,6 +50,7 @@ class FormatVersion(abc.ABC):
     separate_ac_factor: ClassVar[bool]
     absolute_leaf_levels: ClassVar[bool]
     rotations_need_scales: ClassVar[bool]
+    colour_steps: ClassVar[bool] = False
 
     def check(self, parameters: HyperParameters) -> None:
         """Refuse hyper-parameters that a file of this version cannot tell its decoder.
@@ -180,13 +183,12 @@ class Version2(FormatVersion):
 
 
 class Version3(Version2):
-    """Not final: no preset writes it yet. It will have another entropy coder, and steps of colours that fit each splat.
-
-    Its quantiser is version 2's so far. What it does with colours may depend on the levels of scales and opacities,
-    which are decoded before them.
+    """Not final: no preset writes it yet. It will have another entropy coder, and has steps of colours that fit each
+    splat. Geometry is quantised as in version 2.
     """
 
     number = 3
+    colour_steps = True
 
 
 #: All versions that are read, by their number.

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.codec.geometry import quantise_geometry
+from potr_cl.codec.versions import VERSIONS
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
@@ -156,6 +157,8 @@ class Refit(Stage):
                         psnrs.append(photographs.psnr(judged, judging))
                 choice = PhotographChoice(len(judging), *psnrs)
                 refitted = to_photographs if choice.kept else refitted
+        if VERSIONS[parameters.version].colour_steps:
+            geometry = geometry.with_steps(refitted.effects)
         then = replace(state.recoloured(refitted.sh), geometry=geometry).having_learnt(self.name, refitted)
         return then if choice is None else then.having_learnt("photographs", choice)
 

@@ -6,7 +6,6 @@ import ctypes
 from typing import Any
 
 _SIZE, _NUMBER, _POINTER, _WORD = ctypes.c_size_t, ctypes.c_int, ctypes.c_void_p, ctypes.c_uint64
-_REAL = ctypes.c_float
 
 #: Argument types and result of each function, in the order of the C declarations.
 _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
@@ -33,6 +32,7 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_encode_cells": (None, [_POINTER, _SIZE, _POINTER, _POINTER, _SIZE, ctypes.c_int32, _POINTER]),
     "potr_encode_count": (None, [_POINTER, _SIZE, _POINTER]),
     "potr_encode_stream": (_SIZE, [_POINTER, _SIZE, _SIZE, _POINTER, _POINTER, _POINTER]),
+    "potr_unpredicted": (None, [_POINTER, _SIZE, _SIZE, _SIZE, *[_POINTER] * 4]),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
 }
 #: Those that there are for several kinds of integers, by what their names begin with.
@@ -45,7 +45,7 @@ _OF_KINDS: dict[str, tuple[Any, list[Any], tuple[str, ...]]] = {
     "potr_join_planes_": (None, [_POINTER, _SIZE, ctypes.c_uint, _NUMBER, _POINTER], ("medium", "wide")),
     "potr_colours_of_": (
         None,
-        [_POINTER, _POINTER, _POINTER, _SIZE, _REAL, _POINTER, _POINTER, _POINTER],
+        [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _POINTER, _POINTER],
         ("narrow", "medium", "wide"),
     ),
     "potr_look_up_": (_WORD, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER, _SIZE], ("narrow", "medium", "wide")),

@@ -52,6 +52,12 @@ class SplatBlocks(Owner):
         blocks[:, rows, columns] = blocks[:, columns, rows] = packed[:, : layout.splats].T
         return blocks
 
+    def effects(self) -> FloatArray:
+        """(N,) float32 the blocks' first elements: what an error of one in a splat's DC adds to the squared error."""
+        layout = self._coefficients.layout
+        first: FloatArray = self._coefficients.device.download(self.buffer, (layout.stride,), np.float32)
+        return first[: layout.splats]
+
     def precondition(self, residual: cl.Buffer, ridge: Ridge, result: cl.Buffer) -> None:
         """result = (block + ridge)⁻¹ residual on each splat's active coefficients, 0 on the others."""
         layout = self._coefficients.layout

@@ -81,11 +81,13 @@ class Refitted:
         sh: (N, M, 3) float32 coefficients, R, G, B.
         errors: mean squared error over views, pixels and channels before, and after.
         steps: conjugate-gradient steps that were taken.
+        effects: (N,) float32 by how much a unit's error in a splat's DC adds to the squared error, up to a factor.
     """
 
     sh: FloatArray
     errors: tuple[float, float]
     steps: int
+    effects: FloatArray
 
 
 def refit_colours(
@@ -198,7 +200,7 @@ class ColourRefit(Owner):
                 progress(steps, total)
 
         solved = solver.solve(self.colour_map, targets, descent, selection, after_step)
-        return Refitted(coefficients.read_sh(solver.x), solved.errors, solved.steps)
+        return Refitted(coefficients.read_sh(solver.x), solved.errors, solved.steps, solved.effects)
 
     def active(self) -> NDArray[np.bool_]:
         """(N, M, 3) in Y, Co, Cg: the coefficients that the last solution left active."""

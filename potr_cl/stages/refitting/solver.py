@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pyopencl as cl
 
+from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Owner
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Ridge
@@ -65,10 +66,12 @@ class Solved:
     Attributes:
         errors: mean squared error over views, pixels and channels before, and after.
         steps: conjugate-gradient steps that were taken and kept.
+        effects: (N,) float32 by how much a unit's error in a splat's DC adds to the squared error, up to a factor.
     """
 
     errors: tuple[float, float]
     steps: int
+    effects: FloatArray
 
 
 @dataclass(frozen=True)
@@ -149,6 +152,7 @@ class ColourSolver(Owner):
         self._blocks.zero()
         self._coefficients.copy(self._start, self.x)
         first = self._linearise(problem, (selection.descent if selection else descent).ridge, self._blocks)
+        effects = self._blocks.effects()
         state, steps = first, 0
         if selection is not None:
             state, steps = self._choose(problem, first, selection, descent.ridge, after_step)
@@ -157,7 +161,7 @@ class ColourSolver(Owner):
         if last is None:
             last, more = state, 0
         whole = colour_map.total_weight
-        return Solved((first.error / whole, last.error / whole), steps + more)
+        return Solved((first.error / whole, last.error / whole), steps + more, effects)
 
     def _linearise(self, problem: _Problem, ridge: Ridge, blocks: SplatBlocks | None = None) -> _State:
         """Settle which colours are cut, and make the residual: minus half the objective's gradient at x."""
