@@ -23,17 +23,18 @@ FOLDERS: dict[str, set[str]] = {
     "codec": {"errors", "host", "model"},
     "formats": {"errors", "host", "model", "codec"},
     "quality": {"errors", "host", "model", "opencl", "raster", "formats"},
-    "stages": {"errors", "host", "model", "opencl", "raster", "codec", "quality"},
-    "pipeline": {"errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality"},
+    "outputs": {"errors", "host", "model", "opencl", "raster", "codec", "formats"},
+    "stages": {"errors", "host", "model", "opencl", "raster", "codec", "quality", "outputs"},
+    "pipeline": {"errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality", "outputs"},
     "report": {"plain_text", "errors", "host", "model", "opencl", "codec", "formats", "quality", "pipeline"},
     "reference": {"errors", "model", "opencl", "raster", "stages"},
     "api": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality",
-        "pipeline", "report",
+        "pipeline", "report", "outputs",
     },
     "cli": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality",
-        "pipeline", "report", "api",
+        "pipeline", "report", "api", "outputs",
     },
 }  # fmt: skip
 #: They offer the whole package under short names, and start it.

@@ -9,7 +9,7 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from potr_cl.api.inputs import SceneSource, encoded_bytes, scene_of
+from potr_cl.api.inputs import SceneSource, encoded_bytes, encoded_file, scene_of
 from potr_cl.codec.decoder import decode as decode_file
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import Scene
@@ -22,8 +22,8 @@ def save(scene: SceneSource, path: str | os.PathLike[str]) -> None:
     """Write a scene in the format that the suffixes of ``path`` tell; the file appears only when it is whole.
 
     Args:
-        scene: to write. The result of :func:`potr_cl.encode` is written as it is to a .potr file, and decoded for any
-            other format.
+        scene: to write. The result of :func:`potr_cl.encode` is written as it is to a file of its own kind, and decoded
+            for any other format.
         path: of the file.
 
     Raises:
@@ -31,11 +31,12 @@ def save(scene: SceneSource, path: str | os.PathLike[str]) -> None:
         PotrError: the format cannot hold the scene, or the system failed to write.
     """
     from potr_cl.formats import scene_writer
+    from potr_cl.formats.registry import suffix_of_name
 
-    data = encoded_bytes(scene)
-    if data is not None and Path(path).suffix.lower() == ".potr":
+    encoded = encoded_file(scene)
+    if encoded is not None and suffix_of_name(Path(path)) == encoded[0]:
         with replacing(path) as file:
-            file.write(data)
+            file.write(encoded[1])
         return
     write = scene_writer(path)  # a wrong name is told before anything is read
     write(scene_of(scene))

@@ -58,12 +58,21 @@ def scene_of(source: SceneSource, trust: bool = False, antialiased: bool | None 
 
 
 def encoded_bytes(source: object) -> bytes | None:
-    """The bytes of a .potr file, of such bytes or of the result of an encode; None for anything else."""
+    """The bytes of a .potr file, of such bytes or of the result of an encode to one; None for anything else."""
+    found = encoded_file(source)
+    return found[1] if found is not None and found[0] == ".potr" else None
+
+
+def encoded_file(source: object) -> tuple[str, bytes] | None:
+    """The usual suffix and the bytes of what an encode has made, or of a .potr file's bytes; None for anything else."""
     if isinstance(source, bytes):
-        return source
+        return ".potr", source
     # Asked by name: what makes an encode's result takes long to import, and is there if there is one.
     pieces = getattr(source, "pieces", None)
-    return b"".join(pieces) if isinstance(pieces, list) else None
+    if not isinstance(pieces, list):
+        return None
+    options = getattr(source, "options", None)
+    return ".potr" if options is None else options.output.suffix, b"".join(pieces)
 
 
 def cameras_of(source: CamerasSource | None) -> list[Camera] | None:
@@ -126,9 +135,9 @@ def bytes_of_source(source: SceneSource) -> int | None:
     """Bytes of the file that a scene comes from, or of all its files (:mod:`potr_cl.formats.scene_size`); None where it
     comes from none, or whoever reads it will say so.
     """
-    data = encoded_bytes(source)
-    if data is not None:
-        return len(data)
+    encoded = encoded_file(source)
+    if encoded is not None:
+        return len(encoded[1])
     if not isinstance(source, (str, os.PathLike)):
         return None
     from potr_cl.formats.scene_size import bytes_of_scene
@@ -140,7 +149,7 @@ def name_of(source: SceneSource) -> Path:
     """What a scene is called in results: its path, or what it is."""
     if isinstance(source, (str, os.PathLike)):
         return Path(source)
-    return Path("(encoded)" if encoded_bytes(source) is not None else "(scene in memory)")
+    return Path("(encoded)" if encoded_file(source) is not None else "(scene in memory)")
 
 
 def chosen_views(

@@ -1,4 +1,4 @@
-"""The command encode: a scene to a .potr file."""
+"""The command encode: a scene to a .potr file, or to one that viewers open."""
 
 from __future__ import annotations
 
@@ -15,18 +15,18 @@ from potr_cl.api.encoding import (
     check_photographs_have_cameras,
     encode_options,
     encode_target,
-    proved,
 )
-from potr_cl.cli.batch import for_each_scene, jobs
+from potr_cl.cli.batch import add_to_option, for_each_scene, jobs
 from potr_cl.cli.forecasts import tell_what_is_ahead
-from potr_cl.cli.guard import read_file
+from potr_cl.cli.guard import StandardOutput, read_file
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option
-from potr_cl.cli.outputs import WrittenPage, WrittenPotr, place, writing
+from potr_cl.cli.outputs import WrittenEncoded, WrittenPage, place, writing
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import (
     add_antialiased_option,
     add_from_option,
+    add_spz_version_option,
     add_trust_option,
     read_scene,
     size_of_file,
@@ -42,7 +42,9 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, Stopwatch, encode
+from potr_cl.outputs.output import Output
+from potr_cl.outputs.registry import OUTPUTS, encoded_suffix, output_of, output_of_suffix, suffixes_encoded
+from potr_cl.pipeline.encode import Encoded, Stopwatch, encode, proved
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT, PRESETS, PURPOSE
 from potr_cl.pipeline.search import encode_to_target
@@ -56,9 +58,17 @@ from potr_cl.stages.refit import Refit
 
 def _options(args: argparse.Namespace, source_bytes: int | None = None) -> EncodeOptions:
     return encode_options(
-        None, args.preset, stage_choices(args), q=args.quality, background=args.background, memory=args.memory,
-        threads=args.threads, source_bytes=source_bytes, cameras_anyway=args.cameras_anyway,
+        None, args.preset, stage_choices(args), output=_output(args), q=args.quality, background=args.background,
+        memory=args.memory, threads=args.threads, source_bytes=source_bytes, cameras_anyway=args.cameras_anyway,
     )  # fmt: skip
+
+
+def _output(args: argparse.Namespace) -> Output:
+    """The kind of file that is made of one scene."""
+    choices = {"spz_version": args.spz_version}
+    if isinstance(args.output, StandardOutput):
+        return output_of_suffix(args.to, **choices)
+    return output_of(args.output, **choices)
 
 
 def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
@@ -85,12 +95,12 @@ class _Shared:
 
 
 def _encode(args: argparse.Namespace) -> None:
-    options, target = _options(args), encode_target(None, args.max_size, args.min_psnr)
+    works = jobs(args, WrittenEncoded, OUTPUTS[0].suffixes()[0])
+    options, target = _options(works[0]), encode_target(None, args.max_size, args.min_psnr)
     refit = options.stage(Refit)
     check_photographs_have_cameras(options, args.cameras is not None)
     if args.report is None and args.report_view is not None:
         raise UsageError("--report-view needs --report, the page that shows it")
-    works = jobs(args, WrittenPotr, ".potr")
     if args.report is not None and len(works) > 1:
         raise UsageError("--report is about one scene: encode one at a time")
     with contextlib.ExitStack() as stack:
@@ -130,8 +140,9 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
             else:
                 found = encode_to_target(scene, cameras, target, options, progress, device, progress.tell)
                 encoded, options, search = found.encoded, found.options, search_report(target, found)
-            written, candidate = proved(encoded, args.trust)  # what cannot be decoded must not replace what can
+            written = proved(encoded, args.trust)  # what cannot be decoded must not replace what can
             file.write(written.data)
+        candidate = written.scene
         watch = Stopwatch(progress)
         pictures: list[PicturePair] = []
         quality: dict[str, Any] | str = "not judged, as asked"
@@ -213,7 +224,9 @@ def _photographs(
 
 
 def add_encode(commands: Commands) -> None:
-    p = commands.add_parser("encode", help="a scene (.ply) to a .potr file, or several into a folder")
+    p = commands.add_parser(
+        "encode", help="a scene (.ply) to a .potr file or one that viewers open, or several into a folder"
+    )
     p.add_argument(
         "scenes",
         type=read_file,
@@ -227,8 +240,11 @@ def add_encode(commands: Commands) -> None:
         type=place,
         required=True,
         metavar="OUT.potr",
-        help='.potr, a folder, or "-" for standard output',
+        help=f'{suffixes_encoded()}, a folder, or "-" for standard output; all are made by the same stages; .potr is '
+        "the smallest",
     )
+    add_to_option(p)
+    add_spz_version_option(p)
     goal = p.add_mutually_exclusive_group()
     goal.add_argument(
         "-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (smallest) to 1 (best); default 0.5"
@@ -266,4 +282,4 @@ def add_encode(commands: Commands) -> None:
     add_antialiased_option(p)
     add_memory_option(p)
     add_device_options(p)
-    p.set_defaults(run=_encode)
+    p.set_defaults(run=_encode, checked_suffix=encoded_suffix)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import os
 import time
 from collections.abc import Sequence
@@ -13,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.encoder import Coded
+from potr_cl.errors import DataError, PotrError
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.agreement import require_agreement
 from potr_cl.model.camera import Camera, train_views, within_photographs
@@ -27,6 +29,8 @@ from potr_cl.stages.pruning.unseen import Unseen
 from potr_cl.stages.refitting.photographs import PhotographChoice
 from potr_cl.stages.refitting.refit import Refitted
 from potr_cl.stages.stage import Interlude, Progress, Stage, State, Workbench
+
+_log = logging.getLogger("potr_cl")
 
 
 @dataclass(frozen=True)
@@ -70,8 +74,13 @@ class Encoded:
         """The whole file."""
         return b"".join(self.pieces)
 
+    @property
+    def scene(self) -> Scene:
+        """What the file's readers will see; it is read anew each time."""
+        return self.options.output.read(self.data, trust=True)
+
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the file, whole or not at all.
+        """Write the file, whole or not at all; its name does not tell its kind, ``options.output`` does.
 
         Raises:
             UsageError: it cannot be written there.
@@ -80,6 +89,35 @@ class Encoded:
         with replacing(path) as file:
             for piece in self.pieces:
                 file.write(piece)
+
+
+@dataclass(frozen=True)
+class Proved:
+    """A file that its readers take.
+
+    Attributes:
+        data: the whole file.
+        scene: what readers see.
+    """
+
+    data: bytes
+    scene: Scene
+
+
+def proved(encoded: Encoded, trust: bool = False) -> Proved:
+    """The file that was made and the scene that a reader makes of it.
+
+    Raises:
+        PotrError: no reader takes it.
+    """
+    data = encoded.data
+    try:
+        return Proved(data, encoded.options.output.read(data, trust))
+    except DataError as error:
+        raise PotrError(
+            f"the encoded file cannot be decoded ({error}): nothing was written. If the scene has splats that are very "
+            "far away or very large, leave them out"
+        ) from error
 
 
 def encode(
@@ -110,10 +148,18 @@ def encode(
     """
     options = options or EncodeOptions()
     scene = scene.rendered(antialiased)
+    tell_losses(scene, options)
     watch = Stopwatch(progress)
     cameras = cameras_or_virtual(scene, cameras, options, watch)
     run = Run(options, watch, device)
     return run.finished(run.stages(State.of(scene, train_views(cameras) if cameras else [])))
+
+
+def tell_losses(scene: Scene, options: EncodeOptions) -> None:
+    """Say in one line what of the scene the kind of file that is asked for cannot hold."""
+    losses = options.output.losses(scene)
+    if losses:
+        _log.warning("%s cannot hold all of this scene: %s", options.output.format.name, "; ".join(losses))
 
 
 def cameras_or_virtual(
@@ -183,6 +229,7 @@ class Run:
             interludes=self._interludes(stage, state),
             metadata=lambda last: _metadata(last, options),
             progress=self._watch,
+            output=options.output,
         )
         if not stage.asked_for:
             return state

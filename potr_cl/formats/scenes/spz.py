@@ -46,6 +46,12 @@ _EXTENSION_BYTES = 1 << 20
 
 #: Those that are written, the usual one first.
 _VERSIONS = (2, 3, 4)
+#: The same with what sets each apart.
+VERSIONS = {
+    2: "which all readers that were tried take",
+    3: "with finer rotations",
+    4: "smaller and for new readers only",
+}
 #: Of each stream of version 4.
 _ZSTD_LEVEL = 12
 

@@ -31,6 +31,9 @@ from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection
 from potr_cl.stages.refitting.targets import Targets
 
+#: Steps in which the constant coefficients are solved for once more, after the others have been rounded.
+_CONSTANT_STEPS = 3
+
 
 @dataclass(frozen=True)
 class RefitOptions:
@@ -81,13 +84,11 @@ class Refitted:
         sh: (N, M, 3) float32 coefficients, R, G, B.
         errors: mean squared error over views, pixels and channels before, and after.
         steps: conjugate-gradient steps that were taken.
-        effects: (N,) float32 by how much a unit's error in a splat's DC adds to the squared error, up to a factor.
     """
 
     sh: FloatArray
     errors: tuple[float, float]
     steps: int
-    effects: FloatArray
 
 
 def refit_colours(
@@ -99,6 +100,7 @@ def refit_colours(
     active: NDArray[np.bool_] | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: Callable[[int, int], None] | None = None,
+    fix_ac: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
 ) -> Refitted:
     """Re-fit a scene's colours to pictures of all views together.
 
@@ -111,14 +113,32 @@ def refit_colours(
         active: (N, M, 3) in Y, Co, Cg: the coefficients that may differ from 0; all by default.
         background: R, G, B behind the scene.
         progress: called with the steps done and their greatest number.
+        fix_ac: chooses the AC coefficients that a file can hold, from the solution (N, M, 3) R, G, B, which it must not
+            change, and :meth:`ColourRefit.worth`. The constant ones are then solved for again. If it returns the
+            solution itself, that stays as it is.
 
     Raises:
         UsageError: no camera.
         DeviceError: the scene does not fit the device.
     """
     options = options or RefitOptions()
+    more = 0 if fix_ac is None else _CONSTANT_STEPS
+
+    def report(done: int, steps: int) -> None:
+        if progress is not None:
+            progress(done, steps + more)
+
     with ColourRefit(device, scene, cameras, background=background, memory=options.memory) as refit:
-        return refit.solve(scene.sh, targets, options, active, progress=progress)
+        found = refit.solve(scene.sh, targets, options, active, progress=report)
+        fixed = found.sh if fix_ac is None else fix_ac(found.sh, refit.worth())
+        if fixed is found.sh:
+            return found
+        constant = np.zeros(fixed.shape, bool)
+        constant[:, 0] = True
+        few = replace(options, drop=0.0, steps=_CONSTANT_STEPS)
+        again = refit.solve(fixed, targets, few, constant, hold=True)
+        again.sh[:, 1:] = fixed[:, 1:]  # they were rounded once more on their way through Y, Co, Cg
+        return Refitted(again.sh, (found.errors[0], again.errors[1]), found.steps + again.steps)
 
 
 class ColourRefit(Owner):
@@ -200,7 +220,14 @@ class ColourRefit(Owner):
                 progress(steps, total)
 
         solved = solver.solve(self.colour_map, targets, descent, selection, after_step)
-        return Refitted(coefficients.read_sh(solver.x), solved.errors, solved.steps, solved.effects)
+        return Refitted(coefficients.read_sh(solver.x), solved.errors, solved.steps)
+
+    def worth(self) -> FloatArray:
+        """(N, M) float32: by how much the mean squared error grows for an error of 1 in a coefficient of one channel.
+
+        As the last solution has found it at its start; errors of different coefficients are taken as independent.
+        """
+        return self._solver.curvatures() / np.float32(self.colour_map.total_weight)
 
     def active(self) -> NDArray[np.bool_]:
         """(N, M, 3) in Y, Co, Cg: the coefficients that the last solution left active."""

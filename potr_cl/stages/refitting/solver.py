@@ -66,12 +66,10 @@ class Solved:
     Attributes:
         errors: mean squared error over views, pixels and channels before, and after.
         steps: conjugate-gradient steps that were taken and kept.
-        effects: (N,) float32 by how much a unit's error in a splat's DC adds to the squared error, up to a factor.
     """
 
     errors: tuple[float, float]
     steps: int
-    effects: FloatArray
 
 
 @dataclass(frozen=True)
@@ -152,7 +150,6 @@ class ColourSolver(Owner):
         self._blocks.zero()
         self._coefficients.copy(self._start, self.x)
         first = self._linearise(problem, (selection.descent if selection else descent).ridge, self._blocks)
-        effects = self._blocks.effects()
         state, steps = first, 0
         if selection is not None:
             state, steps = self._choose(problem, first, selection, descent.ridge, after_step)
@@ -161,7 +158,7 @@ class ColourSolver(Owner):
         if last is None:
             last, more = state, 0
         whole = colour_map.total_weight
-        return Solved((first.error / whole, last.error / whole), steps + more, effects)
+        return Solved((first.error / whole, last.error / whole), steps + more)
 
     def _linearise(self, problem: _Problem, ridge: Ridge, blocks: SplatBlocks | None = None) -> _State:
         """Settle which colours are cut, and make the residual: minus half the objective's gradient at x."""
@@ -235,6 +232,10 @@ class ColourSolver(Owner):
     def _start_here(self, problem: _Problem, ridge: Ridge) -> _State:
         self._coefficients.copy(self._start, self.x)
         return self._linearise(problem, ridge)
+
+    def curvatures(self) -> FloatArray:
+        """(N, M) float32: squared error by W for an error of 1 in a coefficient of one channel, at the last start."""
+        return self._blocks.diagonals()
 
     def close(self) -> None:
         """Give the blocks' memory back."""
