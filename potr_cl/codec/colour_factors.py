@@ -13,8 +13,8 @@ from typing import Generic, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec.byte_planes import IntegerStream
 from potr_cl.codec.container import Header
-from potr_cl.codec.dequantizer import IntegerStream
 from potr_cl.codec.steps.rule import ColourSteps, factors
 
 F32 = NDArray[np.float32]

@@ -8,12 +8,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
+from potr_cl.codec.byte_planes import IntegerStream
+from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import native
@@ -27,17 +29,6 @@ I8 = NDArray[np.int8]
 _BLOCK = 1 << 15
 #: Levels whose values the native path looks up: small tables for levels of one byte, larger ones for others.
 _SMALL_TABLE, _LARGE_TABLE = 1 << 8, 1 << 16
-
-
-class IntegerStream(Protocol):
-    """The integers of a stream, one a splat."""
-
-    def part(self, start: int, stop: int) -> NDArray[np.integer]:
-        """Those from one splat to another."""
-
-    @property
-    def joined(self) -> NDArray[Any]:
-        """All of them: uint8, mapped to unsigned, where they are that small; else 32 or 64 bits each."""
 
 
 @dataclass(frozen=True)
@@ -92,36 +83,28 @@ class Dequantizer:
         for block, levels in self._blocks([*streams, *needed]):
             quantize.dequantize_rotations(levels[:3], version.rotation_factors(levels[3:], factor), out[block])
 
-    def predicted_colours(self, streams: Sequence[IntegerStream], classes: I8, factors: F32, out: F32) -> None:
-        """Residuals of DC's levels of Y, Co, Cg to R, G, B in ``out`` (3, N).
-
-        Args:
-            streams: three, of what the prediction in reconstructed units has left.
-            classes: (N,) of the steps.
-            factors: float32 (N,), or (1,) for all the same: the scale factors.
-            out: float32.
-        """
-        splats = self.header.splats
-        residuals = np.stack([stream.part(0, splats).astype(np.int64) for stream in streams])
-        levels = from_residuals(residuals, classes)
-        functions = native()
-        if functions is not None:
-            functions.colours(list(levels), factors, out)
-            return
-        for start in range(0, splats, _BLOCK):
-            block = slice(start, start + _BLOCK)
-            _to_rgb(list(levels[:, block]), _part(factors, block), out[:, block])
-
-    def colours(self, streams: Sequence[IntegerStream], factors: F32, differences: bool, out: F32) -> None:
+    def colours(
+        self,
+        streams: Sequence[IntegerStream],
+        coefficient: int,
+        differences: bool,
+        fitting: ColourFactors,
+        out: F32,
+    ) -> None:
         """Levels of Y, Co, Cg of an SH coefficient to R, G, B in ``out`` (3, N).
 
         Args:
-            streams: three.
-            factors: float32 (N,), or (1,) for all the same: the scale factors.
+            streams: three; of DC what is left of its levels, where the version predicts values.
+            coefficient: 0 for DC.
             differences: whether integers are the differences of levels of splats that follow each other.
+            fitting: the splats' scale factors.
             out: float32.
         """
         functions = native()
+        factors = fitting.ac if coefficient else fitting.dc
+        if coefficient == 0 and self.version.colour_steps:
+            self._predicted(streams, fitting.classes, factors, out)
+            return
         if functions is not None:
             levels = [stream.joined for stream in streams]
             if differences:
@@ -139,6 +122,18 @@ class Dequantizer:
             else:
                 channels = _wider(parts)
             _to_rgb(channels, _part(factors, block), out[:, block])
+
+    def _predicted(self, streams: Sequence[IntegerStream], classes: I8, factors: F32, out: F32) -> None:
+        """DC from what the prediction has left of its levels."""
+        splats = self.header.splats
+        levels = from_residuals(np.stack([stream.part(0, splats).astype(np.int64) for stream in streams]), classes)
+        functions = native()
+        if functions is not None:
+            functions.colours(list(levels), factors, out)
+            return
+        for start in range(0, splats, _BLOCK):
+            block = slice(start, start + _BLOCK)
+            _to_rgb(list(levels[:, block]), _part(factors, block), out[:, block])
 
     def _blocks(self, streams: Sequence[IntegerStream]) -> Iterator[tuple[slice, list[NDArray[np.integer]]]]:
         """The integers of some streams side by side, block by block."""

@@ -226,13 +226,20 @@ def _coefficients(
 ) -> NDArray[np.signedinteger]:
     """(M, 3, N) levels of the SH coefficients' Y, Co, Cg; ``classes`` are those of the steps of DC and of AC."""
     count = scene.sh.shape[1]
+    columns = scene.sh.transpose(1, 2, 0)
+    # Coefficients that are contiguous each, as a re-fit leaves them, are picked from each.
+    contiguous = columns.strides[2] == columns.itemsize
     levels: NDArray[np.signedinteger] = np.empty((count, 3, len(scene)), np.int16)
     wide: list[tuple[tuple[int, int, slice], quantize.Integers]] = []
 
     def take(start: int) -> None:
         rows = order[start : start + _BLOCK]
         block = slice(start, start + len(rows))
-        planar = np.ascontiguousarray(scene.sh[rows].transpose(1, 2, 0))
+        planar = (
+            np.array([[column.take(rows) for column in rgb] for rgb in columns])
+            if contiguous
+            else np.ascontiguousarray(scene.sh[rows].transpose(1, 2, 0))
+        )
         of_dc, of_ac = (
             # A factor that is the same for all is not rounded: so versions without steps have always been written.
             factors(scale_factor, part[block]) if part.any() else scale_factor

@@ -358,8 +358,8 @@ class _Search:
             encoded = None
             pieces = self._code(reduced, options.changed(code=_QUICK_CODER)).pieces
             self._watch("evaluate tries", 0.0)
-            seen = options.output.read(b"".join(pieces), trust=True)
-            value = min(self._evaluator.psnr(seen), _IDENTICAL)
+            with options.output.seen(b"".join(pieces), self._evaluator.device, trust=True) as candidate:
+                value = min(self._evaluator.psnr(candidate), _IDENTICAL)
             self._watch("evaluate tries", 1.0)
         self._tries.append(Try(kind, q, value))
         self._tell(f"{KINDS[kind].format(f'{q:g}')} {self._target.describe(value)}")

@@ -6,6 +6,7 @@ import ctypes
 from typing import Any
 
 _SIZE, _NUMBER, _POINTER, _WORD = ctypes.c_size_t, ctypes.c_int, ctypes.c_void_p, ctypes.c_uint64
+_REAL = ctypes.c_float
 
 #: Argument types and result of each function, in the order of the C declarations.
 _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
@@ -32,6 +33,10 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_encode_cells": (None, [_POINTER, _SIZE, _POINTER, _POINTER, _SIZE, ctypes.c_int32, _POINTER]),
     "potr_encode_count": (None, [_POINTER, _SIZE, _POINTER]),
     "potr_encode_stream": (_SIZE, [_POINTER, _SIZE, _SIZE, _POINTER, _POINTER, _POINTER]),
+    "potr_nearest": (None, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER]),
+    "potr_canonical": (None, [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _POINTER, _POINTER, _POINTER]),
+    "potr_ycocg_columns": (None, [_POINTER, _SIZE, _SIZE, _SIZE, _POINTER]),
+    "potr_nonzero_levels": (_NUMBER, [_POINTER, _SIZE, _SIZE, ctypes.c_double, ctypes.c_double, _POINTER]),
     "potr_unpredicted": (None, [_POINTER, _SIZE, _SIZE, _SIZE, *[_POINTER] * 4]),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
 }
