@@ -15,19 +15,17 @@ from numpy.typing import NDArray
 
 from potr_cl.codec import container, octree, quantize, sections
 from potr_cl.codec.byte_planes import pack_integers
+from potr_cl.codec.colours import colour_levels
 from potr_cl.codec.container import EntropyCoder, Header
 from potr_cl.codec.context import encoder as context_encoder
 from potr_cl.codec.geometry import Geometry, quantise_geometry
 from potr_cl.codec.sections import Coder, Property, Section
 from potr_cl.codec.steps.prediction import to_residuals
-from potr_cl.codec.steps.rule import factors
 from potr_cl.codec.versions import VERSIONS, FormatVersion
-from potr_cl.host.threads import Run, thread_pool
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 
-#: Splats whose SH coefficients are quantised at a time: few enough for the temporaries to stay in a cache.
-_BLOCK = 1 << 14
 #: Of fewer splats the models of the context coder may weigh more than they save.
 _FEW = 1 << 15
 
@@ -91,7 +89,7 @@ def code_scene(
             groups.append(_Group(Property.STEPS, 0, [np.frombuffer(geometry.steps.to_bytes(), np.uint8)]))
         plain = pool.map(partial(_plain_sections, coder=coder), groups)
         classes = geometry.colour_classes()
-        coefficients = _coefficients(scene, order, parameters, classes, pool.map)
+        coefficients = colour_levels(scene.sh, order, parameters, classes, pool.map)
         chains = _chains(geometry, coefficients, classes[0] if version.colour_steps else None)
         report(stage, 0.2)
         coded = _code_chains(chains, coder, version, pool, lambda done: report(stage, 0.2 + 0.7 * done))
@@ -215,51 +213,6 @@ def _octree_groups(tree: octree.OctreeStreams) -> list[_Group]:
         (Property.MULTIPLICITY, tree.multiplicities),
     ]
     return [_Group(prop, 0, [stream]) for prop, stream in streams if len(stream)]
-
-
-def _coefficients(
-    scene: Scene,
-    order: NDArray[np.int64],
-    parameters: quantize.HyperParameters,
-    classes: tuple[NDArray[np.int8], NDArray[np.int8]],
-    run: Run,
-) -> NDArray[np.signedinteger]:
-    """(M, 3, N) levels of the SH coefficients' Y, Co, Cg; ``classes`` are those of the steps of DC and of AC."""
-    count = scene.sh.shape[1]
-    columns = scene.sh.transpose(1, 2, 0)
-    # Coefficients that are contiguous each, as a re-fit leaves them, are picked from each.
-    contiguous = columns.strides[2] == columns.itemsize
-    levels: NDArray[np.signedinteger] = np.empty((count, 3, len(scene)), np.int16)
-    wide: list[tuple[tuple[int, int, slice], quantize.Integers]] = []
-
-    def take(start: int) -> None:
-        rows = order[start : start + _BLOCK]
-        block = slice(start, start + len(rows))
-        planar = (
-            np.array([[column.take(rows) for column in rgb] for rgb in columns])
-            if contiguous
-            else np.ascontiguousarray(scene.sh[rows].transpose(1, 2, 0))
-        )
-        of_dc, of_ac = (
-            # A factor that is the same for all is not rounded: so versions without steps have always been written.
-            factors(scale_factor, part[block]) if part.any() else scale_factor
-            for scale_factor, part in zip((parameters.sf_dc, parameters.sf_sh), classes, strict=True)
-        )
-        for m, rgb in enumerate(planar):
-            factor = of_ac if m else of_dc
-            for c, values in enumerate(quantize.to_ycocg(rgb.astype(np.float64).T)):
-                made = quantize.quantize_sh(values, factor)
-                if made.dtype == levels.dtype:
-                    levels[m, c, block] = made
-                else:
-                    wide.append(((m, c, block), made))
-
-    list(run(take, range(0, len(scene), _BLOCK)))
-    if wide:
-        levels = levels.astype(np.result_type(*{made.dtype for _, made in wide}))
-        for where, made in wide:
-            levels[where] = made
-    return levels
 
 
 def _chains(

@@ -7,6 +7,7 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
+from potr_cl.codec.colours import rounded_ac
 from potr_cl.codec.decoder import PotrFile, decode
 from potr_cl.codec.encoder import Coded, code_scene
 from potr_cl.codec.geometry import Geometry, quantise_geometry
@@ -38,7 +39,7 @@ _NAMES = {
 
 @dataclass(frozen=True)
 class Potr(Output):
-    """A .potr file: :mod:`potr_cl.codec`. AC coefficients are rounded with the others, to steps finer than one sees."""
+    """A .potr file: :mod:`potr_cl.codec`. AC coefficients are rounded to steps finer than one sees."""
 
     format: ClassVar[SceneFormat] = FORMAT
     choices: ClassVar[frozenset[str]] = frozenset(
@@ -55,11 +56,16 @@ class Potr(Output):
     def fix_ac(
         self, rounded: Rounded, sh: FloatArray, worth: FloatArray | None, request: Request
     ) -> tuple[Rounded, FloatArray]:
-        """Fit the steps of colours to each splat, in the versions of the format that have such."""
+        """Fit the steps of colours to each splat, and round to them, in the versions of the format that have such.
+
+        DC is solved for once more afterwards: it makes up for what the rounding of the others has changed.
+        """
         assert isinstance(rounded, Geometry)
         if worth is None or not VERSIONS[request.parameters.version].colour_steps:
             return rounded, sh
-        return rounded.with_steps(worth[:, 0]), sh
+        geometry = rounded.with_steps(worth[:, 0])
+        with thread_pool(request.threads) as pool:
+            return geometry, rounded_ac(sh, geometry, pool.map)
 
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
         """See :func:`potr_cl.codec.encoder.code_scene`."""
