@@ -64,9 +64,9 @@ def check_within_steps(source: Scene, decoded: Scene, order, parameters, toleran
 
 
 def check_within_balanced_steps(source: Scene, data: bytes, order, tolerance):
-    """The same for version 2: steps as the header and the decoded scales say."""
+    """The same for version 3: steps as the header and the decoded scales say."""
     header, decoded, original = PotrFile.from_bytes(data).header, decode(data), source.subset(order)
-    assert header.version == 2
+    assert header.version == 3
 
     rounding = np.abs(original.means.astype(np.float64)).max(axis=1) * 2.0**-23
     distance = np.linalg.norm(decoded.means.astype(np.float64) - original.means, axis=1)

@@ -50,6 +50,18 @@ def test_factors_of_colours_that_version_1_cannot_tell_are_refused():
     assert PotrFile.from_bytes(file_of(random_scene(20, 1), best)).header.sf_dc == 30
 
 
+@pytest.mark.parametrize("entropy", ["context", "zstd"])
+def test_version_2_is_still_written_where_it_is_asked_for(entropy):
+    parameters = dataclasses.replace(HyperParameters.from_quality(0.5, "best"), version=2)
+    scene = random_scene(600, 2, seed=5)
+    data = file_of(scene, parameters, entropy=EntropyCoder(entropy))
+    assert PotrFile.from_bytes(data).header.version == 2
+    # Without anything known of what its splats show, a file of version 3 has the same values.
+    newest = decode(file_of(scene, dataclasses.replace(parameters, version=3), entropy=EntropyCoder(entropy)))
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        assert np.array_equal(getattr(decode(data), name), getattr(newest, name))
+
+
 class Version4(versions.Version2):
     """Opacities as they are, rotations of one factor, a single factor for all of SH: nothing else is told of it."""
 
