@@ -218,13 +218,22 @@ class Device:
             self.allocated -= buffer.size
         buffer.release()
 
-    def upload(self, array: np.ndarray[Any, Any], what: str) -> cl.Buffer:
-        """A buffer that holds a copy of ``array``, C order."""
+    def upload(self, array: np.ndarray[Any, Any], what: str, pending: list[cl.Event] | None = None) -> cl.Buffer:
+        """A buffer that holds a copy of ``array``, C order.
+
+        Args:
+            array: to be copied.
+            what: it is, for the error's sake.
+            pending: takes the copy as an event, which is only enqueued then: the array must not change before it is
+                done, nor the event be given up. None: it is done when the method returns.
+        """
         array = np.ascontiguousarray(array)
         buffer = self.allocate(array.nbytes, what)
         if array.nbytes:
             with self.errors(f"cannot hold {what}"):
-                cl.enqueue_copy(self.queue, buffer, array, is_blocking=True)
+                event = cl.enqueue_copy(self.queue, buffer, array, is_blocking=pending is None)
+            if pending is not None:
+                pending.append(event)
         return buffer
 
     def download(self, buffer: cl.Buffer, shape: tuple[int, ...], dtype: Any, start: int = 0) -> np.ndarray[Any, Any]:
