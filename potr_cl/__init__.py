@@ -29,6 +29,7 @@ if TYPE_CHECKING:
     from potr_cl.api.editing import CompactedScene, PrunedScene, RefittedScene, compact, prune, refit
     from potr_cl.api.encoding import encode
     from potr_cl.api.files import convert, decode, decode_to_device, save
+    from potr_cl.api.fitting import FittedScene, fit
     from potr_cl.api.pictures import Rendering, Renderings, preview, render
     from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, PotrError, UnreachableError, UsageError
     from potr_cl.formats import load_cameras, load_scene, read_cameras, read_scene
@@ -51,6 +52,7 @@ __all__ = [
     "DeviceMemoryError",
     "EncodeOptions",
     "Encoded",
+    "FittedScene",
     "PotrError",
     "PrunedScene",
     "RefittedScene",
@@ -70,6 +72,7 @@ __all__ = [
     "decode_to_device",
     "encode",
     "encode_to_target",
+    "fit",
     "info",
     "load_cameras",
     "load_scene",
@@ -94,6 +97,7 @@ _HOMES = {
     "DeviceMemoryError": "errors",
     "EncodeOptions": "pipeline.options",
     "Encoded": "pipeline.encode",
+    "FittedScene": "api.fitting",
     "PotrError": "errors",
     "PrunedScene": "api.editing",
     "RefittedScene": "api.editing",
@@ -112,6 +116,7 @@ _HOMES = {
     "decode_to_device": "api.files",
     "encode": "api.encoding",
     "encode_to_target": "pipeline.search",
+    "fit": "api.fitting",
     "info": "api.describing",
     "load_cameras": "formats",
     "load_scene": "formats",

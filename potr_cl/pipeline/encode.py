@@ -26,6 +26,7 @@ from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
+from potr_cl.stages.fitting.fit import Fitted, LeftOut
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.pruning.unseen import Unseen
@@ -46,6 +47,7 @@ class Encoded:
         order: (N,) index in the source scene of each splat of the file.
         pruned: what pruning did; None if it was left out.
         unseen: the splats that no training view sees; None if pruning was left out.
+        fitted: what the fit of all parameters did, or why it was left out; None if it was not asked for.
         refitted: what the re-fit of the colours did; None if it was left out.
         photographs: what held-out photographs say of a fit to photographs; None if none were given.
         device: the device that did the work; not the one that was asked for if that had too little memory. None if no
@@ -60,6 +62,7 @@ class Encoded:
     order: NDArray[np.int64]
     pruned: Pruned | None
     unseen: Unseen | None
+    fitted: Fitted | LeftOut | None
     refitted: Refitted | None
     photographs: PhotographChoice | None
     device: Device | None
@@ -292,6 +295,7 @@ class Run:
             order=state.survivors[coded.order],
             pruned=state.learnt.get("prune"),
             unseen=state.learnt.get("unseen"),
+            fitted=state.learnt.get("fit"),
             refitted=state.learnt.get("refit"),
             photographs=state.learnt.get("photographs"),
             device=self.device,

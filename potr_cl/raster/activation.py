@@ -13,12 +13,12 @@ from potr_cl.model.scene import FloatArray
 F64 = NDArray[np.float64]
 
 #: Larger standard deviations, in world units, are replaced by this. Nobody can see a difference, and nothing overflows.
-_LARGEST_SCALE = 1e12
+LARGEST_SCALE = 1e12
 
 
 def activated_scales(log_scales: FloatArray) -> F64:
     """Standard deviations, world units, of their natural logarithms."""
-    return np.minimum(np.exp(np.minimum(log_scales.astype(np.float64), 100)), _LARGEST_SCALE)
+    return np.minimum(np.exp(np.minimum(log_scales.astype(np.float64), 100)), LARGEST_SCALE)
 
 
 def unit_quaternions(quaternions: FloatArray) -> F64:

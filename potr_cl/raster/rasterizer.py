@@ -78,6 +78,7 @@ class Rasterizer(Owner):
             self._sh = self._scene.sh
             self._other_sh = Memory(device)
             self._launcher = launcher_for(device, rules)
+            self._filter_macros = _filter_macros(self._scene)
             self._projection = device.shared_kernel(
                 "raster/project.cl",
                 "project",
@@ -85,7 +86,7 @@ class Rasterizer(Owner):
                 SH_COUNT=self._scene.sh_count,
                 NEAR=float(rules.near),
                 SQUARE_EXTENT=int(rules.square_extent),
-                **_filter_macros(self._scene),
+                **self._filter_macros,
             )
         self._bounds = Scratch(device, "the projected splats' bounds")
         self._counts = Scratch(device, "the tile counts")
@@ -97,6 +98,16 @@ class Rasterizer(Owner):
     @property
     def splats(self) -> int:
         return self._scene.splats
+
+    @property
+    def parameters(self) -> SceneBuffers:
+        """The scene on the device. Who writes to its buffers prepares views anew."""
+        return self._scene
+
+    @property
+    def filter_macros(self) -> dict[str, float]:
+        """Macros that a kernel needs which goes through the projection again; none unless the scene is antialiased."""
+        return dict(self._filter_macros)
 
     @property
     def stride(self) -> int:
@@ -213,6 +224,37 @@ class Rasterizer(Owner):
                 for scratch in (self._keys, self._bounds, self._counts):
                     scratch.close()
         return views
+
+    def prepare_again(self, views: ViewSet, cameras: Sequence[Camera]) -> bool:
+        """Point prepared views at other cameras, in the memory that they have; more is taken only where it must be.
+
+        Args:
+            views: as :meth:`prepare_set` gave them.
+            cameras: as many as there are views.
+
+        Returns:
+            Whether each of the cameras has as many tiles across and down as the view that it takes the place of. If
+            not, nothing was done.
+
+        Raises:
+            As :meth:`prepare_set`; the views are of no use then.
+        """
+        if not views.aim_all(cameras):
+            return False
+        try:
+            counts, bounds = self._zeroed_counts(views), self._room_for_bounds(views)
+            self._enqueue_project(views, bounds)
+            self._launcher.enqueue_offsets(views, bounds, counts)
+            found = views.read_counts()
+            for view, count in zip(views.views, found, strict=True):
+                _accept(view, count)
+            if any(count > view.capacity for view, count in zip(views.views, found, strict=True)):
+                views.make_room([count + count // 4 for count in found])
+            self._enqueue_lists(views, bounds, counts, for_frame=False)
+        except BaseException:
+            self._counts.close()  # not zero
+            raise
+        return True
 
     def composite(self, view: View) -> tuple[FloatArray, FloatArray]:
         """The picture of a prepared view; returns what :meth:`render` returns."""
