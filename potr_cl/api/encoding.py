@@ -116,7 +116,7 @@ def encode(
         DeviceError: no device does the work.
     """
     began = time.perf_counter()
-    kind = output_choice(output, to, spz_version=spz_version)
+    kind = output_choice(output, to, version=spz_version)
     settings = encode_options(
         options, preset, choices, output=kind, q=q, background=background, memory=memory, threads=threads,
         source_bytes=bytes_of_source(scene), cameras_anyway=cameras_anyway,

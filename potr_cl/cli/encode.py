@@ -67,7 +67,7 @@ def _options(args: argparse.Namespace, source_bytes: int | None = None) -> Encod
 
 def _output(args: argparse.Namespace) -> Output:
     """The kind of file that is made of one scene."""
-    choices = {"spz_version": args.spz_version}
+    choices = {"version": args.spz_version}
     if isinstance(args.output, StandardOutput):
         return output_of_suffix(args.to, **choices)
     return output_of(args.output, **choices)

@@ -86,7 +86,7 @@ def quantise_geometry(
         DataError: a value too large to quantise, or a splat too far from the others to keep them exact.
     """
     version = VERSIONS[parameters.version]
-    nearest = _nearest(scene.means, views, run)
+    nearest = distances_to_views(scene.means, views, run)
     world = version.in_world_units(parameters, scene, nearest)
     tolerance = np.maximum(world.gamma, world.beta * nearest)
     tree, order = octree.build(scene.means, tolerance, absolute=version.absolute_leaf_levels)
@@ -101,7 +101,7 @@ def quantise_geometry(
     )
 
 
-def _nearest(means: NDArray[np.float32], views: Sequence[Camera], run: Run) -> NDArray[np.float64]:
+def distances_to_views(means: NDArray[np.float32], views: Sequence[Camera], run: Run) -> NDArray[np.float64]:
     """(N,) distance to the nearest view; without views 0, which leaves the tolerance to γ."""
     nearest = np.zeros(len(means))
     if not views:

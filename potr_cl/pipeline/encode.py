@@ -33,6 +33,7 @@ from potr_cl.stages.pruning.unseen import Unseen
 from potr_cl.stages.refitting.photographs import PhotographChoice
 from potr_cl.stages.refitting.refit import Refitted
 from potr_cl.stages.stage import Interlude, Progress, Stage, State, Workbench
+from potr_cl.stages.views_between import Added
 
 _log = logging.getLogger("potr_cl")
 
@@ -50,6 +51,7 @@ class Encoded:
         fitted: what the fit of all parameters did, or why it was left out; None if it was not asked for.
         refitted: what the re-fit of the colours did; None if it was left out.
         photographs: what held-out photographs say of a fit to photographs; None if none were given.
+        between: the views between the training views that were looked at; None if nobody asked for any.
         device: the device that did the work; not the one that was asked for if that had too little memory. None if no
             stage needed a device.
         seconds: wall time by stage.
@@ -65,6 +67,7 @@ class Encoded:
     fitted: Fitted | LeftOut | None
     refitted: Refitted | None
     photographs: PhotographChoice | None
+    between: Added | None
     device: Device | None
     seconds: dict[str, float]
     options: EncodeOptions
@@ -298,6 +301,7 @@ class Run:
             fitted=state.learnt.get("fit"),
             refitted=state.learnt.get("refit"),
             photographs=state.learnt.get("photographs"),
+            between=state.learnt.get("between"),
             device=self.device,
             seconds=self._watch.seconds,
             options=self._options,

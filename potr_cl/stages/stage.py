@@ -151,7 +151,8 @@ class Stage(ABC):
         name: what options and results call it.
         title: heads its options in the help of the command line.
         needs_views: whether it computes on a device, from views. Such a stage is left out if there are no views.
-        serves_others: whether it only prepares what other stages look at. It is left out if none of them does.
+        serves_others: whether it only prepares what other stages look at, the same for every q. It is left out if none
+            of them does. Such stages come first.
     """
 
     name: ClassVar[str]
