@@ -38,7 +38,7 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
     if not added:
         return 0
     budget = default_memory(bench.opened) if bench.memory is None else bench.memory
-    with Rasterizer(bench.opened, state.source, background=bench.background) as rasterizer:
+    with Rasterizer(bench.opened, bench.drawable(state.source), background=bench.background) as rasterizer:
         own, more = (_nbytes(rasterizer, views) for views in (state.views, added))
     left = budget - _MARGIN * own * len(state.views)
     return int(min(max(left // (_MARGIN * more), 0), len(added)))
