@@ -25,8 +25,9 @@ from potr_cl.outputs.sog_geometry import SogGeometry, rounded_geometry
 
 #: Bits that a splat takes, about: with what a splat may cost in error they say what a bit may.
 _BITS_A_SPLAT = 90
-#: Bits that an entry of the palette takes, about; and the most entries to begin with, as a part of the splats.
-_BITS_AN_ENTRY, _MOST_A_SPLAT = 65, 0.5
+#: Bits that an entry of the palette has to be worth; and the most entries to begin with, as a part of the splats. An
+#: entry takes some 60 bits: but points leave a dear one all at once.
+_BITS_AN_ENTRY, _MOST_A_SPLAT = 20, 0.75
 #: Steps of R, G and B that are as coarse as those of Y, Co and Cg of 1.
 _STEP_OF_CHANNEL = math.sqrt(8 / 3)
 
