@@ -14,6 +14,7 @@ from potr_cl.cli.guard import StandardInput, StandardOutput
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene, scene_writer
 from potr_cl.formats.scene_size import bytes_of_scene
+from potr_cl.formats.scenes import spz
 from potr_cl.formats.streams import received, send
 from potr_cl.model.scene import Scene
 
@@ -44,6 +45,18 @@ def add_antialiased_option(p: argparse._ActionsContainer) -> None:
         default="auto",
         help="whether the scene was trained with antialiasing (gsplat's antialiased mode, Mip-Splatting) and is to be "
         "rendered so; default auto: as its file says, which PLY files of gsplat and nerfstudio do not: give yes",
+    )
+
+
+def add_spz_version_option(p: argparse._ActionsContainer) -> None:
+    """``--spz-version``, for commands that write scenes in formats of other programs."""
+    p.add_argument(
+        "--spz-version",
+        type=int,
+        choices=sorted(spz.FORMAT.versions),
+        metavar="V",
+        help=f"of .spz files: {', '.join(f'{version}, {what}' for version, what in spz.VERSIONS.items())}; default "
+        f"{spz.FORMAT.versions[0]}",
     )
 
 

@@ -227,12 +227,12 @@ class Device:
                 cl.enqueue_copy(self.queue, buffer, array, is_blocking=True)
         return buffer
 
-    def download(self, buffer: cl.Buffer, shape: tuple[int, ...], dtype: Any) -> np.ndarray[Any, Any]:
-        """A copy of a buffer's beginning, once everything before it in the queue is done."""
+    def download(self, buffer: cl.Buffer, shape: tuple[int, ...], dtype: Any, start: int = 0) -> np.ndarray[Any, Any]:
+        """A copy of a part of a buffer, from the byte ``start`` on, once everything before it in the queue is done."""
         array = np.empty(shape, dtype)
         if array.nbytes:
             with self.errors("failed while computing"):
-                cl.enqueue_copy(self.queue, array, buffer, is_blocking=True)
+                cl.enqueue_copy(self.queue, array, buffer, src_offset=start, is_blocking=True)
         return array
 
     def launch(

@@ -20,7 +20,9 @@ from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import Family
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.between.amount import most_needed
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
@@ -87,7 +89,12 @@ UNITS: dict[Family, Units] = {
 
 
 def forecast(
-    scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, device: Device, search: bool = False
+    scene: Scene,
+    cameras: Sequence[Camera],
+    options: EncodeOptions,
+    device: Device,
+    search: bool = False,
+    kept: KeptScene | None = None,
 ) -> Forecast:
     """Render a few views, and say from their time what an encode will take.
 
@@ -95,11 +102,12 @@ def forecast(
         scene, options, device: of the encode.
         cameras: its training views, at least one.
         search: whether the encode is repeated to meet a size or a PSNR.
+        kept: the scene on the device, if it lies there already.
 
     Raises:
         DeviceError: the device cannot render the views.
     """
-    seconds, nbytes = _view(scene, cameras, options, device)
+    seconds, nbytes = _view(scene if kept is None else kept.drawable(device, scene), cameras, options, device)
     parts = {stage.name: stage for stage in options.stages if stage.asked_for and stage.looks_at(scene)}
     units = UNITS[device.family]
     views, of_a_splat = float(len(cameras)), units.code_splat
@@ -124,11 +132,11 @@ def forecast(
     return Forecast(work * (_SEARCH if search else 1), memory, seconds, pictures)
 
 
-def _view(scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, device: Device) -> tuple[float, float]:
+def _view(drawable: Drawable, cameras: Sequence[Camera], options: EncodeOptions, device: Device) -> tuple[float, float]:
     """Seconds that a picture takes, and bytes of what can be kept of a view: means of a few."""
     chosen = [cameras[round(place)] for place in np.linspace(0, len(cameras) - 1, min(_SAMPLE, len(cameras)))]
     seconds, nbytes = [], []
-    with Rasterizer(device, scene, background=options.background) as rasterizer:
+    with Rasterizer(device, drawable, background=options.background) as rasterizer:
         for number, camera in enumerate([chosen[0], *chosen]):
             began = time.perf_counter()
             rasterizer.render_device(camera)

@@ -5,6 +5,7 @@ from __future__ import annotations
 from potr_cl.codec.quantize import Preset
 from potr_cl.stages.code import Code
 from potr_cl.stages.compact import Compact
+from potr_cl.stages.fit import Fit
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Stage
@@ -18,6 +19,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "best": (
         Between(),
         Prune(),
+        Fit(),
         Compact(on=False),
         Refit(steps=8),
         Code(),
@@ -25,6 +27,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "smallest": (
         Between(),
         Prune(iterations=64),
+        Fit(),
         Compact(on=False),
         Refit(steps=8, at=(0.5, 0.75)),
         Code(),
@@ -32,6 +35,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "fast": (
         Between(),
         Prune(iterations=16),
+        Fit(),
         Compact(on=False),
         Refit(steps=4),
         Code(entropy="zstd", zstd_level=9),
@@ -39,6 +43,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "paper": (
         Between(views=0),
         Prune(),
+        Fit(),
         Compact(),
         Refit(steps=0),
         Code(),
