@@ -120,7 +120,7 @@ def test_what_does_not_help_is_not_kept(family_device):
     """A scene that is perfect in the views held out, and targets elsewhere that lead away from it."""
     source = visible_scene(60, 1, seed=3)
     cameras = ring_of_cameras(8, size=40)
-    fit_to, held_out = share_out(8, 0)
+    _, held_out = share_out(8, 0)
     with Rasterizer(family_device, source) as rasterizer:
         pictures = [rasterizer.render(camera)[0] for camera in cameras]
     wrong = [picture if number in held_out else 1 - picture for number, picture in enumerate(pictures)]
