@@ -24,6 +24,7 @@ from potr_cl.codec.context.decoder import Reader, Stream
 from potr_cl.codec.context.lanes import Lanes
 from potr_cl.codec.context.model import Sizes
 from potr_cl.codec.dequantizer import Dequantizer, IntegerStream
+from potr_cl.codec.destination import Destination, SceneArrays
 from potr_cl.codec.native.library import native
 from potr_cl.codec.sections import Coder, Property, Section
 from potr_cl.codec.versions import VERSIONS, FormatVersion
@@ -124,7 +125,7 @@ class PotrFile:
             multiplicities=unpack_integers(raw, planes, False, 0, count).astype(np.uint64),
             tail_lengths=self._raw(Property.TAIL_LENGTH),
             tails=self._raw(Property.TAIL),
-            absolute=self._version.absolute_leaf_levels,
+            absolute=self.rules.absolute_leaf_levels,
         )
         return octree.parse(tree, header.splats)
 
@@ -137,14 +138,14 @@ class PotrFile:
     def quaternions(self) -> NDArray[np.float32]:
         """(N, 4) float32 unit quaternions w, x, y, z. Raises DataError if damaged."""
         out = np.empty((self.header.splats, 4), np.float32)
-        scales = self._streams(Property.SCALE) if self._version.rotations_need_scales else []
+        scales = self._streams(Property.SCALE) if self.rules.rotations_need_scales else []
         self._dequantizer.rotations(self._streams(Property.ROTATION), scales, out)
         return out
 
     def opacity_logits(self) -> NDArray[np.float32]:
         """(N,) float32 logits. Raises DataError if damaged."""
         out = np.empty(self.header.splats, np.float32)
-        self._decode_opacities(out, _now)
+        self._dequantizer.opacities(self._streams(Property.OPACITY)[0], out)
         return out
 
     def sh(self, degree: int | None = None) -> NDArray[np.float32]:
@@ -157,10 +158,11 @@ class PotrFile:
             UsageError: there is no such degree.
             DataError: damaged.
         """
-        planar = self._empty_sh(degree)
-        for _, job in self._sh_jobs(planar):
+        count = self.sh_count(degree)
+        arrays = SceneArrays(self.header, self.rules, count)
+        for _, job in self._sh_jobs(arrays, count):
             job(_now)
-        return planar.transpose(2, 0, 1)
+        return arrays.sh
 
     def scene(self, threads: int = 0, sh_degree: int | None = None) -> Scene:
         """Decode everything, or all but some SH coefficients.
@@ -173,29 +175,52 @@ class PotrFile:
             UsageError: there is no such degree.
             DataError: damaged.
         """
-        header = self.header
-        _ = self.metadata  # it takes no part in the scene, but damage anywhere is damage
         try:
-            planar = self._empty_sh(sh_degree)
-            log_scales = np.empty((header.splats, 3), np.float32)
-            quaternions = np.empty((header.splats, 4), np.float32)
-            opacity_logits = np.empty(header.splats, np.float32)
-            shapes: _Job = partial(self._decode_shapes, log_scales, quaternions)
-            opacities: _Job = partial(self._decode_opacities, opacity_logits)
-            # The longest first: a pool that ends with a long one ends late.
-            jobs = [
-                *self._sh_jobs(planar),
-                (self._contextual(Property.SCALE) or self._contextual(Property.ROTATION), shapes),
-                (self._contextual(Property.OPACITY), opacities),
-            ]
-            means = self._run(jobs, min(threads or min(os.cpu_count() or 1, _MOST_THREADS), self._threads_in_memory()))
+            arrays = SceneArrays(self.header, self.rules, self.sh_count(sh_degree))
+            self.decode_into(arrays, threads, sh_degree)
         except MemoryError:
-            needed = header.splats * (11 + 3 * self._coefficients(sh_degree)) * 4
+            needed = self.header.splats * (11 + 3 * self.sh_count(sh_degree)) * 4
             raise DataError(f"the scene needs {needed / 1e9:.1f} GB of memory, more than there is") from None
-        sh = planar.transpose(2, 0, 1)
-        return Scene(means, log_scales, quaternions, opacity_logits, sh, header.antialiased, header.low_pass)
+        return arrays.scene
 
-    def _run(self, jobs: list[tuple[bool, _Job]], threads: int) -> NDArray[np.float32]:
+    def decode_into(self, destination: Destination, threads: int = 0, sh_degree: int | None = None) -> None:
+        """Decode as :meth:`scene` does, but hand what is decoded to a destination, which may be on another device.
+
+        Args:
+            destination: it has room for the SH coefficients that are wanted.
+            threads, sh_degree: as of :meth:`scene`.
+
+        Raises:
+            As :meth:`scene`, and what the destination raises.
+        """
+        _ = self.metadata  # it takes no part in the scene, but damage anywhere is damage
+        shapes: _Job = partial(self._decode_shapes, destination)
+        opacities: _Job = partial(self._decode_opacities, destination)
+        # The longest first: a pool that ends with a long one ends late.
+        jobs = [
+            *self._sh_jobs(destination, self.sh_count(sh_degree)),
+            (self._contextual(Property.SCALE) or self._contextual(Property.ROTATION), shapes),
+            (self._contextual(Property.OPACITY), opacities),
+        ]
+        threads = min(threads or min(os.cpu_count() or 1, _MOST_THREADS), self._threads_in_memory())
+        self._run(jobs, lambda: destination.take_means(self.means()), threads)
+
+    def sh_count(self, degree: int | None = None) -> int:
+        """How many SH coefficients of a channel there are up to a degree, which need not be in the file; None: all.
+
+        Raises:
+            UsageError: there is no such degree.
+        """
+        if degree is not None and not 0 <= degree < len(SH_COEFFICIENTS):
+            raise UsageError(f"SH degree {degree} is unknown: choose 0 to {len(SH_COEFFICIENTS) - 1}")
+        return SH_COEFFICIENTS[self.header.sh_degree if degree is None else min(degree, self.header.sh_degree)]
+
+    @property
+    def rules(self) -> FormatVersion:
+        """Those of the file's version."""
+        return VERSIONS[self.header.version]
+
+    def _run(self, jobs: list[tuple[bool, _Job]], centres: Callable[[], None], threads: int) -> None:
         """Do some jobs, each with whether it takes the context coder, and decode the centres.
 
         By NumPy the context coder makes many short calls, in which threads would only wait for each other: one makes
@@ -220,7 +245,7 @@ class PotrFile:
         contextual = [job for takes_coder, job in jobs if takes_coder]
         with thread_pool(threads) as pool:
             coded = [pool.submit(in_turn, some) for some in ([contextual] if alone else [[job] for job in contextual])]
-            means = pool.submit(self.means)
+            means = pool.submit(centres)
             others = [pool.submit(job, _now) for takes_coder, job in jobs if not takes_coder]
             first: list[Future[Any]] = [*coded, means, *others]
             for futures in (first, left):
@@ -228,13 +253,8 @@ class PotrFile:
                 for future in futures:
                     if future.done() and (error := future.exception()) is not None:
                         raise error
-            return means.result()
 
     # ------------------------------------------------------------------------------------------ inside
-
-    @property
-    def _version(self) -> FormatVersion:
-        return VERSIONS[self.header.version]
 
     def _raw(self, prop: Property, index: int = 0) -> NDArray[np.uint8]:
         section = self.header.find(prop, index)
@@ -276,52 +296,41 @@ class PotrFile:
 
     @property
     def _dequantizer(self) -> Dequantizer:
-        return Dequantizer(self.header, self._version)
+        return Dequantizer(self.header, self.rules)
 
-    def _decode_shapes(
-        self, log_scales: NDArray[np.float32], quaternions: NDArray[np.float32], submit: _Submit
-    ) -> None:
+    def _decode_shapes(self, destination: Destination, submit: _Submit) -> None:
         scales = self._streams(Property.SCALE)
-        submit(partial(self._dequantizer.scales, scales, log_scales))
-        submit(partial(self._dequantizer.rotations, self._streams(Property.ROTATION), scales, quaternions))
+        submit(partial(destination.take_scales, scales))
+        submit(partial(destination.take_rotations, self._streams(Property.ROTATION), scales))
 
-    def _decode_opacities(self, out: NDArray[np.float32], submit: _Submit) -> None:
-        submit(partial(self._dequantizer.opacities, self._streams(Property.OPACITY)[0], out))
+    def _decode_opacities(self, destination: Destination, submit: _Submit) -> None:
+        submit(partial(destination.take_opacities, self._streams(Property.OPACITY)[0]))
 
-    def _coefficients(self, degree: int | None) -> int:
-        """How many there are up to a degree, which need not be in the file."""
-        if degree is not None and not 0 <= degree < len(SH_COEFFICIENTS):
-            raise UsageError(f"SH degree {degree} is unknown: choose 0 to {len(SH_COEFFICIENTS) - 1}")
-        return SH_COEFFICIENTS[self.header.sh_degree if degree is None else min(degree, self.header.sh_degree)]
-
-    def _empty_sh(self, degree: int | None) -> NDArray[np.float32]:
-        return np.empty((self._coefficients(degree), 3, self.header.splats), np.float32)
-
-    def _sh_jobs(self, planar: NDArray[np.float32]) -> list[tuple[bool, _Job]]:
-        """What decodes M SH coefficients into ``planar`` (M, 3, N), and whether it takes the context coder."""
-        stop = 3 * len(planar)
+    def _sh_jobs(self, destination: Destination, count: int) -> list[tuple[bool, _Job]]:
+        """What decodes so many SH coefficients of a channel, and whether it takes the context coder."""
+        stop = 3 * count
         contextual = [s for s in self.header.sections if s.kind == Property.SH and s.coder == Coder.CONTEXT]
         chained = [s for s in contextual if 0 < s.index < stop]
         in_chain = {s.index // 3 + m for s in chained for m in range(s.streams // 3)}
-        alone = [m for m in range(len(planar)) if m not in in_chain]
-        jobs: list[tuple[bool, _Job]] = [(True, partial(self._decode_chain, chained, planar))] if chained else []
+        alone = [m for m in range(count) if m not in in_chain]
+        jobs: list[tuple[bool, _Job]] = [(True, partial(self._decode_chain, chained, destination))] if chained else []
         return jobs + [
-            (self._contextual(Property.SH, 3 * m), partial(self._decode_coefficient, m, planar[m])) for m in alone
+            (self._contextual(Property.SH, 3 * m), partial(self._decode_coefficient, m, destination)) for m in alone
         ]
 
-    def _decode_chain(self, chain: list[Section], planar: NDArray[np.float32], submit: _Submit) -> None:
+    def _decode_chain(self, chain: list[Section], destination: Destination, submit: _Submit) -> None:
         """AC coefficients whose contexts are made of those before."""
         history = Sizes(Lanes(self.header.splats))
         for section in sorted(chain, key=lambda s: s.index):
             streams = self._context_streams(section, history)
             for m, channels in enumerate(zip(streams, streams, streams, strict=True), start=section.index // 3):
-                submit(partial(self._dequantizer.colours, channels, m, False, planar[m]))
+                submit(partial(destination.take_colours, channels, m, False))
 
-    def _decode_coefficient(self, m: int, out: NDArray[np.float32], submit: _Submit) -> None:
-        """One SH coefficient into ``out`` (3, N): R, G, B."""
+    def _decode_coefficient(self, m: int, destination: Destination, submit: _Submit) -> None:
+        """The three channels of one SH coefficient."""
         streams = self._streams(Property.SH, range(3 * m, 3 * m + 3))
         differences = m == 0 and not self._contextual(Property.SH)
-        submit(partial(self._dequantizer.colours, streams, m, differences, out))
+        submit(partial(destination.take_colours, streams, m, differences))
 
 
 #: Takes what needs no more than what is at hand, to be done now or by another thread.

@@ -208,13 +208,20 @@ def _coefficients(
 ) -> NDArray[np.signedinteger]:
     """(M, 3, N) levels of the SH coefficients' Y, Co, Cg."""
     count = scene.sh.shape[1]
+    columns = scene.sh.transpose(1, 2, 0)
+    # Coefficients that are contiguous each, as a re-fit leaves them, are picked from each.
+    contiguous = columns.strides[2] == columns.itemsize
     levels: NDArray[np.signedinteger] = np.empty((count, 3, len(scene)), np.int16)
     wide: list[tuple[tuple[int, int, slice], quantize.Integers]] = []
 
     def take(start: int) -> None:
         rows = order[start : start + _BLOCK]
         block = slice(start, start + len(rows))
-        planar = np.ascontiguousarray(scene.sh[rows].transpose(1, 2, 0))
+        planar = (
+            np.array([[column.take(rows) for column in rgb] for rgb in columns])
+            if contiguous
+            else np.ascontiguousarray(scene.sh[rows].transpose(1, 2, 0))
+        )
         for m, rgb in enumerate(planar):
             factor = parameters.sf_dc if m == 0 else parameters.sf_sh
             for c, values in enumerate(quantize.to_ycocg(rgb.astype(np.float64).T)):

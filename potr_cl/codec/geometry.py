@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import octree, quantize
+from potr_cl.codec.native.library import native
 from potr_cl.codec.outliers import check_positions
 from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import Run
@@ -85,7 +86,7 @@ def quantise_geometry(
         DataError: a value too large to quantise, or a splat too far from the others to keep them exact.
     """
     version = VERSIONS[parameters.version]
-    nearest = _nearest(scene.means, views, run)
+    nearest = distances_to_views(scene.means, views, run)
     world = version.in_world_units(parameters, scene, nearest)
     tolerance = np.maximum(world.gamma, world.beta * nearest)
     tree, order = octree.build(scene.means, tolerance, absolute=version.absolute_leaf_levels)
@@ -100,14 +101,20 @@ def quantise_geometry(
     )
 
 
-def _nearest(means: NDArray[np.float32], views: Sequence[Camera], run: Run) -> NDArray[np.float64]:
+def distances_to_views(means: NDArray[np.float32], views: Sequence[Camera], run: Run) -> NDArray[np.float64]:
     """(N,) distance to the nearest view; without views 0, which leaves the tolerance to γ."""
     nearest = np.zeros(len(means))
     if not views:
         return nearest
     centres = camera_centres(views)
 
+    functions = native()
+
     def find(start: int) -> None:
+        if functions is not None:
+            some = np.ascontiguousarray(means[start : start + _BLOCK], np.float32)
+            functions.quantising.nearest(some, centres, nearest[start : start + _BLOCK])
+            return
         axes = means[start : start + _BLOCK].T.astype(np.float64)
         least = nearest[start : start + _BLOCK]
         squared, part = np.empty_like(least), np.empty_like(least)
@@ -134,9 +141,7 @@ def _canonical(scene: Scene, order: NDArray[np.int64], run: Run) -> tuple[NDArra
     def turn(start: int) -> None:
         rows = order[start : start + _BLOCK]
         block = slice(start, start + len(rows))
-        imaginary[block], log_scales[block] = quantize.canonical_rotations(
-            scene.quaternions[rows], scene.log_scales[rows]
-        )
+        imaginary[block], log_scales[block] = quantize.canonical_rotations(scene.quaternions, scene.log_scales, rows)
 
     list(run(turn, range(0, len(scene), _BLOCK)))
     return imaginary, log_scales

@@ -2,31 +2,26 @@
 
 from __future__ import annotations
 
-from collections.abc import Mapping
 from dataclasses import dataclass
 from typing import ClassVar
-
-import numpy as np
 
 from potr_cl.codec.encoder import Coded
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes import ply
 from potr_cl.model.scene import Scene
-from potr_cl.outputs.output import Output, Request, Rounded, RoundedScene
+from potr_cl.outputs.output import Request, Rounded
+from potr_cl.outputs.whole_floats import WholeFloats
 
 
 @dataclass(frozen=True)
-class Ply(Output):
-    """A .ply: nothing is rounded, so q only decides which splats are left."""
+class Ply(WholeFloats):
+    """A .ply file."""
 
     format: ClassVar[SceneFormat] = ply.FORMAT
-    replaces: ClassVar[Mapping[str, float]] = {"drop": 0.0}
     bytes_a_splat: ClassVar[float] = 20.0
-
-    def geometry(self, scene: Scene, request: Request) -> RoundedScene:
-        """As it is."""
-        return RoundedScene(request.parameters, np.arange(len(scene)), scene)
+    splat_bytes: ClassVar[int] = 68
 
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
-        """See :func:`potr_cl.formats.scenes.ply.save`."""
-        return Coded([bytes(piece) for piece in ply.pieces(scene)], np.arange(len(scene)))
+        """See :func:`potr_cl.formats.scenes.ply.pieces`."""
+        scene, order = self.reduced(scene, rounded, request)
+        return Coded([bytes(piece) for piece in ply.pieces(scene)], order)

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
@@ -10,11 +12,15 @@ from potr_cl.codec.encoder import Coded, code_scene
 from potr_cl.codec.geometry import Geometry, quantise_geometry
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import Property
+from potr_cl.errors import DeviceError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.potr import FORMAT
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import Scene
+from potr_cl.ondevice.decode import decode_to_device
+from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output, Request, Rounded
+from potr_cl.raster.scene_buffers import Drawable
 
 _NAMES = {
     Property.OCCUPANCY: "position",
@@ -60,6 +66,17 @@ class Potr(Output):
     def read(self, data: bytes, trust: bool = False) -> Scene:
         """See :func:`potr_cl.codec.decoder.decode`."""
         return decode(data, **({"trust": True} if trust else {}))
+
+    @contextmanager
+    def seen(self, data: bytes, device: Device, trust: bool = False) -> Iterator[Drawable]:
+        """See :func:`potr_cl.ondevice.decode.decode_to_device`; an ordinary scene where it does not fit the device."""
+        file = PotrFile.from_bytes(data, **({"trust": True} if trust else {}))
+        with ExitStack() as stack:
+            try:
+                scene: Drawable = stack.enter_context(decode_to_device(file, device))
+            except DeviceError:
+                scene = file.scene()
+            yield scene
 
     def properties(self, data: bytes) -> dict[str, int]:
         """Bytes by attribute; the header and the metadata are "other"."""

@@ -8,13 +8,19 @@ from typing import Any
 
 from potr_cl.errors import UsageError
 from potr_cl.formats.registry import listed, stem_of_scene, suffix_of_name, written_format
+from potr_cl.outputs.compressed_ply import CompressedPly
+from potr_cl.outputs.gltf import Gltf
 from potr_cl.outputs.output import Output
 from potr_cl.outputs.ply import Ply
 from potr_cl.outputs.potr import Potr
+from potr_cl.outputs.spz import Spz
 
 #: In the order in which people are told of them; the first is the usual one.
 OUTPUTS: tuple[type[Output], ...] = (
     Potr,
+    Spz,
+    CompressedPly,
+    Gltf,
     Ply,
 )
 
@@ -36,7 +42,7 @@ def output_of(path: Path, **choices: Any) -> Output:
     given = {name: value for name, value in choices.items() if value is not None}
     for name in given:
         if name not in kind.__dataclass_fields__:
-            raise UsageError(f"'{path}': there is no {name.replace('_', '-')} to choose for {kind.format.name}")
+            raise UsageError(f"'{path}': {kind.format.name} has no {name} to choose")
     return kind(**given)
 
 
@@ -66,7 +72,11 @@ def suffixes_encoded() -> str:
 
 
 def _instead(path: Path) -> str:
-    """What to do where a format is written, but not by encode."""
+    """What to do where a format is written, but not by encode, or not under this name."""
+    suffix = suffix_of_name(path)
+    for kind in OUTPUTS:
+        if suffix in kind.format.suffixes:
+            return f": give it a name that ends in {kind.suffixes()[0]}"
     with contextlib.suppress(UsageError):
         written_format(path)
         name = path.with_name(f"{stem_of_scene(path)}.potr")

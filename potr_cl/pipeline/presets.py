@@ -17,7 +17,7 @@ DEFAULT: Preset = "best"
 #: The stages of each preset, in their order. A stage with ``on=False`` is only done if the user asks for it.
 PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "best": (
-        Between(views=0),
+        Between(),
         Prune(),
         Fit(),
         Compact(on=False),
@@ -33,7 +33,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
         Code(),
     ),
     "fast": (
-        Between(views=0),
+        Between(),
         Prune(iterations=16),
         Fit(),
         Compact(on=False),
@@ -53,7 +53,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
 #: What each preset is for, in a line.
 PURPOSE: dict[Preset, str] = {
     "best": "colours re-fitted together, steps of equal worth, the context coder: a small file in little time",
-    "smallest": "as best, with views between the training views and re-fits while pruning: takes 3 to 5 times as long",
+    "smallest": "as best, in more iterations and with re-fits while pruning: takes twice as long",
     "fast": "as best, in fewer iterations and steps, with zstd 9: encodes and decodes faster",
     "paper": "what the paper does: colours compacted splat by splat, its steps",
 }

@@ -71,6 +71,7 @@ def encode_report(
         "pruning": None,
         "unseen": None,
         "fit": None,
+        "views_between": None,
         "search": search,
         "options": options.as_dict(),
         "parameters": dataclasses.asdict(options.parameters),
@@ -89,6 +90,8 @@ def encode_report(
         report["unseen"] = {**dataclasses.asdict(encoded.unseen), "said": str(encoded.unseen)}
     if encoded.fitted is not None:
         report["fit"] = {**encoded.fitted.facts, "said": str(encoded.fitted)}
+    if encoded.between is not None:
+        report["views_between"] = {**dataclasses.asdict(encoded.between), "said": str(encoded.between)}
     if encoded.device is not None:
         info = encoded.device.info
         report["device"] = {"name": info.name, "platform": info.platform, "version": info.version}
@@ -171,6 +174,8 @@ def format_encode_report(report: dict[str, Any]) -> str:
     ]
     if report["unseen"] is not None and report["unseen"]["splats"]:
         lines.append(f"           {report['unseen']['said']}")
+    if report["views_between"] is not None:
+        lines.append(f"views      {report['views_between']['said']}")
     if source["antialiased"]:
         lines.append("rendered   as an antialiased scene")
     for place, (name, nbytes) in enumerate(report["properties"].items()):

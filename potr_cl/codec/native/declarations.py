@@ -33,6 +33,10 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_encode_cells": (None, [_POINTER, _SIZE, _POINTER, _POINTER, _SIZE, ctypes.c_int32, _POINTER]),
     "potr_encode_count": (None, [_POINTER, _SIZE, _POINTER]),
     "potr_encode_stream": (_SIZE, [_POINTER, _SIZE, _SIZE, _POINTER, _POINTER, _POINTER]),
+    "potr_nearest": (None, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER]),
+    "potr_canonical": (None, [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _POINTER, _POINTER, _POINTER]),
+    "potr_ycocg_columns": (None, [_POINTER, _SIZE, _SIZE, _SIZE, _POINTER]),
+    "potr_nonzero_levels": (_NUMBER, [_POINTER, _SIZE, _SIZE, ctypes.c_double, ctypes.c_double, _POINTER]),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
 }
 #: Those that there are for several kinds of integers, by what their names begin with.

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.native.arrays import KINDS, address, addresses, kind_of
 from potr_cl.codec.native.declarations import declared
+from potr_cl.codec.native.quantising import Quantising
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -56,12 +57,16 @@ class Functions:
     Args:
         library: to take the functions from.
 
+    Attributes:
+        quantising: those of the encoder that are about splats, and not about integers.
+
     Raises:
         AttributeError: one is missing.
     """
 
     def __init__(self, library: ctypes.CDLL) -> None:
         self._c = declared(library)
+        self.quantising = Quantising(self._c)
 
     # -------------------------------------------------------------------------------------- context coder
 
