@@ -25,7 +25,7 @@ FOLDERS: dict[str, set[str]] = {
     "clustering": {"errors", "model", "opencl"},
     "formats": {"errors", "host", "model", "opencl", "codec", "clustering"},
     "quality": {"errors", "host", "model", "opencl", "raster", "formats"},
-    "outputs": {"errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats"},
+    "outputs": {"errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "clustering"},
     "stages": {"errors", "host", "model", "opencl", "raster", "codec", "quality", "outputs"},
     "pipeline": {"errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality", "outputs"},
     "report": {"plain_text", "errors", "host", "model", "opencl", "codec", "formats", "quality", "pipeline"},

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.clustering.launch import launcher_for
@@ -63,7 +62,11 @@ class Points(Owner):
             raise
 
     def nearest(
-        self, centres: FloatArray, biases: FloatArray | None = None, cells: U32 | None = None, lists: Lists | None = None
+        self,
+        centres: FloatArray,
+        biases: FloatArray | None = None,
+        cells: U32 | None = None,
+        lists: Lists | None = None,
     ) -> tuple[U32, FloatArray]:
         """The best centre of each point, and its distance less the point's distance to zero, plus the centre's bias.
 

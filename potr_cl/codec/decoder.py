@@ -10,7 +10,7 @@ import stat
 from collections.abc import Callable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import container, metadata, octree, sections
+from potr_cl.codec.bundled_scene import BundledScene
 from potr_cl.codec.byte_planes import PlaneStream, unpack_integers
 from potr_cl.codec.container import Header
 from potr_cl.codec.context.decoder import Reader, Stream
@@ -25,6 +26,7 @@ from potr_cl.codec.context.lanes import Lanes
 from potr_cl.codec.context.model import Sizes
 from potr_cl.codec.dequantizer import Dequantizer, IntegerStream
 from potr_cl.codec.destination import Destination, SceneArrays
+from potr_cl.codec.native.bundles import ValueArrays
 from potr_cl.codec.native.library import native
 from potr_cl.codec.sections import Coder, Property, Section
 from potr_cl.codec.versions import VERSIONS, FormatVersion
@@ -132,12 +134,18 @@ class PotrFile:
     def log_scales(self) -> NDArray[np.float32]:
         """(N, 3) float32 natural logarithms of standard deviations. Raises DataError if damaged."""
         out = np.empty((self.header.splats, 3), np.float32)
+        if self._bundled:
+            self._bundled.fill(ValueArrays(log_scales=out))
+            return out
         self._dequantizer.scales(self._streams(Property.SCALE), out)
         return out
 
     def quaternions(self) -> NDArray[np.float32]:
         """(N, 4) float32 unit quaternions w, x, y, z. Raises DataError if damaged."""
         out = np.empty((self.header.splats, 4), np.float32)
+        if self._bundled:
+            self._bundled.fill(ValueArrays(quaternions=out))
+            return out
         scales = self._streams(Property.SCALE) if self.rules.rotations_need_scales else []
         self._dequantizer.rotations(self._streams(Property.ROTATION), scales, out)
         return out
@@ -145,6 +153,9 @@ class PotrFile:
     def opacity_logits(self) -> NDArray[np.float32]:
         """(N,) float32 logits. Raises DataError if damaged."""
         out = np.empty(self.header.splats, np.float32)
+        if self._bundled:
+            self._bundled.fill(ValueArrays(logits=out))
+            return out
         self._dequantizer.opacities(self._streams(Property.OPACITY)[0], out)
         return out
 
@@ -159,7 +170,10 @@ class PotrFile:
             DataError: damaged.
         """
         count = self.sh_count(degree)
-        arrays = SceneArrays(self.header, self.rules, count)
+        arrays = SceneArrays(self.header, self.rules, count, zeros=self._bundled is not None)
+        if self._bundled:
+            self._bundled.fill(ValueArrays(sh=arrays.values.sh))
+            return arrays.sh
         for _, job in self._sh_jobs(arrays, count):
             job(_now)
         return arrays.sh
@@ -176,7 +190,8 @@ class PotrFile:
             DataError: damaged.
         """
         try:
-            arrays = SceneArrays(self.header, self.rules, self.sh_count(sh_degree))
+            zeros = self._bundled is not None
+            arrays = SceneArrays(self.header, self.rules, self.sh_count(sh_degree), zeros)
             self.decode_into(arrays, threads, sh_degree)
         except MemoryError:
             needed = self.header.splats * (11 + 3 * self.sh_count(sh_degree)) * 4
@@ -194,6 +209,11 @@ class PotrFile:
             As :meth:`scene`, and what the destination raises.
         """
         _ = self.metadata  # it takes no part in the scene, but damage anywhere is damage
+        if self._bundled:
+            self._decode_bundles(
+                self._bundled, destination, threads or min(os.cpu_count() or 1, _MOST_THREADS), sh_degree
+            )
+            return
         shapes: _Job = partial(self._decode_shapes, destination)
         opacities: _Job = partial(self._decode_opacities, destination)
         # The longest first: a pool that ends with a long one ends late.
@@ -254,7 +274,25 @@ class PotrFile:
                     if future.done() and (error := future.exception()) is not None:
                         raise error
 
+    def _decode_bundles(
+        self, scene: BundledScene, destination: Destination, threads: int, sh_degree: int | None
+    ) -> None:
+        def centres() -> None:
+            destination.take_means(self.means())
+
+        if isinstance(destination, SceneArrays):
+            scene.fill(destination.values, threads, centres)
+            return
+        scene.hand_to(destination, self.sh_count(sh_degree), threads)
+        centres()
+
     # ------------------------------------------------------------------------------------------ inside
+
+    @cached_property
+    def _bundled(self) -> BundledScene | None:
+        """The splats of a file of coder BUNDLES, None for others."""
+        section = self.header.find(Property.OPACITY)
+        return BundledScene(self.header, self.data) if section and section.coder == Coder.BUNDLES else None
 
     def _raw(self, prop: Property, index: int = 0) -> NDArray[np.uint8]:
         section = self.header.find(prop, index)

@@ -14,7 +14,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
+from potr_cl.codec.bundles.levels import Levels
 from potr_cl.codec.container import Header
+from potr_cl.codec.native.bundles import ValueArrays
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import native
 from potr_cl.codec.versions import FormatVersion
@@ -118,6 +120,28 @@ class Dequantizer:
             else:
                 channels = _wider(parts)
             _to_rgb(channels, factor, out[:, block])
+
+    def of_levels(self, levels: Levels, arrays: ValueArrays) -> None:
+        """The values of some splats' levels, by NumPy, into the arrays that there are, of all of the file's splats."""
+        version, header = self.version, self.header
+        own = slice(levels.start, levels.stop)
+        scales = levels.scales or []
+        if arrays.logits is not None and levels.opacities is not None:
+            arrays.logits[own] = version.dequantize_opacities(levels.opacities, header.sf_opacity)
+        if arrays.log_scales is not None:
+            for axis, level in enumerate(scales):
+                arrays.log_scales[own, axis] = version.dequantize_scales(level, header.sf_scale)
+        if arrays.quaternions is not None and levels.rotations is not None:
+            factors = version.rotation_factors(scales, header.sf_rotation)
+            quantize.dequantize_rotations(levels.rotations, factors, arrays.quaternions[own])
+        if arrays.sh is None:
+            return
+        if levels.dc is not None:
+            _to_rgb(levels.dc, header.sf_dc, arrays.sh[0, :, own])
+        for items in levels.ac:
+            rgb = np.empty(items.channels.shape, np.float32)
+            _to_rgb(list(items.channels), header.sf_ac, rgb)
+            arrays.sh[items.coefficients, :, levels.start + items.splats] = rgb.T
 
     def _blocks(self, streams: Sequence[IntegerStream]) -> Iterator[tuple[slice, list[NDArray[np.integer]]]]:
         """The integers of some streams side by side, block by block."""

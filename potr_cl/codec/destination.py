@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.container import Header
 from potr_cl.codec.dequantizer import Dequantizer, IntegerStream
+from potr_cl.codec.native.bundles import ValueArrays
 from potr_cl.codec.versions import FormatVersion
 from potr_cl.model.scene import Scene
 
@@ -53,9 +54,10 @@ class SceneArrays:
         header: of the file.
         version: the rules of the file's version.
         sh_count: SH coefficients of a channel that are wanted.
+        zeros: whether colours are filled in only where they are not 0.
     """
 
-    def __init__(self, header: Header, version: FormatVersion, sh_count: int) -> None:
+    def __init__(self, header: Header, version: FormatVersion, sh_count: int, zeros: bool = False) -> None:
         n = header.splats
         self._header = header
         self._dequantizer = Dequantizer(header, version)
@@ -63,7 +65,12 @@ class SceneArrays:
         self._log_scales = np.empty((n, 3), np.float32)
         self._quaternions = np.empty((n, 4), np.float32)
         self._opacity_logits = np.empty(n, np.float32)
-        self._planar = np.empty((sh_count, 3, n), np.float32)
+        self._planar = (np.zeros if zeros else np.empty)((sh_count, 3, n), np.float32)
+
+    @property
+    def values(self) -> ValueArrays:
+        """The arrays but the centres."""
+        return ValueArrays(self._log_scales, self._quaternions, self._opacity_logits, self._planar)
 
     def take_means(self, means: F32) -> None:
         self._means = means

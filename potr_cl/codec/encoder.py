@@ -6,7 +6,7 @@ The bytes do not depend on the number of threads.
 from __future__ import annotations
 
 from collections.abc import Callable, Sequence
-from concurrent.futures import ThreadPoolExecutor
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
 from functools import partial
 
@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import container, octree, quantize, sections
+from potr_cl.codec.bundles import encoder as bundles_encoder
 from potr_cl.codec.byte_planes import pack_integers
 from potr_cl.codec.container import EntropyCoder, Header
 from potr_cl.codec.context import encoder as context_encoder
@@ -151,7 +152,10 @@ def _code_chains(
     """Sections of some groups: those of a chain tell each other's contexts, where the context coder codes them."""
     plain = partial(_plain_sections, coder=coder)
     coded: list[tuple[Section, bytes]] = []
-    if coder.name != "context" or Coder.CONTEXT not in version.coders:
+    streams_by = version.coder_of_streams if coder.name == "context" else None
+    if streams_by == Coder.BUNDLES:
+        return _code_bundles(chains, plain, pool, progress)
+    if streams_by is None:
         # Each stream by itself, so that there is something to do for every thread.
         groups = [_Group(g.prop, g.index + k, [s]) for chain in chains for g in chain for k, s in enumerate(g.streams)]
         for done, made in enumerate(pool.map(plain, groups), start=1):
@@ -176,6 +180,44 @@ def _code_chains(
     return coded
 
 
+def _code_bundles(
+    chains: list[list[_Group]],
+    plain: Callable[[_Group], list[tuple[Section, bytes]]],
+    pool: ThreadPoolExecutor,
+    progress: Callable[[float], None],
+) -> list[tuple[Section, bytes]]:
+    """All sections of splats by coder BUNDLES; none where they would be smaller without, or the format forbids it."""
+    groups = [group for chain in chains for group in chain]
+    kept = [g for g in groups if g.prop == Property.OPACITY or any(s.any() for s in g.streams)]
+    splats = len(groups[0].streams[0])
+    # For few splats one has to try.
+    others = [pool.submit(plain, group) for group in kept] if splats < _FEW else []
+    stored = bundles_encoder.encode({(g.prop, g.index): g.streams for g in kept}, pool.map, progress)
+    made = []
+    for group in kept if stored else []:
+        data = (stored or {})[group.prop, group.index]
+        integers = len(group.streams) * splats
+        if integers > container.most_integers(Coder.BUNDLES, data):
+            break
+        made.append(
+            container.stream_section(Coder.BUNDLES, group.prop, group.index, len(group.streams), integers, data)
+        )
+    if len(made) == len(kept) and not others:
+        return made
+    alternative = [pair for group in (others or kept) for pair in _plain_of(group, plain)]
+    return min((made, alternative), key=_bytes_of) if len(made) == len(kept) else alternative
+
+
+def _plain_of(
+    group: _Group | Future[list[tuple[Section, bytes]]], plain: Callable[[_Group], list[tuple[Section, bytes]]]
+) -> list[tuple[Section, bytes]]:
+    return group.result() if isinstance(group, Future) else plain(group)
+
+
+def _bytes_of(coded: list[tuple[Section, bytes]]) -> int:
+    return sum(len(data) + container.ENTRY_BYTES for _, data in coded)
+
+
 def _context_sections(
     groups: list[_Group], stored: list[bytes], others: list[list[tuple[Section, bytes]]]
 ) -> list[tuple[Section, bytes]] | None:
@@ -183,9 +225,11 @@ def _context_sections(
     made = []
     for group, data in zip(groups, stored, strict=True):
         integers = len(group.streams) * len(group.streams[0])
-        if integers > len(data) << 15:
+        if integers > container.most_integers(Coder.CONTEXT, data):
             return None
-        made.append(container.context_section(group.prop, group.index, len(group.streams), integers, data))
+        made.append(
+            container.stream_section(Coder.CONTEXT, group.prop, group.index, len(group.streams), integers, data)
+        )
     for (_, data), plain in zip(made, others, strict=False):
         if sum(len(p) for _, p in plain) + 24 * (len(plain) - 1) < len(data):
             return None

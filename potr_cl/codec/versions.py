@@ -36,7 +36,8 @@ class FormatVersion(abc.ABC):
 
     Attributes:
         number: that stands in the file.
-        coders: that its sections may be stored by. Without CONTEXT, the entropy coder "context" means zstd.
+        coders: that its sections may be stored by; the entropy coder "context" means the one of streams that there is,
+            zstd where there is none.
         separate_ac_factor: whether the header has a scale factor of AC coefficients beside that of DC.
         absolute_leaf_levels: whether tail lengths are levels of the octree, chosen by the tolerance alone
             (``absolute`` of :func:`potr_cl.codec.octree.build`).
@@ -48,6 +49,11 @@ class FormatVersion(abc.ABC):
     separate_ac_factor: ClassVar[bool]
     absolute_leaf_levels: ClassVar[bool]
     rotations_need_scales: ClassVar[bool]
+
+    @property
+    def coder_of_streams(self) -> Coder | None:
+        """What the entropy coder "context" means."""
+        return next((coder for coder in self.coders if coder.of_streams), None)
 
     def check(self, parameters: HyperParameters) -> None:
         """Refuse hyper-parameters that a file of this version cannot tell its decoder.
@@ -137,7 +143,7 @@ class Version2(FormatVersion):
     """Steps of equal worth: finer rotations for longer splats, opacities as logits, lengths in sizes of a splat."""
 
     number = 2
-    coders = frozenset(Coder)
+    coders = frozenset({Coder.RAW, Coder.ZSTD, Coder.DEFLATE, Coder.CONTEXT})
     separate_ac_factor = True
     absolute_leaf_levels = True
     rotations_need_scales = True
@@ -180,13 +186,14 @@ class Version2(FormatVersion):
 
 
 class Version3(Version2):
-    """Not final: no preset writes it yet. It will have another entropy coder, and steps of colours that fit each splat.
+    """Bundles of splats that are decoded side by side; the quantiser of version 2.
 
-    Its quantiser is version 2's so far. What it does with colours may depend on the levels of scales and opacities,
-    which are decoded before them.
+    Not final: it will have steps of colours that fit each splat. What it does with colours may depend on the levels of
+    scales and opacities, which are decoded before them.
     """
 
     number = 3
+    coders = frozenset({Coder.RAW, Coder.ZSTD, Coder.DEFLATE, Coder.BUNDLES})
 
 
 #: All versions that are read, by their number.

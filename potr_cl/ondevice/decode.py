@@ -49,9 +49,11 @@ def decode_to_device(
         header.low_pass if as_told else LOW_PASS,
     )
     try:
-        file.decode_into(DeviceDequantiser(header, file.rules, buffers), threads, sh_degree)
-        with device.errors("failed while decoding"):
-            device.queue.finish()
+        destination = DeviceDequantiser(header, file.rules, buffers)
+        try:
+            file.decode_into(destination, threads, sh_degree)
+        finally:
+            destination.finish()
     except MemoryError:
         buffers.close()
         raise DataError(f"{header.splats} splats need more memory than the host has, to be decoded") from None

@@ -47,10 +47,23 @@ class DeviceDequantiser:
         self._on_host = Dequantizer(header, version)
         # Threads decode; one after the other tells the device what to do with it.
         self._lock = threading.Lock()
+        # Copies that the device has not made yet; while it makes them, threads go on decoding.
+        self._pending: list[cl.Event] = []
+
+    def finish(self) -> None:
+        """Wait until everything that was taken is there.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        device = self._buffers.device
+        with device.errors("failed while decoding"):
+            device.queue.finish()
+        self._pending.clear()
 
     def take_means(self, means: F32) -> None:
         with self._lock:
-            self._buffers.write_rows(self._buffers.means, means, "the centres")
+            self._buffers.write_rows(self._buffers.means, means, "the centres", self._pending)
 
     def take_scales(self, streams: Sequence[IntegerStream]) -> None:
         factor = self._header.sf_scale
@@ -73,7 +86,7 @@ class DeviceDequantiser:
         self._on_host.rotations(streams, scales, quaternions)
         units = unit_quaternions(quaternions)
         with self._lock:
-            self._buffers.write_rows(self._buffers.quaternions, units, "the rotations")
+            self._buffers.write_rows(self._buffers.quaternions, units, "the rotations", self._pending)
 
     def take_colours(self, streams: Sequence[IntegerStream], coefficient: int, differences: bool) -> None:
         levels, mapped, reach = _summed_up(streams, differences)
@@ -81,7 +94,7 @@ class DeviceDequantiser:
             rgb = np.empty((3, self._header.splats), np.float32)
             self._on_host.colours(streams, coefficient, differences, rgb)
             with self._lock:
-                self._buffers.write_columns(self._buffers.sh, 3 * coefficient, rgb)
+                self._buffers.write_columns(self._buffers.sh, 3 * coefficient, rgb, self._pending)
             return
         factor = np.float32(self._header.sf_dc if coefficient == 0 else self._header.sf_ac)
         table = np.arange(-reach, reach + 1).astype(np.float32) / factor
@@ -99,7 +112,7 @@ class DeviceDequantiser:
         if largest >= _MOST_LEVELS or min(int(level.min()) for level in levels) < 0:
             columns = np.stack([values(level) for level in levels])
             with self._lock:
-                self._buffers.write_columns(parameter, 0, columns)
+                self._buffers.write_columns(parameter, 0, columns, self._pending)
             return
         narrow = np.stack([level.astype(_unsigned(largest), copy=False) for level in levels])
         table = values(np.arange(largest + 1))
@@ -116,8 +129,8 @@ class DeviceDequantiser:
             raise DataError(f"{what} are {levels.shape[1]} integers, not one for each of {buffers.splats} splats")
         kind = _TYPES[levels.dtype.type]
         buffers.device.shared_kernel(_SOURCE, name, LEVEL=kind, MAPPED=int(mapped)).bind(
-            levels=memory.upload(levels, what),
-            table=memory.upload(table, what),
+            levels=memory.upload(levels, what, self._pending),
+            table=memory.upload(table, what, self._pending),
             splats=buffers.splats,
             stride=buffers.stride,
             **arguments,

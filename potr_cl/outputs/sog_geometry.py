@@ -96,14 +96,12 @@ def rounded_geometry(scene: Scene, parameters: HyperParameters, distances: NDArr
         steps[order],
         _rotations(imaginary, factors, (scale_levels == scale_levels[:, :1]).all(axis=1)),
         version.dequantize_scales(book, world.sf_scale),
-        nearest(scale_levels, book.astype(np.float32)).astype(np.uint8),
+        nearest(scale_levels.astype(np.float32), book.astype(np.float32)).astype(np.uint8),
         np.rint(255 / (1 + np.exp(-decoded))).astype(np.uint8),
     )
 
 
-def _positions(
-    scene: Scene, tolerance: NDArray[np.float64]
-) -> tuple[FloatArray, FloatArray, NDArray[np.uint16]]:
+def _positions(scene: Scene, tolerance: NDArray[np.float64]) -> tuple[FloatArray, FloatArray, NDArray[np.uint16]]:
     """What the least and the most step mean, and steps (N, 3), multiples of powers of two that are precise enough.
 
     Args:

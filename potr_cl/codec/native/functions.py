@@ -7,7 +7,7 @@ a function takes are refused before it is called.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,6 +15,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.native.arrays import KINDS, address, addresses, kind_of
+from potr_cl.codec.native.bundles import BundledFile, SectionWords
+from potr_cl.codec.native.bundles_encode import BundleEncoder
 from potr_cl.codec.native.declarations import declared
 from potr_cl.codec.native.quantising import Quantising
 
@@ -67,6 +69,14 @@ class Functions:
     def __init__(self, library: ctypes.CDLL) -> None:
         self._c = declared(library)
         self.quantising = Quantising(self._c)
+
+    def bundled_file(self, splats: int, sections: Mapping[int, SectionWords]) -> BundledFile:
+        """Sections of coder 4, as :class:`potr_cl.codec.native.bundles.BundledFile` takes them."""
+        return BundledFile(self._c, splats, sections)
+
+    def bundle_encoder(self, *integers: Any) -> BundleEncoder:
+        """Integers to code, as :class:`potr_cl.codec.native.bundles_encode.BundleEncoder` takes them."""
+        return BundleEncoder(self._c, *integers)
 
     # -------------------------------------------------------------------------------------- context coder
 

@@ -43,7 +43,7 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
     pixels = sum(view.width * view.height for view in (*state.views, *added))
     if budget > _SPLAT * len(state.source) * (len(state.views) + len(added)) + _PIXEL * pixels:
         return len(added)
-    with Rasterizer(bench.opened, state.source, background=bench.background) as rasterizer:
+    with Rasterizer(bench.opened, bench.drawable(state.source), background=bench.background) as rasterizer:
         own, more = (_nbytes(rasterizer, views) for views in (state.views, added))
     left = budget - _MARGIN * own * len(state.views)
     return int(min(max(left // (_MARGIN * more), 0), len(added)))
