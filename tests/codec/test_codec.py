@@ -103,7 +103,7 @@ def test_within_balanced_steps(degree, entropy, q):
     options = as_it_is("best", entropy, q=q)
     encoded = encode(scene, options=options)
     data = joined(encoded)
-    context = any(s.coder == Coder.CONTEXT for s in PotrFile.from_bytes(data).header.sections)
+    context = any(s.coder == Coder.BUNDLES for s in PotrFile.from_bytes(data).header.sections)
     assert context == (entropy.name == "context")
     check_within_balanced_steps(scene, data, encoded.order, options.parameters.beta * typical_size(scene))
 
@@ -124,7 +124,7 @@ def test_version_1_has_no_context_coder():
     data = joined(encode(random_scene(200), options=as_it_is(entropy=EntropyCoder("context"))))
     file = PotrFile.from_bytes(data)
     assert file.header.version == 1
-    assert all(s.coder != Coder.CONTEXT for s in file.header.sections)
+    assert not any(s.coder.of_streams for s in file.header.sections)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -33,7 +33,7 @@ def test_files_hold_the_coders_that_their_version_has(preset, entropy):
     file = PotrFile.from_bytes(file_of(random_scene(2000, 1), parameters, entropy=EntropyCoder(entropy)))
     coders = {section.coder for section in file.header.sections}
     assert coders <= VERSIONS[file.header.version].coders
-    assert (Coder.CONTEXT in coders) == (preset == "best" and entropy == "context")
+    assert (Coder.BUNDLES in coders) == (preset == "best" and entropy == "context")
 
 
 def test_factors_of_colours_that_version_1_cannot_tell_are_refused():

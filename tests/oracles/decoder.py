@@ -42,8 +42,9 @@ STORED = 0
 ZSTANDARD = 1
 ZLIB = 2
 CONTEXT = 3
+BUNDLES = 4
 LARGEST_SINGLE = (2 - 2.0**-23) * 2.0**127
-LARGEST_EXPANSION = {STORED: 1, ZSTANDARD: 2**15, ZLIB: 1032, CONTEXT: 2**15}
+LARGEST_EXPANSION = {STORED: 1, ZSTANDARD: 2**15, ZLIB: 1032, CONTEXT: 2**15, BUNDLES: 2**16}
 
 
 class Header(NamedTuple):
@@ -193,6 +194,7 @@ def read_sections(data: bytes, header: Header) -> Sections:
         number_of_indices[STEPS] = 1
     sections: Sections = {}
     coded: dict[tuple[int, int], bytes] = {}
+    bundled: set[bool] = set()
     start = header.size
     for number in range(header.sections):
         entry = struct.unpack_from("<BBBBIQQ", data, FIXED_HEADER + ENTRY_SIZE * number)
@@ -202,8 +204,10 @@ def read_sections(data: bytes, header: Header) -> Sections:
         check(prop in number_of_indices, f"{name}: unknown property")
         check(index < number_of_indices[prop], f"{name}: unknown index")
         check((prop, index) not in sections, f"{name} stands twice")
-        check(coder in LARGEST_EXPANSION and (coder != CONTEXT or header.version >= 2), f"{name}: coder {coder}")
-        if coder == CONTEXT:
+        check(coder in LARGEST_EXPANSION, f"{name}: coder {coder}")
+        check(coder != CONTEXT or header.version == 2, f"{name}: coder {coder}")
+        check(coder != BUNDLES or header.version == 3, f"{name}: coder {coder}")
+        if coder in (CONTEXT, BUNDLES):
             check((prop, index, planes) in CONTEXT_SECTIONS, f"{name}: the context coder has no such section")
             check(index + planes <= number_of_indices[prop], f"{name}: more streams than the property has")
             check(not any((prop, index + k) in sections for k in range(planes)), f"{name} stands twice")
@@ -221,7 +225,9 @@ def read_sections(data: bytes, header: Header) -> Sections:
         stored = data[start : start + stored_size]
         start += stored_size
         check(zlib.crc32(stored) == checksum, f"{name}: wrong checksum")
-        if coder == CONTEXT:
+        if prop in ONE_INTEGER_A_SPLAT:
+            bundled.add(coder == BUNDLES)
+        if coder in (CONTEXT, BUNDLES):
             for k in range(planes):
                 sections[prop, index + k] = Section(planes, b"", [])
             coded[prop, index] = stored
@@ -232,7 +238,11 @@ def read_sections(data: bytes, header: Header) -> Sections:
     check_octree_sizes(sections, header)
     # It also bounds the number of splats by the size of the file, before anything is made for each splat.
     check((OPACITY, 0) in sections, "the opacity section is absent")
-    undo_context_coder(coded, sections, header)
+    check(len(bundled) == 1, "only some sections of splats are of coder 4")
+    if True in bundled:
+        undo_bundles(coded, sections, header)
+    else:
+        undo_context_coder(coded, sections, header)
     return sections
 
 
@@ -260,11 +270,19 @@ def undo_context_coder(coded: dict[tuple[int, int], bytes], sections: Sections, 
             splats,
             count=sections[prop, index].planes,
             signed=prop in (ROTATION, SH),
-            predicted=prop == SH and index == 0 and header.version == 2,
+            predicted=prop == SH and index == 0,
             history=history,
         )
         for k, stream in enumerate(streams):
             sections[prop, index + k] = Section(0, b"", [stream])
+
+
+def undo_bundles(coded: dict[tuple[int, int], bytes], sections: Sections, header: Header) -> None:
+    """Decode the sections of coder 4."""
+    from tests.oracles import bundles
+
+    for (prop, index), integers in bundles.decode_bundles(coded, sections, header).items():
+        sections[prop, index] = Section(0, b"", [integers])
 
 
 def undo_coder(coder: int, stored: bytes, raw_size: int, name: str) -> bytes:
@@ -516,13 +534,17 @@ def read_models(raw: bytes, count: int) -> tuple[list[list[int]], list[Model]]:
     """Return the seven weights of each stream, and the models of the channels."""
     check(len(raw) >= 14 * count, "a description is too short")
     weights = [list(struct.unpack_from("<7h", raw, 14 * number)) for number in range(count)]
-    at = 14 * count
+    return weights, read_models_of(raw, 14 * count, [252] * min(3, count))
+
+
+def read_models_of(raw: bytes, at: int, alphabets: list[int]) -> list[Model]:
+    """Return the models that fill a description from some place on; each has at most so many tokens."""
     models = []
-    for _ in range(min(3, count)):
+    for most in alphabets:
         check(len(raw) >= at + 2, "a description is too short")
         contexts, alphabet = raw[at], raw[at + 1]
         at += 2
-        check(1 <= contexts <= 32 and 1 <= alphabet <= 252, "impossible contexts")
+        check(1 <= contexts <= 32 and 1 <= alphabet <= most, "impossible contexts")
         check(len(raw) >= at + contexts - 1 + 2 * contexts * alphabet, "a description is too short")
         thresholds = list(raw[at : at + contexts - 1])
         at += contexts - 1
@@ -539,7 +561,7 @@ def read_models(raw: bytes, count: int) -> tuple[list[list[int]], list[Model]]:
         at += 2 * contexts * alphabet
         models.append(Model(thresholds, rows))
     check(at == len(raw), "a description is too long")
-    return weights, models
+    return models
 
 
 def extra_bits(token: int) -> int:

@@ -111,6 +111,8 @@ class Reader:
         if file is not None:
             work = file.work()
             return joined([_levels_of(self, file, bundle, wanted, work) for bundle in range(first, last)])
+        for key in wanted.keys:
+            self.section(key)
         run = _Run(self, first, last)
         for key in wanted.keys:
             run.decode(key)
@@ -176,7 +178,7 @@ class _Run:
 
     def check_end(self, wanted: Wanted) -> None:
         """Check that every lane of the chains that were read to their ends is back where its encoder began."""
-        for key, read in ((MAIN[0], wanted.sections == len(MAIN)), (ROTATION, wanted.rotations)):
+        for key, read in ((ROTATION, wanted.rotations), (MAIN[0], wanted.sections == len(MAIN))):
             section = self._reader.section(key) if read else None
             if section is not None:
                 check_end(True, self._states[key].astype(np.uint32), section.what)
