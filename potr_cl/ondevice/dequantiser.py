@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.container import Header
 from potr_cl.codec.dequantizer import Dequantizer, IntegerStream
+from potr_cl.codec.native.library import native
 from potr_cl.codec.versions import FormatVersion
 from potr_cl.errors import DataError
 from potr_cl.opencl.memory import Memory
@@ -84,7 +85,12 @@ class DeviceDequantiser:
     def take_rotations(self, streams: Sequence[IntegerStream], scales: Sequence[IntegerStream]) -> None:
         quaternions = np.empty((self._header.splats, 4), np.float32)
         self._on_host.rotations(streams, scales, quaternions)
-        units = unit_quaternions(quaternions)
+        functions = native()
+        units: NDArray[Any]
+        if functions is None:
+            units = unit_quaternions(quaternions)
+        else:
+            units = functions.quantising.unit_quaternions(quaternions)
         with self._lock:
             self._buffers.write_rows(self._buffers.quaternions, units, "the rotations", self._pending)
 
