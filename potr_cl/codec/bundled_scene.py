@@ -18,9 +18,12 @@ from potr_cl.codec import container
 from potr_cl.codec.bundles.decoder import Reader, Wanted, check_said
 from potr_cl.codec.bundles.levels import joined
 from potr_cl.codec.bundles.sections import MAIN, Key
+from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
 from potr_cl.codec.dequantizer import Dequantizer
 from potr_cl.codec.native.bundles import BEYOND_TABLE, BundledFile, Tables, ValueArrays
+from potr_cl.codec.steps import prediction
+from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
 from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import thread_pool
 
@@ -42,15 +45,17 @@ class BundledScene:
     Attributes:
         header: verified.
         data: the whole file.
+        open_steps: gives the steps of its colours.
     """
 
     header: Header
     data: bytes
+    open_steps: Callable[[], ColourSteps | None]
 
     @cached_property
     def reader(self) -> Reader:
         """Of the integers."""
-        return Reader(self.header.splats, self._stored)
+        return Reader(self.header.splats, self._stored, self.open_steps)
 
     def _stored(self, key: Key) -> tuple[memoryview, str] | None:
         section = self.header.find(*key)
@@ -94,14 +99,15 @@ class BundledScene:
             )
             levels = joined(list(parts))
         scales = [LevelStream(level, False) for level in levels.scales or []]
+        opacities = LevelStream(levels.opacities if levels.opacities is not None else np.zeros(0), False)
+        fitting = ColourFactors.of(self.header, self.reader.steps, lambda: [*scales], lambda: opacities)
         destination.take_scales(scales)
         destination.take_rotations([LevelStream(level, True) for level in levels.rotations or []], scales)
-        if levels.opacities is not None:
-            destination.take_opacities(LevelStream(levels.opacities, False))
-        destination.take_colours([LevelStream(level, True) for level in levels.dc or []], 0, False)
+        destination.take_opacities(opacities)
+        destination.take_colours([LevelStream(level, True) for level in levels.dc or []], 0, False, fitting)
         for coefficient in range(1, sh_count):
             planes = levels.coefficient(coefficient)
-            destination.take_colours([LevelStream(level, True) for level in planes], coefficient, False)
+            destination.take_colours([LevelStream(level, True) for level in planes], coefficient, False, fitting)
 
     def _jobs(self, arrays: ValueArrays, threads: int) -> list[Job]:
         wanted = self._wanted(arrays)
@@ -197,15 +203,17 @@ class Job:
         header = self.scene.header
         version = VERSIONS[header.version]
         levels = np.arange(_TABLE)
+        classes = np.arange(-CLASSES, CLASSES).astype(np.int8)
         return Tables(
             version.dequantize_scales(levels, header.sf_scale),
             version.dequantize_opacities(levels, header.sf_opacity),
+            factors(header.sf_dc, classes),
+            factors(header.sf_ac, classes),
+            *prediction.tables(),
             header.sf_rotation,
-            header.sf_dc,
-            header.sf_ac,
         )
 
     def _by_numpy(self, bundles: range) -> None:
         header = self.scene.header
         levels = self.scene.reader.levels(bundles.start, bundles.stop, self.wanted)
-        Dequantizer(header, VERSIONS[header.version]).of_levels(levels, self.arrays)
+        Dequantizer(header, VERSIONS[header.version]).of_levels(levels, self.scene.reader.steps, self.arrays)

@@ -16,6 +16,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from potr_cl.codec.sections import Coder, Property, Section, context_groups, is_bytes, is_per_splat, stream_count
+from potr_cl.codec.steps.rule import MOST_BESIDE_GROUPS
 from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.claims import check_claim
@@ -269,7 +270,7 @@ def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) 
     if not all(1e-3 <= x <= 1e9 for x in (*numbers[4:], sf_ac)):
         raise DataError("the header makes no sense: a scale factor outside 0.001 to 1e9")
     sections = _read_table(data, count, header_bytes, file_bytes, rules, splats, degree)
-    _check_octree_sizes(sections, splats, depth)
+    _check_sizes(sections, splats, depth)
     check_claim(splats, file_bytes, MOST_A_BYTE, trust)
     cells = sum(section.integers for section in sections if section.kind == Property.OCCUPANCY)
     check_claim(cells, file_bytes, MOST_A_BYTE, trust, "octree cells")
@@ -315,6 +316,8 @@ def _read_table(
             raise DataError(f"{what} has an impossible index or stands twice")
         if section.kind == Property.SH and index >= 3 * SH_COEFFICIENTS[degree]:
             raise DataError(f"{what} does not belong to SH degree {degree}")
+        if section.kind == Property.STEPS and not rules.colour_steps:
+            raise DataError(f"{what} does not belong to format version {rules.number}")
         if section.coder not in rules.coders:
             raise DataError(f"{what} is of coder {coder}, which format version {rules.number} does not have")
         if of_streams and (index, streams) not in context_groups(section.kind, degree):
@@ -343,8 +346,8 @@ def _read_table(
     return tuple(sections)
 
 
-def _check_octree_sizes(sections: tuple[Section, ...], splats: int, depth: int) -> None:
-    """Check that the octree's streams are no longer than some splats can need, before they are unpacked.
+def _check_sizes(sections: tuple[Section, ...], splats: int, depth: int) -> None:
+    """Check that streams that are not one integer a splat are no longer than needed, before they are unpacked.
 
     A level has at most as many cells with splats as there are splats. A crowded cell above the deepest level has a byte
     of occupancy; every cell but the root is such a cell, or a leaf, of which there are no more than splats.
@@ -356,6 +359,7 @@ def _check_octree_sizes(sections: tuple[Section, ...], splats: int, depth: int) 
         Property.MULTIPLICITY: splats // 2,
         Property.TAIL_LENGTH: splats,
         Property.TAIL: 3 * depth * ((splats + 7) // 8),
+        Property.STEPS: MOST_BESIDE_GROUPS + splats,
     }
     for kind, limit in most.items():
         if integers.get(kind, 0) > limit:

@@ -13,8 +13,10 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec.byte_planes import IntegerStream
+from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
-from potr_cl.codec.dequantizer import Dequantizer, IntegerStream
+from potr_cl.codec.dequantizer import Dequantizer
 from potr_cl.codec.native.bundles import ValueArrays
 from potr_cl.codec.versions import FormatVersion
 from potr_cl.model.scene import Scene
@@ -37,13 +39,16 @@ class Destination(Protocol):
     def take_opacities(self, stream: IntegerStream) -> None:
         """Levels of the opacities."""
 
-    def take_colours(self, streams: Sequence[IntegerStream], coefficient: int, differences: bool) -> None:
-        """Levels of Y, Co, Cg of an SH coefficient.
+    def take_colours(
+        self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, factors: ColourFactors
+    ) -> None:
+        """Levels of Y, Co, Cg of an SH coefficient; of DC what is left of them where the version predicts its values.
 
         Args:
             streams: three.
             coefficient: 0 for DC.
             differences: whether integers are the differences of levels of splats that follow each other.
+            factors: the splats' scale factors.
         """
 
 
@@ -84,8 +89,10 @@ class SceneArrays:
     def take_opacities(self, stream: IntegerStream) -> None:
         self._dequantizer.opacities(stream, self._opacity_logits)
 
-    def take_colours(self, streams: Sequence[IntegerStream], coefficient: int, differences: bool) -> None:
-        self._dequantizer.colours(streams, coefficient, differences, self._planar[coefficient])
+    def take_colours(
+        self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, factors: ColourFactors
+    ) -> None:
+        self._dequantizer.colours(streams, coefficient, differences, factors, self._planar[coefficient])
 
     @property
     def sh(self) -> F32:

@@ -19,6 +19,7 @@ class Property(enum.IntEnum):
     MULTIPLICITY = 3
     TAIL_LENGTH = 4
     TAIL = 5
+    STEPS = 6
     SCALE = 16
     ROTATION = 17
     OPACITY = 18
@@ -47,6 +48,7 @@ _STREAMS = {
     Property.MULTIPLICITY: 1,
     Property.TAIL_LENGTH: 1,
     Property.TAIL: 1,
+    Property.STEPS: 1,
     Property.SCALE: 3,
     Property.ROTATION: 3,
     Property.OPACITY: 1,
@@ -54,7 +56,14 @@ _STREAMS = {
 }
 _SIGNED = {Property.ROTATION, Property.SH}
 _PER_SPLAT = {Property.SCALE, Property.ROTATION, Property.OPACITY, Property.SH}
-_BYTES = {Property.METADATA, Property.OCCUPANCY, Property.SEVERAL, Property.TAIL_LENGTH, Property.TAIL}
+_BYTES = {
+    Property.METADATA,
+    Property.OCCUPANCY,
+    Property.SEVERAL,
+    Property.TAIL_LENGTH,
+    Property.TAIL,
+    Property.STEPS,
+}
 
 
 @dataclass(frozen=True)

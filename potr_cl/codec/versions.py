@@ -42,6 +42,8 @@ class FormatVersion(abc.ABC):
         absolute_leaf_levels: whether tail lengths are levels of the octree, chosen by the tolerance alone
             (``absolute`` of :func:`potr_cl.codec.octree.build`).
         rotations_need_scales: whether rotations can be dequantised only with the levels of the scales at hand.
+        colour_steps: whether a file may give each splat the steps of its colours (:mod:`potr_cl.codec.steps`), so that
+            colours are dequantised with the levels of scales and opacities at hand, and predicted as values.
     """
 
     number: ClassVar[int]
@@ -49,6 +51,7 @@ class FormatVersion(abc.ABC):
     separate_ac_factor: ClassVar[bool]
     absolute_leaf_levels: ClassVar[bool]
     rotations_need_scales: ClassVar[bool]
+    colour_steps: ClassVar[bool] = False
 
     @property
     def coder_of_streams(self) -> Coder | None:
@@ -186,14 +189,14 @@ class Version2(FormatVersion):
 
 
 class Version3(Version2):
-    """Bundles of splats that are decoded side by side; the quantiser of version 2.
+    """Bundles of splats that are decoded side by side, and steps of colours that fit each splat.
 
-    Not final: it will have steps of colours that fit each splat. What it does with colours may depend on the levels of
-    scales and opacities, which are decoded before them.
+    Geometry is quantised as in version 2.
     """
 
     number = 3
     coders = frozenset({Coder.RAW, Coder.ZSTD, Coder.DEFLATE, Coder.BUNDLES})
+    colour_steps = True
 
 
 #: All versions that are read, by their number.

@@ -2,8 +2,7 @@
 
 Devices need not divide, take roots or logarithms exactly, so nothing is computed there but sums of integers: what a
 level, or a sum of three, stands for is looked up in a table that the host has made. Where levels are too large for a
-table, and for rotations, whose values depend on three levels and a step that the scales set, the host finds the values
-and uploads them.
+table, and for rotations and colours whose steps differ from splat to splat, the host finds the values and uploads them.
 """
 
 from __future__ import annotations
@@ -16,8 +15,10 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.codec.byte_planes import IntegerStream
+from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
-from potr_cl.codec.dequantizer import Dequantizer, IntegerStream
+from potr_cl.codec.dequantizer import Dequantizer
 from potr_cl.codec.native.library import native
 from potr_cl.codec.versions import FormatVersion
 from potr_cl.errors import DataError
@@ -94,16 +95,19 @@ class DeviceDequantiser:
         with self._lock:
             self._buffers.write_rows(self._buffers.quaternions, units, "the rotations", self._pending)
 
-    def take_colours(self, streams: Sequence[IntegerStream], coefficient: int, differences: bool) -> None:
-        levels, mapped, reach = _summed_up(streams, differences)
+    def take_colours(
+        self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, factors: ColourFactors
+    ) -> None:
+        own = factors.dc if coefficient == 0 else factors.ac
+        on_host = len(own) > 1 or (coefficient == 0 and self._version.colour_steps)
+        levels, mapped, reach = (None, False, 0) if on_host else _summed_up(streams, differences)
         if levels is None:
             rgb = np.empty((3, self._header.splats), np.float32)
-            self._on_host.colours(streams, coefficient, differences, rgb)
+            self._on_host.colours(streams, coefficient, differences, factors, rgb)
             with self._lock:
                 self._buffers.write_columns(self._buffers.sh, 3 * coefficient, rgb, self._pending)
             return
-        factor = np.float32(self._header.sf_dc if coefficient == 0 else self._header.sf_ac)
-        table = np.arange(-reach, reach + 1).astype(np.float32) / factor
+        table = np.arange(-reach, reach + 1).astype(np.float32) / own
         with self._lock, Memory(self._buffers.device) as memory:
             self._launch(
                 "colours", levels, mapped, memory, table, "the SH coefficients",

@@ -24,8 +24,8 @@ def test_what_few_views_show_counts_however_many_show_the_rest():
 
 @pytest.mark.parametrize("views", [2, 8, 20, 84, 300, 2000])
 def test_they_take_no_more_than_their_share_of_the_time(views):
-    """As measured: on a GPU an encode takes as long as some 130 views besides its views, on a CPU as some 4."""
-    for slow, besides in ((False, 130), (True, 4)):
+    """As measured: on a GPU an encode takes as long as some 130 views besides its views, on a CPU as some 6."""
+    for slow, besides in ((False, 130), (True, 6)):
         added = views * needed(1, views, slow)
         assert added > 0
         assert (besides + views + added) / (besides + views) < 1.6

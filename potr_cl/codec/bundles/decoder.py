@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -16,12 +17,12 @@ from potr_cl.codec.bundles.layout import BUNDLE, LANES, Bundles, Layout
 from potr_cl.codec.bundles.levels import Items, Levels, joined
 from potr_cl.codec.bundles.ranges import Words, decode_stream
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Key, Section
-from potr_cl.codec.bundles.streams import band, differences, streams_of
-from potr_cl.codec.context.lanes import from_residuals
+from potr_cl.codec.bundles.streams import band, differences, step_terms, streams_of
 from potr_cl.codec.native.bundles import FINE, TOO_FEW_WORDS, BundledFile
 from potr_cl.codec.native.library import native
 from potr_cl.codec.rans import LOWEST, check_end, no_words_left
 from potr_cl.codec.sections import Property
+from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.errors import DataError
 
 I64 = NDArray[np.int64]
@@ -59,16 +60,31 @@ class Reader:
         splats: n of the file.
         open_section: gives the stored bytes of a section and its name, None if the file has none; called when it is
             needed.
+        open_steps: gives the steps of colours, None if the file has none; called when they are needed.
 
     Raises:
         DataError: damaged.
     """
 
-    def __init__(self, splats: int, open_section: Callable[[Key], tuple[memoryview, str] | None]) -> None:
+    def __init__(
+        self,
+        splats: int,
+        open_section: Callable[[Key], tuple[memoryview, str] | None],
+        open_steps: Callable[[], ColourSteps | None],
+    ) -> None:
         self.bundles = Bundles(splats)
-        self._open_section = open_section
+        self._open_section, self._open_steps = open_section, open_steps
         self._sections: dict[Key, Section | None] = {}
         self._files: dict[Wanted, BundledFile | None] = {}
+
+    @cached_property
+    def steps(self) -> ColourSteps | None:
+        """The steps of colours.
+
+        Raises:
+            DataError: damaged.
+        """
+        return self._open_steps()
 
     def section(self, key: Key) -> Section | None:
         """A section; None if the file has none.
@@ -95,6 +111,8 @@ class Reader:
         if file is not None:
             work = file.work()
             return joined([_levels_of(self, file, bundle, wanted, work) for bundle in range(first, last)])
+        for key in wanted.keys:
+            self.section(key)
         run = _Run(self, first, last)
         for key in wanted.keys:
             run.decode(key)
@@ -115,7 +133,8 @@ class Reader:
             there = {number: section for number, section in sections.items() if section is not None}
             fit = all(section.fits for section in there.values())
             words = {number: section.for_native() for number, section in there.items()}
-            self._files[wanted] = functions.bundled_file(self.bundles.splats, words) if fit else None
+            steps = self.steps if wanted.sections > 2 else None
+            self._files[wanted] = functions.bundled_file(self.bundles.splats, words, steps) if fit else None
         return self._files[wanted]
 
 
@@ -152,13 +171,14 @@ class _Run:
             self._terms.update({f"difference {k}": each for k, each in enumerate(differences(scales))})
             self.levels.rotations = [_signed(values) for values in self._dense(key)]
         elif index == 0:
-            self.levels.dc = [self._summed(_signed(values)) for values in self._dense(key)]
+            self._find_steps()
+            self.levels.dc = [_signed(values) for values in self._dense(key)]
         else:
             self._decode_band(key)
 
     def check_end(self, wanted: Wanted) -> None:
         """Check that every lane of the chains that were read to their ends is back where its encoder began."""
-        for key, read in ((MAIN[0], wanted.sections == len(MAIN)), (ROTATION, wanted.rotations)):
+        for key, read in ((ROTATION, wanted.rotations), (MAIN[0], wanted.sections == len(MAIN))):
             section = self._reader.section(key) if read else None
             if section is not None:
                 check_end(True, self._states[key].astype(np.uint32), section.what)
@@ -198,9 +218,13 @@ class _Run:
         terms[fitted.stream.name] = fitted.stream.sizes.take(tokens).astype(np.int64)
         return integers
 
-    def _summed(self, residuals: I64) -> I64:
-        layout = self._bundles.dense
-        return layout.taken(from_residuals(layout.laid(residuals)))
+    def _find_steps(self) -> None:
+        """What the steps of splats' colours tell of them."""
+        steps, levels = self._reader.steps, self.levels
+        classes = np.zeros(self._bundles.splats, np.int8)
+        if steps is not None and levels.scales is not None and levels.opacities is not None:
+            classes, _ = steps.classes(levels.scales, levels.opacities, levels.start)
+        self._terms["step"] = step_terms(classes)
 
     def _decode_band(self, key: Key) -> None:
         """The AC coefficients of a degree."""
@@ -216,7 +240,7 @@ class _Run:
         mask, pattern, *values = section.streams
         masks = self._stream(key, words, mask, self._bundles.dense, terms)
         splat, which = np.nonzero(masks[:, None] >> np.arange(end - first) & 1)
-        at_items = {name: terms[name][splat] for name in (*(f"sum {c}" for c in range(3)), "mask")}
+        at_items = {name: terms[name][splat] for name in (*(f"sum {c}" for c in range(3)), "mask", "step")}
         layout = self._bundles.items(splat)
         patterns = self._stream(key, words, pattern, layout, at_items, which)
         channels = np.zeros((3, len(splat)), np.int64)

@@ -13,8 +13,7 @@ from potr_cl.codec.bundles.layout import LANES, Bundles, Layout
 from potr_cl.codec.bundles.native_encoder import encode_natively, narrow
 from potr_cl.codec.bundles.ranges import Tokens, encode_section
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Key, stored_section
-from potr_cl.codec.bundles.streams import Stream, band, differences, streams_of
-from potr_cl.codec.context.lanes import to_residuals
+from potr_cl.codec.bundles.streams import Stream, band, differences, step_terms, streams_of
 from potr_cl.codec.context.tokens import MOST_BITS, tokens_of
 from potr_cl.codec.native.library import native
 from potr_cl.codec.rans import LOWEST
@@ -26,13 +25,17 @@ Values = Sequence[NDArray[np.integer]]
 
 
 def encode(
-    values: Mapping[Key, Values], run: Run = map, progress: Callable[[float], None] | None = None
+    values: Mapping[Key, Values],
+    classes: NDArray[np.int8],
+    run: Run = map,
+    progress: Callable[[float], None] | None = None,
 ) -> dict[Key, bytes] | None:
     """Code all integers of splats that a file holds.
 
     Args:
         values: of each section its integers, (n,) each; the opacity's at least. Sections whose integers are all 0 may
-            be left out.
+            be left out. Of DC what its prediction has left.
+        classes: (n,) of the steps of DC.
         run: in place of :func:`map`, to work with several threads.
         progress: told which part is done.
 
@@ -43,8 +46,8 @@ def encode(
     functions = native()
     arrays = None if functions is None else narrow(values)
     if functions is not None and arrays is not None:
-        return encode_natively(functions, arrays, run, report)
-    drafts = _Drafts(Bundles(len(values[MAIN[0]][0])))
+        return encode_natively(functions, arrays, classes, run, report)
+    drafts = _Drafts(Bundles(len(classes)), classes)
     keys = [key for key in ORDER if key in values]
     sections: dict[Key, list[Tokens]] = {}
     for done, key in enumerate(keys):
@@ -70,11 +73,12 @@ class _Drafts:
 
     Args:
         bundles: of the file.
+        classes: (n,) of the steps of DC.
     """
 
-    def __init__(self, bundles: Bundles) -> None:
+    def __init__(self, bundles: Bundles, classes: NDArray[np.int8]) -> None:
         self.bundles = bundles
-        self._terms: dict[str, I64] = {}
+        self._terms: dict[str, I64] = {"step": step_terms(classes)}
 
     def section(self, key: Key, values: Values) -> list[Tokens] | None:
         """A section's streams; None if an integer is too large."""
@@ -89,8 +93,6 @@ class _Drafts:
         made = []
         for stream, integers in zip(streams, values, strict=True):
             wide = integers.astype(np.int64)
-            if prop == Property.SH:
-                wide = layout.taken(to_residuals(layout.laid(wide)))
             tokens = self._stream(stream, layout, _mapped(wide) if is_signed(prop) else wide, self._terms)
             if tokens is None:
                 return None
@@ -111,7 +113,7 @@ class _Drafts:
         made = [self._stream(mask, self.bundles.dense, masks, self._terms)]
         splat, which = np.nonzero(there.T)
         items = channels[which, :, splat].T.astype(np.int64)
-        at_items = {name: self._term(name)[splat] for name in (*(f"sum {c}" for c in range(3)), "mask")}
+        at_items = {name: self._term(name)[splat] for name in (*(f"sum {c}" for c in range(3)), "mask", "step")}
         patterns = ((items != 0) << np.arange(3)[:, None]).sum(axis=0)
         made.append(self._stream(pattern, self.bundles.items(splat), patterns, at_items, which))
         sizes = [np.zeros(len(splat), np.int64) for _ in range(3)]

@@ -36,7 +36,7 @@ class Levels:
         opacities: (n,) not negative.
         scales: of each axis, (n,), not negative.
         rotations: x, y, z, (n,) each.
-        dc: Y, Co, Cg of the DC coefficient, (n,) each.
+        dc: Y, Co, Cg of the DC coefficient, (n,) each: what its prediction has left.
         ac: items of the degrees asked for, those of each degree in the order of splats.
     """
 

@@ -23,7 +23,7 @@ from potr_cl.codec.native.bundles_encode import BundleEncoder
 from potr_cl.codec.native.bundles_encode import Model as NativeModel
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.rans import TOTAL
-from potr_cl.codec.sections import Property, is_predicted
+from potr_cl.codec.sections import Property
 from potr_cl.host.threads import Run
 
 I32 = NDArray[np.int32]
@@ -36,7 +36,11 @@ _NOTHING = NativeModel(np.zeros(256, np.uint8), np.full((1, 1), TOTAL, np.uint16
 
 
 def encode_natively(
-    functions: Functions, values: Mapping[Key, list[I32]], run: Run, report: Callable[[float], None]
+    functions: Functions,
+    values: Mapping[Key, list[I32]],
+    classes: NDArray[np.int8],
+    run: Run,
+    report: Callable[[float], None],
 ) -> dict[Key, bytes]:
     """:func:`potr_cl.codec.bundles.encoder.encode` of integers that :func:`narrow` lets through."""
     bundles = Bundles(len(values[MAIN[0]][0]))
@@ -49,6 +53,7 @@ def encode_natively(
         [stream.sizes for stream in streams],
         [len(stream.terms) for stream in streams],
         [stream.coefficients for stream in streams],
+        np.ascontiguousarray(classes),
     )
     at_least = samples_of_bundle(bundles.number)
     deque(run(lambda bundle: encoder.survey(bundle, at_least), range(bundles.number)), 0)
@@ -83,10 +88,10 @@ def encode_natively(
 
 def narrow(values: Mapping[Key, Sequence[NDArray[np.integer]]]) -> dict[Key, list[I32]] | None:
     """The integers as the native path takes them; None if one is too large for it."""
-    for key, streams in values.items():
+    for streams in values.values():
         largest = max(max(int(stream.max()), -int(stream.min())) for stream in streams)
-        # Mapped to unsigned an integer has another bit, and so has the difference of two.
-        if not fits(4 * largest, is_predicted(*key)):
+        # Mapped to unsigned an integer has another bit.
+        if not fits(2 * largest + 1):
             return None
     return {key: [np.ascontiguousarray(stream, np.int32) for stream in streams] for key, streams in values.items()}
 

@@ -21,7 +21,7 @@ from potr_cl.codec.bundles.streams import streams_of
 from potr_cl.codec.context.tokens import largest_integer
 from potr_cl.codec.native.bundles import SectionWords, StreamModel, fits
 from potr_cl.codec.rans import LOWEST
-from potr_cl.codec.sections import Property, is_predicted
+from potr_cl.codec.sections import Property
 from potr_cl.errors import DataError
 
 Key = tuple[Property, int]
@@ -87,8 +87,7 @@ class Section:
     @property
     def fits(self) -> bool:
         """Whether the native path can take its integers; real files' are narrow enough by far."""
-        summed = is_predicted(*self.key)
-        return all(fits(largest_integer(fitted.alphabet - 1), summed) for fitted in self.streams)
+        return all(fits(largest_integer(fitted.alphabet - 1)) for fitted in self.streams)
 
     def for_native(self) -> SectionWords:
         """What the native path takes of it."""

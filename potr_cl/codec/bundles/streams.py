@@ -15,11 +15,14 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.context.tokens import SIZES, token_floors
 from potr_cl.codec.sections import Property
+from potr_cl.codec.steps.rule import CLASSES
 
 I32 = NDArray[np.int32]
 
 #: Size of a mask for each coefficient in it, and of a pattern with chroma.
 COUNT_SIZE, CHROMA_SIZE = 32, 128
+#: What a class of steps adds to the term that it is.
+STEP_SIZE = 4
 #: Patterns: bits 0, 1, 2 for Y, Co, Cg.
 PATTERNS = 8
 #: The first coefficient of each degree, and the one after the last.
@@ -27,6 +30,7 @@ BANDS = ((0, 1), (1, 4), (4, 9), (9, 16))
 
 _CHANNELS = range(3)
 _OPACITY = ("opacity",)
+_STEP = ("step",)
 _SCALES = tuple(f"scale {a}" for a in _CHANNELS)
 _DIFFERENCES = tuple(f"difference {a}" for a in _CHANNELS)
 _ROTATIONS = tuple(f"rotation {a}" for a in _CHANNELS)
@@ -83,12 +87,12 @@ def streams_of(prop: Property, index: int) -> tuple[Stream, ...]:
         known = _SCALES + _DIFFERENCES
         return tuple(Stream(name, known + _ROTATIONS[:a], SIZES[True]) for a, name in enumerate(_ROTATIONS))
     if index == 0:
-        return tuple(Stream(name, _OPACITY + _SCALES + _DC[:c], SIZES[True]) for c, name in enumerate(_DC))
+        return tuple(Stream(name, _OPACITY + _SCALES + _STEP + _DC[:c], SIZES[True]) for c, name in enumerate(_DC))
     first, end = band(index)
     number = end - first
     masks = np.array([COUNT_SIZE * mask.bit_count() for mask in range(1 << number)], np.int32)
     patterns = np.where(np.arange(PATTERNS) > 1, CHROMA_SIZE, 0).astype(np.int32)
-    splat, item = _OPACITY + _SCALES + _DC + _SUMS, (*_SUMS, "mask")
+    splat, item = _OPACITY + _SCALES + _STEP + _DC + _SUMS, (*_SUMS, "mask", *_STEP)
     return (
         Stream("mask", splat, masks),
         Stream("pattern", item, patterns, number),
@@ -99,6 +103,11 @@ def streams_of(prop: Property, index: int) -> tuple[Stream, ...]:
 def band(index: int) -> tuple[int, int]:
     """The first AC coefficient of a section by its index, and the one after the last."""
     return next(limits for limits in BANDS if 3 * limits[0] == index)
+
+
+def step_terms(classes: NDArray[np.int8]) -> NDArray[np.int64]:
+    """The term that splats' classes of the steps of DC are, which are -32 to 31."""
+    return STEP_SIZE * (classes.astype(np.int64) + CLASSES)
 
 
 def differences(scales: Sequence[NDArray[np.signedinteger]]) -> list[NDArray[np.signedinteger]]:

@@ -193,7 +193,7 @@ static int dense_section(
 {
     const size_t steps = steps_of(splats), places = LANES * steps;
     const size_t whole = (places + LANE - 1) / LANE * LANE;
-    const int16_t *terms[12];
+    const int16_t *terms[TERMS];
     for (size_t k = 0; k < known_number; k++)
         terms[k] = known[k];
     for (size_t s = 0; s < number; s++) {
@@ -207,20 +207,58 @@ static int dense_section(
     return r->read == r->available ? FINE : TOO_MANY_WORDS;
 }
 
-/* Adds to each integer the mean of the four before in its lane, rounded. */
-POTR_WIDE_INTEGERS
-static void add_predictions(int32_t *values, size_t steps)
+/* About 16 · log2(4 · level), linear between powers of two; 0 for level 0. Levels are below 2^30. */
+static INLINE int32_t logarithm(int32_t level)
 {
-    for (size_t step = 1; step < steps; step++) {
-        const size_t before = step < 4 ? step : 4;
-        int32_t *const row = values + step * LANES;
-        for (size_t l = 0; l < LANES; l++) {
-            int32_t sum = 2;
-            for (size_t k = 1; k <= before; k++)
-                sum += row[(ptrdiff_t)l - (ptrdiff_t)(k * LANES)];
-            row[l] += sum >> 2;
+    const uint32_t quarters = level > 0 ? 4 * (uint32_t)level : 1;
+    int exponent = 0;
+    for (uint32_t rest = quarters >> 1; rest; rest >>= 1)
+        exponent++;
+    return 16 * exponent + (int32_t)(((uint64_t)(quarters - (1u << exponent)) * 16) >> exponent);
+}
+
+static INLINE uint8_t class_of(int64_t weight, int32_t power, int32_t offset)
+{
+    const int64_t class = (weight * power + offset) >> 6;
+    return (uint8_t)((class < -CLASSES ? -CLASSES : class > CLASSES - 1 ? CLASSES - 1 : class) + CLASSES);
+}
+
+/* Classes of the steps of splats' colours (docs/format.md, "Steps of colours"). */
+static void find_steps(const colour_steps *steps, uint64_t begin, size_t splats, work *w)
+{
+    if (!steps->groups) {
+        memset(w->dc_classes, CLASSES, sizeof w->dc_classes);
+        memset(w->ac_classes, CLASSES, sizeof w->ac_classes);
+    } else {
+        const int64_t first = (int64_t)steps->first_knot << steps->knot_shift;
+        const int64_t most = first + ((int64_t)1 << (4 + steps->knot_shift)) - 1;
+        const size_t rows = steps_of(splats);
+        for (size_t splat = 0, place = 0, lane = 0, step = 0; splat < splats; splat++) {
+            const int32_t x = w->scales[0][place], y = w->scales[1][place], z = w->scales[2][place];
+            const int32_t a = x < ENOUGH ? w->logarithms[x] : logarithm(x);
+            const int32_t b = y < ENOUGH ? w->logarithms[y] : logarithm(y);
+            const int32_t c = z < ENOUGH ? w->logarithms[z] : logarithm(z);
+            const int32_t low = a < b ? a : b, high = a < b ? b : a;
+            const int32_t largest = high > c ? high : c, smallest = low < c ? low : c;
+            const int32_t between = a + b + c - largest - smallest;
+            int64_t level = w->opacity[place] < most ? w->opacity[place] : most;
+            level = level > first ? level - first : 0;
+            const int64_t knot = level >> steps->knot_shift, part = level - (knot << steps->knot_shift);
+            int64_t weight = (steps->scales[0] * largest + steps->scales[1] * between + steps->scales[2] * smallest) >> 8;
+            weight += steps->knots[knot];
+            weight += (part * (steps->knots[knot + 1] - steps->knots[knot])) >> steps->knot_shift;
+            weight += 8 * steps->groups[(begin + splat) >> steps->group_bits];
+            w->dc_classes[place] = class_of(weight, steps->powers[0], steps->offsets[0]);
+            w->ac_classes[place] = class_of(weight, steps->powers[1], steps->offsets[1]);
+            place += LANES;
+            if (++step == rows) {
+                step = 0;
+                place = ++lane;
+            }
         }
     }
+    for (size_t i = 0; i < BUNDLE; i++)
+        w->step_sizes[i] = (int16_t)(STEP_SIZE * w->dc_classes[i]);
 }
 
 /* The mask of each splat to places and coefficients of its items. Returns their number. */
@@ -250,11 +288,11 @@ static int decode_band(
 {
     const size_t steps = steps_of(splats), places = LANES * steps;
     const size_t whole = (places + LANE - 1) / LANE * LANE;
-    const int16_t *const known[10] = { w->opacity_sizes, w->scale_sizes[0], w->scale_sizes[1], w->scale_sizes[2],
-        w->dc_sizes[0], w->dc_sizes[1], w->dc_sizes[2], w->sums[0], w->sums[1], w->sums[2] };
-    const int16_t *const of_items[4] = { w->sums[0], w->sums[1], w->sums[2], w->mask_sizes };
+    const int16_t *const known[11] = { w->opacity_sizes, w->scale_sizes[0], w->scale_sizes[1], w->scale_sizes[2],
+        w->step_sizes, w->dc_sizes[0], w->dc_sizes[1], w->dc_sizes[2], w->sums[0], w->sums[1], w->sums[2] };
+    const int16_t *const of_items[5] = { w->sums[0], w->sums[1], w->sums[2], w->mask_sizes, w->step_sizes };
     const stream_model *model = &models[MASK_STREAM];
-    add_terms(w->expected, model->constant, model->weights, known, 10, whole);
+    add_terms(w->expected, model->constant, model->weights, known, 11, whole);
     memset(w->tokens, 0, whole);
     if (decode_items(model, r, states, lanes, splats, w))
         return TOO_FEW_WORDS;
@@ -266,7 +304,7 @@ static int decode_band(
     w->items[band] = (uint32_t)items;
 
     model = &models[PATTERN_STREAM];
-    add_terms(w->of_splats, model->constant, model->weights, of_items, 4, whole);
+    add_terms(w->of_splats, model->constant, model->weights, of_items, 5, whole);
     size_t item_steps = (items + lanes - 1) / lanes;
     for (size_t lane = 0, i = 0; i < items; lane++)
         for (size_t at = lane, end = i + item_steps < items ? i + item_steps : items; i < end; i++, at += LANES)
@@ -287,8 +325,8 @@ static int decode_band(
             w->chosen[chosen] = (uint32_t)i;
             chosen += w->patterns[i] >> c & 1;
         }
-        add_terms(w->of_splats, model->constant, model->weights, of_items, 4, whole);
-        const int32_t chroma = model->weights[4] * CHROMA_SIZE;
+        add_terms(w->of_splats, model->constant, model->weights, of_items, 5, whole);
+        const int32_t chroma = model->weights[5] * CHROMA_SIZE;
         item_steps = (chosen + lanes - 1) / lanes;
         for (size_t lane = 0, k = 0; k < chosen; lane++)
             for (size_t at = lane, end = k + item_steps < chosen ? k + item_steps : chosen; k < end; k++, at += LANES) {
@@ -296,7 +334,7 @@ static int decode_band(
                 int32_t sum = w->of_splats[place[i]] + model->biases[coefficient[i]];
                 sum += w->patterns[i] > 1 ? chroma : 0;
                 for (size_t b = 0; b < c; b++)
-                    sum += model->weights[5 + b] * w->value_sizes[b][i];
+                    sum += model->weights[6 + b] * w->value_sizes[b][i];
                 w->expected[at] = sum;
             }
         if (decode_items(model, r, states, lanes, chosen, w))
@@ -330,7 +368,8 @@ int decode_bundle(
     memcpy(states, file->states + bundle * LANES, lanes * sizeof *states);
     memset(w->sums, 0, sizeof w->sums);
     memset(w->items, 0, sizeof w->items);
-    const int16_t *const known[9] = { w->opacity_sizes, w->scale_sizes[0], w->scale_sizes[1], w->scale_sizes[2] };
+    const int16_t *const known[5] = { w->opacity_sizes, w->scale_sizes[0], w->scale_sizes[1], w->scale_sizes[2],
+        w->step_sizes };
     for (int s = 0; s < SECTIONS; s++) {
         if (s == ROTATION ? !rotations : s >= sections)
             continue;
@@ -343,6 +382,8 @@ int decode_bundle(
         }
         const stream_model *const models = file->streams;
         int wrong = FINE;
+        if (s == DC)
+            find_steps(&file->steps, bundle * BUNDLE, splats, w);
         if (s == OPACITY) {
             wrong = dense_section(models + OPACITY_STREAM, 1, NULL, 0, 0, &r, states, lanes, splats, w,
                 &w->opacity_sizes, &w->opacity);
@@ -354,9 +395,7 @@ int decode_bundle(
             memset(w->scales, 0, sizeof w->scales);
         } else if (s == DC && there) {
             wrong = dense_section(
-                models + DC_STREAM, 3, known, 4, 1, &r, states, lanes, splats, w, w->dc_sizes, w->dc);
-            for (size_t c = 0; c < 3; c++)
-                add_predictions(w->dc[c], steps_of(splats));
+                models + DC_STREAM, 3, known, 5, 1, &r, states, lanes, splats, w, w->dc_sizes, w->dc);
         } else if (s == DC) {
             memset(w->dc_sizes, 0, sizeof w->dc_sizes);
             memset(w->dc, 0, sizeof w->dc);
@@ -428,6 +467,8 @@ POTR_EXPORT void potr_bundles_begin(work *w)
                 bytes[number++] = (uint8_t)bit;
         memcpy(&w->coefficient_bytes[mask], bytes, 8);
     }
+    for (int32_t level = 0; level < ENOUGH; level++)
+        w->logarithms[level] = (int16_t)logarithm(level);
 }
 
 /* Where a bundle's integers go. */

@@ -19,7 +19,12 @@ enum {
     TOKENS = 256,
     LARGEST_SIZE = 255,
     COUNT_SIZE = 32,
-    CHROMA_SIZE = 128
+    CHROMA_SIZE = 128,
+    STEP_SIZE = 4,
+    ENOUGH = 1024,         /* levels of scales whose logarithms are looked up */
+    CLASSES = 32,          /* of steps: from minus this to one less */
+    KNOTS = 17,
+    TERMS = 12             /* most of a stream */
 };
 
 /* Sections in the order of decoding, and where the streams of each begin among all. */
@@ -38,12 +43,19 @@ typedef struct {
     const uint8_t *slots;      /* (contexts · 4096) token of each slot */
     const uint32_t *intervals; /* (contexts · 256) of each token: frequency, and from bit 16 on the sum of those below */
     const int16_t *sizes;      /* (256) of each token */
-    int32_t weights[12];       /* of its terms */
+    int32_t weights[TERMS];    /* of its terms */
     int32_t biases[8];         /* by coefficient */
     int32_t recent, constant;
     int32_t alphabet;
     int32_t unused;
 } stream_model;
+
+/* What gives each splat the steps of its colours; groups is NULL where all steps are the same. */
+typedef struct {
+    const int8_t *groups; /* of 2^group_bits splats each */
+    int32_t group_bits, knot_shift, first_knot;
+    int32_t powers[2], offsets[2], scales[3], knots[KNOTS];
+} colour_steps;
 
 /* A file's sections of coder 4. */
 typedef struct {
@@ -53,6 +65,7 @@ typedef struct {
     const uint32_t *states;           /* (lanes of all bundles) of the chain of all sections but rotations */
     const uint32_t *rotation_states;
     uint64_t splats;
+    colour_steps steps;
 } bundled_file;
 
 /* What a bundle's decoding works with, and its results. */
@@ -60,7 +73,10 @@ typedef struct {
     /* Sizes of tokens in rows, which are terms of contexts. */
     int16_t opacity_sizes[BUNDLE], scale_sizes[3][BUNDLE], dc_sizes[3][BUNDLE], rotation_sizes[3][BUNDLE];
     int16_t difference_sizes[3][BUNDLE], mask_sizes[BUNDLE], sums[3][BUNDLE];
-    /* Integers in rows; DC after the prediction. */
+    int16_t step_sizes[BUNDLE];
+    /* Classes of the steps of DC and of AC, in rows, from 0 on: more by CLASSES than they are. */
+    uint8_t dc_classes[BUNDLE], ac_classes[BUNDLE];
+    /* Integers in rows; of DC what its prediction has left. */
     int32_t opacity[BUNDLE], scales[3][BUNDLE], rotations[3][BUNDLE], dc[3][BUNDLE];
     /* AC coefficients that are not 0, degree by degree, in the order of splats: place, number of the coefficient from
      * the first of the degree on, channels. */
@@ -77,7 +93,9 @@ typedef struct {
     uint8_t patterns[ITEMS];
     uint32_t chosen[ITEMS + 1];
     int16_t value_sizes[3][ITEMS];
+    /* Tables. */
     uint64_t coefficient_bytes[128];
+    int16_t logarithms[ENOUGH];
 } work;
 
 enum { FINE, TOO_FEW_WORDS, TOO_MANY_WORDS, BAD_END, BEYOND_TABLE };

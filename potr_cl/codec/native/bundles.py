@@ -14,6 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.native.arrays import address
+from potr_cl.codec.steps.rule import CLASSES, KNOTS, ColourSteps
 
 F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
@@ -47,6 +48,19 @@ class _Stream(ctypes.Structure):
     )
 
 
+class _Steps(ctypes.Structure):
+    _fields_ = (
+        ("groups", _POINTER),
+        ("group_bits", _NUMBER),
+        ("knot_shift", _NUMBER),
+        ("first_knot", _NUMBER),
+        ("powers", _NUMBER * 2),
+        ("offsets", _NUMBER * 2),
+        ("scales", _NUMBER * 3),
+        ("knots", _NUMBER * KNOTS),
+    )
+
+
 class _File(ctypes.Structure):
     _fields_ = (
         ("streams", _Stream * STREAMS),
@@ -55,6 +69,7 @@ class _File(ctypes.Structure):
         ("states", _POINTER),
         ("rotation_states", _POINTER),
         ("splats", _WORD),
+        ("steps", _Steps),
     )
 
 
@@ -82,9 +97,11 @@ class _Values(ctypes.Structure):
         ("opacity_table", _POINTER),
         ("scale_levels", _WORD),
         ("opacity_levels", _WORD),
+        ("sf_dc", _POINTER),
+        ("sf_ac", _POINTER),
+        ("step", _POINTER),
+        ("inverse", _POINTER),
         ("sf_rotation", ctypes.c_float),
-        ("sf_dc", ctypes.c_float),
-        ("sf_ac", ctypes.c_float),
         ("unused", ctypes.c_float),
     )
 
@@ -151,14 +168,18 @@ class Tables:
 
     Attributes:
         scales, opacities: value of each level from 0 on.
-        sf_rotation, sf_dc, sf_ac: scale factors.
+        sf_dc, sf_ac: (64,) scale factors of each class of steps.
+        steps, inverses: (64,) int64 of each class of steps, of the prediction of DC.
+        sf_rotation: scale factor.
     """
 
     scales: F32
     opacities: F32
+    sf_dc: F32
+    sf_ac: F32
+    steps: NDArray[np.int64]
+    inverses: NDArray[np.int64]
     sf_rotation: float
-    sf_dc: float
-    sf_ac: float
 
 
 @dataclass(frozen=True)
@@ -167,7 +188,7 @@ class BundleIntegers:
 
     Attributes:
         opacities: (n,).
-        scales, rotations, dc: (3, n).
+        scales, rotations, dc: (3, n); of DC what its prediction has left.
         splats, coefficients: (K,) of the AC coefficients that are not 0, degree by degree.
         channels: (3, K).
         items: of each degree.
@@ -195,9 +216,16 @@ class BundledFile:
         splats: N of the file.
         sections: by their place in the order of decoding (opacity, scale, DC, degrees 1 to 3, rotation); opacity's at
             least.
+        steps: of colours, for files that have them.
     """
 
-    def __init__(self, functions: Mapping[str, Any], splats: int, sections: Mapping[int, SectionWords]) -> None:
+    def __init__(
+        self,
+        functions: Mapping[str, Any],
+        splats: int,
+        sections: Mapping[int, SectionWords],
+        steps: ColourSteps | None = None,
+    ) -> None:
         self._c = functions
         self._splats = splats
         self._kept: list[NDArray[Any]] = []
@@ -219,6 +247,19 @@ class BundledFile:
         self._file.states = self._keep(sections[0].states.astype(np.uint32), np.uint32, lanes)
         if SECTIONS - 1 in sections:
             self._file.rotation_states = self._keep(sections[SECTIONS - 1].states.astype(np.uint32), np.uint32, lanes)
+
+        if steps is not None:
+            self._take_steps(steps)
+
+    def _take_steps(self, steps: ColourSteps) -> None:
+        to = self._file.steps
+        # Both are checked where steps are read, and once more: C shifts by them.
+        if not 0 <= steps.group_bits <= 40 or not 0 <= steps.knot_shift <= 40:
+            raise TypeError("the native path was given impossible steps")
+        to.groups = self._keep(np.ascontiguousarray(steps.groups), np.int8, -(-self._splats >> steps.group_bits))
+        to.group_bits, to.knot_shift, to.first_knot = steps.group_bits, steps.knot_shift, steps.first_knot
+        to.powers[:], to.offsets[:] = list(steps.powers), list(steps.offsets)
+        to.scales[:], to.knots[:] = list(steps.scales), list(steps.opacities)
 
     def _keep(self, array: NDArray[Any], dtype: type[np.generic], number: int) -> int:
         self._kept.append(array)
@@ -323,9 +364,11 @@ class BundledFile:
             address(tables.opacities, np.float32, len(tables.opacities)),
             len(tables.scales),
             len(tables.opacities),
+            address(tables.sf_dc, np.float32, 2 * CLASSES),
+            address(tables.sf_ac, np.float32, 2 * CLASSES),
+            address(tables.steps, np.int64, 2 * CLASSES),
+            address(tables.inverses, np.int64, 2 * CLASSES),
             tables.sf_rotation,
-            tables.sf_dc,
-            tables.sf_ac,
         )
         section = ctypes.c_int()
         said = self._c["potr_bundles_values"](
@@ -350,6 +393,6 @@ def _optional(array: F32 | None, number: int) -> int | None:
     return None if array is None else address(array, np.float32, number, True)
 
 
-def fits(largest: int, summed: bool) -> bool:
-    """Whether C can take integers of at most some magnitude; ``summed`` if they are differences along a lane."""
-    return (largest + 1) * (_LANE if summed else 1) < _LARGEST
+def fits(largest: int) -> bool:
+    """Whether C can take integers of at most some magnitude."""
+    return largest < _LARGEST

@@ -9,15 +9,15 @@
 #include "bundles.h"
 
 enum {
-    TERMS = 10,                  /* most of a stream */
     COLUMNS = TERMS + 2 + BAND + 1, /* terms, recent sizes, constant, coefficients; and what is fitted to */
     SAMPLES = 2048               /* at a time */
 };
 
-/* Integers of a file's splats, (splats) each; NULL where all are 0. All are below 2^29 in magnitude, differences of DC
- * too. */
+/* Integers of a file's splats, (splats) each, below 2^28 in magnitude; NULL where all are 0. Of DC what its prediction
+ * has left. */
 typedef struct {
     const int32_t *opacity, *scales[3], *rotations[3], *dc[3], *ac[45];
+    const int8_t *classes; /* (splats) of the steps of DC */
     uint64_t splats;
 } file_integers;
 
@@ -40,8 +40,8 @@ typedef struct {
 
 typedef struct {
     made_stream made[STREAMS];
-    int16_t terms[16][BUNDLE];              /* of splats, in rows: see the names below */
-    int16_t item_terms[8][ITEMS + LANES];   /* of a stream of items, in rows */
+    int16_t terms[18][BUNDLE];              /* of splats, in rows: see the names below */
+    int16_t item_terms[9][ITEMS + LANES];   /* of a stream of items, in rows */
     int16_t recent[ITEMS + LANES];
     uint8_t row_coefficients[ITEMS + LANES];
     int32_t sums[ITEMS + LANES];
@@ -50,13 +50,13 @@ typedef struct {
     uint8_t coefficients[ITEMS + 8], patterns[ITEMS + 8];
     int32_t channels[3][ITEMS + 8];
     int16_t item_sizes[3][ITEMS + 8];
-    int32_t rows[BUNDLE], residuals[BUNDLE];
+    int32_t rows[BUNDLE];
     int32_t samples[COLUMNS][SAMPLES];
 } encoding;
 
 /* Terms of splats. */
-enum { T_OPACITY, T_SCALE, T_DIFFERENCE = T_SCALE + 3, T_DC = T_DIFFERENCE + 3, T_SUM = T_DC + 3, T_MASK = T_SUM + 3,
-    T_ROTATION };
+enum { T_OPACITY, T_SCALE, T_STEP = T_SCALE + 3, T_DC, T_SUM = T_DC + 3, T_MASK = T_SUM + 3, T_DIFFERENCE,
+    T_ROTATION = T_DIFFERENCE + 3 };
 
 /* Which of the three times it is, and what it gathers. */
 typedef struct {
@@ -211,45 +211,18 @@ static void to_rows(const int32_t *values, size_t lanes, size_t steps, size_t sp
             rows[step * LANES + lane] = values[splat];
 }
 
-/* What is coded of DC: differences from the mean of the four before in the lane, rounded. */
-POTR_WIDE_INTEGERS
-static void subtract_predictions(
-    const int32_t *restrict rows, size_t lanes, size_t steps, size_t splats, int32_t *restrict residuals)
-{
-    for (size_t step = 0; step < steps; step++) {
-        const size_t before = step < 4 ? step : 4;
-        const int32_t *const row = rows + step * LANES;
-        for (size_t l = 0; l < LANES; l++) {
-            int32_t sum = 2;
-            for (size_t k = 1; k <= before; k++)
-                sum += row[(ptrdiff_t)l - (ptrdiff_t)(k * LANES)];
-            residuals[step * LANES + l] = row[l] - (sum >> 2);
-        }
-    }
-    for (size_t splat = splats; splat < lanes * steps; splat++)
-        residuals[splat % steps * LANES + splat / steps] = 0;
-    for (size_t step = 0; step < steps; step++)
-        for (size_t l = lanes; l < LANES; l++)
-            residuals[step * LANES + l] = 0;
-}
-
 /* Streams of an item a splat. */
 static void dense_section(
     const pass *p, size_t first, size_t number, const int32_t *const *values, uint64_t begin, size_t splats,
-    int is_signed, int predicted, const int16_t **terms, size_t known, size_t own)
+    int is_signed, const int16_t **terms, size_t known, size_t own)
 {
     encoding *const e = p->e;
     const size_t steps = steps_of(splats), rows = LANES * steps;
     for (size_t k = 0; k < number; k++) {
         const size_t s = first + k;
         to_rows(values[k] + begin, p->lanes, steps, splats, e->rows);
-        const int32_t *from = e->rows;
-        if (predicted) {
-            subtract_predictions(e->rows, p->lanes, steps, splats, e->residuals);
-            from = e->residuals;
-        }
         for (size_t i = 0; i < rows; i++)
-            e->made[s].integers[i] = is_signed ? to_zigzag(from[i]) : (uint32_t)from[i];
+            e->made[s].integers[i] = is_signed ? to_zigzag(e->rows[i]) : (uint32_t)e->rows[i];
         tokenise(p, s, splats, e->terms[own + k]);
         terms[known + k] = e->terms[own + k];
         visit(p, s, terms, e->terms[own + k]);
@@ -284,16 +257,14 @@ static void make_band(
         masks[place] = mask;
     }
     const int16_t *terms[TERMS];
-    for (size_t k = 0; k < 4; k++)
+    for (size_t k = 0; k < 11; k++)
         terms[k] = e->terms[T_OPACITY + k];
-    for (size_t k = 0; k < 6; k++)
-        terms[4 + k] = e->terms[T_DC + k];
     tokenise(p, first, splats, e->terms[T_MASK]);
     visit(p, first, terms, e->terms[T_MASK]);
 
-    for (size_t k = 0; k < 7; k++)
+    for (size_t k = 0; k < 8; k++)
         terms[k] = e->item_terms[k];
-    int16_t *const sizes = e->item_terms[7];
+    int16_t *const sizes = e->item_terms[8];
     memset(e->item_sizes, 0, sizeof e->item_sizes);
     for (size_t stream = 0; stream < 4; stream++) { /* patterns; Y, Co, Cg */
         const size_t s = first + PATTERN_STREAM + stream;
@@ -304,21 +275,22 @@ static void make_band(
         made_stream *const made = &e->made[s];
         memset(made->integers, 0, rows * sizeof *made->integers);
         memset(e->row_coefficients, 0, rows);
-        for (size_t k = 0; k < 7; k++)
+        for (size_t k = 0; k < 8; k++)
             memset(e->item_terms[k], 0, rows * sizeof(int16_t));
         for (size_t i = 0, at = 0, lane = 0, step = 0; i < items; i++) {
             if (stream && !(e->patterns[i] >> (stream - 1) & 1))
                 continue;
             for (size_t k = 0; k < 4; k++)
                 e->item_terms[k][at] = e->terms[T_SUM + k][e->places[i]];
+            e->item_terms[4][at] = e->terms[T_STEP][e->places[i]];
             e->row_coefficients[at] = e->coefficients[i];
             if (stream == 0) {
                 made->integers[at] = e->patterns[i];
             } else {
                 made->integers[at] = to_zigzag(e->channels[stream - 1][i]) - 1;
-                e->item_terms[4][at] = e->patterns[i] > 1 ? CHROMA_SIZE : 0;
-                e->item_terms[5][at] = e->item_sizes[0][i];
-                e->item_terms[6][at] = e->item_sizes[1][i];
+                e->item_terms[5][at] = e->patterns[i] > 1 ? CHROMA_SIZE : 0;
+                e->item_terms[6][at] = e->item_sizes[0][i];
+                e->item_terms[7][at] = e->item_sizes[1][i];
             }
             at += LANES;
             if (++step == item_steps) {
@@ -356,14 +328,18 @@ static void make_streams(const file_integers *file, uint64_t bundle, pass *p)
     memset(e->terms, 0, sizeof e->terms);
     for (size_t s = 0; s < STREAMS; s++)
         e->made[s].items = 0;
-    const int16_t *terms[TERMS + 3];
-    dense_section(p, OPACITY_STREAM, 1, &file->opacity, begin, splats, 0, 0, terms, 0, T_OPACITY);
+    const int16_t *terms[TERMS];
+    dense_section(p, OPACITY_STREAM, 1, &file->opacity, begin, splats, 0, terms, 0, T_OPACITY);
     if (file->scales[0])
-        dense_section(p, SCALE_STREAM, 3, file->scales, begin, splats, 0, 0, terms, 0, T_SCALE);
-    for (size_t k = 0; k < 4; k++)
+        dense_section(p, SCALE_STREAM, 3, file->scales, begin, splats, 0, terms, 0, T_SCALE);
+    const size_t steps = steps_of(splats);
+    for (size_t splat = 0; splat < splats; splat++)
+        e->terms[T_STEP][splat % steps * LANES + splat / steps] =
+            (int16_t)(STEP_SIZE * (file->classes[begin + splat] + CLASSES));
+    for (size_t k = 0; k < 5; k++)
         terms[k] = e->terms[T_OPACITY + k];
     if (file->dc[0])
-        dense_section(p, DC_STREAM, 3, file->dc, begin, splats, 1, 1, terms, 4, T_DC);
+        dense_section(p, DC_STREAM, 3, file->dc, begin, splats, 1, terms, 5, T_DC);
     for (size_t band = 0; band < 3; band++) {
         const int32_t *const *const values = file->ac + 3 * ((band + 1) * (band + 1) - 1);
         if (values[0])
@@ -376,9 +352,11 @@ static void make_streams(const file_integers *file, uint64_t bundle, pass *p)
         for (size_t i = 0; i < BUNDLE; i++)
             e->terms[T_DIFFERENCE + k][i] = (int16_t)(a[i] < b[i] ? b[i] - a[i] : a[i] - b[i]);
     }
-    for (size_t k = 0; k < 6; k++)
+    for (size_t k = 0; k < 3; k++) {
         terms[k] = e->terms[T_SCALE + k];
-    dense_section(p, ROTATION_STREAM, 3, file->rotations, begin, splats, 1, 0, terms, 6, T_ROTATION);
+        terms[3 + k] = e->terms[T_DIFFERENCE + k];
+    }
+    dense_section(p, ROTATION_STREAM, 3, file->rotations, begin, splats, 1, terms, 6, T_ROTATION);
 }
 
 /* Bytes of what a bundle's encoding works with; they begin as zeros. */
@@ -390,7 +368,7 @@ POTR_EXPORT size_t potr_bundles_encoding(void)
 /* Adds to the sums that weights are fitted to.
  *
  * streams: (25) with sizes and numbers of terms and coefficients. at_least: samples that are taken of a stream, where
- * it has as many. grams: (25, 20, 20) sums of products of terms, recent sizes, constant, coefficients and size; those
+ * it has as many. grams: (25, 22, 22) sums of products of terms, recent sizes, constant, coefficients and size; those
  * on and above the diagonal. largest: (25) brought up to the largest integers, mapped to unsigned. */
 POTR_EXPORT void potr_bundles_survey(
     const file_integers *file, uint64_t bundle, const fitted_stream *streams, encoding *e, uint64_t at_least,

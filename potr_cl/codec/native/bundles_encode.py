@@ -22,7 +22,7 @@ U32 = NDArray[np.uint32]
 T = TypeVar("T")
 
 #: Rows of the sums of products, and numbers of a stream.
-COLUMNS, NUMBERS = 20, 19
+COLUMNS, NUMBERS = 22, 21
 _TOKENS = 256
 _LANES, _BUNDLE = 32, 8192
 _MOST_ALPHABET, _GROUPS, _LOGS = 252, 64, 4096
@@ -40,6 +40,7 @@ class _Integers(ctypes.Structure):
         ("rotations", _POINTER * 3),
         ("dc", _POINTER * 3),
         ("ac", _POINTER * 45),
+        ("classes", _POINTER),
         ("splats", _WORD),
     )
 
@@ -116,6 +117,7 @@ class BundleEncoder:
         ac: by coefficient and channel, from 0 to 44; whole degrees.
         sizes: (tokens,) of the tokens of each stream.
         terms, coefficients: how many each has.
+        classes: (N,) of the steps of DC, -32 to 31.
     """
 
     def __init__(
@@ -127,6 +129,7 @@ class BundleEncoder:
         sizes: Sequence[NDArray[np.integer]],
         terms: Sequence[int],
         coefficients: Sequence[int],
+        classes: NDArray[np.int8],
     ) -> None:
         self._c = functions
         self._splats = splats
@@ -135,6 +138,7 @@ class BundleEncoder:
         self._integers.splats = splats
         (opacity,) = dense["opacity"]
         self._integers.opacity = self._keep(opacity, np.int32, splats)
+        self._integers.classes = self._keep(classes, np.int8, splats)
         for name in ("scales", "rotations", "dc"):
             for k, values in enumerate(dense.get(name, ())):
                 getattr(self._integers, name)[k] = self._keep(values, np.int32, splats)
@@ -148,7 +152,7 @@ class BundleEncoder:
         self._counts = _Pool(lambda: np.zeros((STREAMS, _TOKENS, _TOKENS), np.uint32))
         self._words = _Pool(lambda: np.empty(_WORDS * _BUNDLE + 2, np.uint16))
         for to, size, number, some in zip(self._streams, sizes, terms, coefficients, strict=True):
-            if number > 10 or number + some > NUMBERS - 2:
+            if number > 12 or number + some > NUMBERS - 2:
                 raise TypeError("the native path was given too many terms")
             all_sizes = np.zeros(_TOKENS, np.int16)
             all_sizes[: len(size)] = size
@@ -178,7 +182,7 @@ class BundleEncoder:
             )
 
     def grams(self) -> I64:
-        """(25, 20, 20) sums of products of terms, recent sizes, constant, coefficients and size; not those below the
+        """(25, 22, 22) sums of products of terms, recent sizes, constant, coefficients and size; not those below the
         diagonals."""
         total: I64 = np.sum([grams for grams, _ in self._sums.all()], axis=0)
         return total

@@ -17,8 +17,9 @@ typedef struct {
     const float *scale_table;   /* value of each level, */
     const float *opacity_table; /* and so many levels each */
     uint64_t scale_levels, opacity_levels;
-    float sf_rotation, sf_dc, sf_ac;
-    float unused;
+    const float *sf_dc, *sf_ac;      /* (64) scale factors of each class of steps */
+    const uint64_t *step, *inverse;  /* (64) of each class of steps, of the prediction of DC */
+    float sf_rotation, unused;
 } scene_values;
 
 /* Values of a table for the levels in rows, every `stride`-th number of `out`; whether a level is beyond the table. */
@@ -75,29 +76,39 @@ static void rotations(const work *w, float factor, size_t lanes, size_t steps, s
     }
 }
 
-static void colours_of_dc(
-    const work *w, float divisor, size_t lanes, size_t steps, size_t splats, float *out, uint64_t all)
+/* DC from what its prediction has left (docs/format.md, "Prediction"). Sums and products wrap round. */
+static void colours_of_dc(const work *w, const scene_values *out, size_t steps, size_t splats, float *to, uint64_t all)
 {
-    int32_t y[LANE], co[LANE], cg[LANE];
-    for (size_t lane = 0; lane < lanes; lane++) {
-        const size_t begin = lane * steps, number = splats - begin < steps ? splats - begin : steps;
-        for (size_t step = 0; step < number; step++) {
-            const size_t place = step * LANES + lane;
-            y[step] = w->dc[0][place];
-            co[step] = w->dc[1][place];
-            cg[step] = w->dc[2][place];
+    uint64_t last[4][3], total[3] = { 0, 0, 0 };
+    for (size_t splat = 0, place = 0, lane = 0, step = 0; splat < splats; splat++) {
+        if (splat % LANE == 0) {
+            memset(last, 0, sizeof last);
+            memset(total, 0, sizeof total);
         }
-        float *const red = out + begin, *const green = red + all, *const blue = green + all;
-        for (size_t i = 0; i < number; i++) {
-            const int32_t rest = y[i] - cg[i];
-            red[i] = (float)(rest + co[i]) / divisor;
-            green[i] = (float)(y[i] + cg[i]) / divisor;
-            blue[i] = (float)(rest - co[i]) / divisor;
+        const unsigned class = w->dc_classes[place];
+        const uint64_t inverse = out->inverse[class], one = out->step[class];
+        const float divisor = out->sf_dc[class];
+        uint64_t level[3];
+        for (size_t c = 0; c < 3; c++) {
+            const int64_t mean = (int64_t)(total[c] * inverse + (UINT64_C(1) << 33)) >> 34;
+            level[c] = (uint64_t)(int64_t)w->dc[c][place] + (uint64_t)mean;
+            const uint64_t value = level[c] * one;
+            total[c] += value - last[splat & 3][c];
+            last[splat & 3][c] = value;
+        }
+        const uint64_t rest = level[0] - level[2];
+        to[splat] = (float)(int64_t)(rest + level[1]) / divisor;
+        to[splat + all] = (float)(int64_t)(level[0] + level[2]) / divisor;
+        to[splat + 2 * all] = (float)(int64_t)(rest - level[1]) / divisor;
+        place += LANES;
+        if (++step == steps) {
+            step = 0;
+            place = ++lane;
         }
     }
 }
 
-static void colours_of_items(const work *w, size_t band, float divisor, size_t steps, float *out, uint64_t all)
+static void colours_of_items(const work *w, size_t band, const float *divisors, size_t steps, float *out, uint64_t all)
 {
     const uint16_t *const places = w->places[band];
     const uint8_t *const coefficients = w->coefficients[band];
@@ -105,6 +116,7 @@ static void colours_of_items(const work *w, size_t band, float divisor, size_t s
     const size_t first = (band + 1) * (band + 1) - 1;
     for (size_t i = 0; i < w->items[band]; i++) {
         float *const to = out + 3 * (first + coefficients[i]) * all + places[i] % LANES * steps + places[i] / LANES;
+        const float divisor = divisors[w->ac_classes[places[i]]];
         const int32_t rest = y[i] - cg[i];
         to[0] = (float)(rest + co[i]) / divisor;
         to[all] = (float)(y[i] + cg[i]) / divisor;
@@ -134,7 +146,7 @@ POTR_EXPORT int potr_bundles_values(
     if (out->quaternions && rotating)
         rotations(w, out->sf_rotation, lanes, steps, splats, out->quaternions + 4 * first);
     if (out->dc && sections > DC)
-        colours_of_dc(w, out->sf_dc, lanes, steps, splats, out->dc + first, all);
+        colours_of_dc(w, out, steps, splats, out->dc + first, all);
     if (out->ac)
         for (size_t band = 0; band < 3; band++)
             colours_of_items(w, band, out->sf_ac, steps, out->ac + first, all);

@@ -49,6 +49,7 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_unit_quaternions": (None, [_POINTER, _SIZE, _POINTER]),
     "potr_ycocg_columns": (None, [_POINTER, _SIZE, _SIZE, _SIZE, _POINTER]),
     "potr_nonzero_levels": (_NUMBER, [_POINTER, _SIZE, _SIZE, ctypes.c_double, ctypes.c_double, _POINTER]),
+    "potr_unpredicted": (None, [_POINTER, _SIZE, _SIZE, _SIZE, *[_POINTER] * 4]),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
 }
 #: Those that there are for several kinds of integers, by what their names begin with.
@@ -61,7 +62,7 @@ _OF_KINDS: dict[str, tuple[Any, list[Any], tuple[str, ...]]] = {
     "potr_join_planes_": (None, [_POINTER, _SIZE, ctypes.c_uint, _NUMBER, _POINTER], ("medium", "wide")),
     "potr_colours_of_": (
         None,
-        [_POINTER, _POINTER, _POINTER, _SIZE, _REAL, _POINTER, _POINTER, _POINTER],
+        [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _POINTER, _POINTER],
         ("narrow", "medium", "wide"),
     ),
     "potr_look_up_": (_WORD, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER, _SIZE], ("narrow", "medium", "wide")),
