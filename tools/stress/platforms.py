@@ -317,7 +317,8 @@ def row(info: DeviceInfo, family: str, scenes: Path | None) -> str:
     refit = " | ".join(f"{r['refit'][n]:.0e}" for n in ("adjoint", "transposed", "normal", "blocks", "solution"))
     return (
         f"{head} | {r['vector_width'] if family == 'cpu' else ''} | {r['error']:.1e} | "
-        f"{r['flips']} of {r['pixels']:,} | {'yes' if same else 'NO'} | {refit} | {derivatives:.0e} | {real[0]} | {real[1]} |"
+        f"{r['flips']} of {r['pixels']:,} | {'yes' if same else 'NO'} | {refit} | {derivatives:.0e} | "
+        f"{real[0]} | {real[1]} |"
     )
 
 
