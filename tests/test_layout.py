@@ -21,20 +21,22 @@ FOLDERS: dict[str, set[str]] = {
     "opencl": {"errors", "host"},
     "raster": {"errors", "host", "model", "opencl"},
     "codec": {"errors", "host", "model"},
-    "formats": {"errors", "host", "model", "codec"},
+    "ondevice": {"errors", "host", "model", "opencl", "raster", "codec"},
+    "clustering": {"errors", "model", "opencl"},
+    "formats": {"errors", "host", "model", "opencl", "codec", "clustering"},
     "quality": {"errors", "host", "model", "opencl", "raster", "formats"},
-    "outputs": {"errors", "host", "model", "opencl", "raster", "codec", "formats"},
+    "outputs": {"errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "clustering"},
     "stages": {"errors", "host", "model", "opencl", "raster", "codec", "quality", "outputs"},
     "pipeline": {"errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality", "outputs"},
     "report": {"plain_text", "errors", "host", "model", "opencl", "codec", "formats", "quality", "pipeline"},
     "reference": {"errors", "model", "opencl", "raster", "stages"},
     "api": {
-        "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality",
-        "pipeline", "report", "outputs",
+        "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages",
+        "quality", "pipeline", "report", "outputs",
     },
     "cli": {
-        "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality",
-        "pipeline", "report", "api", "outputs",
+        "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages",
+        "quality", "pipeline", "report", "api", "outputs",
     },
 }  # fmt: skip
 #: They offer the whole package under short names, and start it.

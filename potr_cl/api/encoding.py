@@ -42,6 +42,8 @@ from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Found, Target
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth, judge_by_photographs
+from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.html import PicturePair, html_report, views_to_show
 from potr_cl.report.summary import encode_report, photographs_report, quality_report, search_report
 from potr_cl.stages.code import Code
@@ -137,14 +139,18 @@ def encode(
         file = stack.enter_context(replacing(output)) if output is not None else None
         page = stack.enter_context(replacing(report)) if report is not None else None
         found: Found | None = None
+        kept: KeptScene | None = None
         if target is None:
-            encoded = run_stages(what, views, settings, progress, opened)
+            if judging is not None and opened is not None:
+                kept = stack.enter_context(KeptScene(opened, what))
+            encoded = run_stages(what, views, settings, progress, opened, kept=kept)
         else:
             found = encode_to_target(what, views, target, settings, progress, opened, tell)
             encoded = found.encoded
         if file is None and page is None:
             return encoded
-        written = proved(encoded, trust)
+        judged_on = None if judging is None else encoded.device or opened
+        written = stack.enter_context(proved(encoded, trust, judged_on))
         candidate = written.scene
         if file is not None:
             file.write(written.data)
@@ -162,7 +168,7 @@ def encode(
                     photographs = by_photographs(
                         ground_truth, views, encoded, (what, candidate), used_device, encoded.options.background
                     )
-                judge = Judge(judging, used_device, encoded.options.background, ground_truth)
+                judge = Judge(judging, used_device, encoded.options.background, ground_truth, kept)
                 quality, pictures = judge(what, candidate, watch, report_view, pictures=True)
             seconds = encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
             source = name_of(scene)
@@ -287,7 +293,7 @@ def by_photographs(
     ground_truth: GroundTruth,
     cameras: Sequence[Camera],
     encoded: Encoded,
-    scenes: tuple[Scene, Scene],
+    scenes: tuple[Scene, Drawable],
     device: Device,
     background: Colour,
 ) -> dict[str, Any]:
@@ -305,21 +311,23 @@ class Judge:
         device: to render on.
         background: behind the scene.
         ground_truth: photographs to show beside the pictures, if there are any.
+        kept: the uncompressed scene, if it lies on the device already.
     """
 
     views: EvaluationViews
     device: Device
     background: Colour
     ground_truth: GroundTruth | None = None
+    kept: KeptScene | None = None
 
     def __call__(
-        self, scene: Scene, candidate: Scene, watch: Stopwatch, chosen: str | None = None, pictures: bool = False
+        self, scene: Scene, candidate: Drawable, watch: Stopwatch, chosen: str | None = None, pictures: bool = False
     ) -> tuple[dict[str, Any], list[PicturePair]]:
         """The figures, and pictures for a report.
 
         Args:
             scene: uncompressed.
-            candidate: as a decoder sees it.
+            candidate: as a decoder sees it; where it is on a device, that is the judge's.
             watch: told how far the stage "evaluate" is.
             chosen: a view to show besides the worst and the median one.
             pictures: whether to make any.
@@ -328,7 +336,8 @@ class Judge:
             DeviceError: a view does not fit the device, or the device failed.
         """
         watch("evaluate", 0.0)
-        with Evaluator(self.device, scene, self.views, self.background) as evaluator:
+        original = scene if self.kept is None else self.kept.drawable(self.device, scene)
+        with Evaluator(self.device, original, self.views, self.background) as evaluator:
             quality = quality_report(self.views, evaluator.compare(candidate, lambda _, done: watch("evaluate", done)))
             shown = views_to_show(quality, chosen) if pictures else []
             pairs = evaluator.pictures(candidate, [view["name"] for _, view in shown])

@@ -44,13 +44,15 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output
 from potr_cl.outputs.registry import OUTPUTS, encoded_suffix, output_of, output_of_suffix, suffixes_encoded
-from potr_cl.pipeline.encode import Encoded, Stopwatch, encode, proved
+from potr_cl.pipeline.encode import Encoded, Stopwatch, check_frame, encode, proved
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT, PRESETS, PURPOSE
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Target
 from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.html import PicturePair, html_report
 from potr_cl.report.summary import encode_report, format_encode_report, search_report
 from potr_cl.stages.refit import Refit
@@ -104,7 +106,7 @@ def _encode(args: argparse.Namespace) -> None:
     if args.report is not None and len(works) > 1:
         raise UsageError("--report is about one scene: encode one at a time")
     with contextlib.ExitStack() as stack:
-        opened = stack.enter_context(thread_pool(1)).submit(Device, args.device) if _looks(args, options) else None
+        opened = stack.enter_context(thread_pool(1)).submit(_opened, args) if _looks(args, options) else None
         cameras = given_cameras(args)
         ground_truth = None
         if refit.ground_truth is not None and cameras is not None:
@@ -116,13 +118,23 @@ def _encode(args: argparse.Namespace) -> None:
         for_each_scene(works, lambda one: _encode_one(one, shared, several=len(works) > 1), args.json)
 
 
+def _opened(args: argparse.Namespace) -> Device:
+    """The device, which begins to load what the last encode with this preset has needed."""
+    device = Device(args.device)
+    device.prepare_for(f"encode {args.preset}")
+    return device
+
+
 def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> None:
     began = time.perf_counter()
     options = _options(args, size_of_file(args.scene))
     target, opened, cameras = shared.target, shared.opened, shared.cameras
     with contextlib.ExitStack() as stack:
         scene = read_scene(args, args.scene)
+        # Drivers take as long to open a device.
+        check_frame(scene, cameras, options.cameras_anyway)
         device = opened.result() if opened is not None and options.look_at_views(scene) else None
+        kept = None if device is None or target is not None else stack.enter_context(KeptScene(device, scene))
         progress = stack.enter_context(contextlib.closing(Progress()))
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None
         placing = Stopwatch(progress)
@@ -131,16 +143,18 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
             if cameras is None and device is not None:
                 cameras = virtual_cameras(args, scene, placing)
             if device is not None and cameras is not None:
-                tell_what_is_ahead(device, scene, cameras, options, target is not None)
+                tell_what_is_ahead(device, scene, cameras, options, target is not None, kept)
             views = EvaluationViews.of(cameras) if cameras is not None and not args.no_quality else None
             if args.report_view is not None:
                 _ = views and views.named(args.report_view)  # an unknown name is told before the work
             if target is None:
-                encoded = encode(scene, cameras, options, progress, device)
+                encoded = encode(scene, cameras, options, progress, device, kept=kept, in_frame=True)
             else:
                 found = encode_to_target(scene, cameras, target, options, progress, device, progress.tell)
                 encoded, options, search = found.encoded, found.options, search_report(target, found)
-            written = proved(encoded, args.trust)  # what cannot be decoded must not replace what can
+            judged_on = None if views is None else encoded.device
+            # What cannot be decoded must not replace what can.
+            written = stack.enter_context(proved(encoded, args.trust, judged_on))
             file.write(written.data)
         candidate = written.scene
         watch = Stopwatch(progress)
@@ -148,7 +162,7 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
         quality: dict[str, Any] | str = "not judged, as asked"
         if views is not None:
             quality, pictures = _evaluate(
-                args, scene, candidate, views, encoded.device, opened, watch, shared.ground_truth
+                args, scene, candidate, views, encoded.device, opened, watch, shared.ground_truth, kept
             )
         elif cameras is None:
             quality = "not judged: there are no cameras to look from"
@@ -171,12 +185,13 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
 def _evaluate(
     args: argparse.Namespace,
     scene: Scene,
-    candidate: Scene,
+    candidate: Drawable,
     views: EvaluationViews,
     device: Device | None,
     opened: Future[Device] | None,
     watch: Stopwatch,
     ground_truth: GroundTruth | None,
+    kept: KeptScene | None,
 ) -> tuple[dict[str, Any] | str, list[PicturePair]]:
     """The figures, or why there are none: a device that fails now must not take the finished file with it.
 
@@ -189,6 +204,7 @@ def _evaluate(
             device or (Device(args.device) if opened is None else opened.result()),
             parse_colour(args.background),
             ground_truth,
+            kept,
         )
         return judge(scene, candidate, watch, args.report_view, pictures=args.report is not None)
     except DeviceError as error:
@@ -199,7 +215,7 @@ def _photographs(
     args: argparse.Namespace,
     ground_truth: GroundTruth,
     cameras: list[Camera],
-    scenes: tuple[Scene, Scene],
+    scenes: tuple[Scene, Drawable],
     encoded: Encoded,
     device: Device | None,
 ) -> dict[str, Any] | None:

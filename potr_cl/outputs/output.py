@@ -10,7 +10,8 @@ from __future__ import annotations
 
 import tempfile
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, ClassVar, Protocol
@@ -25,6 +26,7 @@ from potr_cl.formats.declaration import SceneFormat
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
+from potr_cl.raster.scene_buffers import Drawable
 
 
 @dataclass(frozen=True)
@@ -192,6 +194,15 @@ class Output(ABC):
             path = Path(folder) / f"scene{self.suffix}"
             path.write_bytes(data)
             return self.format.load(path, trust)
+
+    @contextmanager
+    def seen(self, data: bytes, device: Device, trust: bool = False) -> Iterator[Drawable]:
+        """The same, to be rendered on a device as long as the context lasts; it may lie there already.
+
+        Raises:
+            DataError: nobody can read it.
+        """
+        yield self.read(data, trust)
 
     def properties(self, data: bytes) -> dict[str, int]:
         """Bytes of the file by what they are for, as far as the format tells them apart."""

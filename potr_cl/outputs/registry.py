@@ -13,12 +13,14 @@ from potr_cl.outputs.gltf import Gltf
 from potr_cl.outputs.output import Output
 from potr_cl.outputs.ply import Ply
 from potr_cl.outputs.potr import Potr
+from potr_cl.outputs.sog import Sog
 from potr_cl.outputs.spz import Spz
 
 #: In the order in which people are told of them; the first is the usual one.
 OUTPUTS: tuple[type[Output], ...] = (
     Potr,
     Spz,
+    Sog,
     CompressedPly,
     Gltf,
     Ply,

@@ -164,6 +164,7 @@ class _Search:
         self._axis = FinenessAxis(options)
         self._scouted: tuple[float, float] | None = None  # where, and the value of a full encode, about
         self._evaluator: Evaluator | None = None
+        self._prepared: State | None = None
         self._used: Device | None = None  # by the stages that look at views
 
     def run(self) -> Found:
@@ -332,7 +333,10 @@ class _Search:
 
     def _thin(self, options: EncodeOptions) -> State:
         """The state after the stages that are not repeated for another q."""
-        return self._run(State.of(self._scene, self._views), options, self._once)
+        if self._prepared is None:
+            state = State.of(self._scene, self._views)
+            self._prepared = self._run(state, options, [kind for kind in self._once if kind.serves_others])
+        return self._run(self._prepared, options, [kind for kind in self._once if not kind.serves_others])
 
     def _refit(self, thinned: State, options: EncodeOptions) -> State:
         """The state after the stages that are repeated for another q, before the coding."""
@@ -358,8 +362,8 @@ class _Search:
             encoded = None
             pieces = self._code(reduced, options.changed(code=_QUICK_CODER)).pieces
             self._watch("evaluate tries", 0.0)
-            seen = options.output.read(b"".join(pieces), trust=True)
-            value = min(self._evaluator.psnr(seen), _IDENTICAL)
+            with options.output.seen(b"".join(pieces), self._evaluator.device, trust=True) as candidate:
+                value = min(self._evaluator.psnr(candidate), _IDENTICAL)
             self._watch("evaluate tries", 1.0)
         self._tries.append(Try(kind, q, value))
         self._tell(f"{KINDS[kind].format(f'{q:g}')} {self._target.describe(value)}")

@@ -70,6 +70,8 @@ def encode_report(
         "photographs": photographs,
         "pruning": None,
         "unseen": None,
+        "fit": None,
+        "views_between": None,
         "search": search,
         "options": options.as_dict(),
         "parameters": dataclasses.asdict(options.parameters),
@@ -86,6 +88,10 @@ def encode_report(
         }
     if encoded.unseen is not None:
         report["unseen"] = {**dataclasses.asdict(encoded.unseen), "said": str(encoded.unseen)}
+    if encoded.fitted is not None:
+        report["fit"] = {**encoded.fitted.facts, "said": str(encoded.fitted)}
+    if encoded.between is not None:
+        report["views_between"] = {**dataclasses.asdict(encoded.between), "said": str(encoded.between)}
     if encoded.device is not None:
         info = encoded.device.info
         report["device"] = {"name": info.name, "platform": info.platform, "version": info.version}
@@ -168,6 +174,8 @@ def format_encode_report(report: dict[str, Any]) -> str:
     ]
     if report["unseen"] is not None and report["unseen"]["splats"]:
         lines.append(f"           {report['unseen']['said']}")
+    if report["views_between"] is not None:
+        lines.append(f"views      {report['views_between']['said']}")
     if source["antialiased"]:
         lines.append("rendered   as an antialiased scene")
     for place, (name, nbytes) in enumerate(report["properties"].items()):
@@ -182,6 +190,8 @@ def format_encode_report(report: dict[str, Any]) -> str:
             f"           mean of {quality['judged_by']}",
             f"           worst view {worst['name']}: PSNR {decibels(worst['psnr'])}, SSIM {worst['ssim']:.4f}",
         ]
+    if report.get("fit") is not None:
+        lines.append(f"fit        {report['fit']['said']}")
     photographs = report["photographs"]
     if photographs is not None:
         held_out = photographs["held_out"]

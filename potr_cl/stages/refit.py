@@ -145,7 +145,8 @@ class Refit(Stage):
 
         with ExitStack() as stack:
             stack.callback(bench.progress, "refit", 1.0)
-            rasterizer = stack.enter_context(Rasterizer(bench.opened, state.source, background=bench.background))
+            source = bench.drawable(state.source)
+            rasterizer = stack.enter_context(Rasterizer(bench.opened, source, background=bench.background))
             refitted, geometry = fitted(state.views, RenderedTargets(rasterizer, state.views), 0)
             choice = None
             if self.ground_truth is not None:
@@ -182,7 +183,8 @@ class RefitOnTheWay(Stage):
 
     def run(self, state: State, bench: Workbench) -> State:
         bench.progress("refit", 0.0)
-        with Rasterizer(bench.opened, state.source, background=bench.background) as rasterizer:
+        source = bench.drawable(state.source)
+        with Rasterizer(bench.opened, source, background=bench.background) as rasterizer:
             refitted = refit_colours(
                 bench.opened,
                 state.scene,

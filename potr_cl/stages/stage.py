@@ -25,6 +25,8 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output, Request, Rounded
 from potr_cl.outputs.potr import Potr
+from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.scene_buffers import Drawable
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -108,6 +110,7 @@ class Workbench:
         metadata: makes the file's metadata from the last state.
         output: the kind of file that is made in the end.
         progress: called to say how far the work is.
+        kept: the uncompressed scene, where it stays on the device from one stage to the next.
     """
 
     parameters: HyperParameters
@@ -119,6 +122,11 @@ class Workbench:
     metadata: Callable[[State], bytes] = lambda state: b""
     progress: Progress = lambda what, done: None
     output: Output = field(default_factory=Potr)
+    kept: KeptScene | None = None
+
+    def drawable(self, scene: Scene) -> Drawable:
+        """What to give to a rasterizer for a scene: it may lie on the device already."""
+        return scene if self.kept is None else self.kept.drawable(self.opened, scene)
 
     def request(self, state: State, metadata: bytes = b"", entropy: EntropyCoder | None = None) -> Request:
         """What the output is told besides the scene."""
@@ -143,7 +151,8 @@ class Stage(ABC):
         name: what options and results call it.
         title: heads its options in the help of the command line.
         needs_views: whether it computes on a device, from views. Such a stage is left out if there are no views.
-        serves_others: whether it only prepares what other stages look at. It is left out if none of them does.
+        serves_others: whether it only prepares what other stages look at, the same for every q. It is left out if none
+            of them does. Such stages come first.
     """
 
     name: ClassVar[str]

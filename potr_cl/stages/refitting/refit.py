@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.quantize import quantize_sh, to_ycocg
+from potr_cl.codec.quantize import nonzero_levels
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
@@ -249,8 +249,6 @@ def active_coefficients(sh: FloatArray, sf_sh: float) -> NDArray[np.bool_]:
         sh: (N, M, 3) R, G, B.
         sf_sh: the quantiser's scale factor.
     """
-    active = np.ones(sh.shape, bool)
-    for m in range(1, sh.shape[1]):
-        for c, channel in enumerate(to_ycocg(sh[:, m].astype(np.float64))):
-            active[:, m, c] = quantize_sh(channel, sf_sh) != 0
+    active = nonzero_levels(sh, sf_sh)
+    active[:, 0] = True
     return active
