@@ -106,7 +106,7 @@ def _encode(args: argparse.Namespace) -> None:
     if args.report is not None and len(works) > 1:
         raise UsageError("--report is about one scene: encode one at a time")
     with contextlib.ExitStack() as stack:
-        opened = stack.enter_context(thread_pool(1)).submit(Device, args.device) if _looks(args, options) else None
+        opened = stack.enter_context(thread_pool(1)).submit(_opened, args) if _looks(args, options) else None
         cameras = given_cameras(args)
         ground_truth = None
         if refit.ground_truth is not None and cameras is not None:
@@ -116,6 +116,13 @@ def _encode(args: argparse.Namespace) -> None:
         if opened is not None and len(works) > 1:
             opened.result()  # no scene can do without it
         for_each_scene(works, lambda one: _encode_one(one, shared, several=len(works) > 1), args.json)
+
+
+def _opened(args: argparse.Namespace) -> Device:
+    """The device, which begins to load what the last encode with this preset has needed."""
+    device = Device(args.device)
+    device.prepare_for(f"encode {args.preset}")
+    return device
 
 
 def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> None:

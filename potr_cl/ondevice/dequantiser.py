@@ -2,8 +2,7 @@
 
 Devices need not divide, take roots or logarithms exactly, so nothing is computed there but sums of integers: what a
 level, or a sum of three, stands for is looked up in a table that the host has made. Where levels are too large for a
-table, and for rotations, whose values depend on three levels and a step that the scales set, the host finds the values
-and uploads them.
+table, and for rotations and colours whose steps differ from splat to splat, the host finds the values and uploads them.
 """
 
 from __future__ import annotations
@@ -16,8 +15,10 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.codec.byte_planes import IntegerStream
+from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
-from potr_cl.codec.dequantizer import Dequantizer, IntegerStream
+from potr_cl.codec.dequantizer import Dequantizer
 from potr_cl.codec.versions import FormatVersion
 from potr_cl.errors import DataError
 from potr_cl.opencl.memory import Memory
@@ -47,10 +48,23 @@ class DeviceDequantiser:
         self._on_host = Dequantizer(header, version)
         # Threads decode; one after the other tells the device what to do with it.
         self._lock = threading.Lock()
+        # Copies that the device has not made yet; while it makes them, threads go on decoding.
+        self._pending: list[cl.Event] = []
+
+    def finish(self) -> None:
+        """Wait until everything that was taken is there.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        device = self._buffers.device
+        with device.errors("failed while decoding"):
+            device.queue.finish()
+        self._pending.clear()
 
     def take_means(self, means: F32) -> None:
         with self._lock:
-            self._buffers.write_rows(self._buffers.means, means, "the centres")
+            self._buffers.write_rows(self._buffers.means, means, "the centres", self._pending)
 
     def take_scales(self, streams: Sequence[IntegerStream]) -> None:
         factor = self._header.sf_scale
@@ -73,18 +87,21 @@ class DeviceDequantiser:
         self._on_host.rotations(streams, scales, quaternions)
         units = unit_quaternions(quaternions)
         with self._lock:
-            self._buffers.write_rows(self._buffers.quaternions, units, "the rotations")
+            self._buffers.write_rows(self._buffers.quaternions, units, "the rotations", self._pending)
 
-    def take_colours(self, streams: Sequence[IntegerStream], coefficient: int, differences: bool) -> None:
-        levels, mapped, reach = _summed_up(streams, differences)
+    def take_colours(
+        self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, factors: ColourFactors
+    ) -> None:
+        own = factors.dc if coefficient == 0 else factors.ac
+        on_host = len(own) > 1 or (coefficient == 0 and self._version.colour_steps)
+        levels, mapped, reach = (None, False, 0) if on_host else _summed_up(streams, differences)
         if levels is None:
             rgb = np.empty((3, self._header.splats), np.float32)
-            self._on_host.colours(streams, coefficient, differences, rgb)
+            self._on_host.colours(streams, coefficient, differences, factors, rgb)
             with self._lock:
-                self._buffers.write_columns(self._buffers.sh, 3 * coefficient, rgb)
+                self._buffers.write_columns(self._buffers.sh, 3 * coefficient, rgb, self._pending)
             return
-        factor = np.float32(self._header.sf_dc if coefficient == 0 else self._header.sf_ac)
-        table = np.arange(-reach, reach + 1).astype(np.float32) / factor
+        table = np.arange(-reach, reach + 1).astype(np.float32) / own
         with self._lock, Memory(self._buffers.device) as memory:
             self._launch(
                 "colours", levels, mapped, memory, table, "the SH coefficients",
@@ -99,7 +116,7 @@ class DeviceDequantiser:
         if largest >= _MOST_LEVELS or min(int(level.min()) for level in levels) < 0:
             columns = np.stack([values(level) for level in levels])
             with self._lock:
-                self._buffers.write_columns(parameter, 0, columns)
+                self._buffers.write_columns(parameter, 0, columns, self._pending)
             return
         narrow = np.stack([level.astype(_unsigned(largest), copy=False) for level in levels])
         table = values(np.arange(largest + 1))
@@ -116,8 +133,8 @@ class DeviceDequantiser:
             raise DataError(f"{what} are {levels.shape[1]} integers, not one for each of {buffers.splats} splats")
         kind = _TYPES[levels.dtype.type]
         buffers.device.shared_kernel(_SOURCE, name, LEVEL=kind, MAPPED=int(mapped)).bind(
-            levels=memory.upload(levels, what),
-            table=memory.upload(table, what),
+            levels=memory.upload(levels, what, self._pending),
+            table=memory.upload(table, what, self._pending),
             splats=buffers.splats,
             stride=buffers.stride,
             **arguments,

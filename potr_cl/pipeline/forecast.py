@@ -25,6 +25,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.between.amount import most_needed
 from potr_cl.stages.compact import Compact
+from potr_cl.stages.fit import Fit
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.sweep_options import default_memory
 from potr_cl.stages.refit import Refit
@@ -64,6 +65,7 @@ class Units:
         prepare, prune, compact, refit: once for each training view, as multiples of the time of one picture of the
             uncompressed scene.
         iteration, step: a pruning iteration and a step of the re-fit, for each view, besides.
+        fit: a view of a step of the fit.
         once: pictures' times that the re-fit takes besides, whatever the number of views.
         compact_splat, refit_splat, code_splat: seconds that compaction, the re-fit and the coding take besides, for
             each splat of the uncompressed scene.
@@ -72,6 +74,7 @@ class Units:
     prepare: float
     prune: float
     iteration: float
+    fit: float
     compact: float
     refit: float
     step: float
@@ -83,8 +86,8 @@ class Units:
 
 #: From tools.bench.forecast for CPUs, and from docs/benchmarks/encode.md for GPUs, where the host does a good part.
 UNITS: dict[Family, Units] = {
-    "cpu": Units(1.0, 3.0, 0.035, 2.0, 4.7, 0.33, 20, 0, 0, 4e-6),
-    "gpu": Units(0.9, 2.0, 0.042, 0, 0, 0.45, 0, 3.5e-6, 1.45e-6, 1.5e-6),
+    "cpu": Units(1.0, 3.0, 0.035, 0.9, 2.0, 4.7, 0.33, 20, 0, 0, 4e-6),
+    "gpu": Units(0.9, 2.0, 0.042, 0.9, 0, 0, 0.45, 0, 3.5e-6, 1.45e-6, 1.5e-6),
 }
 
 
@@ -117,6 +120,8 @@ def forecast(
     pictures = views * units.prepare
     if isinstance(prune := parts.get(Prune.name), Prune):
         pictures += views * (units.prune + units.iteration * prune.iterations)
+    if isinstance(fit := parts.get(Fit.name), Fit):
+        pictures += fit.steps * fit.batch * units.fit
     if Compact.name in parts:
         pictures += views * units.compact
         of_a_splat += units.compact_splat

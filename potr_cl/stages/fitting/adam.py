@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.activation import LARGEST_SCALE
+from potr_cl.raster.activation import LARGEST_SCALE, unit_quaternions
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
 from potr_cl.stages.fitting.derivatives import Columns
 
@@ -122,17 +122,16 @@ class Adam(Owner):
     def _give(self) -> None:
         """Write the parameters to the rasterizer's buffers, as its projection takes them."""
         buffers = self._buffers
-        geometry = buffers.geometry
         self._activate.bind(
             parameters=self._parameters,
             splats=buffers.splats,
             stride=buffers.stride,
             sh_columns=self._columns.sh,
             largest_scale=LARGEST_SCALE,
-            means=geometry["means"],
-            scales=geometry["scales"],
-            quaternions=geometry["quaternions"],
-            log2_opacities=geometry["log2_opacities"],
+            means=buffers.means,
+            scales=buffers.scales,
+            quaternions=buffers.quaternions,
+            log2_opacities=buffers.log2_opacities,
             sh=buffers.sh,
         )
         self._activate.launch((buffers.stride,), (SPLAT_GROUP,))
@@ -166,12 +165,9 @@ def _columns_of(scene: Scene, columns: Columns, stride: int) -> FloatArray:
     """(columns, stride) the parameters of a scene; quaternions of length 1."""
     result = np.zeros((columns.count, stride), np.float32)
     some = slice(0, len(scene))
-    quaternions = scene.quaternions.astype(np.float64)
-    length = np.linalg.norm(quaternions, axis=1, keepdims=True)
-    quaternions = np.where(length > 0, quaternions / np.where(length > 0, length, 1), [1.0, 0.0, 0.0, 0.0])
     result[columns.means, some] = scene.means.T
     result[columns.log_scales, some] = scene.log_scales.T
-    result[columns.quaternions, some] = quaternions.T
+    result[columns.quaternions, some] = unit_quaternions(scene.quaternions).T
     result[columns.opacity_logits, some] = scene.opacity_logits
     result[11:, some] = scene.sh.reshape(len(scene), -1).T
     return result

@@ -26,7 +26,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.pictures import TargetPictures
-from potr_cl.stages.fitting.views import batches, pixel_size, share_out
+from potr_cl.stages.fitting.views import batches, share_out
 from potr_cl.stages.refitting.targets import Targets
 
 logger = logging.getLogger("potr_cl")
@@ -39,8 +39,11 @@ _LEAST_LOGIT, _GREATEST_LOGIT = -5.5, 16.0
 #: Differences are multiplied by a power of two while they are summed up, so that they are about this large.
 _USUAL_DIFFERENCE = 1 / 8
 _LARGEST_UNIT = 2.0**20
-#: Of the first step, means in pixels.
-RATES = Rates(means=0.01, log_scales=5e-3, quaternions=2e-3, opacity_logits=2e-2, dc=5e-3, ac=5e-4)
+#: Of the first step, means in parts of a usual splat's size, for a scene whose mean squared error has this root. All
+#: rates go with the root, because a step in all parameters at once must not do more harm than it can mend; but no rate
+#: is larger than these, or smaller than a part of them.
+RATES = Rates(means=0.01, log_scales=1e-2, quaternions=4e-3, opacity_logits=4e-2, dc=5e-3, ac=5e-4)
+_USUAL_ERROR, _SLOWEST = 1 / 128, 0.02
 
 
 @dataclass(frozen=True)
@@ -52,7 +55,8 @@ class FitOptions:
         batch: views that a step looks at.
         rounds: after how many equal parts of the steps the held-out views are looked at.
         patience: the fit ends after so many rounds in which they did not become better.
-        rates: of the first step; ``means`` in pixels of a view at the scene's usual distance.
+        rates: of the first step, if the scene is far from the targets; smaller where it is near to them. ``means`` in
+            parts of a usual splat's size.
         last: part of the rates that is left at the end; they fall by the same factor in each step.
         seed: of the order of the views.
         memory: bytes of device memory that target pictures may take; None: a quarter of what is free.
@@ -177,7 +181,7 @@ def fit_scene(
         judges = _Judges(rasterizer, [cameras[number] for number in held_out], [pictures.download(n) for n in held_out])
         with Adam(device, scene, rasterizer.parameters, derivatives.columns, _limits(scene)) as adam:
             fit = _Fit(options, derivatives, adam, pictures, judges, cameras)
-            return fit.run(fit_to, pixel_size(scene, cameras), progress, tell or logger.debug)
+            return fit.run(fit_to, _usual_size(scene), progress, tell or logger.debug)
 
 
 class _Judges:
@@ -220,17 +224,18 @@ class _Fit:
         self._pictures, self._judges, self._cameras = pictures, judges, cameras
 
     def run(
-        self, fit_to: Sequence[int], pixel: float, progress: FitProgress | None, tell: Callable[[str], None]
+        self, fit_to: Sequence[int], size: float, progress: FitProgress | None, tell: Callable[[str], None]
     ) -> Fitted:
         options = self._options
         errors = [self._judges.error()]
+        pace = min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
         kept = done = since = 0
         order = batches(fit_to, options.batch, options.seed)
         for round_number in range(1, options.rounds + 1):
             end = options.steps * round_number // options.rounds
             unit = _unit(errors[-1])
             while done < end:
-                self._step(next(order), unit, self._rates(done, pixel))
+                self._step(next(order), unit, self._rates(done, pace, size))
                 done += 1
                 if progress is not None:
                     progress(done, options.steps)
@@ -251,11 +256,11 @@ class _Fit:
         self._derivatives.add(cameras, self._pictures.of(numbers), unit=unit)
         self._adam.step(self._derivatives.gradient, rates)
 
-    def _rates(self, done: int, pixel: float) -> Rates:
+    def _rates(self, done: int, pace: float, size: float) -> Rates:
         rates = self._options.rates
-        left = self._options.last ** (done / max(self._options.steps - 1, 1))
+        left = pace * self._options.last ** (done / max(self._options.steps - 1, 1))
         return Rates(
-            means=left * rates.means * pixel,
+            means=left * rates.means * size,
             log_scales=left * rates.log_scales,
             quaternions=left * rates.quaternions,
             opacity_logits=left * rates.opacity_logits,
@@ -267,6 +272,12 @@ class _Fit:
 def _decibels(error: float) -> float:
     """The PSNR of a mean squared error of colours from 0 to 1."""
     return -10 * math.log10(max(error, 1e-20))
+
+
+def _usual_size(scene: Scene) -> float:
+    """The median of the splats' middle standard deviations, world units."""
+    middle = np.sort(scene.log_scales.astype(np.float64), axis=1)[:, 1]
+    return math.exp(min(float(np.median(middle)), 80.0))
 
 
 def _limits(scene: Scene) -> Limits:

@@ -6,13 +6,8 @@ from collections.abc import Iterator, Sequence
 
 import numpy as np
 
-from potr_cl.model.camera import Camera
-from potr_cl.model.scene import Scene
-
 #: One view in so many is held out, but no more than the most.
 _ONE_IN, _MOST_HELD_OUT = 8, 8
-#: Splats whose distance tells how large a pixel is.
-_SAMPLE = 4096
 
 
 def share_out(given: int, added: int) -> tuple[list[int], list[int]]:
@@ -47,21 +42,3 @@ def batches(numbers: Sequence[int], size: int, seed: int) -> Iterator[list[int]]
             waiting += [int(number) for number in rng.permutation(numbers)]
         yield waiting[:size]
         waiting = waiting[size:]
-
-
-def pixel_size(scene: Scene, cameras: Sequence[Camera]) -> float:
-    """How long a pixel is in the scene, in world units: the median over splats in front of cameras.
-
-    Returns:
-        1 if no camera has a splat in front of it.
-    """
-    rows = np.unique(np.linspace(0, len(scene) - 1, min(_SAMPLE, len(scene))).astype(np.int64))
-    means = scene.means[rows].astype(np.float64)
-    sizes = []
-    for camera in cameras:
-        with np.errstate(over="ignore", invalid="ignore"):
-            depth = means @ camera.rotation[2] + camera.translation[2]
-        seen = depth[np.isfinite(depth) & (depth > 0)]
-        if len(seen):
-            sizes.append(float(np.median(seen)) / camera.fx)
-    return float(np.median(sizes)) if sizes else 1.0
