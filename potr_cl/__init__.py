@@ -8,6 +8,7 @@ do with the same options (docs/python.md has examples):
 - :func:`render`, :func:`compare`: pictures of a scene, and one scene judged by another's;
 - :func:`read_scene`, :func:`read_cameras`, :func:`save`, :func:`convert`, :func:`info`: files, of all formats;
 - :func:`place_cameras`, :func:`look_around`, :func:`turntable`: views for a scene that comes without any;
+- :func:`encode_ladder`, a scene at several qualities; :func:`view`, a page in the browser that shows scenes;
 - :func:`encode_to_target` with a :class:`Target`: what a search for a size or a PSNR has tried;
 - :class:`Scene`, :class:`Camera`: what they work on;
 - :class:`PotrError` and its subclasses: what they raise.
@@ -28,7 +29,9 @@ if TYPE_CHECKING:
     from potr_cl.api.editing import CompactedScene, PrunedScene, RefittedScene, compact, prune, refit
     from potr_cl.api.encoding import encode
     from potr_cl.api.files import convert, decode, save
+    from potr_cl.api.ladder import encode_ladder
     from potr_cl.api.pictures import Rendering, Renderings, preview, render
+    from potr_cl.api.viewing import view
     from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, PotrError, UnreachableError, UsageError
     from potr_cl.formats import load_cameras, load_scene, read_cameras, read_scene
     from potr_cl.model.camera import Camera
@@ -67,6 +70,7 @@ __all__ = [
     "convert",
     "decode",
     "encode",
+    "encode_ladder",
     "encode_to_target",
     "info",
     "load_cameras",
@@ -81,6 +85,7 @@ __all__ = [
     "render",
     "save",
     "turntable",
+    "view",
 ]
 
 #: Imported on first use: the OpenCL loader and NumPy are not everybody's who asks for the version.
@@ -108,6 +113,7 @@ _HOMES = {
     "convert": "api.files",
     "decode": "api.files",
     "encode": "api.encoding",
+    "encode_ladder": "api.ladder",
     "encode_to_target": "pipeline.search",
     "info": "api.describing",
     "load_cameras": "formats",
@@ -122,6 +128,7 @@ _HOMES = {
     "render": "api.pictures",
     "save": "api.files",
     "turntable": "model.viewpoints",
+    "view": "api.viewing",
 }
 
 

@@ -20,6 +20,7 @@ from potr_cl.api.encoding import (
 from potr_cl.cli.batch import for_each_scene, jobs
 from potr_cl.cli.forecasts import tell_what_is_ahead
 from potr_cl.cli.guard import read_file
+from potr_cl.cli.ladder import encode_ladder
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option
 from potr_cl.cli.outputs import WrittenPage, WrittenPotr, place, writing
 from potr_cl.cli.parser import whole_number
@@ -90,6 +91,9 @@ def _encode(args: argparse.Namespace) -> None:
     check_photographs_have_cameras(options, args.cameras is not None)
     if args.report is None and args.report_view is not None:
         raise UsageError("--report-view needs --report, the page that shows it")
+    if args.ladder is not None:
+        encode_ladder(args, options)
+        return
     works = jobs(args, WrittenPotr, ".potr")
     if args.report is not None and len(works) > 1:
         raise UsageError("--report is about one scene: encode one at a time")
@@ -242,6 +246,12 @@ def add_encode(commands: Commands) -> None:
         metavar="DB",
         help="find the quality that just reaches this mean PSNR against the uncompressed scene, on the views that the "
         "result is judged by",
+    )
+    goal.add_argument(
+        "--ladder",
+        metavar="Q,Q,…",
+        help="a file for each of these qualities, 0.1,0.3,0.5, and a ladder.json with their sizes and PSNR, into the "
+        "folder -o: the command view has a slider to choose among them by eye",
     )
     p.add_argument(
         "--preset",

@@ -19,7 +19,7 @@ from potr_cl.model.scene import Scene
 
 FROM_HELP = 'the format that "-", standard input, brings: .ply, .spz …; default: what its content says'
 TO_HELP = "the format to write where no name says it, .ply, .spz …"
-_ANTIALIASED = {"yes": True, "no": False, "auto": None}
+ANTIALIASED = {"yes": True, "no": False, "auto": None}
 
 
 def add_trust_option(p: argparse._ActionsContainer) -> None:
@@ -40,7 +40,7 @@ def add_antialiased_option(p: argparse._ActionsContainer) -> None:
     """``--antialiased``, for every command that renders, encodes or writes the scenes that it reads."""
     p.add_argument(
         "--antialiased",
-        choices=tuple(_ANTIALIASED),
+        choices=tuple(ANTIALIASED),
         default="auto",
         help="whether the scene was trained with antialiasing (gsplat's antialiased mode, Mip-Splatting) and is to be "
         "rendered so; default auto: as its file says, which PLY files of gsplat and nerfstudio do not: give yes",
@@ -59,7 +59,7 @@ def read_scene(args: argparse.Namespace, path: Path) -> Scene:
         As :func:`potr_cl.formats.load_scene`.
     """
     with as_file(path) as file:
-        return load_scene(file, **trust(args), antialiased=_ANTIALIASED[args.antialiased])
+        return load_scene(file, **trust(args), antialiased=ANTIALIASED[args.antialiased])
 
 
 def write_scene(path: Path, scene: Scene, to: str | None = None, version: int | None = None) -> int:
