@@ -21,19 +21,20 @@ FOLDERS: dict[str, set[str]] = {
     "opencl": {"errors", "host"},
     "raster": {"errors", "host", "model", "opencl"},
     "codec": {"errors", "host", "model"},
-    "formats": {"errors", "host", "model", "codec"},
+    "formats": {"plain_text", "errors", "host", "model", "codec"},
     "quality": {"errors", "host", "model", "opencl", "raster", "formats"},
     "stages": {"errors", "host", "model", "opencl", "raster", "codec", "quality"},
     "pipeline": {"errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality"},
     "report": {"plain_text", "errors", "host", "model", "opencl", "codec", "formats", "quality", "pipeline"},
+    "viewer": {"plain_text", "errors", "host", "model", "opencl", "raster", "formats", "quality", "report"},
     "reference": {"errors", "model", "opencl", "raster", "stages"},
     "api": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality",
-        "pipeline", "report",
+        "pipeline", "report", "viewer",
     },
     "cli": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality",
-        "pipeline", "report", "api",
+        "pipeline", "report", "viewer", "api",
     },
 }  # fmt: skip
 #: They offer the whole package under short names, and start it.

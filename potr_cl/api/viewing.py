@@ -76,9 +76,11 @@ def view(
         DataError: a file is damaged.
         DeviceError: there is no device.
     """
-    from potr_cl.viewer.server import Viewer
+    from potr_cl.viewer.server import Viewer, check_address, check_viser
     from potr_cl.viewer.session import Exhibit
 
+    check_viser()
+    check_address(host, port)
     colour, wanted = colour_of(background), rules_of(rules)
     if truth is not None and cameras is None:
         raise UsageError("--truth needs --cameras, the views that the photographs show")

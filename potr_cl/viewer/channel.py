@@ -4,7 +4,8 @@ views, dropped files.
 A connection is a tab's second one. It names the tab by a key that viser's page of that tab was given, and speaks JSON:
 
 - from the page: ``{"divider": 0.4}``, ``{"swap": true}``, ``{"fly": 3}``, ``{"rung": 2}``, ``{"mode": "heat map"}``,
-  and ``{"file": {"name", "size", "as"}}``, after which the file follows as binary messages;
+  ``{"cameras": true}`` to show or hide them, and ``{"file": {"name", "size", "as"}}``, after which the file follows
+  as binary messages;
 - to the page: ``{"state": {…}}`` and ``{"upload": {…}}``.
 """
 
@@ -47,6 +48,9 @@ class Tab(Protocol):
 
     def choose_mode(self, mode: str) -> None:
         """A key chose how to compare."""
+
+    def toggle_cameras(self) -> None:
+        """A key shows or hides the cameras."""
 
     def dropped(self, which: Which, exhibit: Exhibit) -> None:
         """A scene was dropped on the page."""
@@ -178,5 +182,7 @@ def _obey(tab: Tab, content: dict[str, Any]) -> None:
         tab.choose_mode(content["mode"])
     if isinstance(view, int) and not isinstance(view, bool):
         tab.fly(view)
+    if content.get("cameras") is True:
+        tab.toggle_cameras()
     if isinstance(content.get("rung"), int) and not isinstance(content["rung"], bool):
         tab.climb(content["rung"])

@@ -33,6 +33,7 @@ def add_frusta(scene: Any, cameras: Sequence[Camera], click: Callable[[int], Non
     step = max(len(cameras) / MOST_FRUSTA, 1.0)
     for number in (int(place * step) for place in range(min(len(cameras), MOST_FRUSTA))):
         camera = cameras[number]
+        colour = rgb(TEST_VIEW if camera.split == "test" else TRAINING_VIEW)
         # The names of views were chosen by whoever wrote the cameras; those of nodes are ours.
         handle = scene.add_camera_frustum(
             f"/views/{number}",
@@ -41,13 +42,23 @@ def add_frusta(scene: Any, cameras: Sequence[Camera], click: Callable[[int], Non
             scale=size,
             thickness=1.5,
             thickness_units="screen",
-            color=rgb(TEST_VIEW if camera.split == "test" else TRAINING_VIEW),
+            color=colour,
             wxyz=transforms.SO3.from_matrix(camera.rotation.T).wxyz,
             position=camera.centre,
             cast_shadow=False,
             receive_shadow=False,
         )
-        handle.on_click(lambda _, number=number: click(number))
+        # A line is hard to hit: the tip has a ball.
+        ball = scene.add_icosphere(
+            f"/views/{number}/tip",
+            radius=size / 5,
+            color=colour,
+            subdivisions=1,
+            cast_shadow=False,
+            receive_shadow=False,
+        )
+        for each in (handle, ball):
+            each.on_click(lambda _, number=number: click(number))
         handles[number] = handle
     return handles
 

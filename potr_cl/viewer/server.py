@@ -66,7 +66,7 @@ class Viewer:
         url: where the page is.
 
     Raises:
-        UsageError: the extra ``view`` is missing, or the port is taken.
+        UsageError: the address cannot be listened on.
     """
 
     def __init__(
@@ -113,11 +113,9 @@ class Viewer:
             self.climb(self._rung)
 
     def _started(self, host: str, port: int) -> Any:
-        try:
-            import viser
-        except ImportError:
-            raise UsageError(f"the viewer needs viser: {install_command('view')}") from None
-        _refuse_taken(host, port)
+        import viser
+
+        check_address(host, port)
         channel = Channel(self._tab_of, self._readers, self._antialiased)
         door = Door(host, page.assets(), page.head(), {page.CHANNEL: channel.serve})
         with door.guarding(), _silent():
@@ -296,12 +294,15 @@ class Viewer:
             elif loss is not None and loss.psnr is not None:
                 text = decibels(loss.psnr)
             rows.append({"n": number, "name": plain(camera.name), "test": camera.split == "test", "text": text})
-        mean, known = losses.mean(), sum(losses.of(n) is not None for n in range(len(losses.views)))
-        note = f"{len(rows)} views"
-        if known:
-            note = "views, the worst first" + (f"; mean {decibels(mean)}" if mean is not None else "")
+        found = [loss for loss in map(losses.of, range(len(rows))) if loss is not None]
+        note, mean = f"{len(rows)} views", losses.mean()
+        if found:
+            by_photograph = any(loss.photograph_a is not None and loss.photograph_b is not None for loss in found)
+            note = "views, worst first: " + ("B against A on the photograph" if by_photograph else "PSNR")
+            if mean is not None:
+                note += f"; mean PSNR {decibels(mean)}"
             if not losses.is_complete:
-                note += f" of {known} so far"
+                note += f"; {len(found)} judged so far"
         if losses.trouble:
             note += f"; {plain(losses.trouble)}"
         return {"views": rows, "viewsNote": note}
@@ -380,8 +381,20 @@ def _taken(port: int) -> str:
     return f"--port {port} is taken by another program: give another one, or 0 for any that is free"
 
 
-def _refuse_taken(host: str, port: int) -> None:
-    """viser would take the next free port instead, in silence.
+def check_viser() -> None:
+    """Refuse to begin without the extra ``view``.
+
+    Raises:
+        UsageError: viser is missing.
+    """
+    try:
+        import viser  # noqa: F401
+    except ImportError:
+        raise UsageError(f"the viewer needs viser: {install_command('view')}") from None
+
+
+def check_address(host: str, port: int) -> None:
+    """Refuse an address that cannot be listened on: viser would take the next free port instead, in silence.
 
     Raises:
         UsageError: there is no such address here, or the port is taken or out of range.

@@ -98,7 +98,10 @@ class TabHandle:
             "photograph", 0.0, 1.0, 0.01, 0.0, order=6, hint="how much of the photograph shows over the picture"
         )
         self._photograph.on_update(lambda event: self._fade(event))
-        self._shows_frusta = gui.add_checkbox("cameras", bool(self._cameras), order=7, visible=bool(self._cameras))
+        # Off at first: they would hide what is to be compared.
+        self._shows_frusta = gui.add_checkbox(
+            "cameras", False, order=7, visible=bool(self._cameras), hint="key C; a click on one flies there"
+        )
         self._shows_frusta.on_update(lambda _: self._arrange())
         gui.add_html(_box("views"), order=8)
 
@@ -112,6 +115,10 @@ class TabHandle:
         self.visitor.swapped = swapped
         self._house.painter.wake(self.visitor, look=self.visitor.mode in ("A", "B"))
         self.restate(everything=False)
+
+    def toggle_cameras(self) -> None:
+        self._shows_frusta.value = not self._shows_frusta.value
+        self._arrange()
 
     def choose_mode(self, mode: str) -> None:
         chosen = next((each for each in MODES if each == mode), None)

@@ -221,6 +221,7 @@
   addEventListener("keydown", event => {
     if (event.ctrlKey || event.metaKey || event.altKey || typing(event.target)) return;
     if (event.key === "f" || event.key === "F") flick(true);
+    else if ((event.key === "c" || event.key === "C") && !event.repeat) say({ cameras: true });
     else if (modes[event.key] && !event.repeat) say({ mode: modes[event.key] });
   });
   addEventListener("keyup", event => { if (event.key === "f" || event.key === "F") flick(false); });
