@@ -4,6 +4,7 @@ The public interface in short; everything else has its module. What the command 
 do with the same options (docs/python.md has examples):
 
 - :func:`encode`, :func:`decode`: to a .potr file and back; :class:`EncodeOptions`, all options of an encode at once;
+- :func:`decode_to_device`: a .potr file in the memory of an OpenCL device, for a renderer that runs there;
 - :func:`prune`, :func:`compact`, :func:`refit`: one stage alone, from a scene to a scene;
 - :func:`render`, :func:`compare`: pictures of a scene, and one scene judged by another's;
 - :func:`read_scene`, :func:`read_cameras`, :func:`save`, :func:`convert`, :func:`info`: files, of all formats;
@@ -28,7 +29,8 @@ if TYPE_CHECKING:
     from potr_cl.api.describing import SceneInfo, info
     from potr_cl.api.editing import CompactedScene, PrunedScene, RefittedScene, compact, prune, refit
     from potr_cl.api.encoding import encode
-    from potr_cl.api.files import convert, decode, save
+    from potr_cl.api.files import convert, decode, decode_to_device, save
+    from potr_cl.api.fitting import FittedScene, fit
     from potr_cl.api.ladder import encode_ladder
     from potr_cl.api.pictures import Rendering, Renderings, preview, render
     from potr_cl.api.viewing import view
@@ -53,6 +55,7 @@ __all__ = [
     "DeviceMemoryError",
     "EncodeOptions",
     "Encoded",
+    "FittedScene",
     "PotrError",
     "PrunedScene",
     "RefittedScene",
@@ -69,9 +72,11 @@ __all__ = [
     "compare",
     "convert",
     "decode",
+    "decode_to_device",
     "encode",
     "encode_ladder",
     "encode_to_target",
+    "fit",
     "info",
     "load_cameras",
     "load_scene",
@@ -97,6 +102,7 @@ _HOMES = {
     "DeviceMemoryError": "errors",
     "EncodeOptions": "pipeline.options",
     "Encoded": "pipeline.encode",
+    "FittedScene": "api.fitting",
     "PotrError": "errors",
     "PrunedScene": "api.editing",
     "RefittedScene": "api.editing",
@@ -112,9 +118,11 @@ _HOMES = {
     "compare": "api.comparing",
     "convert": "api.files",
     "decode": "api.files",
+    "decode_to_device": "api.files",
     "encode": "api.encoding",
     "encode_ladder": "api.ladder",
     "encode_to_target": "pipeline.search",
+    "fit": "api.fitting",
     "info": "api.describing",
     "load_cameras": "formats",
     "load_scene": "formats",

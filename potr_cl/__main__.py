@@ -1,6 +1,7 @@
 """The program: ``python -m potr_cl`` and the script ``potr-cl``."""
 
 # Few imports: until the first lines of main have run, Ctrl-C ends in a traceback.
+import os
 import sys
 
 
@@ -15,10 +16,16 @@ def main() -> int:
 
     end_cleanly_on_signals()
     open_standard_files()
+    # NumPy's library for matrices starts a thread a processor, which wait for work at full speed. There is little of it
+    # here, and others need the processors.
+    os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
     from potr_cl.cli import main as run
+    from potr_cl.host.ending import end_at_once
 
-    return run()
+    code = run()
+    end_at_once(code)
+    return code
 
 
 if __name__ == "__main__":

@@ -18,6 +18,7 @@ from potr_cl.api.inputs import (
     chosen_views,
     colour_of,
     device_of,
+    drawable_of,
     name_of,
     rules_of,
     scene_of,
@@ -28,7 +29,6 @@ from potr_cl.errors import UsageError
 from potr_cl.formats.images import Colour, write_png
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera, within_photographs
-from potr_cl.model.scene import Scene
 from potr_cl.plain_text import plain
 from potr_cl.quality.compare import (
     Comparison,
@@ -46,6 +46,7 @@ from potr_cl.quality.compare import compare as compare_pictures
 from potr_cl.quality.metrics import Lpips
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RULES, RasterRules
+from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.labels import U8, comparison_picture, shrunk
 
 if TYPE_CHECKING:
@@ -202,26 +203,32 @@ def compare(
         points.refuse_with_cameras()
     elif truth is not None:
         raise UsageError("--truth needs --cameras, the views that the photographs show")
-    scene_a = scene_of(a, trust, antialiased)
-    there = given or points.placed(scene_a)
-    scene_b = scene_of(b, trust, antialiased)
-    comparison = compare_scenes(
-        (named(a, scene_a), scene_a),
-        (named(b, scene_b), scene_b),
-        chosen_views(there, views, split),
-        device=device,
-        rules=wanted,
-        background=colour,
-        truth=None if truth is None else Path(truth),
-        progress=progress,
-        notes=[] if given else [f"no cameras: {told(there)}"],
-    )
+    # Views are placed around a scene on the host.
+    source_a = a if given is not None else scene_of(a, trust, antialiased)
+    there = given or points.placed(scene_of(source_a))
+    chosen = chosen_views(there, views, split)
+    opened = device_of(device)
+    with (
+        drawable_of(source_a, opened, trust, antialiased) as scene_a,
+        drawable_of(b, opened, trust, antialiased) as scene_b,
+    ):
+        comparison = compare_scenes(
+            (named(a, scene_a), scene_a),
+            (named(b, scene_b), scene_b),
+            chosen,
+            device=opened,
+            rules=wanted,
+            background=colour,
+            truth=None if truth is None else Path(truth),
+            progress=progress,
+            notes=[] if given else [f"no cameras: {told(there)}"],
+        )
     if output is not None:
         comparison.save(output)
     return comparison
 
 
-def named(source: SceneSource, scene: Scene) -> SceneFile:
+def named(source: SceneSource, scene: Drawable) -> SceneFile:
     """The facts of a scene; one that comes from no file counts with the bytes of its arrays."""
     nbytes = bytes_of_source(source)
     nbytes = scene.nbytes if nbytes is None else nbytes
@@ -229,8 +236,8 @@ def named(source: SceneSource, scene: Scene) -> SceneFile:
 
 
 def compare_scenes(
-    a: tuple[SceneFile, Scene],
-    b: tuple[SceneFile, Scene],
+    a: tuple[SceneFile, Drawable],
+    b: tuple[SceneFile, Drawable],
     views: Sequence[Camera],
     *,
     device: DeviceSource,

@@ -22,18 +22,18 @@ from potr_cl.api.inputs import (
     name_of,
     scene_of,
 )
-from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.quantize import Preset
-from potr_cl.errors import DataError, PotrError, UsageError
+from potr_cl.errors import UsageError
 from potr_cl.formats.images import Colour
-from potr_cl.formats.registry import refuse_other_than_potr
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.output import Output
+from potr_cl.outputs.registry import OUTPUTS, output_of, output_of_suffix
 from potr_cl.pipeline.amounts import as_bytes, size_in_bytes
-from potr_cl.pipeline.encode import Encoded, Stopwatch
+from potr_cl.pipeline.encode import Encoded, Stopwatch, proved
 from potr_cl.pipeline.encode import encode as run_stages
 from potr_cl.pipeline.keywords import stage_changes
 from potr_cl.pipeline.options import EncodeOptions
@@ -42,10 +42,13 @@ from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Found, Target
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth, judge_by_photographs
+from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.html import PicturePair, html_report, views_to_show
 from potr_cl.report.summary import encode_report, photographs_report, quality_report, search_report
+from potr_cl.stages.code import Code
 from potr_cl.stages.refit import Refit
-from potr_cl.stages.stage import Progress, Stage
+from potr_cl.stages.stage import Progress, Stage, flags
 
 
 def encode(
@@ -61,6 +64,8 @@ def encode(
     min_psnr: float | None = None,
     virtual_views: int | None = None,
     output: str | os.PathLike[str] | None = None,
+    to: str | None = None,
+    spz_version: int | None = None,
     report: str | os.PathLike[str] | None = None,
     report_view: str | None = None,
     background: ColourSource | None = None,
@@ -88,7 +93,10 @@ def encode(
         max_size: find the quality that fills this size: bytes, or a text such as "8MB".
         min_psnr: find the quality that just reaches this PSNR in decibels against the uncompressed scene.
         virtual_views: how many views to place without cameras.
-        output: a .potr file to write; an existing one is only replaced by what a decoder takes.
+        output: a file to write; its suffixes tell the kind, .potr or a format that viewers open (docs/formats.md). An
+            existing one is only replaced by what a decoder takes.
+        to: the suffix of the kind of file, ".spz", where there is no ``output`` to tell it; .potr by default.
+        spz_version: of an .spz file, 2, 3 or 4.
         report: a page of HTML to write: sizes, quality by view, pictures before and after, and the course of pruning.
         report_view: a view to show there besides the worst and the median one.
         background: R, G, B from 0 to 1, or a colour's name; black by default.
@@ -108,13 +116,12 @@ def encode(
         DeviceError: no device does the work.
     """
     began = time.perf_counter()
+    kind = output_choice(output, to, version=spz_version)
     settings = encode_options(
-        options, preset, choices, q=q, background=background, memory=memory, threads=threads,
+        options, preset, choices, output=kind, q=q, background=background, memory=memory, threads=threads,
         source_bytes=bytes_of_source(scene), cameras_anyway=cameras_anyway,
     )  # fmt: skip
     target = encode_target(q, max_size, min_psnr)
-    if output is not None:
-        refuse_other_than_potr(Path(output))
     check_photographs_have_cameras(settings, cameras is not None)
     if report is None and report_view is not None:
         raise UsageError("report_view needs report, the page that shows it")
@@ -132,14 +139,19 @@ def encode(
         file = stack.enter_context(replacing(output)) if output is not None else None
         page = stack.enter_context(replacing(report)) if report is not None else None
         found: Found | None = None
+        kept: KeptScene | None = None
         if target is None:
-            encoded = run_stages(what, views, settings, progress, opened)
+            if judging is not None and opened is not None:
+                kept = stack.enter_context(KeptScene(opened, what))
+            encoded = run_stages(what, views, settings, progress, opened, kept=kept)
         else:
             found = encode_to_target(what, views, target, settings, progress, opened, tell)
             encoded = found.encoded
         if file is None and page is None:
             return encoded
-        written, candidate = proved(encoded, trust)
+        judged_on = None if judging is None else encoded.device or opened
+        written = stack.enter_context(proved(encoded, trust, judged_on))
+        candidate = written.scene
         if file is not None:
             file.write(written.data)
         if page is not None:
@@ -156,7 +168,7 @@ def encode(
                     photographs = by_photographs(
                         ground_truth, views, encoded, (what, candidate), used_device, encoded.options.background
                     )
-                judge = Judge(judging, used_device, encoded.options.background, ground_truth)
+                judge = Judge(judging, used_device, encoded.options.background, ground_truth, kept)
                 quality, pictures = judge(what, candidate, watch, report_view, pictures=True)
             seconds = encoded.seconds | watch.seconds | {"total": time.perf_counter() - began}
             source = name_of(scene)
@@ -181,6 +193,7 @@ def encode_options(
     threads: int | None = None,
     source_bytes: int | None = None,
     cameras_anyway: bool | None = None,
+    output: Output | None = None,
     stages: Collection[type[Stage]] | None = None,
 ) -> EncodeOptions:
     """The options that keywords ask for, checked.
@@ -190,6 +203,7 @@ def encode_options(
         choices: of stages, see :func:`potr_cl.pipeline.keywords.stage_changes`.
         stages: of which choices are allowed; None: of all.
         memory: in GiB.
+        output: the kind of file.
 
     Raises:
         UsageError: an option is unknown or out of range, or both options and a preset are given.
@@ -203,6 +217,7 @@ def encode_options(
         "threads": threads,
         "source_bytes": source_bytes,
         "cameras_anyway": cameras_anyway,
+        "output": output,
     }
     changes = {name: value for name, value in changes.items() if value is not None} | stage_changes(choices, stages)
     if options is None:
@@ -212,7 +227,42 @@ def encode_options(
     else:
         options = options.changed(**changes)
     _ = options.parameters  # a wrong option is told before a gigabyte is read
+    check_choices(options)
     return options
+
+
+def output_choice(path: str | os.PathLike[str] | None, to: str | None, **choices: Any) -> Output | None:
+    """The kind of file that a name or a suffix asks for; None if nothing does.
+
+    Args:
+        path: of the file to write.
+        to: a suffix, where there is no path.
+        choices: that some outputs have; None where they are not given.
+
+    Raises:
+        UsageError: encode does not write such files, or they leave no such choice.
+    """
+    if path is not None:
+        if to is not None:
+            raise UsageError(f"'{path}' tells its format itself: leave out 'to'")
+        return output_of(Path(path), **choices)
+    given = any(choice is not None for choice in choices.values())
+    return output_of_suffix(to or OUTPUTS[0].suffixes()[0], **choices) if to is not None or given else None
+
+
+def check_choices(options: EncodeOptions) -> None:
+    """Refuse options of the coder that mean nothing for the kind of file that is asked for.
+
+    Raises:
+        UsageError: there are such.
+    """
+    usual, code = EncodeOptions(preset=options.preset).stage(Code), options.stage(Code)
+    for name, flag in flags(Code).items():
+        if getattr(code, name) != getattr(usual, name) and name not in options.output.choices:
+            kind = options.output
+            raise UsageError(
+                f"{flag.flag} means nothing for {kind.suffix} files: {kind.format.name} packs in its own way"
+            )
 
 
 def encode_target(q: float | None, max_size: int | str | None, min_psnr: float | None) -> Target | None:
@@ -239,27 +289,11 @@ def check_photographs_have_cameras(options: EncodeOptions, cameras: bool) -> Non
         raise UsageError("--photos needs --cameras, the views that the photographs show, and a re-fit")
 
 
-def proved(encoded: Encoded, trust: bool = False) -> tuple[PotrFile, Scene]:
-    """The file that was made and the scene that a decoder makes of it.
-
-    Raises:
-        PotrError: no decoder takes it.
-    """
-    try:
-        file = PotrFile.from_bytes(encoded.data, **({"trust": True} if trust else {}))
-        return file, file.scene()
-    except DataError as error:
-        raise PotrError(
-            f"the encoded file cannot be decoded ({error}): nothing was written. If the scene has splats that are very "
-            "far away or very large, leave them out"
-        ) from error
-
-
 def by_photographs(
     ground_truth: GroundTruth,
     cameras: Sequence[Camera],
     encoded: Encoded,
-    scenes: tuple[Scene, Scene],
+    scenes: tuple[Scene, Drawable],
     device: Device,
     background: Colour,
 ) -> dict[str, Any]:
@@ -277,21 +311,23 @@ class Judge:
         device: to render on.
         background: behind the scene.
         ground_truth: photographs to show beside the pictures, if there are any.
+        kept: the uncompressed scene, if it lies on the device already.
     """
 
     views: EvaluationViews
     device: Device
     background: Colour
     ground_truth: GroundTruth | None = None
+    kept: KeptScene | None = None
 
     def __call__(
-        self, scene: Scene, candidate: Scene, watch: Stopwatch, chosen: str | None = None, pictures: bool = False
+        self, scene: Scene, candidate: Drawable, watch: Stopwatch, chosen: str | None = None, pictures: bool = False
     ) -> tuple[dict[str, Any], list[PicturePair]]:
         """The figures, and pictures for a report.
 
         Args:
             scene: uncompressed.
-            candidate: as a decoder sees it.
+            candidate: as a decoder sees it; where it is on a device, that is the judge's.
             watch: told how far the stage "evaluate" is.
             chosen: a view to show besides the worst and the median one.
             pictures: whether to make any.
@@ -300,7 +336,8 @@ class Judge:
             DeviceError: a view does not fit the device, or the device failed.
         """
         watch("evaluate", 0.0)
-        with Evaluator(self.device, scene, self.views, self.background) as evaluator:
+        original = scene if self.kept is None else self.kept.drawable(self.device, scene)
+        with Evaluator(self.device, original, self.views, self.background) as evaluator:
             quality = quality_report(self.views, evaluator.compare(candidate, lambda _, done: watch("evaluate", done)))
             shown = views_to_show(quality, chosen) if pictures else []
             pairs = evaluator.pictures(candidate, [view["name"] for _, view in shown])

@@ -1,4 +1,4 @@
-"""Files of scenes: :func:`save`, :func:`convert` and :func:`decode`.
+"""Files of scenes: :func:`save`, :func:`convert`, :func:`decode` and :func:`decode_to_device`.
 
 To decode takes less time than to import what other functions need, so little is imported here.
 """
@@ -9,21 +9,30 @@ import os
 from pathlib import Path
 from typing import TYPE_CHECKING, Any
 
-from potr_cl.api.inputs import SceneSource, encoded_bytes, scene_of
+from potr_cl.api.inputs import (
+    DeviceSource,
+    SceneSource,
+    device_of,
+    encoded_bytes,
+    encoded_file,
+    on_device,
+    scene_of,
+)
 from potr_cl.codec.decoder import decode as decode_file
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import Scene
 
 if TYPE_CHECKING:
     from potr_cl.pipeline.encode import Encoded
+    from potr_cl.raster.scene_buffers import SceneBuffers
 
 
 def save(scene: SceneSource, path: str | os.PathLike[str]) -> None:
     """Write a scene in the format that the suffixes of ``path`` tell; the file appears only when it is whole.
 
     Args:
-        scene: to write. The result of :func:`potr_cl.encode` is written as it is to a .potr file, and decoded for any
-            other format.
+        scene: to write. The result of :func:`potr_cl.encode` is written as it is to a file of its own kind, and decoded
+            for any other format.
         path: of the file.
 
     Raises:
@@ -31,11 +40,12 @@ def save(scene: SceneSource, path: str | os.PathLike[str]) -> None:
         PotrError: the format cannot hold the scene, or the system failed to write.
     """
     from potr_cl.formats import scene_writer
+    from potr_cl.formats.registry import suffix_of_name
 
-    data = encoded_bytes(scene)
-    if data is not None and Path(path).suffix.lower() == ".potr":
+    encoded = encoded_file(scene)
+    if encoded is not None and suffix_of_name(Path(path)) == encoded[0]:
         with replacing(path) as file:
-            file.write(data)
+            file.write(encoded[1])
         return
     write = scene_writer(path)  # a wrong name is told before anything is read
     write(scene_of(scene))
@@ -101,3 +111,36 @@ def decode(
     if write is not None:
         write(scene)
     return scene
+
+
+def decode_to_device(
+    file: str | os.PathLike[str] | bytes | Encoded,
+    device: DeviceSource = None,
+    *,
+    trust: bool = False,
+    sh_degree: int | None = None,
+    antialiased: bool | None = None,
+    threads: int = 0,
+) -> SceneBuffers:
+    """Decode a .potr file into the memory of an OpenCL device, for a renderer that runs there.
+
+    The integers of the file are uploaded as they are and become values on the device, in the layout and with the bits
+    that :class:`potr_cl.raster.rasterizer.Rasterizer` has after it has uploaded the scene that :func:`decode` makes.
+
+    Args:
+        file: its path, its bytes, or the result of :func:`potr_cl.encode`.
+        device: to hold the scene, or what it is called; the one that should be fastest by default.
+        trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
+        sh_degree: leave out SH coefficients of higher degrees, without decoding them; None: none.
+        antialiased: whether to take it as an antialiased scene; None: as the file says.
+        threads: for the host's part; 0: one a processor.
+
+    Returns:
+        The scene, finished; give its memory back with ``close`` or by ``with``.
+
+    Raises:
+        UsageError: the path cannot be read, or there is no such degree.
+        DataError: not a .potr file, a damaged one, or too many splats for its size.
+        DeviceError: the scene does not fit the device, or the device failed.
+    """
+    return on_device(file, device_of(device), trust, sh_degree, antialiased, threads)

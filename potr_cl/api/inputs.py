@@ -3,12 +3,15 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
-from potr_cl.codec.decoder import decode
-from potr_cl.errors import UsageError
+from potr_cl.codec.container import MAGIC
+from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.codec.destination import Destination
+from potr_cl.errors import DataError, UsageError
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene
 
@@ -20,6 +23,7 @@ if TYPE_CHECKING:
     from potr_cl.opencl.discovery import DeviceInfo
     from potr_cl.pipeline.encode import Encoded
     from potr_cl.raster.rules import RasterRules
+    from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 
 #: A scene, or what one is taken from: a path of any format that is read, the result of a stage or of an encode, or a
 #: .potr file's bytes.
@@ -57,13 +61,109 @@ def scene_of(source: SceneSource, trust: bool = False, antialiased: bool | None 
     raise UsageError(f"a scene is wanted, or the path of its file, not {type(source).__name__}")
 
 
+@contextmanager
+def drawable_of(
+    source: SceneSource, device: Device, trust: bool = False, antialiased: bool | None = None
+) -> Iterator[Drawable]:
+    """The scene that a source stands for, to be rendered on a device as long as the context lasts.
+
+    A .potr file is decoded into the device's memory, with no scene on the host.
+
+    Raises:
+        As :func:`scene_of`.
+        DeviceError: the scene does not fit the device.
+    """
+    if not _is_potr(source):
+        yield scene_of(source, trust, antialiased)
+        return
+    with on_device(source, device, trust, antialiased=antialiased) as buffers:  # type: ignore[arg-type]
+        yield buffers
+
+
+@contextmanager
+def drawable_to_judge(
+    source: SceneSource, device: Device, trust: bool = False, antialiased: bool | None = None
+) -> Iterator[tuple[Drawable, Scene]]:
+    """As :func:`drawable_of`, and a scene on the host by which cameras are judged as by the whole one.
+
+    See :func:`potr_cl.model.agreement.judge_cameras`.
+    """
+    if not _is_potr(source):
+        scene = scene_of(source, trust, antialiased)
+        yield scene, scene
+        return
+    from potr_cl.codec.sampled import Sampled
+    from potr_cl.model.sightings import looked_at
+
+    samples: list[Sampled] = []
+
+    def sampled(file: PotrFile) -> Sampled:
+        rows = looked_at(file.header.splats)
+        samples.append(Sampled(file.header, file.rules, file.sh_count(), rows))
+        return samples[0]
+
+    with on_device(source, device, trust, antialiased=antialiased, beside=sampled) as buffers:  # type: ignore[arg-type]
+        yield buffers, samples[0].scene
+
+
+def _is_potr(source: SceneSource) -> bool:
+    if encoded_bytes(source) is not None:
+        return True
+    return isinstance(source, (str, os.PathLike)) and _holds_potr(Path(source))
+
+
+def on_device(
+    source: str | os.PathLike[str] | bytes | Encoded,
+    device: Device,
+    trust: bool = False,
+    sh_degree: int | None = None,
+    antialiased: bool | None = None,
+    threads: int = 0,
+    beside: Callable[[PotrFile], Destination] | None = None,
+) -> SceneBuffers:
+    """The .potr file that a path, bytes or the result of an encode stand for, decoded into a device's memory.
+
+    Args:
+        beside: makes what takes the same splats of the opened file.
+        source, device, trust, sh_degree, antialiased, threads: as of :func:`potr_cl.decode_to_device`.
+
+    Raises:
+        As :func:`potr_cl.decode_to_device`.
+    """
+    from potr_cl.ondevice.decode import decode_to_device
+
+    def decoded(file: PotrFile) -> SceneBuffers:
+        also = None if beside is None else beside(file)
+        return decode_to_device(file, device, sh_degree, antialiased, threads, also)
+
+    data = encoded_bytes(source)
+    if data is not None:
+        return decoded(PotrFile.from_bytes(data, trust))
+    if not isinstance(source, (str, os.PathLike)):
+        raise UsageError(f"a .potr file is wanted, its bytes or an encode to one, not {type(source).__name__}")
+    path = os.fspath(source)
+    try:
+        return decoded(PotrFile.open(path, trust))
+    except DataError as error:
+        raise error if path in str(error) else DataError(f"'{path}': {error}") from None
+
+
 def encoded_bytes(source: object) -> bytes | None:
-    """The bytes of a .potr file, of such bytes or of the result of an encode; None for anything else."""
+    """The bytes of a .potr file, of such bytes or of the result of an encode to one; None for anything else."""
+    found = encoded_file(source)
+    return found[1] if found is not None and found[0] == ".potr" else None
+
+
+def encoded_file(source: object) -> tuple[str, bytes] | None:
+    """The usual suffix and the bytes of what an encode has made, or of a .potr file's bytes; None for anything else."""
     if isinstance(source, bytes):
-        return source
+        return ".potr", source
     # Asked by name: what makes an encode's result takes long to import, and is there if there is one.
     pieces = getattr(source, "pieces", None)
-    return b"".join(pieces) if isinstance(pieces, list) else None
+    if not isinstance(pieces, list):
+        return None
+    options = getattr(source, "options", None)
+    return ".potr" if options is None else options.output.suffix, b"".join(pieces)
 
 
 def cameras_of(source: CamerasSource | None) -> list[Camera] | None:
@@ -126,9 +226,9 @@ def bytes_of_source(source: SceneSource) -> int | None:
     """Bytes of the file that a scene comes from, or of all its files (:mod:`potr_cl.formats.scene_size`); None where it
     comes from none, or whoever reads it will say so.
     """
-    data = encoded_bytes(source)
-    if data is not None:
-        return len(data)
+    encoded = encoded_file(source)
+    if encoded is not None:
+        return len(encoded[1])
     if not isinstance(source, (str, os.PathLike)):
         return None
     from potr_cl.formats.scene_size import bytes_of_scene
@@ -140,7 +240,7 @@ def name_of(source: SceneSource) -> Path:
     """What a scene is called in results: its path, or what it is."""
     if isinstance(source, (str, os.PathLike)):
         return Path(source)
-    return Path("(encoded)" if encoded_bytes(source) is not None else "(scene in memory)")
+    return Path("(encoded)" if encoded_file(source) is not None else "(scene in memory)")
 
 
 def chosen_views(
@@ -177,6 +277,17 @@ def chosen_views(
     if split == "test" and not tests:
         raise UsageError("none of the cameras is a test view: use --split all, or name views with --views")
     return tests or list(cameras)
+
+
+def _holds_potr(path: Path) -> bool:
+    """Whether a path is that of a .potr file, whatever it is called; whoever reads it will say what else is wrong."""
+    try:
+        if not path.is_file():  # a pipe can be read only once
+            return False
+        with path.open("rb") as file:
+            return file.read(len(MAGIC)) == MAGIC
+    except (OSError, ValueError):
+        return False
 
 
 def _trusting(trust: bool) -> dict[str, Any]:

@@ -7,7 +7,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 from typing import Any
 
-from potr_cl.api.encoding import Judge, encode_options, proved, views_or_placed
+from potr_cl.api.encoding import Judge, encode_options, output_choice, views_or_placed
 from potr_cl.api.inputs import (
     CamerasSource,
     ColourSource,
@@ -27,7 +27,7 @@ from potr_cl.host.atomic_write import replacing
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Stopwatch
+from potr_cl.pipeline.encode import Stopwatch, proved
 from potr_cl.pipeline.encode import encode as run_stages
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews
@@ -46,6 +46,8 @@ def encode_ladder(
     *,
     preset: Preset | None = None,
     virtual_views: int | None = None,
+    to: str | None = None,
+    spz_version: int | None = None,
     background: ColourSource | None = None,
     memory: float | None = None,
     threads: int | None = None,
@@ -66,6 +68,7 @@ def encode_ladder(
         ladder: the qualities, 0 to 1: a list, or a text such as "0.1,0.3,0.5".
         cameras, options, progress, device, preset, virtual_views, background, memory, threads, trust, antialiased,
             cameras_anyway, choices: as of :func:`potr_cl.encode`.
+        to, spz_version: the kind of files, as of :func:`potr_cl.encode`.
         tell: told a line about each file that is written.
 
     Raises:
@@ -74,7 +77,8 @@ def encode_ladder(
     """
     steps = qualities(ladder)
     settings = encode_options(
-        options, preset, choices, background=background, memory=memory, threads=threads,
+        options, preset, choices, output=output_choice(None, to, version=spz_version), background=background,
+        memory=memory, threads=threads,
         source_bytes=bytes_of_source(scene), cameras_anyway=cameras_anyway,
     )  # fmt: skip
     given = cameras_of(cameras)
@@ -86,14 +90,20 @@ def encode_ladder(
     return make_ladder(what, name, views, settings, steps, Path(output), opened, progress, tell, trust)
 
 
-def ladder_files(folder: Path, scene: Path, steps: Sequence[float]) -> list[Path]:
+def ladder_files(folder: Path, scene: Path, steps: Sequence[float], suffix: str) -> list[Path]:
     """The files that a ladder consists of: those of the qualities, then the description.
+
+    Args:
+        folder: that they are in.
+        scene: the uncompressed scene's file, which the others are named after.
+        steps: the qualities.
+        suffix: of the kind of file that is encoded to.
 
     Raises:
         UsageError: two qualities would have one file.
     """
     stem = stem_of_scene(scene) if scene.suffix or scene.is_dir() else "scene"
-    names = [f"{stem}_q{q:g}.potr" for q in steps]
+    names = [f"{stem}_q{q:g}{suffix}" for q in steps]
     if len(set(names)) < len(names):
         raise UsageError("--ladder names qualities that are the same to six digits")
     return [folder / name for name in [*names, DESCRIPTION]]
@@ -123,7 +133,7 @@ def make_ladder(
     Raises:
         As :func:`encode_ladder`.
     """
-    files = ladder_files(folder, name, steps)
+    files = ladder_files(folder, name, steps, options.output.suffix)
     try:
         folder.mkdir(parents=True, exist_ok=True)
     except OSError as error:
@@ -132,18 +142,19 @@ def make_ladder(
     rungs = []
     for q, file in zip(steps, files[:-1], strict=True):
         encoded = run_stages(scene, cameras, options.changed(q=q), progress, device)
-        written, candidate = proved(encoded, trust)
-        with replacing(file) as opened:
-            opened.write(written.data)
         psnr = ssim = None
-        if views is not None and device is not None:
-            judge = Judge(views, encoded.device or device, options.background)
-            quality, _ = judge(scene, candidate, Stopwatch(progress))
-            psnr, ssim = quality["psnr"], quality["ssim"]
-        rungs.append(Rung(q, file.name, len(written.data), len(candidate), psnr, ssim))
+        judged_on = None if views is None else encoded.device or device
+        with proved(encoded, trust, judged_on) as written:
+            nbytes, splats = len(written.data), len(written.scene)
+            with replacing(file) as opened:
+                opened.write(written.data)
+            if views is not None and judged_on is not None:
+                quality, _ = Judge(views, judged_on, options.background)(scene, written.scene, Stopwatch(progress))
+                psnr, ssim = quality["psnr"], quality["ssim"]
+        rungs.append(Rung(q, file.name, nbytes, splats, psnr, ssim))
         if tell is not None:
             figure = "" if views is None else f", {decibels(psnr)}"
-            tell(f"{file}: q {q:g}, {len(written.data):,} bytes, {len(candidate):,} splats{figure}")
+            tell(f"{file}: q {q:g}, {nbytes:,} bytes, {splats:,} splats{figure}")
     ladder = Ladder(files[-1], name.name, options.source_bytes, "" if views is None else str(views), tuple(rungs))
     ladder.save()
     return ladder

@@ -18,6 +18,7 @@ from potr_cl.api.inputs import (
     chosen_views,
     colour_of,
     device_of,
+    drawable_of,
     rules_of,
     scene_of,
 )
@@ -205,17 +206,26 @@ def render(
     colour, wanted = colour_of(background), rules_of(rules)
     points = Viewpoints(virtual_views, turntable, up, size)
     if isinstance(cameras, Camera):
-        with Rasterizer(device_of(device), scene_of(scene, trust, antialiased), wanted, colour) as rasterizer:
+        opened = device_of(device)
+        with (
+            drawable_of(scene, opened, trust, antialiased) as drawable,
+            Rasterizer(opened, drawable, wanted, colour) as rasterizer,
+        ):
             return Rendering(*rasterizer.render(cameras))
     given = cameras_of(cameras)
     if given is not None:
         points.refuse_with_cameras()
-    what = scene_of(scene, trust, antialiased)
-    there = given or points.placed(what)
+    # Views are placed around a scene on the host.
+    source = scene if given is not None else scene_of(scene, trust, antialiased)
+    there = given or points.placed(scene_of(source))
     note = "" if given else told(there)
     chosen = chosen_views(there, views, split or (None if views is not None else "all"))
     paths = picture_files(Path(output), chosen) if output is not None else []
-    with Rasterizer(device_of(device), what, wanted, colour) as rasterizer:
+    opened = device_of(device)
+    with (
+        drawable_of(source, opened, trust, antialiased) as drawable,
+        Rasterizer(opened, drawable, wanted, colour) as rasterizer,
+    ):
         pictures = [Rendering(*rasterizer.render(camera)) for camera in chosen]
     result = Renderings(chosen, pictures, note)
     if paths and output is not None:

@@ -27,6 +27,7 @@ COMMANDS = {
     "prune": "edit",
     "compact": "edit",
     "refit": "edit",
+    "fit": "fit",
     "decode": "files",
     "info": "files",
     "convert": "convert",
@@ -36,7 +37,7 @@ COMMANDS = {
     "devices": "devices",
 }
 #: Those that need an OpenCL device.
-_ON_A_DEVICE = {"encode", "prune", "compact", "refit", "render", "compare", "view", "devices"}
+_ON_A_DEVICE = {"encode", "prune", "compact", "refit", "fit", "render", "compare", "view", "devices"}
 #: Set to anything, it has errors that nobody foresaw shown with where they come from.
 TRACEBACK_VARIABLE = "POTR_CL_TRACEBACK"
 

@@ -10,7 +10,7 @@ from collections.abc import Callable, Sequence
 from pathlib import Path
 
 from potr_cl.cli.guard import ReadFile, StandardInput, StandardOutput, WrittenFile, WrittenFolder, check_files
-from potr_cl.cli.outputs import check_file, check_name
+from potr_cl.cli.outputs import check_file, check_name, suffix_of
 from potr_cl.cli.scenes import TO_HELP
 from potr_cl.cli.terminal import note, say_line
 from potr_cl.errors import PotrError, UsageError
@@ -44,7 +44,7 @@ def jobs(args: argparse.Namespace, kind: type[WrittenFile], suffix: str | None) 
     output = args.output
     sources = args.scenes = _expanded(args.scenes)
     to = getattr(args, "to", None)
-    wanted = registry.written_suffix(to) if to is not None else suffix
+    wanted = suffix_of(args) if to is not None else suffix
     if isinstance(output, StandardOutput) and len(sources) > 1:
         raise UsageError(f"standard output takes one scene, not {len(sources)}: give -o a folder")
     if isinstance(output, StandardOutput):

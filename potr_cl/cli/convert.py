@@ -11,6 +11,7 @@ from potr_cl.cli.outputs import WrittenScene, place
 from potr_cl.cli.scenes import (
     add_antialiased_option,
     add_from_option,
+    add_spz_version_option,
     add_trust_option,
     read_scene,
     size_of_file,
@@ -20,7 +21,6 @@ from potr_cl.cli.terminal import say_done
 from potr_cl.errors import UsageError
 from potr_cl.formats import scene_writer
 from potr_cl.formats.registry import extras_needed, suffixes_read, suffixes_written
-from potr_cl.formats.scenes import spz
 
 
 def _arrange(args: argparse.Namespace) -> None:
@@ -67,15 +67,7 @@ def add_convert(commands: Commands) -> None:
     p.add_argument("-o", "--output", type=place, metavar="OUT", help='a file, a folder, or "-" for standard output')
     add_to_option(p)
     add_from_option(p)
-    versions = sorted(spz.FORMAT.versions)
-    p.add_argument(
-        "--spz-version",
-        type=int,
-        choices=versions,
-        metavar="V",
-        help=f"of .spz files: 2, which all readers that were tried take (default), 3 with finer rotations, or "
-        f"{versions[-1]}, smaller and for new readers only",
-    )
+    add_spz_version_option(p)
     add_trust_option(p)
     add_antialiased_option(p)
     p.set_defaults(run=_convert, arrange=_arrange)

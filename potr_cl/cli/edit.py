@@ -63,7 +63,7 @@ def _inputs(args: argparse.Namespace) -> tuple[Scene, list[Camera] | None, Devic
     return read_scene(args, args.scene), cameras, Device(args.device)
 
 
-def _add_output_options(p: argparse.ArgumentParser) -> None:
+def add_output_options(p: argparse.ArgumentParser) -> None:
     p.add_argument(
         "-o",
         "--output",
@@ -80,7 +80,7 @@ def add_prune(commands: Commands) -> None:
     p = commands.add_parser("prune", help="remove the splats that no view misses; nothing else changes")
     p.add_argument("scene", type=read_file, metavar="SCENE", help=f'{suffixes_read()}, or "-" for standard input')
     add_cameras_options(p)
-    _add_output_options(p)
+    add_output_options(p)
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (fewest splats) to 1; default 0.5")
     p.add_argument(
         "--order",
@@ -115,7 +115,7 @@ def add_compact(commands: Commands) -> None:
     p = commands.add_parser("compact", help="make the colours' coefficients sparse; nothing else changes")
     p.add_argument("scene", type=read_file, metavar="SCENE", help=f'{suffixes_read()}, or "-" for standard input')
     add_cameras_options(p)
-    _add_output_options(p)
+    add_output_options(p)
     p.add_argument("-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (sparsest) to 1; default 0.5")
     add_stage_flags(p, [Compact], without=["on", "at"])
     p.add_argument("--sf-sh", type=float, metavar="SF", help="steps a unit of the quantiser to expect")
@@ -195,7 +195,7 @@ def add_refit(commands: Commands) -> None:
     p.add_argument(
         "--photos", type=ReadPhotographs, metavar="DIR", help="photographs, named after the views, to fit instead"
     )
-    _add_output_options(p)
+    add_output_options(p)
     p.add_argument(
         "--steps",
         type=whole_number,

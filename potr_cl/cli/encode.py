@@ -1,4 +1,4 @@
-"""The command encode: a scene to a .potr file."""
+"""The command encode: a scene to a .potr file, or to one that viewers open."""
 
 from __future__ import annotations
 
@@ -15,19 +15,19 @@ from potr_cl.api.encoding import (
     check_photographs_have_cameras,
     encode_options,
     encode_target,
-    proved,
 )
-from potr_cl.cli.batch import for_each_scene, jobs
+from potr_cl.cli.batch import add_to_option, for_each_scene, jobs
 from potr_cl.cli.forecasts import tell_what_is_ahead
-from potr_cl.cli.guard import read_file
+from potr_cl.cli.guard import StandardOutput, read_file
 from potr_cl.cli.ladder import encode_ladder
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option
-from potr_cl.cli.outputs import WrittenPage, WrittenPotr, place, writing
+from potr_cl.cli.outputs import WrittenEncoded, WrittenPage, place, writing
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.scenes import (
     add_antialiased_option,
     add_from_option,
+    add_spz_version_option,
     add_trust_option,
     read_scene,
     size_of_file,
@@ -43,23 +43,41 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, Stopwatch, encode
+from potr_cl.outputs.output import Output
+from potr_cl.outputs.registry import OUTPUTS, encoded_suffix, output_of, output_of_suffix, suffixes_encoded
+from potr_cl.pipeline.encode import Encoded, Stopwatch, check_frame, encode, proved
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT, PRESETS, PURPOSE
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Target
 from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.quality.ground_truth import GroundTruth
+from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.html import PicturePair, html_report
 from potr_cl.report.summary import encode_report, format_encode_report, search_report
 from potr_cl.stages.refit import Refit
 
 
-def _options(args: argparse.Namespace, source_bytes: int | None = None) -> EncodeOptions:
+def _options(args: argparse.Namespace, source_bytes: int | None = None, output: Output | None = None) -> EncodeOptions:
     return encode_options(
-        None, args.preset, stage_choices(args), q=args.quality, background=args.background, memory=args.memory,
-        threads=args.threads, source_bytes=source_bytes, cameras_anyway=args.cameras_anyway,
+        None, args.preset, stage_choices(args), output=output or _output(args), q=args.quality,
+        background=args.background,
+        memory=args.memory, threads=args.threads, source_bytes=source_bytes, cameras_anyway=args.cameras_anyway,
     )  # fmt: skip
+
+
+def _output(args: argparse.Namespace) -> Output:
+    """The kind of file that is made of one scene."""
+    choices = {"version": args.spz_version}
+    if isinstance(args.output, StandardOutput):
+        return output_of_suffix(args.to, **choices)
+    return output_of(args.output, **choices)
+
+
+def _output_of_ladder(args: argparse.Namespace) -> Output:
+    """The kind of file that a ladder has for each quality: what ``-o`` names is a folder."""
+    return output_of_suffix(args.to or OUTPUTS[0].suffixes()[0], version=args.spz_version)
 
 
 def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
@@ -86,19 +104,19 @@ class _Shared:
 
 
 def _encode(args: argparse.Namespace) -> None:
-    options, target = _options(args), encode_target(None, args.max_size, args.min_psnr)
+    if args.ladder is not None:
+        encode_ladder(args, _options(args, output=_output_of_ladder(args)))
+        return
+    works = jobs(args, WrittenEncoded, OUTPUTS[0].suffixes()[0])
+    options, target = _options(works[0]), encode_target(None, args.max_size, args.min_psnr)
     refit = options.stage(Refit)
     check_photographs_have_cameras(options, args.cameras is not None)
     if args.report is None and args.report_view is not None:
         raise UsageError("--report-view needs --report, the page that shows it")
-    if args.ladder is not None:
-        encode_ladder(args, options)
-        return
-    works = jobs(args, WrittenPotr, ".potr")
     if args.report is not None and len(works) > 1:
         raise UsageError("--report is about one scene: encode one at a time")
     with contextlib.ExitStack() as stack:
-        opened = stack.enter_context(thread_pool(1)).submit(Device, args.device) if _looks(args, options) else None
+        opened = stack.enter_context(thread_pool(1)).submit(_opened, args) if _looks(args, options) else None
         cameras = given_cameras(args)
         ground_truth = None
         if refit.ground_truth is not None and cameras is not None:
@@ -110,13 +128,23 @@ def _encode(args: argparse.Namespace) -> None:
         for_each_scene(works, lambda one: _encode_one(one, shared, several=len(works) > 1), args.json)
 
 
+def _opened(args: argparse.Namespace) -> Device:
+    """The device, which begins to load what the last encode with this preset has needed."""
+    device = Device(args.device)
+    device.prepare_for(f"encode {args.preset}")
+    return device
+
+
 def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> None:
     began = time.perf_counter()
     options = _options(args, size_of_file(args.scene))
     target, opened, cameras = shared.target, shared.opened, shared.cameras
     with contextlib.ExitStack() as stack:
         scene = read_scene(args, args.scene)
+        # Drivers take as long to open a device.
+        check_frame(scene, cameras, options.cameras_anyway)
         device = opened.result() if opened is not None and options.look_at_views(scene) else None
+        kept = None if device is None or target is not None else stack.enter_context(KeptScene(device, scene))
         progress = stack.enter_context(contextlib.closing(Progress()))
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None
         placing = Stopwatch(progress)
@@ -125,23 +153,26 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
             if cameras is None and device is not None:
                 cameras = virtual_cameras(args, scene, placing)
             if device is not None and cameras is not None:
-                tell_what_is_ahead(device, scene, cameras, options, target is not None)
+                tell_what_is_ahead(device, scene, cameras, options, target is not None, kept)
             views = EvaluationViews.of(cameras) if cameras is not None and not args.no_quality else None
             if args.report_view is not None:
                 _ = views and views.named(args.report_view)  # an unknown name is told before the work
             if target is None:
-                encoded = encode(scene, cameras, options, progress, device)
+                encoded = encode(scene, cameras, options, progress, device, kept=kept, in_frame=True)
             else:
                 found = encode_to_target(scene, cameras, target, options, progress, device, progress.tell)
                 encoded, options, search = found.encoded, found.options, search_report(target, found)
-            written, candidate = proved(encoded, args.trust)  # what cannot be decoded must not replace what can
+            judged_on = None if views is None else encoded.device
+            # What cannot be decoded must not replace what can.
+            written = stack.enter_context(proved(encoded, args.trust, judged_on))
             file.write(written.data)
+        candidate = written.scene
         watch = Stopwatch(progress)
         pictures: list[PicturePair] = []
         quality: dict[str, Any] | str = "not judged, as asked"
         if views is not None:
             quality, pictures = _evaluate(
-                args, scene, candidate, views, encoded.device, opened, watch, shared.ground_truth
+                args, scene, candidate, views, encoded.device, opened, watch, shared.ground_truth, kept
             )
         elif cameras is None:
             quality = "not judged: there are no cameras to look from"
@@ -164,12 +195,13 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
 def _evaluate(
     args: argparse.Namespace,
     scene: Scene,
-    candidate: Scene,
+    candidate: Drawable,
     views: EvaluationViews,
     device: Device | None,
     opened: Future[Device] | None,
     watch: Stopwatch,
     ground_truth: GroundTruth | None,
+    kept: KeptScene | None,
 ) -> tuple[dict[str, Any] | str, list[PicturePair]]:
     """The figures, or why there are none: a device that fails now must not take the finished file with it.
 
@@ -182,6 +214,7 @@ def _evaluate(
             device or (Device(args.device) if opened is None else opened.result()),
             parse_colour(args.background),
             ground_truth,
+            kept,
         )
         return judge(scene, candidate, watch, args.report_view, pictures=args.report is not None)
     except DeviceError as error:
@@ -192,7 +225,7 @@ def _photographs(
     args: argparse.Namespace,
     ground_truth: GroundTruth,
     cameras: list[Camera],
-    scenes: tuple[Scene, Scene],
+    scenes: tuple[Scene, Drawable],
     encoded: Encoded,
     device: Device | None,
 ) -> dict[str, Any] | None:
@@ -217,7 +250,9 @@ def _photographs(
 
 
 def add_encode(commands: Commands) -> None:
-    p = commands.add_parser("encode", help="a scene (.ply) to a .potr file, or several into a folder")
+    p = commands.add_parser(
+        "encode", help="a scene (.ply) to a .potr file or one that viewers open, or several into a folder"
+    )
     p.add_argument(
         "scenes",
         type=read_file,
@@ -231,8 +266,11 @@ def add_encode(commands: Commands) -> None:
         type=place,
         required=True,
         metavar="OUT.potr",
-        help='.potr, a folder, or "-" for standard output',
+        help=f'{suffixes_encoded()}, a folder, or "-" for standard output; all are made by the same stages; .potr is '
+        "the smallest",
     )
+    add_to_option(p)
+    add_spz_version_option(p)
     goal = p.add_mutually_exclusive_group()
     goal.add_argument(
         "-q", "--quality", type=float, default=0.5, metavar="Q", help="0 (smallest) to 1 (best); default 0.5"
@@ -276,4 +314,4 @@ def add_encode(commands: Commands) -> None:
     add_antialiased_option(p)
     add_memory_option(p)
     add_device_options(p)
-    p.set_defaults(run=_encode)
+    p.set_defaults(run=_encode, checked_suffix=encoded_suffix)

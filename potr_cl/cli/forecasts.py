@@ -11,19 +11,26 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.forecast import forecast
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.kept_scene import KeptScene
 
 #: Splats times views from which on the work may take long enough to be worth a forecast.
 _LONG = 2_000_000
 
 
 def tell_what_is_ahead(
-    device: Device, scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, search: bool = False
+    device: Device,
+    scene: Scene,
+    cameras: Sequence[Camera],
+    options: EncodeOptions,
+    search: bool = False,
+    kept: KeptScene | None = None,
 ) -> None:
     """A line with the device and its kernels; and where the work may take long, with roughly its time and memory.
 
     Args:
         cameras: of which the training views are looked at.
         search: whether the encode is repeated to meet a size or a PSNR.
+        kept: the scene on the device, if it lies there already.
 
     Raises:
         UsageError: there is no training view.
@@ -35,7 +42,7 @@ def tell_what_is_ahead(
     line = f"on {device.info}, kernels for {device.family.upper()}s"
     if len(scene) * len(views) >= _LONG:
         try:
-            ahead = forecast(scene, views, options, device, search)
+            ahead = forecast(scene, views, options, device, search, kept)
         except DeviceError as error:
             note(f"no forecast: {error}", "detail")  # the encode goes on with less memory, or elsewhere
         else:

@@ -35,7 +35,7 @@ def encode_ladder(args: argparse.Namespace, options: EncodeOptions) -> None:
     (source,) = args.scenes
     folder = _folder(args.output)
     name = Path("scene") if isinstance(source, StandardInput) else Path(source)
-    check_files(args, ladder_files(folder, name, steps))
+    check_files(args, ladder_files(folder, name, steps, options.output.suffix))
     options = options.changed(source_bytes=size_of_file(source))
     cameras = given_cameras(args)
     with contextlib.closing(Progress()) as progress:

@@ -25,8 +25,8 @@ class WrittenScene(WrittenFile):
     """A scene in the format that the name's suffix tells."""
 
 
-class WrittenPotr(WrittenFile):
-    """A .potr file."""
+class WrittenEncoded(WrittenFile):
+    """What an encode makes, of the kind that the name's suffix tells."""
 
 
 class WrittenPage(WrittenFile):
@@ -105,10 +105,10 @@ def check_name(path: WrittenFile, option: str = "-o") -> None:
         from potr_cl.formats.registry import writer_of  # imported on use: few commands need all formats
 
         writer_of(path)
-    elif isinstance(path, WrittenPotr):
-        from potr_cl.formats.registry import refuse_other_than_potr
+    elif isinstance(path, WrittenEncoded):
+        from potr_cl.outputs.registry import output_of
 
-        refuse_other_than_potr(path)
+        output_of(path)
     for kind, (suffixes, what) in _SUFFIXES.items():
         if isinstance(path, kind) and path.suffix.lower() not in suffixes:
             raise UsageError(f"'{path}': {option} writes {what}: give it a name that ends in {suffixes[0]}")
@@ -123,12 +123,23 @@ def _check_standard_output(args: argparse.Namespace) -> None:
     if getattr(args, "json", False):
         raise UsageError("--json and the result both want standard output: give -o a name")
     if getattr(args, "to", None) is not None:
-        from potr_cl.formats.registry import written_suffix
-
-        args.to = written_suffix(args.to)
+        args.to = suffix_of(args)
     with contextlib.suppress(OSError, ValueError, AttributeError):
         if sys.stdout.isatty():
             raise UsageError("the result is no text for a terminal: redirect standard output, or give a name")
+
+
+def suffix_of(args: argparse.Namespace) -> str:
+    """What ``--to`` says, checked: a format that the command can write.
+
+    Raises:
+        UsageError: it is none.
+    """
+    from potr_cl.formats.registry import written_suffix
+
+    check = getattr(args, "checked_suffix", written_suffix)
+    checked: str = check(args.to)
+    return checked
 
 
 @contextlib.contextmanager

@@ -8,14 +8,21 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from potr_cl.api.inputs import drawable_to_judge
 from potr_cl.cli.guard import StandardInput, StandardOutput
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene, scene_writer
 from potr_cl.formats.scene_size import bytes_of_scene
+from potr_cl.formats.scenes import spz
 from potr_cl.formats.streams import received, send
 from potr_cl.model.scene import Scene
+
+# What computes on a device is imported where it is needed: other commands do without.
+if TYPE_CHECKING:
+    from potr_cl.opencl.device import Device
+    from potr_cl.raster.scene_buffers import Drawable
 
 FROM_HELP = 'the format that "-", standard input, brings: .ply, .spz …; default: what its content says'
 TO_HELP = "the format to write where no name says it, .ply, .spz …"
@@ -47,6 +54,18 @@ def add_antialiased_option(p: argparse._ActionsContainer) -> None:
     )
 
 
+def add_spz_version_option(p: argparse._ActionsContainer) -> None:
+    """``--spz-version``, for commands that write scenes in formats of other programs."""
+    p.add_argument(
+        "--spz-version",
+        type=int,
+        choices=sorted(spz.FORMAT.versions),
+        metavar="V",
+        help=f"of .spz files: {', '.join(f'{version}, {what}' for version, what in spz.VERSIONS.items())}; default "
+        f"{spz.FORMAT.versions[0]}",
+    )
+
+
 def trust(args: argparse.Namespace) -> dict[str, Any]:
     """What the readers of scenes are told because of ``--trust``."""
     return {"trust": True} if args.trust else {}
@@ -60,6 +79,20 @@ def read_scene(args: argparse.Namespace, path: Path) -> Scene:
     """
     with as_file(path) as file:
         return load_scene(file, **trust(args), antialiased=ANTIALIASED[args.antialiased])
+
+
+@contextlib.contextmanager
+def read_to_draw(args: argparse.Namespace, path: Path, device: Device) -> Iterator[tuple[Drawable, Scene]]:
+    """The same to be rendered on a device, and a scene on the host by which cameras can be judged.
+
+    Raises:
+        As :func:`potr_cl.api.inputs.drawable_to_judge`.
+    """
+    with (
+        as_file(path) as file,
+        drawable_to_judge(file, device, args.trust, ANTIALIASED[args.antialiased]) as found,
+    ):
+        yield found
 
 
 def write_scene(path: Path, scene: Scene, to: str | None = None, version: int | None = None) -> int:

@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from dataclasses import dataclass
-from functools import partial
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,14 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import container, metadata, octree, sections
-from potr_cl.codec.byte_planes import PlaneStream, unpack_integers
+from potr_cl.codec.bundled_scene import BundledScene
+from potr_cl.codec.byte_planes import IntegerStream, PlaneStream, unpack_integers
+from potr_cl.codec.colour_factors import ColourFactors, Once
 from potr_cl.codec.container import Header
 from potr_cl.codec.context.decoder import Reader, Stream
 from potr_cl.codec.context.lanes import Lanes
 from potr_cl.codec.context.model import Sizes
-from potr_cl.codec.dequantizer import Dequantizer, IntegerStream
+from potr_cl.codec.dequantizer import Dequantizer
+from potr_cl.codec.destination import Destination, SceneArrays
+from potr_cl.codec.native.bundles import ValueArrays
 from potr_cl.codec.native.library import native
 from potr_cl.codec.sections import Coder, Property, Section
+from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.threads import thread_pool
@@ -124,27 +129,36 @@ class PotrFile:
             multiplicities=unpack_integers(raw, planes, False, 0, count).astype(np.uint64),
             tail_lengths=self._raw(Property.TAIL_LENGTH),
             tails=self._raw(Property.TAIL),
-            absolute=self._version.absolute_leaf_levels,
+            absolute=self.rules.absolute_leaf_levels,
         )
         return octree.parse(tree, header.splats)
 
     def log_scales(self) -> NDArray[np.float32]:
         """(N, 3) float32 natural logarithms of standard deviations. Raises DataError if damaged."""
         out = np.empty((self.header.splats, 3), np.float32)
+        if self._bundled:
+            self._bundled.fill(ValueArrays(log_scales=out))
+            return out
         self._dequantizer.scales(self._streams(Property.SCALE), out)
         return out
 
     def quaternions(self) -> NDArray[np.float32]:
         """(N, 4) float32 unit quaternions w, x, y, z. Raises DataError if damaged."""
         out = np.empty((self.header.splats, 4), np.float32)
-        scales = self._streams(Property.SCALE) if self._version.rotations_need_scales else []
+        if self._bundled:
+            self._bundled.fill(ValueArrays(quaternions=out))
+            return out
+        scales = self._streams(Property.SCALE) if self.rules.rotations_need_scales else []
         self._dequantizer.rotations(self._streams(Property.ROTATION), scales, out)
         return out
 
     def opacity_logits(self) -> NDArray[np.float32]:
         """(N,) float32 logits. Raises DataError if damaged."""
         out = np.empty(self.header.splats, np.float32)
-        self._decode_opacities(out, _now)
+        if self._bundled:
+            self._bundled.fill(ValueArrays(logits=out))
+            return out
+        self._dequantizer.opacities(self._streams(Property.OPACITY)[0], out)
         return out
 
     def sh(self, degree: int | None = None) -> NDArray[np.float32]:
@@ -157,10 +171,24 @@ class PotrFile:
             UsageError: there is no such degree.
             DataError: damaged.
         """
-        planar = self._empty_sh(degree)
-        for _, job in self._sh_jobs(planar):
+        count = self.sh_count(degree)
+        arrays = SceneArrays(self.header, self.rules, count, zeros=self._bundled is not None)
+        if self._bundled:
+            self._bundled.fill(ValueArrays(sh=arrays.values.sh))
+            return arrays.sh
+        for _, job in self._sh_jobs(arrays, count, _Shared(self)):
             job(_now)
-        return planar.transpose(2, 0, 1)
+        return arrays.sh
+
+    def colour_steps(self) -> ColourSteps | None:
+        """What fits the steps of colours to each splat; None if all are the same.
+
+        Raises:
+            DataError: damaged.
+        """
+        if self.header.find(Property.STEPS) is None:
+            return None
+        return ColourSteps.from_bytes(self._raw(Property.STEPS).tobytes(), self.header.splats)
 
     def scene(self, threads: int = 0, sh_degree: int | None = None) -> Scene:
         """Decode everything, or all but some SH coefficients.
@@ -173,29 +201,59 @@ class PotrFile:
             UsageError: there is no such degree.
             DataError: damaged.
         """
-        header = self.header
-        _ = self.metadata  # it takes no part in the scene, but damage anywhere is damage
         try:
-            planar = self._empty_sh(sh_degree)
-            log_scales = np.empty((header.splats, 3), np.float32)
-            quaternions = np.empty((header.splats, 4), np.float32)
-            opacity_logits = np.empty(header.splats, np.float32)
-            shapes: _Job = partial(self._decode_shapes, log_scales, quaternions)
-            opacities: _Job = partial(self._decode_opacities, opacity_logits)
-            # The longest first: a pool that ends with a long one ends late.
-            jobs = [
-                *self._sh_jobs(planar),
-                (self._contextual(Property.SCALE) or self._contextual(Property.ROTATION), shapes),
-                (self._contextual(Property.OPACITY), opacities),
-            ]
-            means = self._run(jobs, min(threads or min(os.cpu_count() or 1, _MOST_THREADS), self._threads_in_memory()))
+            zeros = self._bundled is not None
+            arrays = SceneArrays(self.header, self.rules, self.sh_count(sh_degree), zeros)
+            self.decode_into(arrays, threads, sh_degree)
         except MemoryError:
-            needed = header.splats * (11 + 3 * self._coefficients(sh_degree)) * 4
+            needed = self.header.splats * (11 + 3 * self.sh_count(sh_degree)) * 4
             raise DataError(f"the scene needs {needed / 1e9:.1f} GB of memory, more than there is") from None
-        sh = planar.transpose(2, 0, 1)
-        return Scene(means, log_scales, quaternions, opacity_logits, sh, header.antialiased, header.low_pass)
+        return arrays.scene
 
-    def _run(self, jobs: list[tuple[bool, _Job]], threads: int) -> NDArray[np.float32]:
+    def decode_into(self, destination: Destination, threads: int = 0, sh_degree: int | None = None) -> None:
+        """Decode as :meth:`scene` does, but hand what is decoded to a destination, which may be on another device.
+
+        Args:
+            destination: it has room for the SH coefficients that are wanted.
+            threads, sh_degree: as of :meth:`scene`.
+
+        Raises:
+            As :meth:`scene`, and what the destination raises.
+        """
+        _ = self.metadata  # it takes no part in the scene, but damage anywhere is damage
+        if self._bundled:
+            self._decode_bundles(
+                self._bundled, destination, threads or min(os.cpu_count() or 1, _MOST_THREADS), sh_degree
+            )
+            return
+        shared = _Shared(self)
+        shapes: _Job = partial(self._decode_shapes, destination, shared)
+        opacities: _Job = partial(self._decode_opacities, destination, shared)
+        # The longest first: a pool that ends with a long one ends late.
+        jobs = [
+            *self._sh_jobs(destination, self.sh_count(sh_degree), shared),
+            (self._contextual(Property.SCALE) or self._contextual(Property.ROTATION), shapes),
+            (self._contextual(Property.OPACITY), opacities),
+        ]
+        threads = min(threads or min(os.cpu_count() or 1, _MOST_THREADS), self._threads_in_memory())
+        self._run(jobs, lambda: destination.take_means(self.means()), threads)
+
+    def sh_count(self, degree: int | None = None) -> int:
+        """How many SH coefficients of a channel there are up to a degree, which need not be in the file; None: all.
+
+        Raises:
+            UsageError: there is no such degree.
+        """
+        if degree is not None and not 0 <= degree < len(SH_COEFFICIENTS):
+            raise UsageError(f"SH degree {degree} is unknown: choose 0 to {len(SH_COEFFICIENTS) - 1}")
+        return SH_COEFFICIENTS[self.header.sh_degree if degree is None else min(degree, self.header.sh_degree)]
+
+    @property
+    def rules(self) -> FormatVersion:
+        """Those of the file's version."""
+        return VERSIONS[self.header.version]
+
+    def _run(self, jobs: list[tuple[bool, _Job]], centres: Callable[[], None], threads: int) -> None:
         """Do some jobs, each with whether it takes the context coder, and decode the centres.
 
         By NumPy the context coder makes many short calls, in which threads would only wait for each other: one makes
@@ -220,7 +278,7 @@ class PotrFile:
         contextual = [job for takes_coder, job in jobs if takes_coder]
         with thread_pool(threads) as pool:
             coded = [pool.submit(in_turn, some) for some in ([contextual] if alone else [[job] for job in contextual])]
-            means = pool.submit(self.means)
+            means = pool.submit(centres)
             others = [pool.submit(job, _now) for takes_coder, job in jobs if not takes_coder]
             first: list[Future[Any]] = [*coded, means, *others]
             for futures in (first, left):
@@ -228,13 +286,28 @@ class PotrFile:
                 for future in futures:
                     if future.done() and (error := future.exception()) is not None:
                         raise error
-            return means.result()
+
+    def _decode_bundles(
+        self, scene: BundledScene, destination: Destination, threads: int, sh_degree: int | None
+    ) -> None:
+        def centres() -> None:
+            destination.take_means(self.means())
+
+        if isinstance(destination, SceneArrays):
+            scene.fill(destination.values, threads, centres)
+            return
+        scene.hand_to(destination, self.sh_count(sh_degree), threads)
+        centres()
 
     # ------------------------------------------------------------------------------------------ inside
 
-    @property
-    def _version(self) -> FormatVersion:
-        return VERSIONS[self.header.version]
+    @cached_property
+    def _bundled(self) -> BundledScene | None:
+        """The splats of a file of coder BUNDLES, None for others."""
+        section = self.header.find(Property.OPACITY)
+        if section is None or section.coder != Coder.BUNDLES:
+            return None
+        return BundledScene(self.header, self.data, self.colour_steps)
 
     def _raw(self, prop: Property, index: int = 0) -> NDArray[np.uint8]:
         section = self.header.find(prop, index)
@@ -255,7 +328,7 @@ class PotrFile:
             section.integers // section.streams,
             section.streams,
             sections.is_signed(section.kind),
-            sections.is_predicted(section.kind, section.index),
+            sections.is_predicted(section.kind, section.index) and not self.rules.colour_steps,
             history,
             section.name,
         )
@@ -276,52 +349,72 @@ class PotrFile:
 
     @property
     def _dequantizer(self) -> Dequantizer:
-        return Dequantizer(self.header, self._version)
+        return Dequantizer(self.header, self.rules)
 
-    def _decode_shapes(
-        self, log_scales: NDArray[np.float32], quaternions: NDArray[np.float32], submit: _Submit
-    ) -> None:
-        scales = self._streams(Property.SCALE)
-        submit(partial(self._dequantizer.scales, scales, log_scales))
-        submit(partial(self._dequantizer.rotations, self._streams(Property.ROTATION), scales, quaternions))
+    def _decode_shapes(self, destination: Destination, shared: _Shared, submit: _Submit) -> None:
+        scales = shared.scales.get()
+        submit(partial(destination.take_scales, scales))
+        submit(partial(destination.take_rotations, self._streams(Property.ROTATION), scales))
 
-    def _decode_opacities(self, out: NDArray[np.float32], submit: _Submit) -> None:
-        submit(partial(self._dequantizer.opacities, self._streams(Property.OPACITY)[0], out))
+    def _decode_opacities(self, destination: Destination, shared: _Shared, submit: _Submit) -> None:
+        submit(partial(destination.take_opacities, shared.opacities.get()))
 
-    def _coefficients(self, degree: int | None) -> int:
-        """How many there are up to a degree, which need not be in the file."""
-        if degree is not None and not 0 <= degree < len(SH_COEFFICIENTS):
-            raise UsageError(f"SH degree {degree} is unknown: choose 0 to {len(SH_COEFFICIENTS) - 1}")
-        return SH_COEFFICIENTS[self.header.sh_degree if degree is None else min(degree, self.header.sh_degree)]
-
-    def _empty_sh(self, degree: int | None) -> NDArray[np.float32]:
-        return np.empty((self._coefficients(degree), 3, self.header.splats), np.float32)
-
-    def _sh_jobs(self, planar: NDArray[np.float32]) -> list[tuple[bool, _Job]]:
-        """What decodes M SH coefficients into ``planar`` (M, 3, N), and whether it takes the context coder."""
-        stop = 3 * len(planar)
+    def _sh_jobs(self, destination: Destination, count: int, shared: _Shared) -> list[tuple[bool, _Job]]:
+        """What decodes so many SH coefficients of a channel, and whether it takes the context coder."""
+        stop = 3 * count
         contextual = [s for s in self.header.sections if s.kind == Property.SH and s.coder == Coder.CONTEXT]
         chained = [s for s in contextual if 0 < s.index < stop]
         in_chain = {s.index // 3 + m for s in chained for m in range(s.streams // 3)}
-        alone = [m for m in range(len(planar)) if m not in in_chain]
-        jobs: list[tuple[bool, _Job]] = [(True, partial(self._decode_chain, chained, planar))] if chained else []
+        alone = [m for m in range(count) if m not in in_chain]
+        jobs: list[tuple[bool, _Job]] = (
+            [(True, partial(self._decode_chain, chained, destination, shared))] if chained else []
+        )
         return jobs + [
-            (self._contextual(Property.SH, 3 * m), partial(self._decode_coefficient, m, planar[m])) for m in alone
+            (self._contextual(Property.SH, 3 * m), partial(self._decode_coefficient, m, destination, shared))
+            for m in alone
         ]
 
-    def _decode_chain(self, chain: list[Section], planar: NDArray[np.float32], submit: _Submit) -> None:
+    def _decode_chain(self, chain: list[Section], destination: Destination, shared: _Shared, submit: _Submit) -> None:
         """AC coefficients whose contexts are made of those before."""
         history = Sizes(Lanes(self.header.splats))
         for section in sorted(chain, key=lambda s: s.index):
             streams = self._context_streams(section, history)
             for m, channels in enumerate(zip(streams, streams, streams, strict=True), start=section.index // 3):
-                submit(partial(self._dequantizer.colours, channels, m, False, planar[m]))
+                submit(partial(_take_colours, destination, channels, m, False, shared))
 
-    def _decode_coefficient(self, m: int, out: NDArray[np.float32], submit: _Submit) -> None:
-        """One SH coefficient into ``out`` (3, N): R, G, B."""
+    def _decode_coefficient(self, m: int, destination: Destination, shared: _Shared, submit: _Submit) -> None:
+        """The three channels of one SH coefficient."""
         streams = self._streams(Property.SH, range(3 * m, 3 * m + 3))
-        differences = m == 0 and not self._contextual(Property.SH)
-        submit(partial(self._dequantizer.colours, streams, m, differences, out))
+        differences = m == 0 and not self.rules.colour_steps and not self._contextual(Property.SH)
+        submit(partial(_take_colours, destination, streams, m, differences, shared))
+
+
+class _Shared:
+    """What more than one of a file's properties is made of; any thread may ask for it.
+
+    Args:
+        file: that is decoded.
+
+    Attributes:
+        scales, opacities: their streams.
+        factors: what colours are made with.
+    """
+
+    def __init__(self, file: PotrFile) -> None:
+        self.scales = Once(lambda: file._streams(Property.SCALE))
+        self.opacities = Once(lambda: file._streams(Property.OPACITY)[0])
+        self.factors = Once(self._find_factors)
+        self._file = file
+
+    def _find_factors(self) -> ColourFactors:
+        header, steps = self._file.header, self._file.colour_steps()
+        return ColourFactors.of(header, steps, self.scales.get, self.opacities.get)
+
+
+def _take_colours(
+    destination: Destination, streams: Sequence[IntegerStream], m: int, differences: bool, shared: _Shared
+) -> None:
+    destination.take_colours(streams, m, differences, shared.factors.get())
 
 
 #: Takes what needs no more than what is at hand, to be done now or by another thread.

@@ -18,6 +18,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.logarithm import natural_logarithm
+from potr_cl.codec.native.library import native
 from potr_cl.errors import DataError, UsageError
 
 Integers = NDArray[np.signedinteger]
@@ -58,7 +59,8 @@ class HyperParameters:
         beta: allowed distance of a centre to its leaf's centre: version 1: as a part of the distance to the nearest
             camera; version 2: as a part of a typical splat's size at that distance.
         gamma: the least such distance, world units.
-        sf_dc, sf_sh: scale factors of constant and of all other SH coefficients; a quantiser step is 1 / SF.
+        sf_dc, sf_sh: scale factors of constant and of all other SH coefficients; a quantiser step is 1 / SF. Version 3:
+            of steps that, the same for all splats, would show as much as the splats' own.
         sf_opacity: of opacities; version 2: of their logits.
         sf_rotation: of quaternions; version 2: times the root of the largest level of the splat's three scales.
         sf_scale: of standard deviations, world units; version 2: steps in a typical splat's size.
@@ -134,14 +136,14 @@ def _balanced(q: float, given: Mapping[str, float]) -> HyperParameters:
     delta_mse_max = 10 ** (-8.3 - 2 * q)
     values = replace(
         _paper(q, {}),
-        version=2,
+        version=3,
         delta_mse_max=delta_mse_max,
         drop=delta_mse_max / 14,
         beta=0.056 / finer,
         gamma=1e-30,
         sf_dc=31 * finer,
-        sf_sh=48 * finer,
-        sf_opacity=5.5 * finer,
+        sf_sh=40 * finer,
+        sf_opacity=3.3 * finer,
         sf_rotation=7.6 * finer,
         sf_scale=8.8 * finer,
     )
@@ -270,9 +272,10 @@ def _octahedral_rotations() -> tuple[F64, NDArray[np.intp]]:
 
 
 _GROUP, _PERMUTATIONS = _octahedral_rotations()
+_CONJUGATES = np.ascontiguousarray((_GROUP * (1, -1, -1, -1)).T)
 
 
-def canonical_rotations(quaternions: F32, log_scales: F32) -> tuple[F64, F32]:
+def canonical_rotations(quaternions: F32, log_scales: F32, order: NDArray[np.int64] | None = None) -> tuple[F64, F32]:
     """The equivalent form of each splat whose unit quaternion has the largest real part.
 
     A Gaussian has 24 equivalent pairs of rotation and order of scales, and two signs of each quaternion. The one with
@@ -282,16 +285,31 @@ def canonical_rotations(quaternions: F32, log_scales: F32) -> tuple[F64, F32]:
     Args:
         quaternions: (N, 4) w, x, y, z of any non-zero length.
         log_scales: (N, 3).
+        order: (n,) which of the splats; None: all.
 
     Returns:
-        (N, 3) float64 imaginary parts of unit quaternions with a real part >= 0, and the log scales in matching order.
+        (n, 3) float64 imaginary parts of unit quaternions with a real part >= 0, and the log scales in matching order.
     """
-    q = quaternions.astype(np.float64)
+    functions = native()
+    order = np.arange(len(quaternions)) if order is None else order
+    if functions is not None:
+        imaginary, turned = np.empty((len(order), 3)), np.empty((len(order), 3), np.float32)
+        functions.quantising.canonical(
+            np.ascontiguousarray(quaternions, np.float32),
+            np.ascontiguousarray(log_scales, np.float32),
+            np.ascontiguousarray(order, np.int64),
+            _CONJUGATES,
+            _PERMUTATIONS.astype(np.uint8),
+            imaginary,
+            turned,
+        )
+        return imaginary, turned
+    log_scales = log_scales[order]
+    q = quaternions[order].astype(np.float64)
     q /= np.linalg.norm(q, axis=1, keepdims=True)
     real = np.empty((len(q), len(_GROUP)))
-    conjugates = (_GROUP * (1, -1, -1, -1)).T
     for start in range(0, len(q), _ROWS):
-        np.matmul(q[start : start + _ROWS], conjugates, out=real[start : start + _ROWS])
+        np.matmul(q[start : start + _ROWS], _CONJUGATES, out=real[start : start + _ROWS])
     # Rounded, so that ties between equivalent forms fall the same way on every processor.
     real *= 1e9
     np.rint(real, out=real)
@@ -349,9 +367,31 @@ def to_ycocg(rgb: F64) -> tuple[F64, F64, F64]:
     return r * 0.25 + half + b * 0.25, (r - b) * 0.5, half - (r + b) * 0.25
 
 
-def quantize_sh(values: F64, sf_sh: float) -> Integers:
-    """One channel of one SH coefficient (YCoCg) to levels, in steps of 1 / SF."""
+def quantize_sh(values: F64, sf_sh: float | F32) -> Integers:
+    """One channel of one SH coefficient (YCoCg) to levels, in steps of 1 / SF, which may be one a splat."""
     return _to_levels(values, sf_sh, "SH coefficient")
+
+
+def nonzero_levels(sh: F32, sf_sh: float) -> NDArray[np.bool_]:
+    """Which SH coefficients the quantiser does not round to 0.
+
+    Args:
+        sh: (N, M, 3) R, G, B.
+        sf_sh: scale factor.
+
+    Returns:
+        (N, M, 3) in Y, Co, Cg, the flags of each coefficient contiguous in memory.
+    """
+    functions = native()
+    if functions is not None and sh.flags.c_contiguous and sh.dtype == np.float32:
+        found = functions.quantising.nonzero_levels(sh, sf_sh, _LARGEST)
+        if found is not None:
+            return found.transpose(2, 0, 1)
+    planar = np.empty((*sh.shape[1:], len(sh)), bool)
+    for m, flags in enumerate(planar):
+        for c, channel in enumerate(to_ycocg(sh[:, m].astype(np.float64))):
+            np.not_equal(quantize_sh(channel, sf_sh), 0, out=flags[c])
+    return planar.transpose(2, 0, 1)
 
 
 def ac_sparsity(sh: F32, sf_sh: float) -> float:
@@ -361,10 +401,5 @@ def ac_sparsity(sh: F32, sf_sh: float) -> float:
         sh: (N, M, 3) R, G, B.
         sf_sh: scale factor.
     """
-    coefficients = range(1, sh.shape[1])
-    zeros = [
-        np.count_nonzero(quantize_sh(channel, sf_sh) == 0)
-        for m in coefficients
-        for channel in to_ycocg(sh[:, m].astype(np.float64))
-    ]
-    return sum(zeros) / (3 * len(sh) * len(coefficients)) if zeros else 1.0
+    rest = sh[:, 1:]
+    return 1 - np.count_nonzero(nonzero_levels(rest, sf_sh)) / rest.size if rest.size else 1.0

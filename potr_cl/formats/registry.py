@@ -6,7 +6,6 @@ Reading, writing, error messages, the help of the command line and docs/formats.
 
 from __future__ import annotations
 
-import contextlib
 import os
 import zlib
 from collections.abc import Iterable, Sequence
@@ -149,6 +148,12 @@ def stem_of_scene(path: Path) -> str:
     return name[: -len(max(fitting, key=len))] if fitting else name
 
 
+def suffix_of_name(path: Path) -> str | None:
+    """The longest suffix of a format that a file's name ends in, ".compressed.ply" rather than ".ply"; None: no one."""
+    fitting = [suffix for suffix in _scene_suffixes(SCENE_FORMATS) if path.name.lower().endswith(suffix)]
+    return max(fitting, key=len, default=None)
+
+
 def writer_of(path: Path) -> SceneSaver:
     """What writes a scene in the format that the suffixes of the file to be written ask for.
 
@@ -178,22 +183,6 @@ def written_format(path: Path) -> SceneFormat:
     if entry.save is None:
         raise UsageError(f"'{path}': {entry.not_written}; {expected}")
     return entry
-
-
-def refuse_other_than_potr(path: Path) -> None:
-    """Refuse a name for an encoded file that promises another format.
-
-    Raises:
-        UsageError: it does not end in .potr.
-    """
-    if path.suffix.lower() == ".potr":
-        return
-    said = "give it a name that ends in .potr"
-    with contextlib.suppress(UsageError):
-        writer_of(path)
-        name = path.with_name(f"{stem_of_scene(path)}.potr")
-        said = f"encode to '{name}', then 'potr-cl decode {name} -o {path}'"
-    raise UsageError(f"'{path}': encode writes .potr files only: {said}")
 
 
 def suffixes_read() -> str:

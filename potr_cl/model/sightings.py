@@ -132,7 +132,7 @@ def sample(scene: Scene) -> Sample:
     Args:
         scene: clean, at least one splat.
     """
-    rows = np.unique(np.linspace(0, len(scene) - 1, min(len(scene), _THINNED)).astype(np.int64))
+    rows = looked_at(len(scene))
     opaque = rows[scene.opacities[rows] > _OPAQUE]
     scene = scene.subset(opaque if len(opaque) else rows)
     means = scene.means.astype(np.float64)
@@ -145,7 +145,7 @@ def sample(scene: Scene) -> Sample:
     means = np.clip((means - centre) / unit, -_FAR, _FAR)
     scales = np.exp(np.clip(log_scales - math.log(unit), -30, 3))
 
-    chosen = np.unique(np.linspace(0, len(means) - 1, _TARGETS).astype(np.int64))
+    chosen = _spread(len(means), _TARGETS)
     colours = unit_coefficients(scene.sh[chosen, 1:])
     around = ac_basis(spiral(_DIRECTIONS))[:, : colours.shape[1]]
     overall = np.einsum("dm,kmc->dkc", around, colours, optimize=True) ** 2
@@ -164,6 +164,17 @@ def sample(scene: Scene) -> Sample:
         points,
         areas,
     )
+
+
+def _spread(count: int, wanted: int) -> NDArray[np.int64]:
+    """Numbers of so many of ``count`` things, or of all, evenly spread and ascending."""
+    numbers = np.linspace(0, count - 1, min(count, wanted)).astype(np.int64)
+    return numbers[np.diff(numbers, prepend=-1) > 0]
+
+
+def looked_at(count: int) -> NDArray[np.int64]:
+    """Which of so many splats :func:`sample` looks at: of a scene of these alone it makes the same sample."""
+    return _spread(count, _THINNED)
 
 
 def poses(cameras: Sequence[Camera]) -> Poses:

@@ -6,8 +6,7 @@ spoils what lies between them. The pictures that it compares with are renders, s
 it, and looks where the two look. Where cameras orbit something, the way is the orbit and not the chord: the distance to
 what they look at is kept.
 
-A view is only added where a camera might have been: not in matter, not where the colours do not remember that they
-were looked at from there, and not where it would show what no given view shows.
+A view is only added where a camera might have been (:meth:`potr_cl.model.placement.given_views.GivenViews.allow`).
 """
 
 from __future__ import annotations
@@ -20,13 +19,12 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
-from potr_cl.model.placement.colour_memory import ColourMemory
-from potr_cl.model.placement.matter import CROWDED, Frame, Matter, cell_of, frame_of, matter_of, surroundings
+from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.scene import Scene
 
 F64 = NDArray[np.float64]
-F32 = NDArray[np.float32]
 
 #: How far a view is off the way between two given ones, as a part of their distance: one standard deviation.
 SPREAD = 0.3
@@ -36,12 +34,6 @@ _TURN = 0.02
 _NEIGHBOURS = 4
 #: How often a place is tried nearer to the way, if it is not allowed, and by how much.
 _TRIES, _NEARER = 3, 0.4
-#: Part of what an added view shows that some given view must show, too.
-_KNOWN = 0.9
-#: An added view shows at least this part of what the view shows that it lies beside, by number of splats.
-_FULL = 0.5
-#: What colours remember of an added view's place, as a part of the least that they remember of given ones.
-_REMEMBERED = 0.95
 #: Lines of sight that meet under a smaller angle (its sine) have no point in common to go around.
 _PARALLEL = 0.03
 #: What the names of added views begin with.
@@ -49,17 +41,25 @@ _PREFIX = "between_"
 
 
 def views_between(
-    scene: Scene, cameras: Sequence[Camera], each: int, spread: float = SPREAD, first: int = 0
+    scene: Scene,
+    cameras: Sequence[Camera],
+    each: float,
+    spread: float = SPREAD,
+    first: int = 0,
+    known: GivenViews | None = None,
+    run: Run = map,
 ) -> list[Camera]:
     """Views between given ones, the same ones every time.
 
     Args:
         scene: that they show.
         cameras: the given views, of any number; fewer than two have nothing between them.
-        each: views to add to each given one. Fewer are added where too few are allowed.
+        each: views to add to each given one; with 0.5, one to every second. Fewer are added where too few are allowed.
         spread: how far they are off the way to a neighbour, as a part of the way: one standard deviation.
         first: the number of the first round: rounds of other numbers give other views, so that
             ``each=1, first=1`` adds to those of ``each=1``.
+        known: what the given views show, if that has been found already.
+        run: calls functions, perhaps in several threads; the result does not depend on it.
 
     Returns:
         Training views with the intrinsics of the given ones and no photograph, in rounds: first one for each given
@@ -68,32 +68,42 @@ def views_between(
     Raises:
         UsageError: ``each`` is negative, or ``spread`` is not a number from 0 to 10.
     """
-    if each < 0 or not 0 <= spread <= 10:
-        raise UsageError(f"{each} views between with a spread of {spread:g}: at least 0, and a spread from 0 to 10")
+    if not 0 <= each < math.inf or not 0 <= spread <= 10:
+        raise UsageError(f"{each:g} views between with a spread of {spread:g}: at least 0, and a spread from 0 to 10")
     if each == 0 or len(cameras) < 2:
         return []
-    guard = _Guard(scene, cameras)
+    known = known or GivenViews(scene, cameras, run)
     centres = camera_centres(cameras)
     distance = np.linalg.norm(centres[:, None] - centres, axis=2)
     np.fill_diagonal(distance, np.inf)
     neighbours = np.argsort(distance, axis=1, kind="stable")[:, :_NEIGHBOURS]
-    added = []
-    for turn in range(first, first + each):
-        for number, camera in enumerate(cameras):
-            random = np.random.default_rng((turn, number))
-            others = neighbours[number][np.isfinite(distance[number][neighbours[number]])]
-            draw = _Draw.drawn(random, len(others))
-            other = cameras[others[draw.neighbour]]
-            off = spread
-            for _ in range(_TRIES):
-                view = dataclasses.replace(
-                    _between(camera, other, draw, off), name=f"{_PREFIX}{turn}_{number:04d}", split="train"
-                )
-                if guard.allows(view, number):
-                    added.append(view)
-                    break
-                off *= _NEARER
-    return added
+
+    def view_of(turn_and_number: tuple[int, int]) -> Camera | None:
+        turn, number = turn_and_number
+        random = np.random.default_rng((turn, number))
+        others = neighbours[number][np.isfinite(distance[number][neighbours[number]])]
+        draw = _Draw.drawn(random, len(others))
+        other = cameras[others[draw.neighbour]]
+        off = spread
+        for _ in range(_TRIES):
+            view = dataclasses.replace(
+                _between(cameras[number], other, draw, off), name=f"{_PREFIX}{turn}_{number:04d}", split="train"
+            )
+            if known.allow(view, number):
+                return view
+            off *= _NEARER
+        return None
+
+    return [view for view in run(view_of, _rounds(len(cameras), each, first)) if view is not None]
+
+
+def _rounds(count: int, each: float, first: int) -> list[tuple[int, int]]:
+    """Round and given view of each view to add: all of them in each round, and in the last perhaps not all, evenly."""
+    chosen = []
+    for turn in range(math.ceil(each)):
+        part = min(each - turn, 1.0)
+        chosen += [(first + turn, n) for n in range(count) if int((n + 1) * part) > int(n * part)]
+    return chosen
 
 
 def is_between(camera: Camera) -> bool:
@@ -207,59 +217,3 @@ def _rotation_vector(rotation: F64) -> F64:
         return np.zeros(3)
     vector: F64 = 2 * math.atan2(sine, float(quaternion[3])) * quaternion[:3] / sine
     return vector
-
-
-class _Guard:
-    """Knows where a view may be added: it has seen the scene and all given views.
-
-    Args:
-        scene: that they show.
-        cameras: the given views.
-    """
-
-    def __init__(self, scene: Scene, cameras: Sequence[Camera]) -> None:
-        self._frame: Frame = frame_of(scene)
-        self._matter: Matter = matter_of(scene, self._frame)
-        shown, blocked = zip(*[self._look(camera) for camera in cameras], strict=True)
-        self._places = (camera_centres(cameras) - self._frame.centre) / self._frame.unit
-        self._shown: list[F32] = list(shown)
-        self._known = np.stack(shown).max(axis=0)
-        # Whoever photographs indoors, stands close to things.
-        self._crowded = max(CROWDED, max(blocked))
-        self._memory = ColourMemory(self._places, self._matter)
-        self._forgotten = 0.0
-        if self._memory.tells:
-            least = min(self._memory.of(*given) for given in zip(self._places, self._shown, strict=True))
-            self._forgotten = _REMEMBERED * least
-
-    def allows(self, camera: Camera, beside: int) -> bool:
-        """Whether a camera might have been here.
-
-        Args:
-            camera: the view.
-            beside: number of the given view that it lies beside.
-        """
-        if not np.isfinite(camera.translation).all():
-            return False
-        shown, blocked = self._look(camera)
-        total = float(shown.sum())
-        if blocked > self._crowded or total < _FULL * float(self._shown[beside].sum()):
-            return False
-        if total > 0 and float((shown * self._known).sum()) < _KNOWN * total:
-            return False
-        place = (camera.centre - self._frame.centre) / self._frame.unit
-        return not self._memory.tells or self._memory.of(place, shown) >= self._forgotten
-
-    def _look(self, camera: Camera) -> tuple[F32, float]:
-        """(K,) 1 for each target that the view shows, else 0; and how much matter there is close by."""
-        matter, frame = self._matter, self._frame
-        place = (camera.centre - frame.centre) / frame.unit
-        horizon, blocked = surroundings(place, matter)
-        rays = matter.targets - place
-        distance = np.linalg.norm(rays, axis=1)
-        x, y, z = camera.rotation @ rays.T
-        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-            inside = (z > frame.near) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
-        visible = distance <= 1.1 * horizon[cell_of(rays.T.astype(np.float32))] + 0.02
-        return (inside & visible).astype(np.float32), blocked

@@ -4,15 +4,18 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import logging
 import os
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.encoder import Coded
+from potr_cl.errors import DataError, PotrError
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.agreement import require_agreement
 from potr_cl.model.camera import Camera, train_views, within_photographs
@@ -21,12 +24,18 @@ from potr_cl.model.virtual_cameras import is_virtual, place_cameras
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.scene_buffers import Drawable
+from potr_cl.stages.fitting.fit import Fitted, LeftOut
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.pruning.unseen import Unseen
 from potr_cl.stages.refitting.photographs import PhotographChoice
 from potr_cl.stages.refitting.refit import Refitted
 from potr_cl.stages.stage import Interlude, Progress, Stage, State, Workbench
+from potr_cl.stages.views_between import Added
+
+_log = logging.getLogger("potr_cl")
 
 
 @dataclass(frozen=True)
@@ -39,8 +48,10 @@ class Encoded:
         order: (N,) index in the source scene of each splat of the file.
         pruned: what pruning did; None if it was left out.
         unseen: the splats that no training view sees; None if pruning was left out.
+        fitted: what the fit of all parameters did, or why it was left out; None if it was not asked for.
         refitted: what the re-fit of the colours did; None if it was left out.
         photographs: what held-out photographs say of a fit to photographs; None if none were given.
+        between: the views between the training views that were looked at; None if nobody asked for any.
         device: the device that did the work; not the one that was asked for if that had too little memory. None if no
             stage needed a device.
         seconds: wall time by stage.
@@ -53,8 +64,10 @@ class Encoded:
     order: NDArray[np.int64]
     pruned: Pruned | None
     unseen: Unseen | None
+    fitted: Fitted | LeftOut | None
     refitted: Refitted | None
     photographs: PhotographChoice | None
+    between: Added | None
     device: Device | None
     seconds: dict[str, float]
     options: EncodeOptions
@@ -70,8 +83,13 @@ class Encoded:
         """The whole file."""
         return b"".join(self.pieces)
 
+    @property
+    def scene(self) -> Scene:
+        """What the file's readers will see; it is read anew each time."""
+        return self.options.output.read(self.data, trust=True)
+
     def save(self, path: str | os.PathLike[str]) -> None:
-        """Write the file, whole or not at all.
+        """Write the file, whole or not at all; its name does not tell its kind, ``options.output`` does.
 
         Raises:
             UsageError: it cannot be written there.
@@ -82,6 +100,45 @@ class Encoded:
                 file.write(piece)
 
 
+@dataclass(frozen=True)
+class Proved:
+    """A file that its readers take.
+
+    Attributes:
+        data: the whole file.
+        scene: what readers see; in a device's memory, where it will be looked at there.
+    """
+
+    data: bytes
+    scene: Drawable
+
+
+@contextmanager
+def proved(encoded: Encoded, trust: bool = False, device: Device | None = None) -> Iterator[Proved]:
+    """The file that was made and the scene that a reader makes of it.
+
+    Args:
+        encoded: that made it.
+        trust: whether it may hold more splats a byte than a real scene has.
+        device: on which the scene will be looked at, as long as the context lasts; None: it is an ordinary one.
+
+    Raises:
+        PotrError: no reader takes it.
+    """
+    data, output = encoded.data, encoded.options.output
+    with ExitStack() as stack:
+        try:
+            scene = (
+                output.read(data, trust) if device is None else stack.enter_context(output.seen(data, device, trust))
+            )
+        except DataError as error:
+            raise PotrError(
+                f"the encoded file cannot be decoded ({error}): nothing was written. If the scene has splats that are "
+                "very far away or very large, leave them out"
+            ) from error
+        yield Proved(data, scene)
+
+
 def encode(
     scene: Scene,
     cameras: Sequence[Camera] | None = None,
@@ -89,6 +146,8 @@ def encode(
     progress: Progress | None = None,
     device: Device | None = None,
     antialiased: bool | None = None,
+    kept: KeptScene | None = None,
+    in_frame: bool = False,
 ) -> Encoded:
     """Encode a scene.
 
@@ -101,6 +160,8 @@ def encode(
         device: computes; by default the best one there is. If its memory is too small, less is kept in it, and if that
             is not enough, a CPU does the work. A warning says so.
         antialiased: whether to take it as an antialiased scene; None: as what it says that it is.
+        kept: the scene on the device, if it will be needed there afterwards.
+        in_frame: whether :func:`check_frame` has found the cameras to be in the scene's frame.
 
     Raises:
         UsageError: options out of range, cameras without a training view, or cameras that are probably not in the
@@ -110,14 +171,30 @@ def encode(
     """
     options = options or EncodeOptions()
     scene = scene.rendered(antialiased)
+    tell_losses(scene, options)
     watch = Stopwatch(progress)
-    cameras = cameras_or_virtual(scene, cameras, options, watch)
-    run = Run(options, watch, device)
-    return run.finished(run.stages(State.of(scene, train_views(cameras) if cameras else [])))
+    cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame)
+    with ExitStack() as stack:
+        if kept is None and cameras and options.look_at_views(scene):
+            device = device or Device()
+            kept = stack.enter_context(KeptScene(device, scene))
+        run = Run(options, watch, device, kept)
+        return run.finished(run.stages(State.of(scene, train_views(cameras) if cameras else [])))
+
+
+def tell_losses(scene: Scene, options: EncodeOptions) -> None:
+    """Say in one line what of the scene the kind of file that is asked for cannot hold."""
+    losses = options.output.losses(scene)
+    if losses:
+        _log.warning("%s cannot hold all of this scene: %s", options.output.format.name, "; ".join(losses))
 
 
 def cameras_or_virtual(
-    scene: Scene, cameras: Sequence[Camera] | None, options: EncodeOptions, watch: Stopwatch
+    scene: Scene,
+    cameras: Sequence[Camera] | None,
+    options: EncodeOptions,
+    watch: Stopwatch,
+    in_frame: bool = False,
 ) -> Sequence[Camera] | None:
     """The cameras; or virtual ones, if there are none and a stage needs views.
 
@@ -126,7 +203,7 @@ def cameras_or_virtual(
     Raises:
         UsageError: the training views are probably not in the scene's frame; but with ``options.cameras_anyway``.
     """
-    check_frame(scene, cameras, options.cameras_anyway)
+    check_frame(scene, cameras, options.cameras_anyway or in_frame)
     if cameras is None and options.look_at_views(scene):
         watch("place cameras", 0.0)
         cameras = place_cameras(scene)
@@ -153,14 +230,17 @@ class Run:
         options: the stages, and what they all share.
         watch: keeps the time and passes the progress on.
         device: the first to be tried; by default the best one there is, opened when a stage needs it.
+        kept: the uncompressed scene on that device.
 
     Attributes:
         device: the one on which the last stage ran that needs views; None if none did.
     """
 
-    def __init__(self, options: EncodeOptions, watch: Stopwatch, device: Device | None = None) -> None:
+    def __init__(
+        self, options: EncodeOptions, watch: Stopwatch, device: Device | None = None, kept: KeptScene | None = None
+    ) -> None:
         self.device: Device | None = None
-        self._options, self._watch, self._given = options, watch, device
+        self._options, self._watch, self._given, self._kept = options, watch, device, kept
 
     def stages(self, state: State, only: Sequence[type[Stage]] | None = None) -> State:
         """Run the stages, or some of them, in their order.
@@ -183,6 +263,8 @@ class Run:
             interludes=self._interludes(stage, state),
             metadata=lambda last: _metadata(last, options),
             progress=self._watch,
+            output=options.output,
+            kept=self._kept,
         )
         if not stage.asked_for:
             return state
@@ -216,8 +298,10 @@ class Run:
             order=state.survivors[coded.order],
             pruned=state.learnt.get("prune"),
             unseen=state.learnt.get("unseen"),
+            fitted=state.learnt.get("fit"),
             refitted=state.learnt.get("refit"),
             photographs=state.learnt.get("photographs"),
+            between=state.learnt.get("between"),
             device=self.device,
             seconds=self._watch.seconds,
             options=self._options,

@@ -16,11 +16,16 @@ import numpy as np
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
+from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import Family
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import Drawable
+from potr_cl.stages.between.amount import most_needed
 from potr_cl.stages.compact import Compact
+from potr_cl.stages.fit import Fit
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.sweep_options import default_memory
 from potr_cl.stages.refit import Refit
@@ -60,14 +65,16 @@ class Units:
         prepare, prune, compact, refit: once for each training view, as multiples of the time of one picture of the
             uncompressed scene.
         iteration, step: a pruning iteration and a step of the re-fit, for each view, besides.
+        fit: a view of a step of the fit.
         once: pictures' times that the re-fit takes besides, whatever the number of views.
-        compact_splat, refit_splat, code_splat, trial_splat: seconds that compaction, the re-fit, the coding and the
-            trial of views between the views take besides, for each splat of the uncompressed scene.
+        compact_splat, refit_splat, code_splat: seconds that compaction, the re-fit and the coding take besides, for
+            each splat of the uncompressed scene.
     """
 
     prepare: float
     prune: float
     iteration: float
+    fit: float
     compact: float
     refit: float
     step: float
@@ -75,20 +82,22 @@ class Units:
     compact_splat: float
     refit_splat: float
     code_splat: float
-    trial_splat: float
 
 
 #: From tools.bench.forecast for CPUs, and from docs/benchmarks/encode.md for GPUs, where the host does a good part.
 UNITS: dict[Family, Units] = {
-    "cpu": Units(1.0, 3.0, 0.035, 2.0, 4.7, 0.33, 20, 0, 0, 4e-6, 30e-6),
-    "gpu": Units(0.9, 2.0, 0.042, 0, 0, 0.45, 0, 3.5e-6, 1.45e-6, 1.5e-6, 12e-6),
+    "cpu": Units(1.0, 3.0, 0.035, 0.9, 2.0, 4.7, 0.33, 20, 0, 0, 4e-6),
+    "gpu": Units(0.9, 2.0, 0.042, 0.9, 0, 0, 0.45, 0, 3.5e-6, 1.45e-6, 1.5e-6),
 }
-#: Views that a trial adds for each training view, at most: nobody knows before.
-_ADDED: dict[Family, float] = {"cpu": 0.5, "gpu": 2}
 
 
 def forecast(
-    scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, device: Device, search: bool = False
+    scene: Scene,
+    cameras: Sequence[Camera],
+    options: EncodeOptions,
+    device: Device,
+    search: bool = False,
+    kept: KeptScene | None = None,
 ) -> Forecast:
     """Render a few views, and say from their time what an encode will take.
 
@@ -96,20 +105,23 @@ def forecast(
         scene, options, device: of the encode.
         cameras: its training views, at least one.
         search: whether the encode is repeated to meet a size or a PSNR.
+        kept: the scene on the device, if it lies there already.
 
     Raises:
         DeviceError: the device cannot render the views.
     """
-    seconds, nbytes = _view(scene, cameras, options, device)
+    seconds, nbytes = _view(scene if kept is None else kept.drawable(device, scene), cameras, options, device)
     parts = {stage.name: stage for stage in options.stages if stage.asked_for and stage.looks_at(scene)}
     units = UNITS[device.family]
     views, of_a_splat = float(len(cameras)), units.code_splat
-    if isinstance(between := parts.get(Between.name), Between):
-        views *= 1 + (_ADDED[device.family] if between.views is None else between.views)
-        of_a_splat += 0 if between.views is not None else units.trial_splat
+    if isinstance(between := parts.get(Between.name), Between) and len(cameras) > 1 and not is_virtual(cameras):
+        each = between.views  # with auto, nobody knows yet how many the scene needs
+        views *= 1 + (most_needed(len(cameras), device.info.kind == "cpu") if each == "auto" else each)
     pictures = views * units.prepare
     if isinstance(prune := parts.get(Prune.name), Prune):
         pictures += views * (units.prune + units.iteration * prune.iterations)
+    if isinstance(fit := parts.get(Fit.name), Fit):
+        pictures += fit.steps * fit.batch * units.fit
     if Compact.name in parts:
         pictures += views * units.compact
         of_a_splat += units.compact_splat
@@ -125,11 +137,11 @@ def forecast(
     return Forecast(work * (_SEARCH if search else 1), memory, seconds, pictures)
 
 
-def _view(scene: Scene, cameras: Sequence[Camera], options: EncodeOptions, device: Device) -> tuple[float, float]:
+def _view(drawable: Drawable, cameras: Sequence[Camera], options: EncodeOptions, device: Device) -> tuple[float, float]:
     """Seconds that a picture takes, and bytes of what can be kept of a view: means of a few."""
     chosen = [cameras[round(place)] for place in np.linspace(0, len(cameras) - 1, min(_SAMPLE, len(cameras)))]
     seconds, nbytes = [], []
-    with Rasterizer(device, scene, background=options.background) as rasterizer:
+    with Rasterizer(device, drawable, background=options.background) as rasterizer:
         for number, camera in enumerate([chosen[0], *chosen]):
             began = time.perf_counter()
             rasterizer.render_device(camera)

@@ -46,7 +46,7 @@ class Typical:
         self._values = values
 
     @staticmethod
-    def sizes(preset: Preset, splats: int) -> Typical:
+    def sizes(preset: Preset, splats: float) -> Typical:
         """Logarithms of the file's bytes, for a scene of so many splats."""
         return Typical(np.log(_TYPICAL[preset][0]) + math.log(splats))
 

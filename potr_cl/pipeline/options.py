@@ -4,13 +4,15 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any, TypeVar
 
 from potr_cl.codec.quantize import HyperParameters, Preset
 from potr_cl.errors import UsageError
 from potr_cl.model.scene import Scene
+from potr_cl.outputs.output import Output
+from potr_cl.outputs.potr import Potr
 from potr_cl.pipeline.presets import DEFAULT, PRESETS
 from potr_cl.stages.stage import Stage, parameters
 
@@ -33,6 +35,7 @@ class EncodeOptions:
         background: R, G, B behind the scene in the views that are looked at.
         memory: how many bytes of device memory may be filled with views; None: half of a GPU's memory, 0.3 of a CPU's.
         threads: number of threads for work on the host; the bytes do not depend on it. 0: one for each processor.
+        output: the kind of file that is made (:mod:`potr_cl.outputs.registry`).
         source_bytes: size of the file that the scene came from, for the metadata; None if it came from none.
     """
 
@@ -44,6 +47,7 @@ class EncodeOptions:
     memory: int | None = None
     threads: int = 0
     source_bytes: int | None = None
+    output: Output = field(default_factory=Potr)
 
     def __post_init__(self) -> None:
         if self.preset not in PRESETS:
@@ -81,7 +85,7 @@ class EncodeOptions:
         """
         stages = {stage.name: stage for stage in self.stages}
         own: dict[str, Any] = {}
-        fields = {field.name for field in dataclasses.fields(self)}
+        fields = {each.name for each in dataclasses.fields(self)}
         for name, change in changes.items():
             if name in stages:
                 stages[name] = stages[name].changed(**_changes_of(name, change))
@@ -118,6 +122,7 @@ class EncodeOptions:
             UsageError: q or a replaced value is out of range.
         """
         given = {name: getattr(stage, name) for stage in self.stages for name in parameters(type(stage))}
+        given |= {name: value for name, value in self.output.replaces.items() if given.get(name) is None}
         return HyperParameters.from_quality(self.q, self.preset, **given)
 
     def with_parameters(self, **values: float) -> EncodeOptions:
@@ -144,7 +149,8 @@ class EncodeOptions:
         def plain(values: dict[str, Any]) -> dict[str, Any]:
             return {name: str(value) if isinstance(value, Path) else value for name, value in values.items()}
 
-        own = {field.name: getattr(self, field.name) for field in dataclasses.fields(self) if field.name != "stages"}
+        own = {each.name: getattr(self, each.name) for each in dataclasses.fields(self) if each.name != "stages"}
+        own["output"] = {"suffix": self.output.suffix, **dataclasses.asdict(self.output)}
         return own | {stage.name: plain(dataclasses.asdict(stage)) for stage in self.stages}
 
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 from potr_cl.codec.quantize import Preset
 from potr_cl.stages.code import Code
 from potr_cl.stages.compact import Compact
+from potr_cl.stages.fit import Fit
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Stage
@@ -16,8 +17,9 @@ DEFAULT: Preset = "best"
 #: The stages of each preset, in their order. A stage with ``on=False`` is only done if the user asks for it.
 PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "best": (
-        Between(views=0),
+        Between(),
         Prune(),
+        Fit(),
         Compact(on=False),
         Refit(steps=8),
         Code(),
@@ -25,13 +27,15 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "smallest": (
         Between(),
         Prune(iterations=64),
+        Fit(),
         Compact(on=False),
         Refit(steps=8, at=(0.5, 0.75)),
         Code(),
     ),
     "fast": (
-        Between(views=0),
+        Between(),
         Prune(iterations=16),
+        Fit(),
         Compact(on=False),
         Refit(steps=4),
         Code(entropy="zstd", zstd_level=9),
@@ -39,6 +43,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "paper": (
         Between(views=0),
         Prune(),
+        Fit(),
         Compact(),
         Refit(steps=0),
         Code(),
@@ -48,7 +53,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
 #: What each preset is for, in a line.
 PURPOSE: dict[Preset, str] = {
     "best": "colours re-fitted together, steps of equal worth, the context coder: a small file in little time",
-    "smallest": "as best, with views between the training views and re-fits while pruning: takes 3 to 5 times as long",
+    "smallest": "as best, in more iterations and with re-fits while pruning: takes twice as long",
     "fast": "as best, in fewer iterations and steps, with zstd 9: encodes and decodes faster",
     "paper": "what the paper does: colours compacted splat by splat, its steps",
 }

@@ -22,12 +22,12 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-from potr_cl.codec.decoder import decode
+from potr_cl.codec.geometry import Geometry
 from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, cameras_or_virtual
+from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, cameras_or_virtual, tell_losses
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.growth import FASTEST, SLOWEST, FinenessAxis, Typical, meet, with_colour_steps, with_steps
 from potr_cl.pipeline.options import EncodeOptions
@@ -93,6 +93,7 @@ def encode_to_target(
     """
     options = options or EncodeOptions()
     scene = scene.rendered(antialiased)
+    tell_losses(scene, options)
     watch = Stopwatch(progress)
     cameras = cameras_or_virtual(scene, cameras, options, watch)
     if target.min_psnr is not None and not cameras:
@@ -155,10 +156,15 @@ class _Search:
         first = kinds.index(Refit) if Refit in kinds else kinds.index(Code)
         self._once, self._repeated = kinds[:first], [kind for kind in kinds[first:] if kind is not Code]
         by_size = target.max_bytes is not None
-        self._typical = Typical.sizes(options.preset, len(scene)) if by_size else Typical.psnrs(options.preset)
+        self._typical = (
+            Typical.sizes(options.preset, len(scene) * options.output.bytes_a_splat)
+            if by_size
+            else Typical.psnrs(options.preset)
+        )
         self._axis = FinenessAxis(options)
         self._scouted: tuple[float, float] | None = None  # where, and the value of a full encode, about
         self._evaluator: Evaluator | None = None
+        self._prepared: State | None = None
         self._used: Device | None = None  # by the stages that look at views
 
     def run(self) -> Found:
@@ -289,6 +295,8 @@ class _Search:
             most: the largest change of a step's logarithm.
         """
         points, best = {0.0: start.value}, start
+        if not self._options.output.steps:
+            return best
         for _ in range(_TRIES):
             finer = meet(points, self._target.aim, self._colour_rate)
             finer = round(min(max(finer, -most), most), 4)
@@ -296,7 +304,7 @@ class _Search:
             if finer in points or options == start.options or self._target.inside(best.value):
                 break
             reduced, geometry = start.reduced, start.reduced.geometry
-            if geometry is not None:
+            if isinstance(geometry, Geometry):
                 reduced = dataclasses.replace(reduced, geometry=geometry.with_colour_steps(options.parameters))
             found = self._evaluate("colours", start.options.q, start.thinned, reduced, options)
             points[finer] = found.value
@@ -306,6 +314,7 @@ class _Search:
     def _colours_suffice(self, value: float) -> bool:
         """Whether other quantiser steps of the colours will probably reach the target."""
         given = self._options.code.sf_dc is not None and self._options.code.sf_sh is not None
+        given = given or not self._options.output.steps
         low, high = self._target.window
         spare = (high - low) / 4
         reach = self._colour_rate * _MOST_COLOUR_STEPS
@@ -324,7 +333,10 @@ class _Search:
 
     def _thin(self, options: EncodeOptions) -> State:
         """The state after the stages that are not repeated for another q."""
-        return self._run(State.of(self._scene, self._views), options, self._once)
+        if self._prepared is None:
+            state = State.of(self._scene, self._views)
+            self._prepared = self._run(state, options, [kind for kind in self._once if kind.serves_others])
+        return self._run(self._prepared, options, [kind for kind in self._once if not kind.serves_others])
 
     def _refit(self, thinned: State, options: EncodeOptions) -> State:
         """The state after the stages that are repeated for another q, before the coding."""
@@ -350,7 +362,8 @@ class _Search:
             encoded = None
             pieces = self._code(reduced, options.changed(code=_QUICK_CODER)).pieces
             self._watch("evaluate tries", 0.0)
-            value = min(self._evaluator.psnr(decode(b"".join(pieces), trust=True)), _IDENTICAL)
+            with options.output.seen(b"".join(pieces), self._evaluator.device, trust=True) as candidate:
+                value = min(self._evaluator.psnr(candidate), _IDENTICAL)
             self._watch("evaluate tries", 1.0)
         self._tries.append(Try(kind, q, value))
         self._tell(f"{KINDS[kind].format(f'{q:g}')} {self._target.describe(value)}")

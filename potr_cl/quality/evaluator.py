@@ -13,7 +13,7 @@ import numpy as np
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import Colour
 from potr_cl.model.camera import Camera, test_views, train_views
-from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.scene import FloatArray
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
@@ -21,6 +21,7 @@ from potr_cl.quality.compare import Comparison, compare
 from potr_cl.quality.metrics_device import Similarity, in_batches
 from potr_cl.quality.pictures import Picture, rendered
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import Drawable
 
 #: So many training views, spread evenly, stand for all of them where there are no test views.
 _MOST_TRAINING_VIEWS = 32
@@ -84,13 +85,16 @@ class Evaluator(Owner):
         views: to judge by.
         background: behind both.
 
+    Attributes:
+        device: as given.
+
     Raises:
         DeviceError: the scene does not fit the device.
     """
 
-    def __init__(self, device: Device, scene: Scene, views: EvaluationViews, background: Colour) -> None:
+    def __init__(self, device: Device, scene: Drawable, views: EvaluationViews, background: Colour) -> None:
         self.views = views
-        self._device = device
+        self.device = device
         self._background = background
         self._reference = Rasterizer(device, scene, background=background)
         self._similarity = Similarity(device)
@@ -98,21 +102,21 @@ class Evaluator(Owner):
         self._kept = ExitStack()
         self._room = min(CACHED_PICTURES, device.info.memory // 16)
 
-    def psnr(self, candidate: Scene, most: int | None = None) -> float:
+    def psnr(self, candidate: Drawable, most: int | None = None) -> float:
         """Mean over the views of the PSNR against the uncompressed scene's pictures, in decibels.
 
         Identical pictures are left out of the mean; it is infinite if all are identical.
 
         Args:
-            candidate: to judge.
+            candidate: to judge; where it is on a device, that is the evaluator's.
             most: look at so many views only, spread evenly.
         """
         views = self.views.views
         if most is not None and most < len(views):
             views = [views[k] for k in np.linspace(0, len(views) - 1, most).round().astype(int)]
         values: list[float] = []
-        with Rasterizer(self._device, candidate, background=self._background) as rasterizer:
-            for some in in_batches(self._device, views):
+        with Rasterizer(self.device, candidate, background=self._background) as rasterizer:
+            for some in in_batches(self.device, views):
                 with self._references(some) as references, rendered(rasterizer, some) as pictures:
                     values += [psnr for psnr, _ in self._similarity(list(zip(pictures, references, strict=True)))]
         finite = [value for value in values if math.isfinite(value)]
@@ -134,19 +138,19 @@ class Evaluator(Owner):
             rest = iter(new)
             yield [self._pictures.get(camera.name) or next(rest) for camera in cameras]
 
-    def compare(self, candidate: Scene, progress: Callable[[str, float], None]) -> Comparison:
+    def compare(self, candidate: Drawable, progress: Callable[[str, float], None]) -> Comparison:
         """PSNR and SSIM from every view; see :func:`potr_cl.quality.compare.compare`."""
-        with Rasterizer(self._device, candidate, background=self._background) as rasterizer:
+        with Rasterizer(self.device, candidate, background=self._background) as rasterizer:
             return compare(self._reference, rasterizer, self.views.views, progress=progress)
 
-    def pictures(self, candidate: Scene, names: Sequence[str]) -> list[tuple[FloatArray, FloatArray]]:
+    def pictures(self, candidate: Drawable, names: Sequence[str]) -> list[tuple[FloatArray, FloatArray]]:
         """(H, W, 3) float32 pictures of both scenes from the named views.
 
         Raises:
             UsageError: there is no such view.
         """
         cameras = [self.views.named(name) for name in names]
-        with Rasterizer(self._device, candidate, background=self._background) as rasterizer:
+        with Rasterizer(self.device, candidate, background=self._background) as rasterizer:
             return [(self._reference.render(camera)[0], rasterizer.render(camera)[0]) for camera in cameras]
 
     def close(self) -> None:

@@ -16,6 +16,7 @@ from potr_cl.quality.compare import find_ground_truth, missing_photographs
 from potr_cl.quality.metrics import psnr
 from potr_cl.quality.photographs import read_photograph
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import Drawable
 
 
 class GroundTruth:
@@ -92,7 +93,7 @@ class PhotographFigures:
 def judge_by_photographs(
     ground_truth: GroundTruth,
     cameras: Sequence[Camera],
-    scenes: tuple[Scene, Scene],
+    scenes: tuple[Scene, Drawable],
     device: Device,
     background: Colour = (0.0, 0.0, 0.0),
 ) -> PhotographFigures:

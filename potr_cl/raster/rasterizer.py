@@ -27,10 +27,10 @@ from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import LOW_PASS, FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Owner, Scratch
+from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.raster.launcher import launcher_for
 from potr_cl.raster.rules import INRIA, LEAST_COMPENSATION, RasterRules
-from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
+from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, uploaded
 from potr_cl.raster.view_set import View, ViewSet
 
 #: Least room for intersections before anything is known of a view, and as a multiple of the splats.
@@ -42,7 +42,8 @@ class Rasterizer(Owner):
 
     Args:
         device: to render on.
-        scene: to render; copied to the device, later changes of its arrays are not seen.
+        scene: to render; copied to the device, later changes of its arrays are not seen. Or one that lies on the device
+            already, which stays the caller's.
         rules: of the rasterizer to follow.
         background: R, G, B behind everything.
 
@@ -52,13 +53,13 @@ class Rasterizer(Owner):
         stride: N rounded up; buffers that hold one value for each splat have this length.
 
     Raises:
-        DeviceError: the scene does not fit, or the kernels cannot be built.
+        DeviceError: the scene does not fit or lies on another device, or the kernels cannot be built.
     """
 
     def __init__(
         self,
         device: Device,
-        scene: Scene,
+        scene: Drawable,
         rules: RasterRules = INRIA,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
@@ -66,8 +67,18 @@ class Rasterizer(Owner):
         self.rules = rules
         self.background = background
         with device.all_or_nothing():
-            self._scene = SceneBuffers(device, scene)
+            if isinstance(scene, SceneBuffers):
+                if scene.device is not device:
+                    raise DeviceError(
+                        f"the scene lies on {scene.device.info}, which was opened apart from {device.info}"
+                    )
+                self._scene, self._owns = scene, False
+            else:
+                self._scene, self._owns = uploaded(device, scene), True
+            self._sh = self._scene.sh
+            self._other_sh = Memory(device)
             self._launcher = launcher_for(device, rules)
+            self._filter_macros = _filter_macros(self._scene)
             self._projection = device.shared_kernel(
                 "raster/project.cl",
                 "project",
@@ -75,7 +86,7 @@ class Rasterizer(Owner):
                 SH_COUNT=self._scene.sh_count,
                 NEAR=float(rules.near),
                 SQUARE_EXTENT=int(rules.square_extent),
-                **_filter_macros(scene),
+                **self._filter_macros,
             )
         self._bounds = Scratch(device, "the projected splats' bounds")
         self._counts = Scratch(device, "the tile counts")
@@ -87,6 +98,16 @@ class Rasterizer(Owner):
     @property
     def splats(self) -> int:
         return self._scene.splats
+
+    @property
+    def parameters(self) -> SceneBuffers:
+        """The scene on the device. Who writes to its buffers prepares views anew."""
+        return self._scene
+
+    @property
+    def filter_macros(self) -> dict[str, float]:
+        """Macros that a kernel needs which goes through the projection again; none unless the scene is antialiased."""
+        return dict(self._filter_macros)
 
     @property
     def stride(self) -> int:
@@ -204,6 +225,37 @@ class Rasterizer(Owner):
                     scratch.close()
         return views
 
+    def prepare_again(self, views: ViewSet, cameras: Sequence[Camera]) -> bool:
+        """Point prepared views at other cameras, in the memory that they have; more is taken only where it must be.
+
+        Args:
+            views: as :meth:`prepare_set` gave them.
+            cameras: as many as there are views.
+
+        Returns:
+            Whether each of the cameras has as many tiles across and down as the view that it takes the place of. If
+            not, nothing was done.
+
+        Raises:
+            As :meth:`prepare_set`; the views are of no use then.
+        """
+        if not views.aim_all(cameras):
+            return False
+        try:
+            counts, bounds = self._zeroed_counts(views), self._room_for_bounds(views)
+            self._enqueue_project(views, bounds)
+            self._launcher.enqueue_offsets(views, bounds, counts)
+            found = views.read_counts()
+            for view, count in zip(views.views, found, strict=True):
+                _accept(view, count)
+            if any(count > view.capacity for view, count in zip(views.views, found, strict=True)):
+                views.make_room([count + count // 4 for count in found])
+            self._enqueue_lists(views, bounds, counts, for_frame=False)
+        except BaseException:
+            self._counts.close()  # not zero
+            raise
+        return True
+
     def composite(self, view: View) -> tuple[FloatArray, FloatArray]:
         """The picture of a prepared view; returns what :meth:`render` returns."""
         self._enqueue_composite(view.owner)
@@ -219,15 +271,25 @@ class Rasterizer(Owner):
         """Enqueue only the projection of prepared views; with other SH, or into other buffers, if these are given."""
         self._enqueue_project(views, self._room_for_bounds(views), sh, shapes, colours)
 
-    def replace_sh(self, sh: FloatArray) -> cl.Buffer:
+    @property
+    def sh(self) -> cl.Buffer:
+        """The SH coefficients that splats have now, as :class:`~potr_cl.raster.scene_buffers.SceneBuffers` has them."""
+        return self._sh
+
+    def replace_sh(self, sh: FloatArray) -> cl.Buffer | None:
         """Give the scene other SH coefficients, (N, M, 3) float32 of the same degree.
 
         Views that were prepared before keep their colours until they are projected again.
 
         Returns:
-            The buffer of the former coefficients, which is the caller's to free.
+            The buffer of the former coefficients, which is the caller's to free; None if they are those of a scene that
+            lay on the device already, and stay there.
         """
-        return self._scene.replace_sh(sh)
+        former = self._sh
+        self._sh = self._scene.other_sh(self._other_sh, sh)
+        if former is not self._scene.sh:
+            return self._other_sh.release(former)
+        return self._scene.release_sh() if self._owns else None
 
     def _room_for_bounds(self, views: ViewSet) -> cl.Buffer:
         self._bounds.reserve(8 * self.stride * len(views.views))
@@ -249,7 +311,7 @@ class Rasterizer(Owner):
     ) -> None:
         self._projection.bind(
             **self._scene.geometry,
-            sh=self._scene.sh if sh is None else sh,
+            sh=self._sh if sh is None else sh,
             views=views.table,
             shapes=views.shapes if shapes is None else shapes,
             colours=views.colours if colours is None else colours,
@@ -297,7 +359,15 @@ class Rasterizer(Owner):
     def close(self) -> None:
         if self._frame is not None:
             self._frame.close()
-        for owner in (self._scene, self._bounds, self._counts, self._keys, self._image, self._transmittance):
+        for owner in (
+            *([self._scene] if self._owns else []),
+            self._other_sh,
+            self._bounds,
+            self._counts,
+            self._keys,
+            self._image,
+            self._transmittance,
+        ):
             owner.close()
 
 
@@ -321,7 +391,7 @@ def render(
         return rasterizer.render(camera)
 
 
-def _filter_macros(scene: Scene) -> dict[str, float]:
+def _filter_macros(scene: SceneBuffers) -> dict[str, float]:
     """Macros of the projection that an antialiased scene needs; the kernel of classic ones has no trace of it."""
     if not scene.antialiased:
         return {}

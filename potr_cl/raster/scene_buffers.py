@@ -1,17 +1,18 @@
-"""A scene's splats on a device, as the projection takes them."""
+"""A scene's splats on a device, as the projection takes them (:class:`SceneBuffers`), and how they come there."""
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.errors import DeviceError
-from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.scene import LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.raster.activation import activated_scales, log2_opacities, unit_quaternions
 
 #: Splats are padded to a multiple of this and handled in work-groups of it. CPUs are told the work-group too: left to
 #: itself, PoCL makes one of thousands and overflows its stack with their private memory.
@@ -20,88 +21,185 @@ SPLAT_GROUP = 256
 #: Splats whose parameters are uploaded at a time.
 _UPLOADED = 1 << 18
 
-#: Larger standard deviations, in world units, are replaced by this. Nobody can see a difference, and nothing overflows.
-_LARGEST_SCALE = 1e12
-
 
 class SceneBuffers(Owner):
-    """A scene's parameters, activated: standard deviations, unit quaternions, log2 of the opacities.
+    """A scene's parameters in a device's memory, activated, for a :class:`~potr_cl.raster.rasterizer.Rasterizer`.
 
-    Every parameter is an array of columns, each padded to the stride: cl/raster/project.cl says how they are used.
+    Every parameter is an array of float32 columns, (columns, stride), a column a value of every splat:
+    cl/raster/project.cl says how they are used. :func:`uploaded` makes one of a scene,
+    :func:`potr_cl.decode_to_device` of a file.
 
     Args:
         device: to hold them.
-        scene: of N splats; copied, later changes of its arrays are not seen.
+        splats: N.
+        sh_count: M, SH coefficients of a colour channel.
+        antialiased, low_pass: as of :class:`potr_cl.model.scene.Scene`.
 
     Attributes:
-        splats: N.
-        stride: N rounded up; buffers that hold one value for each splat have this length.
-        sh: (3 M, stride) float32, the SH coefficients of M = ``sh_count`` basis functions.
-        sh_count: M.
-        geometry: all other parameters and the stride, by the names that the projection's arguments have.
+        device, splats, sh_count, antialiased, low_pass: as given.
+        stride: N rounded up; what lies beyond the N-th splat is not drawn.
+        means: (3, stride) centres in world units.
+        scales: (3, stride) standard deviations in world units.
+        quaternions: (4, stride) unit quaternions w, x, y, z.
+        log2_opacities: (1, stride) logarithms to base 2 of the opacities.
+        sh: (3 M, stride) SH coefficients: R, G, B of the first, of the second, …
 
     Raises:
         DeviceError: the scene does not fit the device.
     """
 
-    def __init__(self, device: Device, scene: Scene) -> None:
-        if len(scene) > 0xFFFFFF00:
-            raise DeviceError(f"{len(scene)} splats are more than the kernels can number")
-        self._device = device
+    def __init__(
+        self, device: Device, splats: int, sh_count: int, antialiased: bool = False, low_pass: float = LOW_PASS
+    ) -> None:
+        if splats > 0xFFFFFF00:
+            raise DeviceError(f"{splats} splats are more than the kernels can number")
+        self.device = device
+        self.splats = splats
+        self.stride = max(-(-splats // SPLAT_GROUP), 1) * SPLAT_GROUP
+        self.sh_count = sh_count
+        self.antialiased, self.low_pass = antialiased, low_pass
         self._memory = Memory(device)
-        self.splats = len(scene)
-        self.stride = max(-(-len(scene) // SPLAT_GROUP), 1) * SPLAT_GROUP
-        self.sh_count = scene.sh.shape[1]
         try:
-            self.geometry: dict[str, Any] = {"stride": self.stride, **self._upload_geometry(scene)}
-            self.sh = self._upload_sh(scene.sh)
+            self.means = self._columns(3, 0, "the centres")
+            self.scales = self._columns(3, 0, "the scales")
+            self.quaternions = self._columns(4, 0, "the rotations")
+            # The padding has an opacity of 0: it is not drawn.
+            self.log2_opacities = self._columns(1, -np.inf, "the opacities")
+            self.sh = self._columns(3 * sh_count, 0, "the SH coefficients")
         except BaseException:
             self.close()
             raise
 
-    def replace_sh(self, sh: FloatArray) -> cl.Buffer:
-        """Replace the SH coefficients by others, (N, M, 3) float32 of the same degree.
+    def __len__(self) -> int:
+        return self.splats
 
-        Returns:
-            The buffer of the former ones, which is the caller's to free.
-        """
-        former, self.sh = self.sh, self._upload_sh(sh)
-        return self._memory.release(former)
+    @property
+    def sh_degree(self) -> int:
+        """Degree of the spherical harmonics, 0 to 3."""
+        return SH_COEFFICIENTS.index(self.sh_count)
 
-    def _upload_geometry(self, scene: Scene) -> dict[str, cl.Buffer]:
-        quaternions = scene.quaternions.astype(np.float64)
-        length = np.sqrt(np.einsum("ij,ij->i", quaternions, quaternions))[:, None]
-        nothing = np.flatnonzero(length == 0)
-        length[nothing] = 1
-        quaternions /= length
-        quaternions[nothing] = (1.0, 0.0, 0.0, 0.0)
-        scales = np.minimum(np.exp(np.minimum(scene.log_scales.astype(np.float64), 100)), _LARGEST_SCALE)
-        logits = scene.opacity_logits.astype(np.float64)
-        # log(sigmoid(logit)): logaddexp says the same, and takes eight times as long.
-        log2_opacities = (np.minimum(logits, 0) - np.log1p(np.exp(-np.abs(logits)))) / np.log(2)
+    @property
+    def nbytes(self) -> int:
+        """Bytes of all buffers."""
+        return self._memory.nbytes
+
+    @property
+    def geometry(self) -> dict[str, Any]:
+        """All parameters but the SH coefficients, and the stride, by the names that the projection's arguments have."""
         return {
-            "means": self._upload(scene.means, 0, "the centres"),
-            "scales": self._upload(scales, 0, "the scales"),
-            "quaternions": self._upload(quaternions, 0, "the rotations"),
-            # The padding has an opacity of 0: it is not drawn.
-            "log2_opacities": self._upload(log2_opacities[:, None], -np.inf, "the opacities"),
+            "stride": self.stride,
+            "means": self.means,
+            "scales": self.scales,
+            "quaternions": self.quaternions,
+            "log2_opacities": self.log2_opacities,
         }
 
-    def _upload_sh(self, sh: FloatArray) -> cl.Buffer:
-        return self._upload(sh.reshape(self.splats, -1), 0, "the SH coefficients")
+    def write_rows(
+        self, parameter: cl.Buffer, rows: NDArray[Any], what: str, pending: list[cl.Event] | None = None
+    ) -> None:
+        """Set a parameter to rows, one for each splat, which are turned to columns on the device.
 
-    def _upload(self, rows: NDArray[Any], padding: float, what: str) -> cl.Buffer:
-        """Upload rows, one for each splat, and transpose them to columns on the device, some rows at a time."""
-        device, width = self._device, rows.shape[1]
-        result = self._memory.allocate(4 * width * self.stride, what)
-        cl.enqueue_fill_buffer(device.queue, result, np.float32(padding), 0, 4 * width * self.stride)
+        Args:
+            parameter: one of the buffers.
+            rows: (N, columns) of any kind of float.
+            what: they are, for errors.
+            pending: as of :meth:`potr_cl.opencl.device.Device.upload`.
+
+        Raises:
+            DeviceError: there is no room for them beside the scene.
+        """
+        device, width = self.device, rows.shape[1]
         turn = device.shared_kernel("raster/columns.cl", "columns")
         for first in range(0, self.splats, _UPLOADED):
             some = np.ascontiguousarray(rows[first : first + _UPLOADED], np.float32)
             with Memory(device) as memory:
-                turn.bind(rows=memory.upload(some, what), first=first, width=width, stride=self.stride, result=result)
+                turn.bind(
+                    rows=memory.upload(some, what, pending),
+                    first=first,
+                    width=width,
+                    stride=self.stride,
+                    result=parameter,
+                )
                 turn.launch((len(some),))
-        return result
+
+    def write_columns(
+        self, parameter: cl.Buffer, first: int, columns: FloatArray, pending: list[cl.Event] | None = None
+    ) -> None:
+        """Set some columns of a parameter, from number ``first`` on, to (columns, N) float32, C order.
+
+        ``pending`` as of :meth:`potr_cl.opencl.device.Device.upload`.
+        """
+        number, splats = columns.shape
+        with self.device.errors("cannot take a scene"):
+            event = cl.enqueue_copy(
+                self.device.queue,
+                parameter,
+                columns,
+                buffer_origin=(0, first, 0),
+                host_origin=(0, 0, 0),
+                region=(4 * splats, number, 1),
+                buffer_pitches=(4 * self.stride, 0),
+                host_pitches=(4 * splats, 0),
+                is_blocking=pending is None,
+            )
+        if pending is not None:
+            pending.append(event)
+
+    def write_sh(self, parameter: cl.Buffer, sh: FloatArray) -> None:
+        """Set SH coefficients, (N, M, 3) float32 of any strides.
+
+        Args:
+            parameter: ``sh``, or a buffer of :meth:`other_sh`.
+            sh: the coefficients.
+        """
+        planar = sh.transpose(1, 2, 0)
+        if planar.flags.c_contiguous and planar.dtype == np.float32:  # as a decoder leaves them
+            self.write_columns(parameter, 0, planar.reshape(3 * self.sh_count, self.splats))
+        else:
+            self.write_rows(parameter, sh.reshape(self.splats, -1), "the SH coefficients")
+
+    def other_sh(self, memory: Memory, sh: FloatArray) -> cl.Buffer:
+        """Other SH coefficients for the same splats, (N, M, 3) float32 of the same degree, in a buffer like ``sh``.
+
+        Args:
+            memory: that owns the buffer.
+            sh: the coefficients.
+        """
+        buffer = self._columns(3 * self.sh_count, 0, "the SH coefficients", memory)
+        self.write_sh(buffer, sh)
+        return buffer
+
+    def release_sh(self) -> cl.Buffer:
+        """The buffer ``sh``, which is the caller's to free from now on."""
+        return self._memory.release(self.sh)
+
+    def _columns(self, number: int, value: float, what: str, memory: Memory | None = None) -> cl.Buffer:
+        buffer = (memory or self._memory).allocate(4 * number * self.stride, what)
+        cl.enqueue_fill_buffer(self.device.queue, buffer, np.float32(value), 0, 4 * number * self.stride)
+        return buffer
 
     def close(self) -> None:
         self._memory.close()
+
+
+#: What can be rendered: a scene of the host, or one that is on the device already.
+Drawable: TypeAlias = "Scene | SceneBuffers"
+
+
+def uploaded(device: Device, scene: Scene) -> SceneBuffers:
+    """A scene's parameters on a device: copied, later changes of its arrays are not seen.
+
+    Raises:
+        DeviceError: the scene does not fit the device.
+    """
+    buffers = SceneBuffers(device, len(scene), scene.sh.shape[1], scene.antialiased, scene.low_pass)
+    try:
+        buffers.write_rows(buffers.means, scene.means, "the centres")
+        buffers.write_rows(buffers.scales, activated_scales(scene.log_scales), "the scales")
+        buffers.write_rows(buffers.quaternions, unit_quaternions(scene.quaternions), "the rotations")
+        buffers.write_rows(buffers.log2_opacities, log2_opacities(scene.opacity_logits)[:, None], "the opacities")
+        buffers.write_sh(buffers.sh, scene.sh)
+    except BaseException:
+        buffers.close()
+        raise
+    return buffers

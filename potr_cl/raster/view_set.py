@@ -110,6 +110,20 @@ class ViewSet(Owner):
             self._write_table()
         return True
 
+    def aim_all(self, cameras: Sequence[Camera]) -> bool:
+        """Point the views at other cameras, if each has as many tiles across and down as the one before it.
+
+        Returns:
+            Whether all have.
+        """
+        if [(view.columns, view.rows) for view in self.views] != [_tiles(camera) for camera in cameras]:
+            return False
+        for view, camera in zip(self.views, cameras, strict=True):
+            view.camera = camera
+        self.pixels = sum(view.pixels for view in self.views)
+        self._write_table()
+        return True
+
     def make_room(self, counts: Sequence[int]) -> None:
         """Make room for this many intersections of each view. Earlier intersections are lost.
 

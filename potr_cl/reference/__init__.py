@@ -3,6 +3,7 @@
 Every result of the OpenCL kernels is compared with these, by the tests and by the tools that measure errors:
 
 - :mod:`potr_cl.reference.raster`: projection, spherical harmonics, compositing;
+- :mod:`potr_cl.reference.derivatives`: a picture's derivatives with respect to the splats' parameters;
 - :mod:`potr_cl.reference.removal`: the effect of removing a splat;
 - :mod:`potr_cl.reference.ridge`: the compaction's regressions;
 - :mod:`potr_cl.reference.refit`: the linear map of the colours, its least-squares solution;

@@ -10,19 +10,15 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl import __version__
-from potr_cl.codec.decoder import PotrFile
 from potr_cl.model.scene import Scene
-from potr_cl.pipeline.encode import Encoded
+from potr_cl.pipeline.encode import Encoded, Proved
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.target import Found, Target
 from potr_cl.plain_text import plain_document
 from potr_cl.quality.compare import Comparison, Figures, mean_view
 from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.quality.ground_truth import PhotographFigures
-from potr_cl.report.file import file_report
 
-#: Sections of :func:`potr_cl.report.file.file_report` by the property that they belong to, as their names begin.
-_PROPERTIES = ("position", "scale", "rotation", "opacity", "colour: DC", "colour: AC")
 #: Packages whose version may change the bytes.
 _PACKAGES = ("numpy", "pyopencl", "zstandard")
 
@@ -31,7 +27,7 @@ def encode_report(
     source: Path,
     scene: Scene,
     target: Path,
-    file: PotrFile,
+    file: Proved,
     encoded: Encoded,
     options: EncodeOptions,
     search: dict[str, Any] | None,
@@ -45,7 +41,7 @@ def encode_report(
     Args:
         source, target: paths of the uncompressed and the compressed file.
         scene: the uncompressed scene.
-        file: what was written to ``target``.
+        file: what was written to ``target``, and what its readers see.
         encoded: how it came about.
         options: that it was encoded with; they know the size of ``source``. Of a scene that comes from no file, the
             bytes of its arrays stand for it.
@@ -55,7 +51,6 @@ def encode_report(
         photographs: of :func:`photographs_report`, where photographs were fitted to.
         command: the command line, where there was one.
     """
-    contents = file_report(file)
     source_bytes = scene.nbytes if options.source_bytes is None else options.source_bytes
     report: dict[str, Any] = {
         "source": {
@@ -68,13 +63,15 @@ def encode_report(
         "file": str(target),
         "bytes": len(file.data),
         "ratio": source_bytes / len(file.data),
-        "splats": file.header.splats,
-        "bytes_a_splat": len(file.data) / file.header.splats,
-        "properties": _properties(contents["sections"]),
+        "splats": len(file.scene),
+        "bytes_a_splat": len(file.data) / len(file.scene),
+        "properties": options.output.properties(file.data),
         "quality": quality,
         "photographs": photographs,
         "pruning": None,
         "unseen": None,
+        "fit": None,
+        "views_between": None,
         "search": search,
         "options": options.as_dict(),
         "parameters": dataclasses.asdict(options.parameters),
@@ -91,19 +88,15 @@ def encode_report(
         }
     if encoded.unseen is not None:
         report["unseen"] = {**dataclasses.asdict(encoded.unseen), "said": str(encoded.unseen)}
+    if encoded.fitted is not None:
+        report["fit"] = {**encoded.fitted.facts, "said": str(encoded.fitted)}
+    if encoded.between is not None:
+        report["views_between"] = {**dataclasses.asdict(encoded.between), "said": str(encoded.between)}
     if encoded.device is not None:
         info = encoded.device.info
         report["device"] = {"name": info.name, "platform": info.platform, "version": info.version}
     shown: dict[str, Any] = plain_document(report)
     return shown
-
-
-def _properties(sections: dict[str, dict[str, float]]) -> dict[str, int]:
-    """Bytes by property: all sections of one name's beginning together, the rest as "other"."""
-    sums = dict.fromkeys((*_PROPERTIES, "other"), 0)
-    for name, entry in sections.items():
-        sums[next((p for p in _PROPERTIES if name.startswith(p)), "other")] += int(entry["bytes"])
-    return {name: nbytes for name, nbytes in sums.items() if nbytes}
 
 
 def search_report(target: Target, found: Found) -> dict[str, Any]:
@@ -181,6 +174,8 @@ def format_encode_report(report: dict[str, Any]) -> str:
     ]
     if report["unseen"] is not None and report["unseen"]["splats"]:
         lines.append(f"           {report['unseen']['said']}")
+    if report["views_between"] is not None:
+        lines.append(f"views      {report['views_between']['said']}")
     if source["antialiased"]:
         lines.append("rendered   as an antialiased scene")
     for place, (name, nbytes) in enumerate(report["properties"].items()):
@@ -195,6 +190,8 @@ def format_encode_report(report: dict[str, Any]) -> str:
             f"           mean of {quality['judged_by']}",
             f"           worst view {worst['name']}: PSNR {decibels(worst['psnr'])}, SSIM {worst['ssim']:.4f}",
         ]
+    if report.get("fit") is not None:
+        lines.append(f"fit        {report['fit']['said']}")
     photographs = report["photographs"]
     if photographs is not None:
         held_out = photographs["held_out"]

@@ -1,4 +1,4 @@
-"""The stage "code": quantise what is left and make the bytes of a file of it."""
+"""The stage "code": quantise what is left and make the bytes of a file of it, of the kind that is asked for."""
 
 from __future__ import annotations
 
@@ -6,14 +6,13 @@ from dataclasses import dataclass
 from typing import Any
 
 from potr_cl.codec.container import ENTROPY_CODERS, EntropyCoder
-from potr_cl.codec.encoder import code_scene
 from potr_cl.errors import UsageError
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
 
 @dataclass(frozen=True)
 class Code(Stage):
-    """Octree, quantised streams and entropy coding; the last stage, which is always done.
+    """The file itself (:class:`potr_cl.outputs.output.Output`); the last stage, which is always done.
 
     Attributes:
         entropy, zstd_level: choose the entropy coder (:class:`potr_cl.codec.container.EntropyCoder`).
@@ -108,14 +107,5 @@ class Code(Stage):
         geometry = state.geometry
         if geometry is not None and geometry.asked != bench.parameters:
             geometry = None
-        coded = code_scene(
-            state.scene,
-            bench.parameters,
-            state.views,
-            bench.metadata(state),
-            self.coder,
-            bench.threads,
-            bench.progress,
-            geometry,
-        )
+        coded = bench.output.file(state.scene, geometry, bench.request(state, bench.metadata(state), self.coder))
         return state.having_learnt(self.name, coded)

@@ -8,10 +8,10 @@ from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
-from potr_cl.codec.geometry import quantise_geometry
 from potr_cl.errors import UsageError
-from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray
+from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
@@ -117,26 +117,36 @@ class Refit(Stage):
         parameters = bench.parameters
         geometry = state.geometry
         if geometry is None or geometry.asked != parameters:
-            with thread_pool(bench.threads) as pool:
-                geometry = quantise_geometry(state.scene, parameters, state.views, pool.map)
+            geometry = bench.output.geometry(state.scene, bench.request(state))
+        rounded = geometry
         decoded = geometry.decoded(state.scene.sh)
         compacted = "compact" in state.learnt
         active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
         options = RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory)
         fits = 1 if self.ground_truth is None else 2
 
-        def fitted(views: Sequence[Camera], targets: Targets, number: int) -> Refitted:
+        def fitted(views: Sequence[Camera], targets: Targets, number: int) -> tuple[Refitted, Rounded]:
+            geometry = rounded
+
             def progress(done: int, steps: int) -> None:
                 bench.progress("refit", (number + done / steps) / fits)
 
-            return refit_colours(
-                bench.opened, decoded, views, targets, options, active, bench.background, progress
+            def fix_ac(sh: FloatArray, worth: FloatArray) -> FloatArray:
+                nonlocal geometry
+                geometry, sh = bench.output.fix_ac(rounded, sh, worth, bench.request(state))
+                return sh
+
+            found = refit_colours(
+                bench.opened, decoded, views, targets, options, active, bench.background, progress,
+                fix_ac if bench.output.fixes_ac else None,
             )  # fmt: skip
+            return found, geometry
 
         with ExitStack() as stack:
             stack.callback(bench.progress, "refit", 1.0)
-            rasterizer = stack.enter_context(Rasterizer(bench.opened, state.source, background=bench.background))
-            refitted = fitted(state.views, RenderedTargets(rasterizer, state.views), 0)
+            source = bench.drawable(state.source)
+            rasterizer = stack.enter_context(Rasterizer(bench.opened, source, background=bench.background))
+            refitted, geometry = fitted(state.views, RenderedTargets(rasterizer, state.views), 0)
             choice = None
             if self.ground_truth is not None:
                 first_added = len(state.views) - state.added
@@ -149,13 +159,14 @@ class Refit(Stage):
                 if state.added:  # nobody photographed these
                     views = [*fit_to, *added]
                     targets = PartlyPhotographed(of_photographs, len(fit_to), RenderedTargets(rasterizer, views))
-                to_photographs = fitted(views, targets, 1)
+                to_photographs, its_geometry = fitted(views, targets, 1)
                 psnrs = []
                 for each in (to_photographs, refitted):
                     with Rasterizer(bench.opened, replace(decoded, sh=each.sh), background=bench.background) as judged:
                         psnrs.append(photographs.psnr(judged, judging))
                 choice = PhotographChoice(len(judging), *psnrs)
-                refitted = to_photographs if choice.kept else refitted
+                if choice.kept:
+                    refitted, geometry = to_photographs, its_geometry
         then = replace(state.recoloured(refitted.sh), geometry=geometry).having_learnt(self.name, refitted)
         return then if choice is None else then.having_learnt("photographs", choice)
 
@@ -171,7 +182,8 @@ class RefitOnTheWay(Stage):
 
     def run(self, state: State, bench: Workbench) -> State:
         bench.progress("refit", 0.0)
-        with Rasterizer(bench.opened, state.source, background=bench.background) as rasterizer:
+        source = bench.drawable(state.source)
+        with Rasterizer(bench.opened, source, background=bench.background) as rasterizer:
             refitted = refit_colours(
                 bench.opened,
                 state.scene,

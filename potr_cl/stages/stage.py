@@ -17,16 +17,20 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.output import Output, Request, Rounded
+from potr_cl.outputs.potr import Potr
+from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.scene_buffers import Drawable
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-    from potr_cl.codec.geometry import Geometry
 
 T = TypeVar("T")
 
@@ -58,8 +62,8 @@ class State:
         survivors: (n,) int64, ascending: the number in ``source`` of each splat of ``scene``.
         views: the training views; empty if there are no cameras.
         added: how many of them, the last ones, a stage has put between those that were given.
-        geometry: of ``scene`` as a decoder will see it, once a stage has quantised it. A stage that then changes
-            anything but colours makes it None again.
+        geometry: of ``scene`` as the file's readers will see it, once a stage has had it rounded. A stage that then
+            changes anything but colours makes it None again.
         importances: of the splats in each view, for stages that work while splats are being removed; else None.
         learnt: what each stage has found out, by the stage's name.
     """
@@ -68,7 +72,7 @@ class State:
     scene: Scene
     survivors: NDArray[np.int64]
     views: tuple[Camera, ...]
-    geometry: Geometry | None = None
+    geometry: Rounded | None = None
     importances: Importances | None = None
     learnt: Mapping[str, Any] = field(default_factory=dict)
     added: int = 0
@@ -104,7 +108,9 @@ class Workbench:
         threads: number of threads for work on the host; results do not depend on it. 0: one for each processor.
         interludes: what other stages want done while splats are being removed.
         metadata: makes the file's metadata from the last state.
+        output: the kind of file that is made in the end.
         progress: called to say how far the work is.
+        kept: the uncompressed scene, where it stays on the device from one stage to the next.
     """
 
     parameters: HyperParameters
@@ -115,6 +121,19 @@ class Workbench:
     interludes: tuple[Interlude, ...] = ()
     metadata: Callable[[State], bytes] = lambda state: b""
     progress: Progress = lambda what, done: None
+    output: Output = field(default_factory=Potr)
+    kept: KeptScene | None = None
+
+    def drawable(self, scene: Scene) -> Drawable:
+        """What to give to a rasterizer for a scene: it may lie on the device already."""
+        return scene if self.kept is None else self.kept.drawable(self.opened, scene)
+
+    def request(self, state: State, metadata: bytes = b"", entropy: EntropyCoder | None = None) -> Request:
+        """What the output is told besides the scene."""
+        return Request(
+            self.parameters, state.views, self.device, self.memory, self.threads, metadata, entropy or EntropyCoder(),
+            self.progress,
+        )  # fmt: skip
 
     @property
     def opened(self) -> Device:
@@ -132,7 +151,8 @@ class Stage(ABC):
         name: what options and results call it.
         title: heads its options in the help of the command line.
         needs_views: whether it computes on a device, from views. Such a stage is left out if there are no views.
-        serves_others: whether it only prepares what other stages look at. It is left out if none of them does.
+        serves_others: whether it only prepares what other stages look at, the same for every q. It is left out if none
+            of them does. Such stages come first.
     """
 
     name: ClassVar[str]

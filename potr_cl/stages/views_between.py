@@ -2,27 +2,51 @@
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass, replace
+from typing import Literal
 
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import thread_pool
+from potr_cl.model.camera import Camera
+from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import SPREAD, views_between
 from potr_cl.model.virtual_cameras import is_virtual
-from potr_cl.stages.between.trial import Trial, try_views
+from potr_cl.stages.between.amount import needed, views_where_few
+from potr_cl.stages.between.room import room_for
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
-#: The most views that are added for each training view if the scene decides. On CPUs, where each takes nearly as long
-#: as a training view, every second training view gets one.
-_MOST, _MOST_ON_CPU, _EVERY_ON_CPU = 2, 1, 2
 _MOST_ASKED = 100
 
 
-def _number(text: str) -> int | None:
-    if text in ("auto", "off"):
-        return None if text == "auto" else 0
-    if not text.isdecimal() or len(text) > 9:
-        raise UsageError(f"--views-between is '{text[:40]}': give a number of views, auto, or off")
-    return int(text)
+def _number(text: str) -> float | Literal["auto"]:
+    if text == "auto":
+        return "auto"
+    try:
+        return 0.0 if text == "off" else float(text)
+    except ValueError:
+        raise UsageError(f"--views-between is '{text[:40]}': give a number of views, auto, or off") from None
+
+
+@dataclass(frozen=True)
+class Added:
+    """What the stage has added.
+
+    Attributes:
+        given: the number of training views that were given.
+        added: of views between them.
+        shown_by: how many given views at most show the quarter of the scene that the fewest show; None if nobody asked,
+            or they show nothing.
+    """
+
+    given: int
+    added: int
+    shown_by: float | None = None
+
+    def __str__(self) -> str:
+        count = f"{self.added} view{'' if self.added == 1 else 's'}" if self.added else "no view"
+        return f"{count} between the {self.given} training views {'were' if self.added > 1 else 'was'} looked at, too"
 
 
 @dataclass(frozen=True)
@@ -32,7 +56,8 @@ class Between(Stage):
     Virtual cameras are spread so that nothing has to be added.
 
     Attributes:
-        views: how many to add for each training view; None: as many as the scene needs; 0: none.
+        views: how many to add for each training view; 0.5: one for every second; 0: none; "auto": as many as the scene
+            needs, and as fit the memory for views.
         spread: how far they are off the way to a neighbouring view, as a part of that way: one standard deviation.
 
     Raises:
@@ -43,21 +68,22 @@ class Between(Stage):
     title = "views between the training views"
     serves_others = True
 
-    views: int | None = option(
-        None,
+    views: float | Literal["auto"] = option(
+        "auto",
         Flag(
             "--views-between",
-            "views to look at besides, for each training view, between it and its neighbours; off: none",
+            "views to look at besides, for each training view, between it and its neighbours; 0.5: for every second; "
+            "auto: as many as the scene needs; off: none",
             "N",
             _number,
-            default="the preset's: auto, as many as the scene needs, in smallest, else off",
+            default="the preset's: auto, but off in paper",
         ),
     )
     spread: float = option(SPREAD)
 
     def __post_init__(self) -> None:
-        if self.views is not None and not 0 <= self.views <= _MOST_ASKED:
-            raise UsageError(f"--views-between is {self.views}, it must be from 0 to {_MOST_ASKED}")
+        if self.views != "auto" and not (isinstance(self.views, (int, float)) and 0 <= self.views <= _MOST_ASKED):
+            raise UsageError(f"--views-between is {self.views}, it must be from 0 to {_MOST_ASKED}, or auto")
         if not 0 <= self.spread <= 10:
             raise UsageError(f"the spread of the views between is {self.spread:g}, it must be from 0 to 10")
 
@@ -69,17 +95,27 @@ class Between(Stage):
         return self.asked_for
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Add them; ``learnt`` gets a :class:`potr_cl.stages.between.trial.Trial`."""
-        if is_virtual(state.views) or len(state.views) < 2 or state.added:
+        """Add them; ``learnt`` gets an :class:`Added`."""
+        given = len(state.views)
+        if is_virtual(state.views) or given < 2 or state.added:
             return state
         bench.progress("views between", 0.0)
-        slow = bench.opened.info.kind == "cpu"
-        if self.views is None:
-            trial = try_views(state, bench, self.spread, _MOST_ON_CPU if slow else _MOST, brief=slow)
-        else:
-            trial = Trial(self.views)
-        added = views_between(state.source, state.views, trial.each, self.spread)
-        if slow and self.views is None:
-            added = added[::_EVERY_ON_CPU]
+        with thread_pool(bench.threads) as pool:
+            known = GivenViews(state.source, state.views, pool.map)
+            each, shown_by = self.views, None
+            if each == "auto":
+                each, parts = 0.0, known.views_of_parts()
+                if len(parts):
+                    shown_by = views_where_few(parts)
+                    each = needed(shown_by, given, bench.opened.info.kind == "cpu")
+            added = views_between(state.source, state.views, each, self.spread, known=known, run=pool.map)
+        if self.views == "auto":
+            added = _evenly(added, room_for(added, state, bench))
         bench.progress("views between", 1.0)
-        return replace(state, views=(*state.views, *added), added=len(added)).having_learnt(self.name, trial)
+        then = replace(state, views=(*state.views, *added), added=len(added))
+        return then.having_learnt(self.name, Added(given, len(added), shown_by))
+
+
+def _evenly(views: Sequence[Camera], count: int) -> list[Camera]:
+    """So many of some views, spread evenly over their order."""
+    return [views[number * len(views) // count] for number in range(count)]

@@ -25,7 +25,7 @@ from potr_cl.opencl.discovery import list_devices
 from potr_cl.pipeline.keywords import stage_keywords
 
 #: The commands that have a function of their name.
-COMMANDS = ("encode", "prune", "compact", "refit", "decode", "info", "convert", "render", "compare")
+COMMANDS = ("encode", "prune", "compact", "refit", "fit", "decode", "info", "convert", "render", "compare")
 #: Options that have no keyword, and why.
 COMMAND_LINE_ONLY = {
     "--help": "Python has its own",
@@ -68,6 +68,7 @@ VALUES: dict[str, tuple[list[str], Any]] = {
     "--weighting": (["visibility"], "visibility"),
     "--one-pass": ([], True),
     "--refit": (["off"], "off"),
+    "--fit": (["10"], 10),
     "--drop": (["1e-5"], 1e-5),
     "--refit-at": (["0.3", "0.6"], [0.3, 0.6]),
     "--photos": (["{photos}"], "{photos}"),
@@ -110,7 +111,7 @@ NO_DIFFERENCE = {
     ("encode", "--mapping-a"),
     ("prune", "--mapping-a"),
     ("compact", "--background"),
-    *((command, "--virtual-views") for command in ("encode", "prune", "compact", "refit")),
+    *((command, "--virtual-views") for command in ("encode", "prune", "compact", "refit", "fit")),
 }
 #: What else has to be given for an option to have anything to do: as typed, and in Python.
 WITH: dict[str, list[str]] = {
@@ -126,6 +127,7 @@ WITH: dict[str, list[str]] = {
     "--damping": ["--keep"],
     "--mapping-a": ["--keep"],
     "--refit-at": ["--keep"],
+    "--fit": ["--keep"],
 }
 #: Options that cannot be given with cameras.
 WITHOUT_CAMERAS = {"--virtual-views", "--turntable", "--up", "--size"}
@@ -242,7 +244,9 @@ def called(command: str, flags: list[str], files: dict[str, Path], folder: Path,
         suffix = ".spz" if "--spz-version" in flags else suffix
         names = {**files, "output": here / f"out{suffix}", "report": here / "page.html", "order": here / "order.npy"}
         paths = {name: str(path) for name, path in names.items()}
-        sources = {"decode": ["potr"], "refit": ["reduced"], "compare": ["scene", "reduced"]}.get(command, ["scene"])
+        sources = {"decode": ["potr"], "refit": ["reduced"], "fit": ["reduced"], "compare": ["scene", "reduced"]}.get(
+            command, ["scene"]
+        )
         positional = [paths[name] for name in sources]
         if side == "typed":
             words = [command, *positional]

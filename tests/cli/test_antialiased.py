@@ -45,11 +45,12 @@ def test_every_command_that_writes_a_scene(tmp_path, paths, capsys, marked, opti
         ["prune", scene, "--cameras", cameras, "-o", tmp_path / "b.ply", *few],
         ["compact", scene, "--cameras", cameras, "-o", tmp_path / "c.ply"],
         ["refit", scene, "--reference", scene, "--cameras", cameras, "-o", tmp_path / "d.ply", "--steps", 1],
+        ["fit", scene, "--reference", scene, "--cameras", cameras, "-o", tmp_path / "g.ply", "--steps", 1],
     ):
         run(*command, *option)
         said = capsys.readouterr().out
         assert ("as an antialiased scene" in said) == (expected and command[0] == "encode")
-    for name in ("a.potr", "a.spz", "a.ply", "b.ply", "c.ply", "d.ply"):
+    for name in ("a.potr", "a.spz", "a.ply", "b.ply", "c.ply", "d.ply", "g.ply"):
         assert load_scene(tmp_path / name).antialiased is expected, name
     run("decode", tmp_path / "a.potr", "-o", tmp_path / "e.ply")
     assert load_scene(tmp_path / "e.ply").antialiased is expected

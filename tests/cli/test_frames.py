@@ -19,10 +19,10 @@ def turned(tmp_path_factory, plush_excerpt) -> Path:
     return path
 
 
-@pytest.mark.parametrize("command", ["encode", "prune", "compact", "refit"])
+@pytest.mark.parametrize("command", ["encode", "prune", "compact", "refit", "fit"])
 def test_what_throws_away_refuses(command, turned, data, tmp_path, capsys):
     output = tmp_path / ("out.potr" if command == "encode" else "out.ply")
-    more = ["--reference", str(turned)] if command == "refit" else []
+    more = ["--reference", str(turned)] if command in ("refit", "fit") else []
     cameras = str(data / "plush_excerpt_cameras.json")
     assert main([command, str(turned), "--cameras", cameras, "-o", str(output), *more]) == 2
     said = capsys.readouterr().err.strip().splitlines()[-1]

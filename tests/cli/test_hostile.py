@@ -152,6 +152,7 @@ def calls(name: str, good: str) -> list[list[str]]:
         ["prune", name, "-o", "new.ply"],
         ["prune", good, "-o", "new.ply", "--order", name],
         ["refit", good, "--reference", name, "-o", "new.ply"],
+        ["fit", good, "--reference", name, "-o", "new.ply"],
         ["render", name, "--cameras", cameras, "-o", "new"],
         ["render", good, "--cameras", name, "-o", "new"],
         ["render", good, "--cameras", cameras, "-o", name, "--views", "0"],
@@ -410,6 +411,7 @@ def test_trust_reaches_the_readers(
         ["prune", scene, "-o", out],
         ["compact", scene, "-o", out],
         ["refit", scene, "--reference", scene, "-o", out],
+        ["fit", scene, "--reference", scene, "-o", out],
         ["render", scene, "--cameras", cameras, "-o", out],
         ["compare", scene, scene],
     ):

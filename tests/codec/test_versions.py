@@ -23,7 +23,7 @@ def file_of(scene, parameters, **options) -> bytes:
 
 
 def test_versions_are_known_by_their_numbers():
-    assert {number: version.number for number, version in VERSIONS.items()} == {1: 1, 2: 2}
+    assert {number: version.number for number, version in VERSIONS.items()} == {1: 1, 2: 2, 3: 3}
 
 
 @pytest.mark.parametrize("preset", ["paper", "best"])
@@ -33,7 +33,7 @@ def test_files_hold_the_coders_that_their_version_has(preset, entropy):
     file = PotrFile.from_bytes(file_of(random_scene(2000, 1), parameters, entropy=EntropyCoder(entropy)))
     coders = {section.coder for section in file.header.sections}
     assert coders <= VERSIONS[file.header.version].coders
-    assert (Coder.CONTEXT in coders) == (preset == "best" and entropy == "context")
+    assert (Coder.BUNDLES in coders) == (preset == "best" and entropy == "context")
 
 
 def test_factors_of_colours_that_version_1_cannot_tell_are_refused():
@@ -50,10 +50,22 @@ def test_factors_of_colours_that_version_1_cannot_tell_are_refused():
     assert PotrFile.from_bytes(file_of(random_scene(20, 1), best)).header.sf_dc == 30
 
 
-class Version3(versions.Version2):
+@pytest.mark.parametrize("entropy", ["context", "zstd"])
+def test_version_2_is_still_written_where_it_is_asked_for(entropy):
+    parameters = dataclasses.replace(HyperParameters.from_quality(0.5, "best"), version=2)
+    scene = random_scene(600, 2, seed=5)
+    data = file_of(scene, parameters, entropy=EntropyCoder(entropy))
+    assert PotrFile.from_bytes(data).header.version == 2
+    # Without anything known of what its splats show, a file of version 3 has the same values.
+    newest = decode(file_of(scene, dataclasses.replace(parameters, version=3), entropy=EntropyCoder(entropy)))
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        assert np.array_equal(getattr(decode(data), name), getattr(newest, name))
+
+
+class Version4(versions.Version2):
     """Opacities as they are, rotations of one factor, a single factor for all of SH: nothing else is told of it."""
 
-    number = 3
+    number = 4
     coders = frozenset({Coder.RAW, Coder.CONTEXT, Coder.ZSTD})
     separate_ac_factor = False
     rotations_need_scales = False
@@ -72,13 +84,13 @@ class Version3(versions.Version2):
 def test_a_new_version_is_one_object(monkeypatch, entropy):
     scene = random_scene(2000, 2)
     parameters = dataclasses.replace(
-        HyperParameters.from_quality(0.7, "best", sf_dc=60, sf_sh=60, sf_opacity=200, sf_rotation=100), version=3
+        HyperParameters.from_quality(0.7, "best", sf_dc=60, sf_sh=60, sf_opacity=200, sf_rotation=100), version=4
     )
-    monkeypatch.setitem(VERSIONS, 3, Version3())
+    monkeypatch.setitem(VERSIONS, 4, Version4())
     coded = code_scene(scene, parameters, entropy=EntropyCoder(entropy))
     data = b"".join(coded.pieces)
     file, source = PotrFile.from_bytes(data), scene.subset(coded.order)
-    assert file.header.version == 3
+    assert file.header.version == 4
     assert (file.header.sf_dc, file.header.sf_ac) == (60, 60)
     assert (Coder.CONTEXT in {section.coder for section in file.header.sections}) == (entropy == "context")
     back = file.scene()
@@ -87,7 +99,7 @@ def test_a_new_version_is_one_object(monkeypatch, entropy):
     assert np.array_equal(file.quaternions(), back.quaternions)
     assert np.allclose(np.linalg.norm(back.quaternions, axis=1), 1, atol=1e-6)
     monkeypatch.undo()
-    with pytest.raises(DataError, match="format version 3, this potr_cl reads up to 2"):
+    with pytest.raises(DataError, match="format version 4, this potr_cl reads up to 3"):
         decode(data)
 
 

@@ -8,7 +8,9 @@ import numpy as np
 import pytest
 
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, camera_centres
+from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.views_between import is_between, views_between
 from potr_cl.reference.surfaces import together
 from tests.cases.surfaces import flat_splats, sphere
@@ -121,3 +123,31 @@ def test_cameras_at_one_place_do_no_harm(cameras):
 def test_wrong_numbers(each, spread):
     with pytest.raises(UsageError, match="views between"):
         views_between(BALL, ORBIT, each, spread)
+
+
+def test_half_of_the_given_views_get_one():
+    whole, half = views_between(BALL, ORBIT, 1), views_between(BALL, ORBIT, 0.5)
+    assert [camera.name for camera in half] == [camera.name for camera in whole[1::2]]
+    assert len(half) == 6
+    more = views_between(BALL, ORBIT, 1.5)
+    assert [camera.name for camera in more[:12]] == [camera.name for camera in whole]
+    assert len(more) == 18
+
+
+def test_threads_do_not_change_them():
+    with thread_pool(4) as pool:
+        shared = views_between(BALL, ORBIT, 2, run=pool.map)
+    alone = views_between(BALL, ORBIT, 2)
+    assert [c.name for c in shared] == [c.name for c in alone]
+    assert np.array_equal(camera_centres(shared), camera_centres(alone))
+
+
+def test_parts_of_a_scene_are_shown_by_the_views_that_face_them():
+    once, twice = (GivenViews(BALL, orbit(count)).views_of_parts() for count in (12, 24))
+    # From four radii away, somewhat less than half of the ball is seen.
+    assert once.min() > 0
+    assert 3 < once.mean() < 6
+    assert 1.8 < twice.mean() / once.mean() < 2.2
+    # Cameras in one place all show the same half.
+    here = [dataclasses.replace(ORBIT[0], name=f"{number}") for number in range(5)]
+    assert set(GivenViews(BALL, here).views_of_parts()) == {5}

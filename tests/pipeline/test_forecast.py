@@ -39,6 +39,7 @@ def test_more_work_takes_longer(ahead):
     assert ahead(best.changed(prune={"iterations": 480})) > 1.5 * whole
     assert ahead(best.changed(prune=False)) < 0.9 * whole
     assert ahead(best.changed(refit={"steps": 80})) > 1.5 * whole
+    assert ahead(best.changed(fit={"steps": 1000})) > 2 * whole
     assert ahead(best, views=4) < 0.7 * whole
 
 

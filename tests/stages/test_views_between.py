@@ -8,18 +8,23 @@ import numpy as np
 import pytest
 
 from potr_cl.codec.decoder import decode
+from potr_cl.codec.quantize import PRESETS, HyperParameters
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import to_8_bits, write_png
 from potr_cl.model.camera import test_views, train_views
-from potr_cl.model.views_between import views_between
+from potr_cl.model.views_between import is_between, views_between
 from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.search import encode_to_target
+from potr_cl.pipeline.target import Target
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.pruning.prepared_views import PreparedViews
 from potr_cl.stages.refitting.targets import GroundTruthTargets, PartlyPhotographed, RenderedTargets
+from potr_cl.stages.stage import State, Workbench
 from potr_cl.stages.views_between import Between
 
 
@@ -28,7 +33,7 @@ def device():
     return Device()
 
 
-def options(views: int | None, **changes):
+def options(views: float | str, **changes):
     return EncodeOptions.for_preset("best", between={"views": views}, prune={"iterations": 12}, **changes)
 
 
@@ -60,8 +65,79 @@ def test_what_lies_between_few_views_gets_better_at_no_more_bytes(device, plush_
 
 
 def test_the_scene_decides_and_does_so_the_same_way_every_time(device, plush_excerpt, plush_excerpt_cameras):
-    files = {file_of(device, plush_excerpt, plush_excerpt_cameras, options(None)) for _ in range(2)}
+    files = {file_of(device, plush_excerpt, plush_excerpt_cameras, options("auto")) for _ in range(2)}
     assert len(files) == 1
+
+
+def added(device, scene, views, **changes) -> tuple[int, State]:
+    """How many views the scene is found to need, and the state with them."""
+    bench = Workbench(HyperParameters.from_quality(0.5), device=device, **changes)
+    state = Between().run(State.of(scene, views), bench)
+    return state.added, state
+
+
+def test_a_scene_of_which_parts_are_seen_by_few_views_gets_more(device, plush_excerpt, plush_excerpt_cameras):
+    given = train_views(plush_excerpt_cameras)
+    count, state = added(device, plush_excerpt, given)
+    assert 0 < count <= 2 * len(given)
+    assert state.views[: len(given)] == tuple(given)
+    assert len(state.views) == len(given) + count
+    assert all(is_between(camera) for camera in state.views[len(given) :])
+    assert (state.learnt["between"].given, state.learnt["between"].added) == (len(given), count)
+
+
+def test_dense_views_get_none(device, plush_excerpt, plush_excerpt_cameras):
+    given = train_views(plush_excerpt_cameras)
+    dense = [*given, *views_between(plush_excerpt, given, 6)]
+    assert len(dense) > 50
+    count, state = added(device, plush_excerpt, dense)
+    assert count == 0
+    assert state.views == tuple(dense)
+
+
+def test_only_as_many_are_added_as_fit_the_memory_beside_the_given_ones(device, plush_excerpt, plush_excerpt_cameras):
+    given = train_views(plush_excerpt_cameras)
+    wanted, _ = added(device, plush_excerpt, given)
+    counts = [added(device, plush_excerpt, given, memory=megabytes * 250_000)[0] for megabytes in range(60)]
+    assert counts[0] == 0
+    assert counts[-1] == wanted
+    assert counts == sorted(counts)
+    some = counts.index(next(count for count in counts if 0 < count < wanted))
+    # What pruning keeps of views with that budget is within it, and no view is made again for each measurement.
+    _, state = added(device, plush_excerpt, given, memory=some * 250_000)
+    with Rasterizer(device, plush_excerpt) as rasterizer:
+        before = device.allocated
+        with PreparedViews(rasterizer, state.views, some * 250_000, 1) as prepared:
+            assert not prepared.uncached
+            assert device.allocated - before < some * 250_000 + 1_000_000
+    assert device.allocated == 0
+
+
+def test_a_search_finds_them_once(device, plush_excerpt, plush_excerpt_cameras):
+    began = []
+    chosen = EncodeOptions.for_preset("best", prune={"iterations": 16})
+    found = encode_to_target(
+        plush_excerpt,
+        plush_excerpt_cameras,
+        Target(max_bytes=24_000),
+        chosen,
+        device=device,
+        progress=lambda what, done: began.append(what) if done == 0 else None,
+    )
+    assert began.count("prune") > 1
+    assert began.count("views between") == 1
+    again = encode(plush_excerpt, plush_excerpt_cameras, found.options, device=device)
+    assert again.data == found.encoded.data
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_all_presets_but_the_papers_add_them(preset):
+    assert EncodeOptions.for_preset(preset).between.asked_for == (preset != "paper")
+
+
+def test_the_summary_tells_of_them(device, plush_excerpt, plush_excerpt_cameras):
+    encoded = encode(plush_excerpt, plush_excerpt_cameras, options(1), device=device)
+    assert str(encoded.between) == "8 views between the 9 training views were looked at, too"
 
 
 def test_virtual_cameras_and_single_ones_get_none(device, plush_excerpt, plush_excerpt_cameras):

@@ -207,7 +207,7 @@ def test_a_click_on_a_frustum_flies_there(viewer, page):
     visitor = still(viewer, page)
     page.keyboard.press("3")
     page.keyboard.press("c")
-    page.locator("input[type=checkbox]:checked").wait_for()
+    until(page.get_by_role("checkbox").first.is_checked)
     page.mouse.move(200, 300)
     for _ in range(8):
         page.mouse.wheel(0, 400)

@@ -66,6 +66,11 @@ def commands() -> list[Command]:
         Command(
             "refit", ("refit", "in/scene.potr", "--reference", "in/scene.ply", *_VIEWS, "-o", "out/a.ply"), ("a.ply",)
         ),
+        Command(
+            "fit",
+            ("fit", "in/scene.potr", "--reference", "in/scene.ply", *_VIEWS, "-o", "out/a.ply", "--steps", "20"),
+            ("a.ply",),
+        ),
         Command("decode", ("decode", "in/scene.potr", "-o", "out/a.ply"), ("a.ply",)),
         *(
             Command(f"convert to {suffix}", ("convert", "in/scene.potr", f"out/a.{suffix}"), (f"a.{suffix}",))

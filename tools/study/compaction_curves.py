@@ -135,7 +135,9 @@ class _CurveEvaluator:
     def add(self, label: str, sh: FloatArray, **settings: float) -> None:
         """A row of figures for these coefficients, quantised."""
         back, degrees, magnitude = quantized(sh, self._sf_sh)
-        self._rasterizer.device.free(self._rasterizer.replace_sh(back))
+        former = self._rasterizer.replace_sh(back)
+        assert former is not None
+        self._rasterizer.device.free(former)
         images = _renders(self._rasterizer, self._tests)
         row = {"label": label, "zeros": _whole(degrees), "by degree": degrees.tolist(), "magnitude": magnitude}
         self.rows.append(row | settings | {name: _psnr(images, target) for name, target in self._targets.items()})

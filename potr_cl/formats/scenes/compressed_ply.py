@@ -1,4 +1,4 @@
-"""Scenes as compressed PLY files (SuperSplat's and splat-transform's .compressed.ply), through the library gsply.
+"""Scenes as compressed PLY files (SuperSplat's and splat-transform's .compressed.ply), read through the library gsply.
 
 The library unpacks without looking at the bounds of its arrays. So it never sees a header of somebody else: this module
 reads one, strictly, and hands on a header of its own with exactly the bytes that belong to it.
@@ -10,17 +10,27 @@ import os
 import re
 from typing import BinaryIO
 
+import numpy as np
+from numpy.typing import NDArray
+
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.gsply_arrays import EXTRA, from_scene, library, to_scene
+from potr_cl.formats.scenes.compressed_ply_values import (
+    CHUNK,
+    PackedGeometry,
+    elements,
+    packed_colours,
+    packed_geometry,
+    packed_sh,
+)
+from potr_cl.formats.scenes.gsply_arrays import EXTRA, library, to_scene
 from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
-from potr_cl.formats.scenes.scene_files import opened, tell_of_low_pass
+from potr_cl.formats.scenes.scene_files import arranged, opened, tell_of_low_pass
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.scene import SH_COEFFICIENTS, Scene
+from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
 _MAX_HEADER_BYTES = 1 << 16
-#: Splats that share one set of bounds, and these bounds.
-_CHUNK = 256
+#: What the splats of a chunk share.
 _BOUNDS = [
     ("float", f"{end}_{name}")
     for names in (("x", "y", "z"), ("scale_x", "scale_y", "scale_z"), ("r", "g", "b"))
@@ -63,17 +73,41 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
     """Write a scene as compressed PLY; the file appears under its name only when it is whole.
 
     Raises:
-        UsageError: ``path`` cannot be written to, or the extra ``convert`` is not installed.
+        UsageError: ``path`` cannot be written to.
         PotrError: the system failed to write.
     """
-    gsply = library(path)
     tell_of_low_pass(path, scene)
-    content = gsply.compress_to_bytes(from_scene(gsply, scene))
-    if scene.antialiased:
-        first = f"ply\n{_FORMAT}\n".encode("ascii")
-        content = content.replace(first, first + f"comment {ANTIALIASED_COMMENT}\n".encode("ascii"), 1)
+    scene = arranged(scene)
+    packed, colours = packed_geometry(scene), packed_colours(scene.sh[:, 0])
     with replacing(path) as file:
-        file.write(content)
+        for piece in pieces(packed, colours, packed_sh(scene.sh[:, 1:]), scene.antialiased):
+            file.write(piece)
+
+
+def pieces(
+    packed: PackedGeometry, colours: tuple[FloatArray, NDArray[np.uint32]], sh: NDArray[np.uint8], antialiased: bool
+) -> list[bytes]:
+    """A file's bytes, to be written one after another.
+
+    Args:
+        packed, colours, sh: of :mod:`potr_cl.formats.scenes.compressed_ply_values`.
+        antialiased: what a comment says of the scene.
+    """
+    splats, rest = len(packed.positions), 3 * sh.shape[1]
+    comments = [f"comment {ANTIALIASED_COMMENT}"] if antialiased else []
+    header = _header(
+        [("chunk", len(packed.means), _BOUNDS), ("vertex", splats, _VERTEX), ("sh", splats, _coefficients(rest))],
+        comments,
+    )
+    return [header, *elements(packed, colours, sh)]
+
+
+def _header(elements: list[tuple[str, int, list[tuple[str, str]]]], comments: list[str]) -> bytes:
+    lines = ["ply", _FORMAT, *comments]
+    for name, rows, properties in elements:
+        if properties:
+            lines += [f"element {name} {rows}", *(f"property {kind} {value}" for kind, value in properties)]
+    return "\n".join([*lines, "end_header", ""]).encode("ascii")
 
 
 FORMAT = SceneFormat(
@@ -95,11 +129,7 @@ def _canonical(path: str | os.PathLike[str], file: BinaryIO, size: int) -> tuple
     lines, comments, start = _header_lines(path, file.read(_MAX_HEADER_BYTES))
     chunks, splats, rest = _counts(path, lines)
     elements = [("chunk", chunks, _BOUNDS), ("vertex", splats, _VERTEX), ("sh", splats, _coefficients(rest))]
-    header = ["ply", _FORMAT]
-    for name, rows, properties in elements:
-        if properties:
-            header += [f"element {name} {rows}", *(f"property {kind} {value}" for kind, value in properties)]
-    whole = bytearray("\n".join([*header, "end_header", ""]).encode("ascii"))
+    whole = bytearray(_header(elements, []))
     values = 4 * len(_BOUNDS) * chunks + (4 * len(_VERTEX) + rest) * splats
     if size < start + values:
         raise DataError(f"'{path}' is truncated: its header tells of {start + values} bytes, it has {size}")
@@ -151,7 +181,7 @@ def _counts(path: str | os.PathLike[str], lines: list[str]) -> tuple[int, int, i
         raise DataError(f"'{path}' is a compressed PLY of an older layout: run 'splat-transform IN.ply OUT.ply'")
     if len(rest) not in [3 * (m - 1) for m in SH_COEFFICIENTS] or rest != _coefficients(len(rest)) or rows != splats:
         raise DataError(f"'{path}' is damaged: {rows} rows of {len(rest)} SH coefficients for {splats} splats")
-    if chunks != -(-splats // _CHUNK):
+    if chunks != -(-splats // CHUNK):
         raise DataError(f"'{path}' is damaged: {chunks} chunks for {splats} splats")
     return chunks, splats, len(rest)
 

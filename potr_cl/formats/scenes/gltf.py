@@ -19,10 +19,13 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.logarithm import natural_logarithm
-from potr_cl.errors import DataError
+from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.gltf_file import Asset
+from potr_cl.formats.scenes.gltf_writer import EXTENSION as _EXTENSION
+from potr_cl.formats.scenes.gltf_writer import pieces
 from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, cleaned, joined, log_of_scales, reading, shown
+from potr_cl.host.atomic_write import replacing
 from potr_cl.model.claims import check_claim
 from potr_cl.model.quaternions import quaternions_of, rotation_matrices
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
@@ -30,7 +33,6 @@ from potr_cl.model.sh_rotation import rotated_sh
 
 _log = logging.getLogger("potr_cl")
 
-_EXTENSION = "KHR_gaussian_splatting"
 _POINTS = 0
 _SRGB, _LINEAR = "srgb_rec709_display", "lin_rec709_display"
 #: Extensions of the asset that change nothing of what is read here, or are read.
@@ -69,13 +71,29 @@ def files(path: Path) -> list[Path]:
     return [path] if path.suffix.lower() == ".glb" else Asset(path).files()
 
 
+def save(path: str | os.PathLike[str], scene: Scene) -> None:
+    """Write a scene as binary glTF; the file appears under its name only when it is whole.
+
+    Raises:
+        UsageError: ``path`` cannot be written to, or does not end in .glb.
+        PotrError: the system failed to write.
+    """
+    if Path(path).suffix.lower() != ".glb":
+        raise UsageError(f"'{path}': glTF is written as one binary file: give it a name that ends in .glb")
+    if scene.antialiased:
+        _log.warning("'%s': glTF cannot say that the scene is antialiased: it will be drawn as the others", path)
+    with replacing(path) as file:
+        for piece in pieces(scene):
+            file.write(piece)
+
+
 FORMAT = SceneFormat(
     name="glTF",
     suffixes=(".glb", ".gltf"),
     note="with the Khronos Group's KHR_gaussian_splatting, uncompressed, floats or integers; nodes' transforms are "
-    "applied, axes kept",
+    "applied, axes kept; written as .glb, in float32",
     load=load,
-    not_written="nothing here writes glTF: convert to .ply, and that with splat-transform",
+    save=save,
     starts=(b"glTF",),
     files=files,
 )

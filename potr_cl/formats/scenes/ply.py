@@ -107,6 +107,13 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
         UsageError: ``path`` cannot be written to.
         PotrError: the system failed to write.
     """
+    with replacing(path) as file:
+        for piece in pieces(scene):
+            file.write(piece)
+
+
+def pieces(scene: Scene) -> Iterator[bytes | memoryview]:
+    """The bytes of :func:`save`, to be written one after another; each is good until the next is asked for."""
     rest = scene.sh.shape[1] - 1
     names = ["x", "y", "z", *_NORMALS, *_property_names(rest * 3)[3:]]
     end = len(names)
@@ -120,19 +127,18 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
     header += ["end_header", ""]
     height = _BLOCK_BYTES // (4 * len(names))
     rows = np.zeros((min(height, len(scene)), len(names)), dtype="<f4")
-    with replacing(path) as file:
-        file.write("\n".join(header).encode("ascii"))
-        for start in range(0, len(scene), height):
-            span = slice(start, min(start + height, len(scene)))
-            block = rows[: span.stop - start]
-            block[:, 0:3] = scene.means[span]
-            block[:, 6:9] = scene.sh[span, 0]
-            for channel in range(3):
-                block[:, 9 + channel * rest : 9 + (channel + 1) * rest] = scene.sh[span, 1:, channel]
-            block[:, end - 8] = scene.opacity_logits[span]
-            block[:, end - 7 : end - 4] = scene.log_scales[span]
-            block[:, end - 4 : end] = scene.quaternions[span]
-            file.write(block.data)
+    yield "\n".join(header).encode("ascii")
+    for start in range(0, len(scene), height):
+        span = slice(start, min(start + height, len(scene)))
+        block = rows[: span.stop - start]
+        block[:, 0:3] = scene.means[span]
+        block[:, 6:9] = scene.sh[span, 0]
+        for channel in range(3):
+            block[:, 9 + channel * rest : 9 + (channel + 1) * rest] = scene.sh[span, 1:, channel]
+        block[:, end - 8] = scene.opacity_logits[span]
+        block[:, end - 7 : end - 4] = scene.log_scales[span]
+        block[:, end - 4 : end] = scene.quaternions[span]
+        yield block.data.cast("B")
 
 
 FORMAT = SceneFormat(

@@ -13,6 +13,7 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
 import numpy as np
+from numpy.typing import NDArray
 
 from potr_cl.codec import octree
 from potr_cl.codec.logarithm import natural_logarithm
@@ -216,8 +217,17 @@ def arranged(scene: Scene) -> Scene:
 
     A compressed PLY has one set of bounds for 256 splats in sequence: in a trainer's order they span the scene.
     """
+    return unit_quaternions(scene.subset(arrangement(scene)))
+
+
+def arrangement(scene: Scene) -> NDArray[np.int64]:
+    """(N,) the numbers of a scene's splats in an order that has neighbours together."""
     side = max(float(axis.max()) - float(axis.min()) for axis in scene.means.T)
-    scene = scene.subset(octree.build(scene.means, max(side * 2.0**-20, 1e-30))[1])
+    return octree.build(scene.means, max(side * 2.0**-20, 1e-30))[1]
+
+
+def unit_quaternions(scene: Scene) -> Scene:
+    """A scene as bytes can tell it: unit quaternions, and opacities that are not nearer to 0 or 1 than they say."""
     quaternions = scene.quaternions
     largest = np.abs(quaternions).max(axis=1, keepdims=True)
     if (long := largest > _LONG).any():  # the square of its length would be infinite

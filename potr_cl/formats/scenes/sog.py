@@ -15,34 +15,42 @@ from pathlib import Path
 from typing import Any, BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
-from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
-from potr_cl.formats.scenes.scene_files import MOST_A_BYTE, cleaned, file_in_folder, opened, reading, related, unfilled
+from potr_cl.formats.scenes.scene_files import (
+    MOST_A_BYTE,
+    cleaned,
+    file_in_folder,
+    opened,
+    reading,
+    related,
+    tell_of_low_pass,
+    unfilled,
+    unit_quaternions,
+)
+from potr_cl.formats.scenes.sog_images import (
+    ANTIALIASED,
+    CODEBOOK,
+    DESCRIPTION,
+    PALETTE,
+    PALETTE_COLUMNS,
+    U8,
+    bundle,
+    write_folder,
+)
+from potr_cl.formats.scenes.sog_palette import areas, palette_of
+from potr_cl.formats.scenes.sog_steps import in_order, opacity_logits, quantised, unpacked_means, unpacked_rotations
+from potr_cl.host.atomic_write import replacing
 from potr_cl.model.claims import check_claim
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
-#: Of the scene, in an archive or a folder.
-DESCRIPTION = "meta.json"
 #: What is packed in a SOG file is compressed already; only its description shrinks.
 _DESCRIPTION_BYTES = 1 << 22
 #: Others take memory that an archive's size does not bound.
 _METHODS = (zipfile.ZIP_STORED, zipfile.ZIP_DEFLATED)
-_CODEBOOK = 256
-#: The "model" of a scene that was trained with antialiasing; one without has none.
-_ANTIALIASED = "antialiased"
-#: Most entries of a palette of SH coefficients; they stand 64 in a row.
-_PALETTE, _PALETTE_COLUMNS = 1 << 16, 64
-#: The alpha of a quaternion's pixel: this and the number of its largest part, of w, x, y, z.
-_FIRST_TAG = 252
-_OTHER_PARTS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])
-_LEAST_OPACITY = np.float32(1e-6)
 #: Splats worked on at a time: the temporaries stay small.
 _BLOCK = 1 << 16
-
-U8 = NDArray[np.uint8]
 
 
 def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
@@ -67,6 +75,32 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
     return cleaned(path, scene)
 
 
+def save(path: str | os.PathLike[str], scene: Scene) -> None:
+    """Write a scene as SOG, version 2, as fine as the format is: an archive, or the files of a folder.
+
+    SH coefficients come from a palette of 65536 sets at most. If the scene has more, they are found by clustering on
+    the OpenCL device that should be fastest.
+
+    Args:
+        path: of the .sog, or of the file meta.json in a folder that exists.
+        scene: of any SH degree.
+
+    Raises:
+        UsageError: ``path`` cannot be written to.
+        DataError: the format cannot hold so many splats.
+        DeviceError: no device finds the palette.
+        PotrError: the system failed to write.
+    """
+    tell_of_low_pass(path, scene)
+    scene = in_order(unit_quaternions(scene))
+    images = quantised(scene, palette_of(scene), areas(scene))
+    if Path(path).name.lower() == DESCRIPTION:
+        write_folder(path, images)
+        return
+    with replacing(path) as file:
+        file.write(bundle(images))
+
+
 def files(path: Path) -> list[Path]:
     """A packed file; of a folder the description and the images that it names.
 
@@ -85,10 +119,10 @@ FORMAT = SceneFormat(
     suffixes=(".sog",),
     names=(DESCRIPTION,),
     files=files,
-    note="of PlayCanvas; version 2 is read, packed (`.sog`) or as a folder",
+    note="of PlayCanvas; version 2, packed (`.sog`) or as a folder (`meta.json`)",
     load=load,
+    save=save,
     starts=(b"PK\x03\x04",),
-    not_written="nothing here writes SOG: convert to .ply, and that with splat-transform",
     packed=True,
 )
 
@@ -214,36 +248,33 @@ class Sog:
         quaternions, scales = self._pixels("quats", 0), self._pixels("scales", 0)
         book = self._codebook("scales")
         for block in self._blocks():
-            scene.quaternions[block] = _smallest_three(quaternions[block])
+            scene.quaternions[block] = unpacked_rotations(quaternions[block])
             scene.log_scales[block] = book.take(scales[block, :3])
         del quaternions, scales
         colours, book = self._pixels("sh0", 0), self._codebook("sh0")
-        opacity = np.clip(np.arange(256).astype(np.float32) / np.float32(255), _LEAST_OPACITY, 1 - _LEAST_OPACITY)
-        logits = natural_logarithm(opacity / (1 - opacity))
+        logits = opacity_logits()
         for block in self._blocks():
             scene.sh[block, 0] = book.take(colours[block, :3])
             scene.opacity_logits[block] = logits.take(colours[block, 3])
         if coefficients > 1:
             self._fill_rest(scene.sh[:, 1:])
-        return scene.rendered(self._meta.get("model") == _ANTIALIASED)
+        return scene.rendered(self._meta.get("model") == ANTIALIASED)
 
     def _fill_means(self, means: FloatArray) -> None:
         low, high = self._pixels("means", 0), self._pixels("means", 1)
         least, most = (np.array(self._numbers("means", key, 3), np.float32) for key in ("mins", "maxs"))
-        extent = np.where(most == least, np.float32(1), most - least)
         for block in self._blocks():
             steps = low[block, :3] | high[block, :3].astype(np.uint16) << np.uint16(8)
-            logarithms = least + extent * (steps.astype(np.float32) * np.float32(1 / 65535))
             with np.errstate(over="ignore"):  # such a splat is dropped
-                means[block] = np.copysign(np.expm1(np.abs(logarithms), dtype=np.float64), logarithms)
+                means[block] = unpacked_means(steps, least, most)
 
     def _fill_rest(self, rest: FloatArray) -> None:
         part, coefficients = self._meta["shN"], rest.shape[1]
         entries = _whole(part["count"])
-        if not 0 < entries <= _PALETTE:
+        if not 0 < entries <= PALETTE:
             raise self._damaged(f"'shN' has {_said(part['count'])} entries")
         width, height = self._size("shN", 0)
-        if width != _PALETTE_COLUMNS * coefficients or not entries <= _PALETTE_COLUMNS * height <= 2 * _PALETTE:
+        if width != PALETTE_COLUMNS * coefficients or not entries <= PALETTE_COLUMNS * height <= 2 * PALETTE:
             raise self._damaged(f"a palette of {width} x {height} pixels for {entries} entries")
         self._check_pixels("shN", 1)
         palette = self._pixels("shN", 0)[:, :3].reshape(-1, coefficients, 3)
@@ -259,7 +290,7 @@ class Sog:
         return [slice(start, min(start + _BLOCK, self.count)) for start in range(0, self.count, _BLOCK)]
 
     def _codebook(self, name: str) -> FloatArray:
-        return np.array(self._numbers(name, "codebook", _CODEBOOK), np.float32)
+        return np.array(self._numbers(name, "codebook", CODEBOOK), np.float32)
 
     def _numbers(self, name: str, key: str, length: int) -> list[float]:
         numbers = self._meta[name][key]
@@ -315,19 +346,6 @@ def webp_size(data: bytes) -> tuple[int, int] | None:
     if kind == b"VP8 ":
         return int.from_bytes(head[26:28], "little") & 0x3FFF, int.from_bytes(head[28:30], "little") & 0x3FFF
     return None
-
-
-def _smallest_three(pixels: U8) -> FloatArray:
-    """Quaternions w, x, y, z; no rotation where a pixel holds none."""
-    stored = ((pixels[:, :3].astype(np.float32) / np.float32(255)) * 2 - 1) * np.float32(np.sqrt(0.5))
-    squares = stored * stored
-    left = 1 - (squares[:, 0] + squares[:, 1] + squares[:, 2])
-    largest = np.maximum(pixels[:, 3].astype(np.intp) - _FIRST_TAG, 0)
-    quaternions = np.empty((len(pixels), 4), np.float32)
-    np.put_along_axis(quaternions, _OTHER_PARTS[largest], stored, axis=1)
-    np.put_along_axis(quaternions, largest[:, None], np.sqrt(np.maximum(left, 0))[:, None], axis=1)
-    quaternions[pixels[:, 3] < _FIRST_TAG] = (1, 0, 0, 0)
-    return quaternions
 
 
 def _whole(value: Any) -> int:

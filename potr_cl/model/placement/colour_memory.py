@@ -53,12 +53,24 @@ class ColourMemory:
 
     def of(self, place: F64, shown: F32) -> float:
         """How well they remember a place, (3,), from where ``shown``, (K,), is seen; see :func:`remembered`."""
-        assert self._energies is not None
         weights = shown * self._informative
         total = max(float(weights.sum()), 1e-6)
         own = float(weights @ self._energy(place)) / total
-        best = float(np.quantile(self._energies @ weights / total, 0.95))
-        return own / max(best, 1e-12)
+        return own / self._best(weights, total)
+
+    def of_known(self, number: int, shown: F32) -> float:
+        """The same of one of the places that are known, by its number."""
+        assert self._energies is not None
+        weights = shown * self._informative
+        total = max(float(weights.sum()), 1e-6)
+        return float(weights @ self._energies[number]) / total / self._best(weights, total)
+
+    def _best(self, weights: F32, total: float) -> float:
+        """How well the best of the known places are remembered by the same splats."""
+        assert self._energies is not None
+        # Without BLAS, whose threads would wait for each other where several threads ask.
+        best = float(np.quantile(np.einsum("pk,k->p", self._energies, weights) / total, 0.95))
+        return max(best, 1e-12)
 
     def _energy(self, place: F64) -> F32:
         """(K,) of the targets' colours, as they are seen from a place."""

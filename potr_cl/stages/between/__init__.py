@@ -1,1 +1,4 @@
-"""What the stage "between" computes with: trial.py finds out how many views a scene needs between its own."""
+"""What the stage "between" computes with.
+
+amount.py decides how many views a scene needs, and room.py how many of these fit the memory.
+"""

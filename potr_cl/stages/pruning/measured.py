@@ -22,7 +22,7 @@ def measurement(state: State, bench: Workbench, options: SweepOptions) -> Iterat
         DeviceError: the scene or a view does not fit the device.
     """
     with (
-        Rasterizer(bench.opened, state.scene, background=bench.background) as rasterizer,
+        Rasterizer(bench.opened, bench.drawable(state.scene), background=bench.background) as rasterizer,
         RemovalSweep(
             rasterizer, state.views, options, lambda done, count: bench.progress("prepare views", done / count)
         ) as removal,

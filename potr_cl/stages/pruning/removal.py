@@ -139,10 +139,13 @@ class RemovalSweep(Owner):
     def replace_sh(self, sh: FloatArray) -> None:
         """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
         self._cached.settle()
+        before = self._rasterizer.sh
         former = self._rasterizer.replace_sh(sh)
         if self._original_sh is None:
-            self._original_sh = self._memory.adopt(former)
-        else:
+            self._original_sh = before
+            if former is not None:
+                self._memory.adopt(former)
+        elif former is not None:
             self._device.free(former)
         for views in self._prepared.cached:
             if views.views.shapes is not None:

@@ -60,6 +60,8 @@ class Split:
 def find_unseen(state: State) -> tuple[NDArray[np.bool_], float]:
     """Which splats of a state no training view sees, and their part of the opacity-weighted area."""
     unseen = unseen_splats(state.scene, state.views)
+    if not unseen.any():  # as usual
+        return unseen, 0.0
     areas = opacity_weighted_areas(state.scene)
     return unseen, float(areas[unseen].sum() / max(float(areas.sum()), 1e-300))
 

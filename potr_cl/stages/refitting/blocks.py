@@ -52,6 +52,16 @@ class SplatBlocks(Owner):
         blocks[:, rows, columns] = blocks[:, columns, rows] = packed[:, : layout.splats].T
         return blocks
 
+    def diagonals(self) -> FloatArray:
+        """(N, M) float32, what stands on the blocks' diagonals."""
+        layout = self._coefficients.layout
+        rows, columns = np.triu_indices(layout.sh_count)
+        diagonals = np.empty((layout.splats, layout.sh_count), np.float32)
+        for m, place in enumerate(np.flatnonzero(rows == columns)):
+            start = 4 * layout.stride * int(place)
+            diagonals[:, m] = self._coefficients.device.download(self.buffer, (layout.splats,), np.float32, start)
+        return diagonals
+
     def precondition(self, residual: cl.Buffer, ridge: Ridge, result: cl.Buffer) -> None:
         """result = (block + ridge)⁻¹ residual on each splat's active coefficients, 0 on the others."""
         layout = self._coefficients.layout

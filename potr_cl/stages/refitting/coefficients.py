@@ -9,6 +9,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.codec.native.library import native
 from potr_cl.codec.quantize import to_ycocg
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
@@ -178,28 +179,30 @@ class Coefficients(Owner):
             sh: (N, M, 3) R, G, B.
             only: (N, M, 3) in Y, Co, Cg: the others become 0; None: none does.
         """
-        layout = self.layout
+        layout, functions = self.layout, native()
         columns = np.zeros((layout.columns, layout.stride), np.float32)
-        for some in self._slices():
-            rows = sh[some].astype(np.float64)
-            for c, channel in enumerate(to_ycocg(rows.reshape(-1, 3))):
-                columns[c::3, some] = channel.reshape(-1, layout.sh_count).T
+        if functions is not None and sh.flags.c_contiguous and sh.dtype == np.float32:
+            functions.quantising.ycocg_columns(sh, columns.reshape(layout.sh_count, 3, -1))
+        else:
+            for some in self._slices():
+                rows = sh[some].astype(np.float64)
+                for c, channel in enumerate(to_ycocg(rows.reshape(-1, 3))):
+                    columns[c::3, some] = channel.reshape(-1, layout.sh_count).T
         if only is not None:
             for column in range(layout.columns):
                 columns[column, : layout.splats] *= only[:, column // 3, column % 3]
         cl.enqueue_copy(self.device.queue, x, columns, is_blocking=True)
 
     def read_sh(self, x: cl.Buffer) -> FloatArray:
-        """(N, M, 3) float32, a vector in R, G, B."""
-        columns = self._columns_of(x)
-        sh = np.empty((self.layout.splats, self.layout.sh_count, 3), np.float32)
-        for some in self._slices():
-            y, co, cg = columns[:, 0, some], columns[:, 1, some], columns[:, 2, some]
+        """(N, M, 3) float32, a vector in R, G, B; each coefficient contiguous in memory."""
+        sh = np.empty((self.layout.sh_count, 3, self.layout.splats), np.float32)
+        for (y, co, cg), (red, green, blue) in zip(self._columns_of(x)[:, :, : self.layout.splats], sh, strict=True):
             # In this order nothing overflows that did not in R, G, B.
             rest = y - cg
-            for c, channel in enumerate((rest + co, y + cg, rest - co)):
-                sh[some, :, c] = channel.T
-        return sh
+            np.add(rest, co, out=red)
+            np.add(y, cg, out=green)
+            np.subtract(rest, co, out=blue)
+        return sh.transpose(2, 0, 1)
 
     def _columns_of(self, x: cl.Buffer) -> FloatArray:
         """(M, 3, stride)."""

@@ -17,7 +17,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.quantize import quantize_sh, to_ycocg
+from potr_cl.codec.quantize import nonzero_levels
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
@@ -30,6 +30,9 @@ from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection
 from potr_cl.stages.refitting.targets import Targets
+
+#: Steps in which the constant coefficients are solved for once more, after the others have been rounded.
+_CONSTANT_STEPS = 3
 
 
 @dataclass(frozen=True)
@@ -97,6 +100,7 @@ def refit_colours(
     active: NDArray[np.bool_] | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: Callable[[int, int], None] | None = None,
+    fix_ac: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
 ) -> Refitted:
     """Re-fit a scene's colours to pictures of all views together.
 
@@ -109,14 +113,32 @@ def refit_colours(
         active: (N, M, 3) in Y, Co, Cg: the coefficients that may differ from 0; all by default.
         background: R, G, B behind the scene.
         progress: called with the steps done and their greatest number.
+        fix_ac: chooses the AC coefficients that a file can hold, from the solution (N, M, 3) R, G, B, which it must not
+            change, and :meth:`ColourRefit.worth`. The constant ones are then solved for again. If it returns the
+            solution itself, that stays as it is.
 
     Raises:
         UsageError: no camera.
         DeviceError: the scene does not fit the device.
     """
     options = options or RefitOptions()
+    more = 0 if fix_ac is None else _CONSTANT_STEPS
+
+    def report(done: int, steps: int) -> None:
+        if progress is not None:
+            progress(done, steps + more)
+
     with ColourRefit(device, scene, cameras, background=background, memory=options.memory) as refit:
-        return refit.solve(scene.sh, targets, options, active, progress=progress)
+        found = refit.solve(scene.sh, targets, options, active, progress=report)
+        fixed = found.sh if fix_ac is None else fix_ac(found.sh, refit.worth())
+        if fixed is found.sh:
+            return found
+        constant = np.zeros(fixed.shape, bool)
+        constant[:, 0] = True
+        few = replace(options, drop=0.0, steps=_CONSTANT_STEPS)
+        again = refit.solve(fixed, targets, few, constant, hold=True)
+        again.sh[:, 1:] = fixed[:, 1:]  # they were rounded once more on their way through Y, Co, Cg
+        return Refitted(again.sh, (found.errors[0], again.errors[1]), found.steps + again.steps)
 
 
 class ColourRefit(Owner):
@@ -200,6 +222,13 @@ class ColourRefit(Owner):
         solved = solver.solve(self.colour_map, targets, descent, selection, after_step)
         return Refitted(coefficients.read_sh(solver.x), solved.errors, solved.steps)
 
+    def worth(self) -> FloatArray:
+        """(N, M) float32: by how much the mean squared error grows for an error of 1 in a coefficient of one channel.
+
+        As the last solution has found it at its start; errors of different coefficients are taken as independent.
+        """
+        return self._solver.curvatures() / np.float32(self.colour_map.total_weight)
+
     def active(self) -> NDArray[np.bool_]:
         """(N, M, 3) in Y, Co, Cg: the coefficients that the last solution left active."""
         return self.coefficients.is_active()
@@ -216,8 +245,6 @@ def active_coefficients(sh: FloatArray, sf_sh: float) -> NDArray[np.bool_]:
         sh: (N, M, 3) R, G, B.
         sf_sh: the quantiser's scale factor.
     """
-    active = np.ones(sh.shape, bool)
-    for m in range(1, sh.shape[1]):
-        for c, channel in enumerate(to_ycocg(sh[:, m].astype(np.float64))):
-            active[:, m, c] = quantize_sh(channel, sf_sh) != 0
+    active = nonzero_levels(sh, sf_sh)
+    active[:, 0] = True
     return active

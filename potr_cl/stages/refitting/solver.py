@@ -19,6 +19,7 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pyopencl as cl
 
+from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Owner
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Ridge
@@ -231,6 +232,10 @@ class ColourSolver(Owner):
     def _start_here(self, problem: _Problem, ridge: Ridge) -> _State:
         self._coefficients.copy(self._start, self.x)
         return self._linearise(problem, ridge)
+
+    def curvatures(self) -> FloatArray:
+        """(N, M) float32: squared error by W for an error of 1 in a coefficient of one channel, at the last start."""
+        return self._blocks.diagonals()
 
     def close(self) -> None:
         """Give the blocks' memory back."""

@@ -1,0 +1,131 @@
+"""Points on a device, each of which is compared with the centres of some cells: :class:`Points`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.clustering.launch import launcher_for
+from potr_cl.clustering.rows import QUARTER, rows_of_centres
+from potr_cl.model.scene import FloatArray
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory, Owner
+
+U32 = NDArray[np.uint32]
+
+_NO_POINT = np.uint32(0xFFFFFFFF)
+
+
+@dataclass(frozen=True)
+class Lists:
+    """Which centres the points of each cell are compared with.
+
+    Attributes:
+        runs: (R, 2) uint32, first and number of centres in sequence.
+        runs_of: (C + 1,) uint32, where the runs of each cell begin, and the end.
+    """
+
+    runs: U32
+    runs_of: U32
+
+    @staticmethod
+    def of_all(centres: int) -> Lists:
+        """One cell, whose points are compared with all centres."""
+        return Lists(np.array([[0, centres]], np.uint32), np.array([0, 1], np.uint32))
+
+
+class Points(Owner):
+    """Points on a device.
+
+    Args:
+        device: to compute on.
+        rows: (N, width) float32 (:mod:`potr_cl.clustering.rows`).
+
+    Raises:
+        DeviceError: the device has too little memory, or the kernels cannot be built.
+    """
+
+    def __init__(self, device: Device, rows: FloatArray) -> None:
+        self._device = device
+        self._count, self._width = rows.shape
+        self._launcher = launcher_for(device, self._width)
+        self._sums = device.shared_kernel("clustering/sums.cl", "sums", WIDTH=self._width)
+        self._memory = Memory(device)
+        try:
+            self._rows = self._memory.upload(rows, "vectors to be clustered")
+            self._labels = self._memory.allocate(4 * self._count, "the clusters of vectors")
+            self._scores = self._memory.allocate(4 * self._count, "the distances of vectors")
+        except BaseException:
+            self.close()
+            raise
+
+    def nearest(
+        self,
+        centres: FloatArray,
+        biases: FloatArray | None = None,
+        cells: U32 | None = None,
+        lists: Lists | None = None,
+    ) -> tuple[U32, FloatArray]:
+        """The best centre of each point, and its distance less the point's distance to zero, plus the centre's bias.
+
+        Args:
+            centres: (K, G, C).
+            biases: (K,) float32, added to the distances; None: 0.
+            cells: (N,) the cell of each point; None: there is one.
+            lists: which centres the points of a cell are compared with; None: one cell's points with all.
+        """
+        lists = lists or Lists.of_all(len(centres))
+        order, block_cells = _blocks(self._count, cells, len(lists.runs_of) - 1, self._launcher.block)
+        with Memory(self._device) as memory:
+            self._launcher.enqueue(
+                len(block_cells),
+                points=self._rows,
+                order=memory.upload(order, "the order of vectors"),
+                cells=memory.upload(block_cells, "the cells of vectors"),
+                runs_of=memory.upload(lists.runs_of, "the centres of each cell"),
+                runs=memory.upload(lists.runs, "the centres of each cell"),
+                centres=memory.upload(rows_of_centres(centres), "the centres"),
+                biases=memory.upload(np.zeros(len(centres), np.float32) if biases is None else biases, "their biases"),
+                labels=self._labels,
+                scores=self._scores,
+            )
+            labels: U32 = self._device.download(self._labels, (self._count,), np.uint32)
+        return labels, self._device.download(self._scores, (self._count,), np.float32)
+
+    def sums(self, labels: U32, count: int) -> FloatArray:
+        """(count, width) float32, the sum of the rows of each label's points."""
+        order = np.argsort(labels, kind="stable").astype(np.uint32)
+        starts = np.concatenate([[0], np.cumsum(np.bincount(labels, minlength=count))]).astype(np.uint32)
+        with Memory(self._device) as memory:
+            result = memory.allocate(4 * count * self._width, "the sums of clusters")
+            self._sums.bind(
+                points=self._rows,
+                order=memory.upload(order, "the order of clusters"),
+                starts=memory.upload(starts, "the first of each cluster"),
+                result=result,
+            ).launch((count * self._width // QUARTER,))
+            sums: FloatArray = self._device.download(result, (count, self._width), np.float32)
+        return sums
+
+    def close(self) -> None:
+        """Give the device's memory back."""
+        self._memory.close()
+
+
+def _blocks(count: int, cell_of: U32 | None, cells: int, size: int) -> tuple[U32, U32]:
+    """Points in blocks of ``size``, each of one cell: their numbers (blocks * size,), and the cell of each block."""
+    if cell_of is None:
+        order = np.full(-(-count // size) * size, _NO_POINT, np.uint32)
+        order[:count] = np.arange(count)
+        return order, np.zeros(len(order) // size, np.uint32)
+    counts = np.bincount(cell_of, minlength=cells)
+    blocks = -(-counts // size)
+    firsts = (np.cumsum(blocks) - blocks) * size
+    by_cell = np.argsort(cell_of, kind="stable")
+    sorted_cells = cell_of[by_cell]
+    ranks = np.arange(count) - (np.cumsum(counts) - counts)[sorted_cells]
+    order = np.full(int(blocks.sum()) * size, _NO_POINT, np.uint32)
+    order[firsts[sorted_cells] + ranks] = by_cell
+    return order, np.repeat(np.arange(cells, dtype=np.uint32), blocks)

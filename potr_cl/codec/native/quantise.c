@@ -1,0 +1,139 @@
+/* The encoder's loops over all splats: distances to views, canonical rotations, colours in Y, Co, Cg.
+ *
+ * Each operation is rounded by itself, in the order of the NumPy modules (geometry.py, quantize.py), whose bits these
+ * functions give: the build forbids to fuse multiplications and additions, and nothing here may be compiled for
+ * processors on which that could not be told. */
+
+#include <math.h>
+
+#include "potr_native.h"
+
+/* Splats worked on at a time: what a block needs stays in the nearest cache. */
+#define BLOCK 256
+/* The same where a splat has all SH coefficients. */
+#define SH_BLOCK 64
+/* Equivalent forms of a splat, and how many of them make a vector. */
+#define FORMS 24
+#define LANES 8
+
+/* The least distance of n points (n, 3) to v others (v, 3). */
+POTR_EXPORT void potr_nearest(
+    const float *restrict points, size_t n, const double *restrict others, size_t v, double *restrict nearest)
+{
+    double x[BLOCK], y[BLOCK], z[BLOCK], least[BLOCK];
+    for (size_t start = 0; start < n; start += BLOCK) {
+        const size_t some = n - start < BLOCK ? n - start : BLOCK;
+        for (size_t i = 0; i < some; i++) {
+            x[i] = points[3 * (start + i)];
+            y[i] = points[3 * (start + i) + 1];
+            z[i] = points[3 * (start + i) + 2];
+            least[i] = INFINITY;
+        }
+        for (size_t k = 0; k < v; k++) {
+            const double *other = others + 3 * k;
+            for (size_t i = 0; i < some; i++) {
+                const double dx = x[i] - other[0], dy = y[i] - other[1], dz = z[i] - other[2];
+                const double square = dx * dx + dy * dy + dz * dz;
+                least[i] = square < least[i] ? square : least[i];
+            }
+        }
+        for (size_t i = 0; i < some; i++)
+            nearest[start + i] = sqrt(least[i]);
+    }
+}
+
+/* rint for what is small, in operations that become vectors everywhere. */
+static INLINE double nearest_whole(double x)
+{
+    const double shift = 6755399441055744.0; /* 3 * 2^51: what is added to it has no digits behind the point */
+    return (x + shift) - shift;
+}
+
+/* The equivalent form with the largest real part of n splats, which `order` picks among some rows.
+ *
+ * quaternions: (rows, 4) w, x, y, z; log_scales: (rows, 3). group: (4, 24) w, x, y, z of the axes' rotations, conjugated;
+ * permutations: (24, 3), the scales that each makes first, second and third. imaginary, turned: (n, 3). */
+POTR_EXPORT void potr_canonical(
+    const float *restrict quaternions, const float *restrict log_scales, const int64_t *restrict order, size_t n,
+    const double *restrict group, const uint8_t *restrict permutations, double *restrict imaginary,
+    float *restrict turned)
+{
+    for (size_t i = 0; i < n; i++) {
+        const float *row = quaternions + 4 * order[i], *scales = log_scales + 3 * order[i];
+        const double a = row[0], b = row[1], c = row[2], d = row[3];
+        const double length = sqrt(a * a + b * b + c * c + d * d);
+        const double w = a / length, x = b / length, y = c / length, z = d / length;
+        double real[FORMS], size[FORMS], lanes[LANES] = {0}, largest = 0;
+        size_t best = 0;
+        for (size_t k = 0; k < FORMS; k++) {
+            /* Rounded, so that ties between equivalent forms fall the same way on every processor. */
+            real[k] = nearest_whole(
+                (w * group[k] + x * group[FORMS + k] + y * group[2 * FORMS + k] + z * group[3 * FORMS + k]) * 1e9);
+            size[k] = fabs(real[k]);
+        }
+        for (size_t k = 0; k < FORMS; k += LANES)
+            for (size_t lane = 0; lane < LANES; lane++)
+                lanes[lane] = size[k + lane] > lanes[lane] ? size[k + lane] : lanes[lane];
+        for (size_t lane = 0; lane < LANES; lane++)
+            largest = lanes[lane] > largest ? lanes[lane] : largest;
+        while (best < FORMS - 1 && size[best] < largest)
+            best++;
+        const double sign = real[best] < 0 ? -1 : 1;
+        const double gw = group[best], gx = -group[FORMS + best], gy = -group[2 * FORMS + best],
+                     gz = -group[3 * FORMS + best];
+        imaginary[3 * i] = sign * (w * gx + x * gw + y * gz - z * gy);
+        imaginary[3 * i + 1] = sign * (w * gy - x * gz + y * gw + z * gx);
+        imaginary[3 * i + 2] = sign * (w * gz + x * gy - y * gx + z * gw);
+        for (size_t axis = 0; axis < 3; axis++)
+            turned[3 * i + axis] = scales[permutations[3 * best + axis]];
+    }
+}
+
+/* R, G, B of `some` splats, which lie `step` floats apart, to Y, Co, Cg. */
+static INLINE void to_ycocg(const float *rgb, size_t step, size_t some, double (*channels)[SH_BLOCK])
+{
+    for (size_t i = 0; i < some; i++, rgb += step) {
+        const double r = rgb[0], half = rgb[1] * 0.5, b = rgb[2];
+        channels[0][i] = r * 0.25 + half + b * 0.25;
+        channels[1][i] = (r - b) * 0.5;
+        channels[2][i] = half - (r + b) * 0.25;
+    }
+}
+
+/* SH coefficients of n splats, (n, count, 3) R, G, B, to columns (count, 3, stride) in Y, Co, Cg. */
+POTR_EXPORT void potr_ycocg_columns(
+    const float *restrict sh, size_t n, size_t count, size_t stride, float *restrict columns)
+{
+    for (size_t start = 0; start < n; start += SH_BLOCK) {
+        const size_t some = n - start < SH_BLOCK ? n - start : SH_BLOCK;
+        for (size_t m = 0; m < count; m++) {
+            double channels[3][SH_BLOCK];
+            to_ycocg(sh + 3 * (start * count + m), 3 * count, some, channels);
+            for (size_t c = 0; c < 3; c++)
+                for (size_t i = 0; i < some; i++)
+                    columns[(3 * m + c) * stride + start + i] = (float)channels[c][i];
+        }
+    }
+}
+
+/* Which of the coefficients, in Y, Co, Cg, have a level other than 0: columns (count, 3, n) of 0 and 1. Returns whether
+ * no level is as large as `most`, or no number at all. */
+POTR_EXPORT int potr_nonzero_levels(
+    const float *restrict sh, size_t n, size_t count, double factor, double most, uint8_t *restrict columns)
+{
+    int sound = 1;
+    for (size_t start = 0; start < n; start += SH_BLOCK) {
+        const size_t some = n - start < SH_BLOCK ? n - start : SH_BLOCK;
+        for (size_t m = 0; m < count; m++) {
+            double channels[3][SH_BLOCK];
+            to_ycocg(sh + 3 * (start * count + m), 3 * count, some, channels);
+            for (size_t c = 0; c < 3; c++)
+                for (size_t i = 0; i < some; i++) {
+                    const double level = channels[c][i] * factor + 0.5; /* the whole number below it, that is */
+                    sound &= fabs(level) < most;
+                    columns[(3 * m + c) * n + start + i] = !((level >= 0) & (level < 1));
+                }
+        }
+    }
+    return sound;
+}

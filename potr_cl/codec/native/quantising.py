@@ -1,0 +1,105 @@
+"""The C functions of the encoder's loops over all splats, for NumPy arrays: :class:`Quantising` (quantise.c)."""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.native.arrays import address
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+
+
+class Quantising:
+    """The same bits as NumPy gives. All may be called from several threads at a time, and leaves the interpreter free.
+
+    Args:
+        functions: of the library, by name.
+    """
+
+    def __init__(self, functions: dict[str, Any]) -> None:
+        self._c = functions
+
+    def nearest(self, points: F32, others: F64, out: F64) -> None:
+        """The least distance of each point to the others.
+
+        Args:
+            points: (n, 3). others: (v, 3).
+            out: (n,), filled.
+        """
+        self._c["potr_nearest"](
+            address(points, np.float32, 3 * len(out)),
+            len(out),
+            address(others, np.float64, 3 * len(others)),
+            len(others),
+            address(out, np.float64, len(out), True),
+        )
+
+    def canonical(
+        self, quaternions: F32, log_scales: F32, order: I64, group: F64, permutations: U8, imaginary: F64, turned: F32
+    ) -> None:
+        """The equivalent form of some splats whose unit quaternion has the largest real part.
+
+        Args:
+            quaternions: (rows, 4). log_scales: (rows, 3).
+            order: (n,) of the rows.
+            group: (4, 24) quaternions of the axes' rotations, conjugated. permutations: (24, 3), of the scales.
+            imaginary, turned: (n, 3), filled with imaginary parts and log scales.
+        """
+        rows, number = len(quaternions), len(order)
+        if number and not 0 <= int(order.min()) <= int(order.max()) < rows:
+            raise TypeError("the native path was given splats that are not there")
+        if int(permutations.max()) > 2:
+            raise TypeError("the native path was given axes that are not there")
+        self._c["potr_canonical"](
+            address(quaternions, np.float32, 4 * rows),
+            address(log_scales, np.float32, 3 * rows),
+            address(order, np.int64, number),
+            number,
+            address(group, np.float64, 24 * 4),
+            address(permutations, np.uint8, 24 * 3),
+            address(imaginary, np.float64, 3 * number, True),
+            address(turned, np.float32, 3 * number, True),
+        )
+
+    def ycocg_columns(self, sh: F32, columns: F32) -> None:
+        """Coefficients (n, count, 3) in R, G, B to ``columns`` (count, 3, stride) in Y, Co, Cg; the rest is left."""
+        number, count, _ = sh.shape
+        stride = columns.shape[2]
+        if stride < number:
+            raise TypeError("the native path was given columns that are too short")
+        self._c["potr_ycocg_columns"](
+            address(sh, np.float32, 3 * number * count),
+            number,
+            count,
+            stride,
+            address(columns, np.float32, 3 * stride * count, True),
+        )
+
+    def nonzero_levels(self, sh: F32, factor: float, most: float) -> NDArray[np.bool_] | None:
+        """Which coefficients, in Y, Co, Cg, have a level other than 0.
+
+        Args:
+            sh: (n, count, 3) in R, G, B.
+            factor: scale factor of the quantiser.
+            most: no level may be as large.
+
+        Returns:
+            (count, 3, n); None if a level is as large, or no number.
+        """
+        number, count, _ = sh.shape
+        columns = np.empty((count, 3, number), np.uint8)
+        sound = self._c["potr_nonzero_levels"](
+            address(sh, np.float32, 3 * number * count),
+            number,
+            count,
+            factor,
+            most,
+            address(columns, np.uint8, columns.size, True),
+        )
+        return columns.view(np.bool_) if sound else None

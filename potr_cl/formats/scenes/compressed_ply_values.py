@@ -1,0 +1,157 @@
+"""What the integers of a compressed PLY stand for, in both directions: :func:`packed_geometry` and its like.
+
+256 splats in sequence share the bounds of their centres, logarithms of scales and colours; within them centres and
+scales have 11, 10 and 11 bits, colours 8. Opacities and SH coefficients have 8 bits, rotations three parts of 10 bits,
+without the largest.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.logarithm import natural_logarithm
+from potr_cl.formats.scenes.scene_files import SH_0
+from potr_cl.model.scene import FloatArray, Scene
+
+#: Splats that share one set of bounds.
+CHUNK = 256
+#: Logarithms of scales outside are cut, as other writers do.
+_SCALE_LIMIT = np.float32(20)
+#: What readers make of opacities of 0 and 1.
+_LARGEST_LOGIT = np.float32(10)
+#: Shifts and bits of three values in a word.
+_POSITION = ((21, 11), (11, 10), (0, 11))
+_COLOUR = ((24, 8), (16, 8), (8, 8))
+
+Words = NDArray[np.uint32]
+U8 = NDArray[np.uint8]
+
+
+@dataclass(frozen=True)
+class PackedGeometry:
+    """All but the colours, N splats in C chunks.
+
+    Attributes:
+        means, log_scales: (C, 2, 3) float32, the lower and the upper bounds.
+        positions, rotations, scales: (N,) words.
+        opacities: (N,) levels.
+    """
+
+    means: FloatArray
+    log_scales: FloatArray
+    positions: Words
+    rotations: Words
+    scales: Words
+    opacities: U8
+
+
+def packed_geometry(scene: Scene) -> PackedGeometry:
+    """Geometry and opacities of a scene with unit quaternions, in its order."""
+    means, positions = _packed_in_bounds(scene.means, _POSITION)
+    log_scales, scales = _packed_in_bounds(np.clip(scene.log_scales, -_SCALE_LIMIT, _SCALE_LIMIT), _POSITION)
+    with np.errstate(over="ignore"):
+        opacities = np.round(255 / (1 + np.exp(-scene.opacity_logits.astype(np.float64)))).astype(np.uint8)
+    return PackedGeometry(means, log_scales, positions, _packed_rotations(scene.quaternions), scales, opacities)
+
+
+def unpacked_geometry(packed: PackedGeometry) -> Scene:
+    """What readers see, with colours of zero."""
+    count = len(packed.positions)
+    byte = np.arange(256, dtype=np.float32) / np.float32(255)
+    with np.errstate(divide="ignore"):
+        logits = np.zeros(256, np.float32)
+        logits[1:255] = natural_logarithm((byte / (1 - byte))[1:255])
+    logits[[0, 255]] = -_LARGEST_LOGIT, _LARGEST_LOGIT
+    return Scene(
+        _unpacked_in_bounds(packed.means, packed.positions, _POSITION),
+        _unpacked_in_bounds(packed.log_scales, packed.scales, _POSITION),
+        _unpacked_rotations(packed.rotations),
+        logits.take(packed.opacities),
+        np.zeros((count, 1, 3), np.float32),
+    )
+
+
+def packed_colours(dc: FloatArray) -> tuple[FloatArray, Words]:
+    """Constant coefficients (N, 3) as bounds (C, 2, 3) of colours, and words without opacities."""
+    return _packed_in_bounds(dc * np.float32(SH_0) + np.float32(0.5), _COLOUR)
+
+
+def packed_sh(sh: FloatArray) -> U8:
+    """AC coefficients (N, K, 3) as levels of the same shape. 0 and 255, which readers disagree about, are not used."""
+    levels: U8 = np.clip(np.floor(sh * np.float32(32)) + np.float32(128), 1, 254).astype(np.uint8)
+    return levels
+
+
+def unpacked_sh(levels: U8) -> FloatArray:
+    """Levels of :func:`packed_sh` as coefficients."""
+    return (levels.astype(np.float32) - np.float32(127.5)) / np.float32(32)
+
+
+def elements(packed: PackedGeometry, colours: tuple[FloatArray, Words], sh: U8) -> tuple[bytes, bytes, bytes]:
+    """The elements chunk, vertex and sh of a file.
+
+    Args:
+        packed: geometry.
+        colours: of :func:`packed_colours`.
+        sh: of :func:`packed_sh`.
+    """
+    bounds, words = colours
+    parts = [packed.means, packed.log_scales, bounds]
+    chunk = np.concatenate([part.reshape(len(part), 6) for part in parts], axis=1).astype("<f4")
+    vertex = np.stack([packed.positions, packed.rotations, packed.scales, words | packed.opacities], axis=1)
+    return chunk.tobytes(), vertex.astype("<u4").tobytes(), np.ascontiguousarray(sh.transpose(0, 2, 1)).tobytes()
+
+
+def _packed_in_bounds(values: FloatArray, places: Any) -> tuple[FloatArray, Words]:
+    starts = np.arange(0, len(values), CHUNK)
+    bounds = np.stack([np.minimum.reduceat(values, starts), np.maximum.reduceat(values, starts)], axis=1)
+    chunk = np.arange(len(values)) // CHUNK
+    words = np.zeros(len(values), np.uint32)
+    for axis, (shift, bits) in enumerate(places):
+        low = bounds[:, 0, axis].astype(np.float64)
+        extent = bounds[:, 1, axis] - low
+        scale = np.divide((1 << bits) - 1, extent, out=np.zeros_like(extent), where=extent > 0)
+        levels = np.floor((values[:, axis] - low[chunk]) * scale[chunk] + 0.5)
+        words |= np.clip(levels, 0, (1 << bits) - 1).astype(np.uint32) << np.uint32(shift)
+    return bounds, words
+
+
+def _unpacked_in_bounds(bounds: FloatArray, words: Words, places: Any) -> FloatArray:
+    chunk = np.arange(len(words)) // CHUNK
+    values = np.empty((len(words), 3), np.float32)
+    for axis, (shift, bits) in enumerate(places):
+        most = (1 << bits) - 1
+        part = (words >> np.uint32(shift) & np.uint32(most)) / np.float64(most)
+        low, high = bounds[:, 0, axis].astype(np.float64), bounds[:, 1, axis].astype(np.float64)
+        values[:, axis] = low[chunk] + part * (high - low)[chunk]
+    return values
+
+
+def _packed_rotations(quaternions: FloatArray) -> Words:
+    """The number of the largest part of w, x, y, z and the three others."""
+    turned = quaternions.astype(np.float64)
+    largest = np.abs(turned).argmax(axis=1)
+    turned *= np.where(np.take_along_axis(turned, largest[:, None], axis=1) < 0, -1, 1)
+    others = np.take_along_axis(turned, _OTHERS[largest], axis=1)
+    levels = np.clip(np.floor((others * np.sqrt(0.5) + 0.5) * 1023 + 0.5), 0, 1023).astype(np.uint32)
+    words: Words = largest.astype(np.uint32) << 30 | levels[:, 0] << 20 | levels[:, 1] << 10 | levels[:, 2]
+    return words
+
+
+def _unpacked_rotations(words: Words) -> FloatArray:
+    others = np.stack([(words >> np.uint32(shift) & np.uint32(1023)) for shift in (20, 10, 0)], axis=1)
+    parts = (others / 1023.0 - 0.5) * np.sqrt(2.0)
+    largest = (words >> np.uint32(30)).astype(np.intp)
+    quaternions = np.empty((len(words), 4), np.float32)
+    np.put_along_axis(quaternions, _OTHERS[largest], parts.astype(np.float32), axis=1)
+    rest = np.sqrt(np.maximum(1 - (parts * parts).sum(axis=1), 0)).astype(np.float32)
+    np.put_along_axis(quaternions, largest[:, None], rest[:, None], axis=1)
+    return quaternions
+
+
+#: The parts of w, x, y, z that are stored, by the number of the largest.
+_OTHERS = np.array([[1, 2, 3], [0, 2, 3], [0, 1, 3], [0, 1, 2]])

@@ -1,0 +1,97 @@
+"""What given views show of a scene, and where a camera might have been besides: :class:`GivenViews`."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.host.threads import Run
+from potr_cl.model.camera import Camera, camera_centres
+from potr_cl.model.placement.colour_memory import ColourMemory
+from potr_cl.model.placement.matter import CROWDED, cell_of, frame_of, matter_of, surroundings
+from potr_cl.model.scene import Scene
+
+F32 = NDArray[np.float32]
+
+#: So many splats, evenly taken, tell where a scene is and what hides what.
+_TAKEN = 50_000
+#: Part of what a new view shows that some given view must show, too.
+_KNOWN = 0.9
+#: A new view shows at least this part of what the view shows that it lies beside, by number of splats.
+_FULL = 0.5
+#: What colours remember of a new view's place, as a part of the least that they remember of given ones.
+_REMEMBERED = 0.95
+
+
+class GivenViews:
+    """A scene as given views see it.
+
+    Args:
+        scene: that they show.
+        cameras: the given views, at least one.
+        run: calls functions, perhaps in several threads.
+    """
+
+    def __init__(self, scene: Scene, cameras: Sequence[Camera], run: Run = map) -> None:
+        every = max(len(scene) // _TAKEN, 1)
+        some = scene.subset(np.arange(0, len(scene), every))
+        self._frame = frame_of(some)
+        matter = matter_of(some, self._frame)
+        # Each point stands for the surface of the splats that were not taken, too.
+        self._matter = dataclasses.replace(matter, areas=matter.areas * np.float32(every))
+        shown, blocked = zip(*run(self._look, cameras), strict=True)
+        self._shown: F32 = np.stack(shown)
+        self._known: F32 = self._shown.max(axis=0)
+        # Whoever photographs indoors, stands close to things.
+        self._crowded = max(CROWDED, max(blocked))
+        places = (camera_centres(cameras) - self._frame.centre) / self._frame.unit
+        self._memory = ColourMemory(places, self._matter)
+        self._forgotten = 0.0
+        if self._memory.tells:
+            self._forgotten = _REMEMBERED * min(run(self._remembered, range(len(cameras))))
+
+    def views_of_parts(self) -> NDArray[np.int64]:
+        """(K,) how many given views show each of a few thousand splats, evenly taken from those that any view shows."""
+        counts: NDArray[np.int64] = np.count_nonzero(self._shown, axis=0)
+        return counts[counts > 0]
+
+    def allow(self, camera: Camera, beside: int) -> bool:
+        """Whether a camera might have been here.
+
+        That is: not in matter, not where the colours do not remember that they were looked at from there, and not where
+        it would show what no given view shows.
+
+        Args:
+            camera: the view.
+            beside: number of the given view that it lies beside.
+        """
+        if not np.isfinite(camera.translation).all():
+            return False
+        shown, blocked = self._look(camera)
+        total = float(shown.sum())
+        if blocked > self._crowded or total < _FULL * float(self._shown[beside].sum()):
+            return False
+        if total > 0 and float((shown * self._known).sum()) < _KNOWN * total:
+            return False
+        place = (camera.centre - self._frame.centre) / self._frame.unit
+        return not self._memory.tells or self._memory.of(place, shown) >= self._forgotten
+
+    def _remembered(self, number: int) -> float:
+        return self._memory.of_known(number, self._shown[number])
+
+    def _look(self, camera: Camera) -> tuple[F32, float]:
+        """(K,) 1 for each target that the view shows, else 0; and how much matter there is close by."""
+        matter, frame = self._matter, self._frame
+        place = (camera.centre - frame.centre) / frame.unit
+        horizon, blocked = surroundings(place, matter)
+        rays = matter.targets - place
+        distance = np.linalg.norm(rays, axis=1)
+        x, y, z = camera.rotation @ rays.T
+        with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
+            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
+            inside = (z > frame.near) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
+        visible = distance <= 1.1 * horizon[cell_of(rays.T.astype(np.float32))] + 0.02
+        return (inside & visible).astype(np.float32), blocked

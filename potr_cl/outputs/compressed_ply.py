@@ -1,0 +1,78 @@
+"""Compressed PLY files (SuperSplat's .compressed.ply) as an output: all splats take the same bytes, q decides how many.
+
+Its finest steps are coarser than those of other formats in one place, the AC coefficients: 1/32. The constant ones are
+solved for on what that leaves.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+
+from potr_cl.codec.encoder import Coded
+from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.scenes import compressed_ply, compressed_ply_values
+from potr_cl.formats.scenes.scene_files import arrangement, unit_quaternions
+from potr_cl.model.scene import LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
+from potr_cl.outputs.degrees import worthwhile_degree
+from potr_cl.outputs.output import Output, Request, Rounded, RoundedScene
+
+#: Bytes of a splat without AC coefficients, its part of the bounds included, and of a coefficient.
+_SPLAT, _COEFFICIENT = 16, 3
+
+
+@dataclass(frozen=True)
+class CompressedPlyRounded(RoundedScene):
+    """:class:`RoundedScene` with the words of the file; ``ac`` are the levels of the AC coefficients that it has."""
+
+    packed: compressed_ply_values.PackedGeometry | None = None
+
+
+@dataclass(frozen=True)
+class CompressedPly(Output):
+    """A .compressed.ply file."""
+
+    format: ClassVar[SceneFormat] = compressed_ply.FORMAT
+    fixes_ac: ClassVar[bool] = True
+    replaces: ClassVar[Mapping[str, float]] = {"drop": 0.0}
+    bytes_a_splat: ClassVar[float] = 5.0
+
+    def losses(self, scene: Scene) -> list[str]:
+        """A low-pass filter of the scene's own."""
+        return [f"its low-pass filter of {scene.low_pass:g} square pixels"] if scene.low_pass != LOW_PASS else []
+
+    def geometry(self, scene: Scene, request: Request) -> CompressedPlyRounded:
+        """Round within the bounds of 256 neighbours."""
+        order = arrangement(scene)
+        packed = compressed_ply_values.packed_geometry(unit_quaternions(scene.subset(order)))
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        seen = compressed_ply_values.unpacked_geometry(packed).subset(back)
+        seen = replace(seen, antialiased=scene.antialiased)
+        return CompressedPlyRounded(request.parameters, order, seen, None, packed)
+
+    def fix_ac(
+        self, rounded: Rounded, sh: FloatArray, worth: FloatArray | None, request: Request
+    ) -> tuple[CompressedPlyRounded, FloatArray]:
+        """Round them; degrees that are not worth their bytes become zero and are not written."""
+        assert isinstance(rounded, CompressedPlyRounded)
+        kept = SH_COEFFICIENTS[worthwhile_degree(sh, worth, _COEFFICIENT, _SPLAT, request)]
+        levels = compressed_ply_values.packed_sh(sh[:, 1:kept])
+        fixed = np.zeros_like(sh)
+        fixed[:, 0] = sh[:, 0]
+        fixed[:, 1:kept] = compressed_ply_values.unpacked_sh(levels)
+        return replace(rounded, ac=levels), fixed
+
+    def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
+        """The constant coefficients, within the bounds of 256 neighbours, and the bytes."""
+        request.progress("pack", 0.0)
+        rounded, sh = self.prepared(scene, rounded, request)
+        assert isinstance(rounded, CompressedPlyRounded)
+        assert rounded.packed is not None
+        colours = compressed_ply_values.packed_colours(sh[rounded.order, 0])
+        pieces = compressed_ply.pieces(rounded.packed, colours, rounded.ac[rounded.order], scene.antialiased)
+        request.progress("pack", 1.0)
+        return Coded(pieces, rounded.order)

@@ -1,0 +1,209 @@
+"""The seam between the stages and the kinds of files that an encode ends in: :class:`Output`.
+
+The stages are the same for every kind. The last two ask the output: the re-fit solves for the colours on the geometry
+that the file's readers will see (:meth:`Output.geometry`), has the output choose its AC coefficients
+(:meth:`Output.fix_ac`) and solves again for the constant ones, which make up for what that choice has lost; the stage
+"code" has the bytes made (:meth:`Output.file`). docs/architecture.md tells how to add an output.
+"""
+
+from __future__ import annotations
+
+import tempfile
+from abc import ABC, abstractmethod
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass, field, replace
+from pathlib import Path
+from typing import Any, ClassVar, Protocol
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.container import EntropyCoder
+from potr_cl.codec.encoder import Coded
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.formats.declaration import SceneFormat
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.opencl.device import Device
+from potr_cl.raster.scene_buffers import Drawable
+
+
+@dataclass(frozen=True)
+class Request:
+    """What an output is told besides the scene.
+
+    Attributes:
+        parameters: the hyper-parameters: how large errors of geometry and of colours may be.
+        views: the training views; empty if there are none.
+        device: computes, if there is one: without views there is none.
+        memory: how many bytes of the device's memory may be filled; None: the callee's own default.
+        threads: for work on the host; the bytes do not depend on it. 0: one for each processor.
+        metadata: how the file was made, for formats that hold it.
+        entropy: the entropy coder, for formats that leave a choice.
+        progress: called with what is being done and the part of it that is done.
+    """
+
+    parameters: HyperParameters
+    views: Sequence[Camera] = ()
+    device: Device | None = None
+    memory: int | None = None
+    threads: int = 0
+    metadata: bytes = b""
+    entropy: EntropyCoder = field(default_factory=EntropyCoder)
+    progress: Callable[[str, float], None] = lambda what, done: None
+
+
+class Rounded(Protocol):
+    """A scene's geometry and opacities as a file holds them.
+
+    Attributes:
+        asked: the parameters that it was rounded with.
+        order: (N,) int64, the number in the scene of each splat of the file.
+    """
+
+    @property
+    def asked(self) -> HyperParameters: ...
+
+    @property
+    def order(self) -> NDArray[np.int64]: ...
+
+    def decoded(self, sh: FloatArray) -> Scene:
+        """What a reader makes of it, in the order of the scene, with colours (N, M, 3) of that order."""
+        ...
+
+
+@dataclass(frozen=True)
+class RoundedScene:
+    """:class:`Rounded` for outputs that keep what their readers will see, value by value.
+
+    Attributes:
+        asked, order: as of :class:`Rounded`.
+        scene: geometry and opacities as readers see them, in the order of the scene; its colours are of no account.
+        ac: what :meth:`Output.fix_ac` has chosen, if the output needs it again to make the file (as a palette).
+    """
+
+    asked: HyperParameters
+    order: NDArray[np.int64]
+    scene: Scene
+    ac: Any = None
+
+    def decoded(self, sh: FloatArray) -> Scene:
+        """See :meth:`Rounded.decoded`."""
+        return replace(self.scene, sh=sh)
+
+
+@dataclass(frozen=True)
+class Output(ABC):
+    """A kind of file that an encode can end in; its fields are its own options.
+
+    Attributes:
+        format: reads and names such files.
+        choices: options of the stage "code" that mean something here; others are refused when a user gives them.
+        steps: whether the steps of colours follow ``sf_dc`` and ``sf_sh`` freely, as a search for a size tries them.
+        fixes_ac: whether :meth:`fix_ac` does anything.
+        replaces: hyper-parameters that q does not set here: as ``drop``, where a coefficient of 0 saves no byte.
+        bytes_a_splat: of its files, as a multiple of those of a .potr file of the same q, roughly: where a search for a
+            size begins.
+    """
+
+    format: ClassVar[SceneFormat]
+    choices: ClassVar[frozenset[str]] = frozenset()
+    steps: ClassVar[bool] = False
+    fixes_ac: ClassVar[bool] = False
+    replaces: ClassVar[Mapping[str, float]] = {}
+    bytes_a_splat: ClassVar[float] = 1.0
+
+    @classmethod
+    def suffixes(cls) -> tuple[str, ...]:
+        """Of the names that ask for it, the usual one first."""
+        return cls.format.suffixes
+
+    @property
+    def suffix(self) -> str:
+        """That its files usually have."""
+        return self.suffixes()[0]
+
+    def losses(self, scene: Scene) -> list[str]:
+        """What of a scene such a file cannot hold, a clause each; told once, before the work."""
+        return []
+
+    @abstractmethod
+    def geometry(self, scene: Scene, request: Request) -> Rounded:
+        """Round geometry and opacities as the file does; colours are of no account.
+
+        Args:
+            scene: clean, at least one splat.
+            request: parameters and views count.
+
+        Raises:
+            DataError: the format cannot hold a value.
+        """
+
+    def fix_ac(
+        self, rounded: Rounded, sh: FloatArray, worth: FloatArray | None, request: Request
+    ) -> tuple[Rounded, FloatArray]:
+        """Choose the AC coefficients that the file will hold: levels, bits or a palette.
+
+        It is called once, after the re-fit, or by :meth:`file` where there was none. The re-fit then solves for the
+        constant coefficients again, with the others as they are returned here.
+
+        Args:
+            rounded: what :meth:`geometry` has returned.
+            sh: (N, M, 3) R, G, B in the order of the scene; not to be changed.
+            worth: (N, M) float32: by how much the mean squared error of the views grows for an error of 1 in this
+                coefficient of one channel; None if there are no views.
+            request: its parameters tell what an error is worth in bytes: ``delta_mse_max`` those of a splat.
+
+        Returns:
+            What :meth:`file` is given, and the coefficients as readers will see them. ``sh`` itself where nothing is
+            rounded that anybody could see.
+        """
+        return rounded, sh
+
+    @abstractmethod
+    def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
+        """Make the bytes of the file.
+
+        Args:
+            scene: what is left of the scene, its geometry not rounded yet, with the colours of the re-fit.
+            rounded: of :meth:`fix_ac`; None if there was no re-fit (see :meth:`prepared`).
+            request: what to write.
+
+        Raises:
+            DataError: the format cannot hold a value.
+            UsageError: an extra is missing, or the format cannot hold what the options ask for.
+        """
+
+    def prepared(self, scene: Scene, rounded: Rounded | None, request: Request) -> tuple[Rounded, FloatArray]:
+        """Rounded geometry and fixed AC coefficients, where :meth:`file` gets none from a re-fit."""
+        if rounded is not None:
+            return rounded, scene.sh
+        return self.fix_ac(self.geometry(scene, request), scene.sh, None, request)
+
+    def read(self, data: bytes, trust: bool = False) -> Scene:
+        """The scene that a file's readers will see.
+
+        Raises:
+            DataError: nobody can read it.
+        """
+        with tempfile.TemporaryDirectory() as folder:
+            path = Path(folder) / f"scene{self.suffix}"
+            path.write_bytes(data)
+            return self.format.load(path, trust)
+
+    @contextmanager
+    def seen(self, data: bytes, device: Device, trust: bool = False) -> Iterator[Drawable]:
+        """The same, to be rendered on a device as long as the context lasts; it may lie there already.
+
+        Raises:
+            DataError: nobody can read it.
+        """
+        yield self.read(data, trust)
+
+    def properties(self, data: bytes) -> dict[str, int]:
+        """Bytes of the file by what they are for, as far as the format tells them apart."""
+        return {}
+
+    def __str__(self) -> str:
+        return self.suffix

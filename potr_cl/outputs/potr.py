@@ -1,0 +1,110 @@
+"""The package's own files as an output: the usual one, with steps that q sets, and entropy coders."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass, fields
+from typing import ClassVar
+
+from potr_cl.codec.colours import rounded_ac
+from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.codec.encoder import Coded, code_scene
+from potr_cl.codec.geometry import Geometry, quantise_geometry
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.sections import Property
+from potr_cl.codec.versions import VERSIONS
+from potr_cl.errors import DeviceError
+from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.scenes.potr import FORMAT
+from potr_cl.host.threads import thread_pool
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.ondevice.decode import decode_to_device
+from potr_cl.opencl.device import Device
+from potr_cl.outputs.output import Output, Request, Rounded
+from potr_cl.raster.scene_buffers import Drawable
+
+_NAMES = {
+    Property.OCCUPANCY: "position",
+    Property.SEVERAL: "position",
+    Property.MULTIPLICITY: "position",
+    Property.TAIL_LENGTH: "position",
+    Property.TAIL: "position",
+    Property.SCALE: "scale",
+    Property.ROTATION: "rotation",
+    Property.OPACITY: "opacity",
+    Property.STEPS: "colour: steps",
+}
+
+
+@dataclass(frozen=True)
+class Potr(Output):
+    """A .potr file: :mod:`potr_cl.codec`. AC coefficients are rounded to steps finer than one sees."""
+
+    format: ClassVar[SceneFormat] = FORMAT
+    choices: ClassVar[frozenset[str]] = frozenset(
+        {"entropy", "zstd_level"} | {each.name for each in fields(HyperParameters)}
+    )
+    steps: ClassVar[bool] = True
+    fixes_ac: ClassVar[bool] = True
+
+    def geometry(self, scene: Scene, request: Request) -> Geometry:
+        """See :func:`potr_cl.codec.geometry.quantise_geometry`."""
+        with thread_pool(request.threads) as pool:
+            return quantise_geometry(scene, request.parameters, request.views, pool.map)
+
+    def fix_ac(
+        self, rounded: Rounded, sh: FloatArray, worth: FloatArray | None, request: Request
+    ) -> tuple[Rounded, FloatArray]:
+        """Fit the steps of colours to each splat, and round to them, in the versions of the format that have such.
+
+        DC is solved for once more afterwards: it makes up for what the rounding of the others has changed.
+        """
+        assert isinstance(rounded, Geometry)
+        if worth is None or not VERSIONS[request.parameters.version].colour_steps:
+            return rounded, sh
+        geometry = rounded.with_steps(worth[:, 0])
+        with thread_pool(request.threads) as pool:
+            return geometry, rounded_ac(sh, geometry, pool.map)
+
+    def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
+        """See :func:`potr_cl.codec.encoder.code_scene`."""
+        assert rounded is None or isinstance(rounded, Geometry)
+        return code_scene(
+            scene,
+            request.parameters,
+            request.views,
+            request.metadata,
+            request.entropy,
+            request.threads,
+            request.progress,
+            rounded,
+        )
+
+    def read(self, data: bytes, trust: bool = False) -> Scene:
+        """See :func:`potr_cl.codec.decoder.decode`."""
+        return decode(data, **({"trust": True} if trust else {}))
+
+    @contextmanager
+    def seen(self, data: bytes, device: Device, trust: bool = False) -> Iterator[Drawable]:
+        """See :func:`potr_cl.ondevice.decode.decode_to_device`; an ordinary scene where it does not fit the device."""
+        file = PotrFile.from_bytes(data, **({"trust": True} if trust else {}))
+        with ExitStack() as stack:
+            try:
+                scene: Drawable = stack.enter_context(decode_to_device(file, device))
+            except DeviceError:
+                scene = file.scene()
+            yield scene
+
+    def properties(self, data: bytes) -> dict[str, int]:
+        """Bytes by attribute; the header and the metadata are "other"."""
+        names = ("position", "scale", "rotation", "opacity", "colour: DC", "colour: AC", "colour: steps", "other")
+        sums = dict.fromkeys(names, 0)
+        for section in PotrFile.from_bytes(data, trust=True).header.sections:
+            if section.kind == Property.SH:
+                name = "colour: DC" if section.index < 3 else "colour: AC"
+            else:
+                name = _NAMES.get(section.kind, "other")
+            sums[name] += section.stored_bytes
+        sums["other"] += len(data) - sum(sums.values())
+        return {name: nbytes for name, nbytes in sums.items() if nbytes}

@@ -1,0 +1,214 @@
+"""Derivatives of a scene's pictures with respect to all its parameters, on a device: :class:`PictureDerivatives`.
+
+With J the derivatives of all pixels of some views, and v a number for each pixel and channel, it finds Jᵀ W v, where W
+weighs pixels so that all views count the same whatever their size. Where v is the difference to target pictures, this
+is half the gradient of the squared error. A view takes three steps:
+
+1. the rasterizer prepares it (:class:`potr_cl.raster.rasterizer.Rasterizer`);
+2. ``derivatives`` goes back from the pixels to nine sums for each splat (cl/fit/derivatives_cpu.cl and its twin);
+3. ``chain`` goes back from those to the splat's parameters (cl/fit/chain.cl).
+
+What the rasterizer decides by comparing numbers is taken as constant (:mod:`potr_cl.reference.derivatives` lists it).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass
+
+import numpy as np
+import pyopencl as cl
+
+from potr_cl.errors import DeviceMemoryError
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory, Owner, Scratch
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA, RasterRules
+from potr_cl.raster.scene_buffers import SPLAT_GROUP
+from potr_cl.raster.view_set import ViewSet
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
+from potr_cl.stages.fitting.fixed_point import fixed_point_scale
+from potr_cl.stages.fitting.launcher import launcher_for
+
+#: Bytes of a splat's sums in a view: nine 64-bit integers.
+_SUMS = 72
+
+
+@dataclass(frozen=True)
+class Columns:
+    """Where a scene's parameters lie on the device: a column of ``stride`` floats for each.
+
+    Attributes:
+        sh: coefficients of all three channels.
+    """
+
+    sh: int
+    means = slice(0, 3)
+    log_scales = slice(3, 6)
+    quaternions = slice(6, 10)
+    opacity_logits = slice(10, 11)
+
+    @property
+    def dc(self) -> slice:
+        return slice(11, 14)
+
+    @property
+    def ac(self) -> slice:
+        return slice(14, self.count)
+
+    @property
+    def count(self) -> int:
+        return 11 + self.sh
+
+
+class PictureDerivatives(Owner):
+    """Jᵀ W v of one scene, whose parameters may change on the device between two calls.
+
+    Args:
+        device: to compute on.
+        scene: of N splats.
+        rules, background: of the rasterizer.
+
+    Attributes:
+        rasterizer: of the scene.
+        columns: which parameter is in which column of the gradient.
+        gradient: (columns, stride) float32, what :meth:`add` adds to; zero at first.
+
+    Raises:
+        DeviceError: the scene does not fit the device, or the kernels cannot be built.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        scene: Scene,
+        rules: RasterRules = INRIA,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    ) -> None:
+        self._device = device
+        self._launcher = launcher_for(device, rules)
+        self._memory = Memory(device)
+        self._totals = Scratch(device, "the derivatives' sums")
+        self._errors = Scratch(device, "the tiles' errors")
+        self._factors = Scratch(device, "the views' weights")
+        self._views: ViewSet | None = None
+        self.rasterizer = Rasterizer(device, scene, rules, background)
+        try:
+            parameters = self.rasterizer.parameters
+            self.columns = Columns(3 * parameters.sh_count)
+            self._chain = device.shared_kernel(
+                "fit/chain.cl",
+                "chain",
+                LANES=self._launcher.lanes,
+                SH_COUNT=parameters.sh_count,
+                **self.rasterizer.filter_macros,
+            )
+            self.gradient = self._memory.allocate(4 * self.columns.count * parameters.stride, "the gradient")
+            self.forget()
+        except BaseException:
+            self.close()
+            raise
+
+    def forget(self) -> None:
+        """Set the gradient to 0."""
+        cl.enqueue_fill_buffer(self._device.queue, self.gradient, np.float32(0), 0, self.gradient.size)
+
+    def add(self, cameras: Sequence[Camera], target: cl.Buffer, given: bool = False, unit: float = 1.0) -> None:
+        """Add Jᵀ W v of some views to the gradient.
+
+        Args:
+            cameras: of the views.
+            target: (pixels, 3) float32, the pictures of the views, one behind the other.
+            given: whether ``target`` holds v; if not, v is the views' difference to these pictures.
+            unit: by what v is multiplied while it is summed up: with large numbers small differences keep their digits,
+                but what exceeds ``LARGEST_VALUE`` then is cut.
+
+        Raises:
+            DeviceError: a view does not fit the device, or the device failed.
+        """
+        pixels = 0
+        at_a_time = self._launcher.most_views
+        number = 0
+        while number < len(cameras):
+            some = cameras[number : number + at_a_time]
+            try:
+                views = self._prepared(some)
+                self._totals_for(views)
+            except DeviceMemoryError:
+                self._release()
+                if len(some) == 1:
+                    raise
+                at_a_time = (len(some) + 1) // 2
+                continue
+            self._enqueue(views, some, target, pixels, given, unit)
+            number += len(some)
+            pixels += views.pixels
+
+    def _prepared(self, cameras: Sequence[Camera]) -> ViewSet:
+        if self._views is None or not self.rasterizer.prepare_again(self._views, cameras):
+            if self._views is not None:
+                self._views.close()
+                self._views = None
+            self._views = self.rasterizer.prepare_set(cameras)
+        return self._views
+
+    def _totals_for(self, views: ViewSet) -> None:
+        if self._totals.reserve(_SUMS * views.stride * len(views.views)):
+            # They become zero again whenever they have been used.
+            cl.enqueue_fill_buffer(self._device.queue, self._totals.buffer, np.uint32(0), 0, self._totals.nbytes)
+        self._errors.reserve(4 * views.tiles)
+        self._factors.reserve(4 * len(views.views))
+
+    def _enqueue(
+        self, views: ViewSet, cameras: Sequence[Camera], target: cl.Buffer, first: int, given: bool, unit: float
+    ) -> None:
+        queue = self._device.queue
+        scale = fixed_point_scale(max(c.width for c in cameras), max(c.height for c in cameras))
+        factors = [REFERENCE_PIXELS / (c.width * c.height) / (scale * (1.0 if given else unit)) for c in cameras]
+        cl.enqueue_copy(queue, self._factors.buffer, np.array(factors, np.float32), is_blocking=True)
+        self._launcher.sweep(
+            views,
+            self.rasterizer.background,
+            target,
+            first,
+            given,
+            unit,
+            scale,
+            self._errors.buffer,
+            self._totals.buffer,
+        )
+        parameters = self.rasterizer.parameters
+        self._chain.bind(
+            **parameters.geometry,
+            sh=parameters.sh,
+            views=views.table,
+            view_count=len(views.views),
+            colours=views.colours,
+            factors=self._factors.buffer,
+            totals=self._totals.buffer,
+            gradient=self.gradient,
+        )
+        lanes = self._launcher.lanes
+        self._chain.launch((parameters.stride // lanes,), (SPLAT_GROUP // lanes,))
+
+    def read(self) -> FloatArray:
+        """(N, columns) float32, the gradient."""
+        shape = (self.columns.count, self.rasterizer.stride)
+        columns = self._device.download(self.gradient, shape, np.float32)
+        return np.ascontiguousarray(columns[:, : self.rasterizer.splats].T)
+
+    def _release(self) -> None:
+        """Give back what the next call can make again."""
+        if self._views is not None:
+            self._views.close()
+            self._views = None
+        for scratch in (self._totals, self._errors, self._factors):
+            scratch.close()
+
+    def close(self) -> None:
+        """Give all device memory back."""
+        self._release()
+        self._memory.close()
+        self.rasterizer.close()

@@ -1,0 +1,295 @@
+"""A fit of all parameters of a reduced scene to target pictures: :func:`fit_scene`.
+
+Pruning leaves splats where they were: here they move, turn, grow and fade, so that together they show again what the
+uncompressed scene shows. Adam goes down the mean squared error of a few views at a time (adam.py, derivatives.py). Some
+views are held out; after each round these tell whether the scene has become better, and the best round is kept. So the
+result is never worse on them than the scene was before.
+
+The targets are pictures of the uncompressed scene, so any number of views between the true ones may be targets too.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+
+from potr_cl.errors import UsageError
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.opencl.device import Device
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.fitting.adam import Adam, Limits, Rates
+from potr_cl.stages.fitting.derivatives import PictureDerivatives
+from potr_cl.stages.fitting.pictures import TargetPictures
+from potr_cl.stages.fitting.views import batches, share_out
+from potr_cl.stages.refitting.targets import Targets
+
+logger = logging.getLogger("potr_cl")
+
+#: Part of the device's memory not yet taken that the targets may take unless the caller says how much.
+_SHARE = 0.25
+#: The opacity below which a splat is not drawn is 1/255, of logit -5.54: none falls so far that nothing can bring it
+#: back. Single precision tells opacities up to a logit of 16 from 1.
+_LEAST_LOGIT, _GREATEST_LOGIT = -5.5, 16.0
+#: Differences are multiplied by a power of two while they are summed up, so that they are about this large.
+_USUAL_DIFFERENCE = 1 / 8
+_LARGEST_UNIT = 2.0**20
+#: Of the first step, means in parts of a usual splat's size, for a scene whose mean squared error has this root. All
+#: rates go with the root, because a step in all parameters at once must not do more harm than it can mend; but no rate
+#: is larger than these, or smaller than a part of them.
+RATES = Rates(means=0.01, log_scales=1e-2, quaternions=4e-3, opacity_logits=4e-2, dc=5e-3, ac=5e-4)
+_USUAL_ERROR, _SLOWEST = 1 / 128, 0.02
+
+
+@dataclass(frozen=True)
+class FitOptions:
+    """How to fit.
+
+    Attributes:
+        steps: in all, at the most.
+        batch: views that a step looks at.
+        rounds: after how many equal parts of the steps the held-out views are looked at.
+        patience: the fit ends after so many rounds in which they did not become better.
+        rates: of the first step, if the scene is far from the targets; smaller where it is near to them. ``means`` in
+            parts of a usual splat's size.
+        last: part of the rates that is left at the end; they fall by the same factor in each step.
+        seed: of the order of the views.
+        memory: bytes of device memory that target pictures may take; None: a quarter of what is free.
+
+    Raises:
+        UsageError: a value is out of range.
+    """
+
+    steps: int = 1500
+    batch: int = 4
+    rounds: int = 10
+    patience: int = 3
+    rates: Rates = RATES
+    last: float = 0.1
+    seed: int = 0
+    memory: int | None = None
+
+    def __post_init__(self) -> None:
+        if not 0 <= self.steps <= 10**6:
+            raise UsageError(f"{self.steps} steps of the fit: it must be from 0 to 1,000,000")
+        for name in ("batch", "rounds", "patience"):
+            if not 1 <= getattr(self, name) <= 1000:
+                raise UsageError(f"the fit's {name} is {getattr(self, name)}, it must be from 1 to 1000")
+        if not 0 < self.last <= 1:
+            raise UsageError(f"the fit's last rate is {self.last:g}, it must be above 0 and at most 1")
+
+
+@dataclass(frozen=True)
+class Fitted:
+    """What a fit did.
+
+    Attributes:
+        scene: the one that is kept.
+        steps: that were taken, and kept: of these, up to the round that is kept.
+        errors: mean squared error of the held-out views before the first round, and after each.
+        held_out: how many views these are.
+    """
+
+    scene: Scene
+    steps: int
+    kept: int
+    errors: tuple[float, ...]
+    held_out: int
+
+    @property
+    def psnr(self) -> tuple[float, float]:
+        """Of the held-out views before and after, in decibels."""
+        return _decibels(self.errors[0]), _decibels(min(self.errors))
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """All but the scene, by name."""
+        return {"steps": self.steps, "kept": self.kept, "held_out": self.held_out, "errors": list(self.errors)}
+
+    def __str__(self) -> str:
+        before, after = self.psnr
+        views = f"{self.held_out} view{'s' if self.held_out > 1 else ''} held out"
+        steps = f"{self.kept} of {self.steps} steps are kept"
+        return f"{steps}: PSNR {before:.2f} dB before, {after:.2f} dB after, {views}"
+
+
+@dataclass(frozen=True)
+class LeftOut:
+    """That a fit was left out, because there are too few views for any to be held out."""
+
+    @property
+    def facts(self) -> dict[str, Any]:
+        """None."""
+        return {}
+
+    def __str__(self) -> str:
+        return (
+            "the fit was left out: it needs two training views or more, because one of them is held out and tells "
+            "whether it helps"
+        )
+
+
+#: Called with the steps done, and their greatest number.
+FitProgress = Callable[[int, int], None]
+
+
+def fit_scene(
+    device: Device,
+    scene: Scene,
+    cameras: Sequence[Camera],
+    targets: Targets,
+    options: FitOptions | None = None,
+    added: int = 0,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+    progress: FitProgress | None = None,
+    tell: Callable[[str], None] | None = None,
+) -> Fitted:
+    """Fit all parameters of a scene to pictures of some views.
+
+    Args:
+        device: to compute on.
+        scene: where the fit begins.
+        cameras: the views.
+        targets: the picture that each of them should show.
+        options: of the fit.
+        added: how many of the views, the last ones, lie between those that were given: they are never held out.
+        background: R, G, B behind the scene.
+        progress: called after each step.
+        tell: called with a line for each round.
+
+    Raises:
+        UsageError: there are fewer than two given views, so that none can be held out.
+        DeviceError: the scene does not fit the device.
+    """
+    options = options or FitOptions()
+    fit_to, held_out = share_out(len(cameras) - added, added)
+    if not held_out:
+        raise UsageError("a fit needs two training views or more: one of them is held out and tells whether it helps")
+    free = device.info.memory - device.allocated
+    with (
+        PictureDerivatives(device, scene, background=background) as derivatives,
+        TargetPictures(
+            device, cameras, targets, free * _SHARE if options.memory is None else options.memory
+        ) as pictures,
+    ):
+        rasterizer = derivatives.rasterizer
+        judges = _Judges(rasterizer, [cameras[number] for number in held_out], [pictures.download(n) for n in held_out])
+        with Adam(device, scene, rasterizer.parameters, derivatives.columns, _limits(scene)) as adam:
+            fit = _Fit(options, derivatives, adam, pictures, judges, cameras)
+            return fit.run(fit_to, _usual_size(scene), progress, tell or logger.debug)
+
+
+class _Judges:
+    """The views that are held out.
+
+    Args:
+        rasterizer: of the scene that changes.
+        cameras: the views.
+        pictures: (H, W, 3) float32, what they should show.
+    """
+
+    def __init__(self, rasterizer: Rasterizer, cameras: Sequence[Camera], pictures: Sequence[FloatArray]) -> None:
+        self._rasterizer, self._cameras, self._pictures = rasterizer, cameras, pictures
+
+    def __len__(self) -> int:
+        return len(self._cameras)
+
+    def error(self) -> float:
+        """The mean squared error of the scene as it is now, all views the same."""
+        errors = []
+        for camera, picture in zip(self._cameras, self._pictures, strict=True):
+            difference = self._rasterizer.render(camera)[0].astype(np.float64) - picture
+            errors.append(float(np.mean(difference**2)))
+        return float(np.mean(errors))
+
+
+class _Fit:
+    """One fit while it runs."""
+
+    def __init__(
+        self,
+        options: FitOptions,
+        derivatives: PictureDerivatives,
+        adam: Adam,
+        pictures: TargetPictures,
+        judges: _Judges,
+        cameras: Sequence[Camera],
+    ) -> None:
+        self._options, self._derivatives, self._adam = options, derivatives, adam
+        self._pictures, self._judges, self._cameras = pictures, judges, cameras
+
+    def run(
+        self, fit_to: Sequence[int], size: float, progress: FitProgress | None, tell: Callable[[str], None]
+    ) -> Fitted:
+        options = self._options
+        errors = [self._judges.error()]
+        pace = min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
+        kept = done = since = 0
+        order = batches(fit_to, options.batch, options.seed)
+        for round_number in range(1, options.rounds + 1):
+            end = options.steps * round_number // options.rounds
+            unit = _unit(errors[-1])
+            while done < end:
+                self._step(next(order), unit, self._rates(done, pace, size))
+                done += 1
+                if progress is not None:
+                    progress(done, options.steps)
+            errors.append(self._judges.error())
+            now, first = _decibels(errors[-1]), _decibels(errors[0])
+            tell(f"fit: {done} steps, held-out views {now:.2f} dB, {first:.2f} dB at first")
+            if errors[-1] < min(errors[:-1]):
+                self._adam.keep()
+                kept, since = done, 0
+            else:
+                since += 1
+            if since >= options.patience:
+                break
+        return Fitted(self._adam.kept(), done, kept, tuple(errors), len(self._judges))
+
+    def _step(self, numbers: Sequence[int], unit: float, rates: Rates) -> None:
+        cameras = [self._cameras[number] for number in numbers]
+        self._derivatives.add(cameras, self._pictures.of(numbers), unit=unit)
+        self._adam.step(self._derivatives.gradient, rates)
+
+    def _rates(self, done: int, pace: float, size: float) -> Rates:
+        rates = self._options.rates
+        left = pace * self._options.last ** (done / max(self._options.steps - 1, 1))
+        return Rates(
+            means=left * rates.means * size,
+            log_scales=left * rates.log_scales,
+            quaternions=left * rates.quaternions,
+            opacity_logits=left * rates.opacity_logits,
+            dc=left * rates.dc,
+            ac=left * rates.ac,
+        )
+
+
+def _decibels(error: float) -> float:
+    """The PSNR of a mean squared error of colours from 0 to 1."""
+    return -10 * math.log10(max(error, 1e-20))
+
+
+def _usual_size(scene: Scene) -> float:
+    """The median of the splats' middle standard deviations, world units."""
+    middle = np.sort(scene.log_scales.astype(np.float64), axis=1)[:, 1]
+    return math.exp(min(float(np.median(middle)), 80.0))
+
+
+def _limits(scene: Scene) -> Limits:
+    """No splat grows larger or thinner than the largest and the thinnest one were."""
+    return Limits(
+        (float(scene.log_scales.min()), float(scene.log_scales.max())),
+        (_LEAST_LOGIT, max(_GREATEST_LOGIT, float(scene.opacity_logits.max()))),
+    )
+
+
+def _unit(error: float) -> float:
+    """By what differences of this mean square are multiplied while they are summed up."""
+    if not 0 < error < math.inf:
+        return 1.0
+    return min(max(2.0 ** math.floor(math.log2(_USUAL_DIFFERENCE / math.sqrt(error))), 1.0), _LARGEST_UNIT)

@@ -1,0 +1,112 @@
+"""The command fit, and --fit of encode."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+import re
+
+import numpy as np
+import pytest
+
+from potr_cl import cli
+from potr_cl.formats import load_scene
+from potr_cl.formats.cameras import cameras_json
+from potr_cl.formats.scenes import ply
+from potr_cl.reference.scenes import ring_of_cameras, visible_scene
+
+
+@pytest.fixture
+def paths(tmp_path):
+    """A scene, half of its splats, and 12 views, 3 of them test views."""
+    scene = visible_scene(120, 1, seed=3)
+    ply.save(tmp_path / "scene.ply", scene)
+    ply.save(tmp_path / "half.ply", scene.subset(np.arange(0, 120, 2)))
+    views = [dataclasses.replace(c, name=f"view_{k}") for k, c in enumerate(ring_of_cameras(12, size=48))]
+    (tmp_path / "cameras.json").write_text(
+        json.dumps(
+            [
+                {
+                    "id": k, "img_name": c.name, "width": c.width, "height": c.height, "fx": c.fx, "fy": c.fy,
+                    "position": c.centre.tolist(), "rotation": c.rotation.T.tolist(), "split": c.split,
+                }
+                for k, c in enumerate(views)
+            ]
+        )
+    )  # fmt: skip
+    assert len(cameras_json.load(tmp_path / "cameras.json")) == 12
+    return tmp_path
+
+
+def command_of(paths, *more):
+    words = ["fit", paths / "half.ply", "--reference", paths / "scene.ply", "--cameras", paths / "cameras.json"]
+    return [str(word) for word in [*words, "-o", paths / "out.ply", *more]]
+
+
+def decibels(text):
+    return [float(value) for value in re.findall(r"([\d.]+) dB", text)]
+
+
+def test_the_command(paths, capsys):
+    assert cli.main(command_of(paths, "--steps", "100")) == 0
+    captured = capsys.readouterr()
+    before, after = decibels(captured.out.splitlines()[-1])
+    assert after > before + 1, "on test views, which the fit has not seen"
+    assert "held out" in captured.out
+    assert len(re.findall(r"^fit: \d+ steps, held-out views", captured.err, re.MULTILINE)) == 10
+    half, fitted = load_scene(paths / "half.ply"), load_scene(paths / "out.ply")
+    assert len(half) == len(fitted)
+    assert not np.array_equal(half.means, fitted.means)
+    compare = ["compare", paths / "scene.ply", paths / "out.ply", "--cameras", paths / "cameras.json", "--json"]
+    assert cli.main([str(word) for word in compare]) == 0
+    judged = json.loads(capsys.readouterr().out)
+    assert judged["mean"]["b_against_a"]["psnr"] == pytest.approx(after, abs=0.01)
+
+
+def test_views_between_are_looked_at_too(paths, capsys):
+    assert cli.main(command_of(paths, "--steps", "20", "--views-between", "1")) == 0
+    added = re.search(r"9 training views and (\d+) between them", capsys.readouterr().out)
+    assert added is not None
+    assert 0 < int(added[1]) <= 9
+
+
+@pytest.mark.parametrize(
+    ("more", "said"),
+    [
+        (("--steps", "-1"), "-1 steps"),
+        (("--steps", "10000000"), "steps of the fit"),
+        (("--views-between", "101"), "from 0 to 100"),
+    ],
+    ids=str,
+)
+def test_what_is_out_of_range_is_told_before_anything_is_read(paths, capsys, more, said):
+    (paths / "half.ply").write_bytes(b"")
+    assert cli.main(command_of(paths, *more)) == 2
+    assert said in capsys.readouterr().err
+    assert not (paths / "out.ply").exists()
+
+
+def test_one_training_view_is_too_few(paths, capsys):
+    views = json.loads((paths / "cameras.json").read_text())
+    (paths / "cameras.json").write_text(json.dumps([v for v in views if v["split"] == "test" or v["id"] == 1]))
+    assert cli.main(command_of(paths)) == 2
+    assert "two training views" in capsys.readouterr().err
+    assert not (paths / "out.ply").exists()
+
+
+def test_encode_with_a_fit(paths, capsys):
+    words = ["encode", paths / "scene.ply", "--cameras", paths / "cameras.json", "--keep", "0.5", "--json"]
+    reports = []
+    for steps in ("off", "100"):
+        out = paths / f"{steps}.potr"
+        assert cli.main([str(word) for word in [*words, "-o", out, "--fit", steps]]) == 0
+        reports.append(json.loads(capsys.readouterr().out))
+    without, with_fit = reports
+    assert without["fit"] is None
+    assert with_fit["fit"]["kept"] > 0
+    assert "held out" in with_fit["fit"]["said"]
+    assert with_fit["splats"] == without["splats"]
+    assert with_fit["quality"]["psnr"] > without["quality"]["psnr"] + 0.5
+    assert cli.main([str(word) for word in [*words[:-1], "-o", paths / "a.potr", "--fit", "100"]]) == 0
+    assert f"fit        {with_fit['fit']['said']}" in capsys.readouterr().out
+    assert (paths / "a.potr").read_bytes() == (paths / "100.potr").read_bytes()

@@ -1,0 +1,123 @@
+"""The encoder's loops over all splats in C: the same bits as NumPy's, and nothing beyond their arrays."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from potr_cl.codec import quantize
+from potr_cl.codec.geometry import quantise_geometry
+from potr_cl.codec.native.library import VARIABLE, native
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.errors import DataError
+from potr_cl.reference.scenes import random_scene, tilted_camera
+from potr_cl.stages.refitting.refit import active_coefficients
+
+
+@pytest.fixture
+def both(monkeypatch):
+    """Calls something by NumPy and by the compiled library; skips where there is none."""
+    monkeypatch.delenv(VARIABLE, raising=False)
+    if native() is None:
+        pytest.skip("the compiled library is not there: python -m tools.make.native, or pip install -e .")
+
+    def called(work):
+        results = []
+        for value in ("0", "1"):
+            monkeypatch.setenv(VARIABLE, value)
+            results.append(work())
+        return results
+
+    return called
+
+
+def assert_same_bits(a, b):
+    assert (a.dtype, a.shape) == (b.dtype, b.shape)
+    assert np.ascontiguousarray(a).tobytes() == np.ascontiguousarray(b).tobytes()
+
+
+def axis_rotations() -> np.ndarray:
+    """Quaternions of which several equivalent forms have the same real part, and their negatives."""
+    half, root = 0.5, np.sqrt(0.5)
+    some = [[1, 0, 0, 0], [0, 0, 1, 0], [half] * 4, [half, -half, half, -half], [root, root, 0, 0], [0, root, 0, -root]]
+    return np.array(some + [[-x for x in q] for q in some], np.float32)
+
+
+@pytest.mark.parametrize("number", [0, 1, 255, 256, 257, 5000])
+def test_canonical_rotations(number, both):
+    rng = np.random.default_rng(number)
+    quaternions = rng.normal(0, 1, (5000, 4)).astype(np.float32) * rng.lognormal(0, 4, (5000, 1)).astype(np.float32)
+    quaternions[:12] = axis_rotations()
+    log_scales = rng.normal(0, 2, (5000, 3)).astype(np.float32)
+    order = rng.permutation(5000)[:number]
+    ours, wanted = both(lambda: quantize.canonical_rotations(quaternions, log_scales, order))
+    for a, b in zip(ours, wanted, strict=True):
+        assert_same_bits(a, b)
+
+
+def test_all_splats_are_taken_without_an_order(both):
+    rotations, scales = axis_rotations(), np.arange(36, dtype=np.float32).reshape(12, 3)
+    for imaginary, turned in both(lambda: quantize.canonical_rotations(rotations, scales)):
+        assert imaginary.shape == turned.shape == (12, 3)
+        assert (np.linalg.norm(imaginary, axis=1) < 0.53).all()  # the real part is 0.85 or more
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+@pytest.mark.parametrize("number", [1, 63, 64, 65, 1000])
+def test_coefficients_that_are_not_rounded_to_zero(degree, number, both):
+    sh = random_scene(number, degree, seed=number).sh
+    sh[::3] = np.round(sh[::3] * 20) / 20  # between two levels, exactly
+    sh[::5] = 0
+    ours, wanted = both(lambda: quantize.nonzero_levels(sh, 10.0))
+    assert_same_bits(ours, wanted)
+    assert ours.shape == sh.shape
+    assert 0 < np.count_nonzero(ours) < ours.size or number == 1
+    assert active_coefficients(sh, 10.0)[:, 0].all()
+
+
+@pytest.mark.parametrize("value", [1e20, np.inf, np.nan])
+def test_coefficients_without_a_level_are_refused_alike(value, monkeypatch):
+    sh = random_scene(70, 1, seed=1).sh
+    sh[69, 3, 2] = value
+    for path in ("0", "") if native() is not None else ("0",):
+        monkeypatch.setenv(VARIABLE, path)
+        with np.errstate(invalid="ignore"), pytest.raises(DataError, match="SH coefficient"):
+            quantize.nonzero_levels(sh, 10.0)
+
+
+@pytest.mark.parametrize("views", [0, 1, 5])
+def test_geometry(views, both):
+    scene = random_scene(3000, 0, seed=4)
+    scene = replace(scene, means=scene.means * np.float32(100))
+    cameras = [tilted_camera(view, 64, 64) for view in range(views)]
+    a, b = both(lambda: quantise_geometry(scene, HyperParameters.from_quality(0.5, "best"), cameras))
+    assert a.parameters == b.parameters
+    assert_same_bits(a.order, b.order)
+    for name in ("scales", "rotations"):
+        for ours, wanted in zip(getattr(a, name), getattr(b, name), strict=True):
+            assert_same_bits(ours, wanted)
+    assert_same_bits(a.tree.tails, b.tree.tails)
+
+
+def test_what_does_not_fit_is_refused_before_c_sees_it():
+    functions = native()
+    if functions is None:
+        pytest.skip("the compiled library is not there: python -m tools.make.native, or pip install -e .")
+    quantising = functions.quantising
+    ones, sh = np.ones((4, 3), np.float32), np.ones((4, 1, 3), np.float32)
+    with pytest.raises(TypeError):
+        quantising.nearest(ones, np.ones((2, 3)), np.empty(5))
+    with pytest.raises(TypeError):
+        quantising.nearest(ones.astype(np.float64), np.ones((2, 3)), np.empty(4))  # type: ignore[arg-type]
+    with pytest.raises(TypeError):
+        quantising.ycocg_columns(sh, np.empty((1, 3, 3), np.float32))
+    with pytest.raises(TypeError):
+        quantising.ycocg_columns(sh.transpose(2, 1, 0), np.empty((1, 3, 4), np.float32))
+    for number in (-1, 4):
+        with pytest.raises(TypeError, match="not there"):
+            quantising.canonical(
+                np.ones((4, 4), np.float32), ones, np.array([number]), np.ones((4, 24)), np.zeros((24, 3), np.uint8),
+                np.empty((1, 3)), np.empty((1, 3), np.float32),
+            )  # fmt: skip

@@ -1,0 +1,196 @@
+"""A file decoded into a device's memory: the bits of its scene decoded and uploaded, and nothing left behind."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import potr_cl
+from potr_cl.codec.container import EntropyCoder
+from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.encoder import code_scene
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, UsageError
+from potr_cl.ondevice.decode import decode_to_device
+from potr_cl.opencl.device import Device
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
+from potr_cl.reference.scenes import random_scene
+from tests.devices import KERNELS, open_device
+
+GOLDEN = sorted((Path(__file__).parents[1] / "data").glob("golden_v*.potr"))
+PARAMETERS = ("means", "scales", "quaternions", "log2_opacities", "sh")
+
+
+@pytest.fixture(scope="module", params=KERNELS)
+def device(request: pytest.FixtureRequest) -> Iterator[Device]:
+    device = open_device(request.param)
+    yield device
+    assert device.allocated == 0, "a decoded scene did not give all its memory back"
+
+
+def bits(buffers: SceneBuffers) -> dict[str, bytes]:
+    device = buffers.device
+    columns = {name: getattr(buffers, name).size // (4 * buffers.stride) for name in PARAMETERS}
+    return {
+        name: device.download(getattr(buffers, name), (number, buffers.stride), np.uint32).tobytes()
+        for name, number in columns.items()
+    }
+
+
+def assert_as_uploaded(file: PotrFile, device: Device, sh_degree: int | None = None) -> None:
+    with uploaded(device, file.scene(sh_degree=sh_degree)) as wanted, decode_to_device(file, device, sh_degree) as got:
+        assert (got.splats, got.stride, got.sh_count) == (wanted.splats, wanted.stride, wanted.sh_count)
+        assert (got.antialiased, got.low_pass) == (wanted.antialiased, wanted.low_pass)
+        a, b = bits(wanted), bits(got)
+    assert [name for name in PARAMETERS if a[name] != b[name]] == []
+
+
+def coded(splats: int, preset: str, entropy: EntropyCoder | None = None, q: float = 0.5, degree: int = 3) -> bytes:
+    parameters = HyperParameters.from_quality(q, preset)  # type: ignore[arg-type]
+    return b"".join(code_scene(random_scene(splats, degree, seed=splats), parameters, entropy=entropy).pieces)
+
+
+@pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
+def test_golden_files_have_the_bits_of_the_host(path, device):
+    assert_as_uploaded(PotrFile.open(path), device)
+
+
+@pytest.mark.parametrize("native", ["0", ""])
+@pytest.mark.parametrize(
+    ("preset", "entropy", "q"),
+    [
+        ("best", None, 0.5),
+        ("best", EntropyCoder("zstd", 3), 0.9),
+        ("fast", EntropyCoder("zstd", 3), 0.2),
+        ("paper", EntropyCoder("zstd", 3), 0.5),
+        ("paper", EntropyCoder("npz"), 1.0),
+    ],
+)
+def test_coded_scenes_have_the_bits_of_the_host(preset, entropy, q, native, device, monkeypatch):
+    """More splats than a work-group has, and not a multiple of it."""
+    monkeypatch.setenv("POTR_CL_NATIVE", native)
+    assert_as_uploaded(PotrFile.from_bytes(coded(3001, preset, entropy, q)), device)
+
+
+@pytest.mark.parametrize("factor", [1e3, 1e5, 1e9])
+def test_levels_of_any_size_have_the_bits_of_the_host(factor, device):
+    """Of one, two and more bytes, and beyond all tables."""
+    parameters = replace(
+        HyperParameters.from_quality(0.5, "best"),
+        sf_dc=factor, sf_sh=factor, sf_opacity=factor, sf_rotation=factor, sf_scale=factor,
+    )  # fmt: skip
+    pieces = code_scene(random_scene(700, 2, seed=1), parameters, entropy=EntropyCoder("zstd", 3)).pieces
+    assert_as_uploaded(PotrFile.from_bytes(b"".join(pieces)), device)
+
+
+@pytest.mark.parametrize("degree", [0, 1, 3])
+def test_a_lower_degree_has_the_bits_of_the_host(degree, device):
+    assert_as_uploaded(PotrFile.from_bytes(coded(500, "best")), device, degree)
+
+
+def test_an_unknown_degree_is_refused(device):
+    with pytest.raises(UsageError, match="SH degree 4"):
+        decode_to_device(PotrFile.from_bytes(coded(20, "best")), device, 4)
+
+
+def test_pictures_are_those_of_the_scene(device, plush_excerpt, plush_excerpt_cameras):
+    camera = plush_excerpt_cameras[0]
+    pieces = code_scene(plush_excerpt, HyperParameters.from_quality(0.5, "best")).pieces
+    data = b"".join(pieces)
+    for antialiased in (None, True):
+        wanted = potr_cl.render(potr_cl.decode(data).rendered(antialiased), camera, device)
+        with (
+            potr_cl.decode_to_device(data, device, antialiased=antialiased) as scene,
+            Rasterizer(device, scene) as rasterizer,
+        ):
+            image, transmittance = rasterizer.render(camera)
+        assert np.array_equal(image, wanted.image)
+        assert np.array_equal(transmittance, wanted.transmittance)
+        assert np.array_equal(potr_cl.render(data, camera, device, antialiased=antialiased).image, wanted.image)
+
+
+def test_a_closed_rasterizer_leaves_the_scene_to_its_owner(device, plush_excerpt_cameras):
+    with potr_cl.decode_to_device(coded(300, "best"), device) as scene:
+        before = bits(scene)
+        for _ in range(2):
+            with Rasterizer(device, scene) as rasterizer:
+                rasterizer.render(plush_excerpt_cameras[0])
+        assert bits(scene) == before
+
+
+def test_a_scene_on_another_device_is_refused(device):
+    other = Device(device.info, family=device.family)
+    with (
+        potr_cl.decode_to_device(coded(20, "best"), other) as scene,
+        pytest.raises(DeviceError, match="the scene lies on"),
+    ):
+        Rasterizer(device, scene)
+
+
+def test_what_the_host_refuses_is_refused_and_leaves_nothing(device):
+    """Every byte changed in turn: a checksum tells of each, at whatever depth."""
+    data = coded(40, "best", degree=1)
+    before = device.allocated
+    for place in range(0, len(data), 7):
+        damaged = bytearray(data)
+        damaged[place] ^= 0x55
+        with pytest.raises(DataError):
+            potr_cl.decode_to_device(bytes(damaged), device)
+    assert device.allocated == before
+
+
+def test_a_scene_that_does_not_fit_leaves_nothing(device, monkeypatch):
+    data, before = coded(3000, "best"), device.allocated
+    monkeypatch.setattr(device, "info", replace(device.info, memory=before + 300_000))
+    with pytest.raises(DeviceMemoryError):
+        potr_cl.decode_to_device(data, device)
+    assert device.allocated == before
+
+
+def test_a_path_is_named_in_errors(tmp_path, device):
+    path = tmp_path / "scene.potr"
+    data = bytearray(coded(40, "best"))
+    data[-3] ^= 1
+    path.write_bytes(bytes(data))
+    with pytest.raises(DataError, match=r"scene\.potr': section"):
+        potr_cl.decode_to_device(path, device)
+
+
+def test_comparing_files_says_what_comparing_scenes_says(tmp_path, device, plush_excerpt, plush_excerpt_cameras):
+    path = tmp_path / "b.potr"
+    path.write_bytes(b"".join(code_scene(plush_excerpt, HyperParameters.from_quality(0.3, "best")).pieces))
+    views = plush_excerpt_cameras[:2]
+    of_file = potr_cl.compare(plush_excerpt, path, views, device=device)
+    of_scene = potr_cl.compare(plush_excerpt, potr_cl.decode(path), views, device=device)
+    assert of_file.psnr == of_scene.psnr
+    assert of_file.report()["views"] == of_scene.report()["views"]
+
+
+def test_the_commands_say_the_same_of_a_file_and_of_its_scene(tmp_path, monkeypatch, capsys, plush_excerpt):
+    """Render and compare read the file into the device; as a PLY file it takes the way by the host."""
+    from potr_cl import cli
+
+    data = Path(__file__).parents[1] / "data"
+    cameras = str(data / "plush_excerpt_cameras.json")
+    files = {"potr": tmp_path / "b.potr", "ply": tmp_path / "b.ply"}
+    pieces = code_scene(plush_excerpt, HyperParameters.from_quality(0.3, "best")).pieces
+    files["potr"].write_bytes(b"".join(pieces))
+    potr_cl.decode(files["potr"]).save(files["ply"])
+    pictures, told = {}, {}
+    for kind, path in files.items():
+        folder = tmp_path / kind
+        assert cli.main(["render", str(path), "--cameras", cameras, "--views", "0", "1", "-o", str(folder)]) == 0
+        pictures[kind] = {picture.name: picture.read_bytes() for picture in folder.iterdir()}
+        capsys.readouterr()
+        arguments = ["compare", str(data / "plush_excerpt.ply"), str(path), "--cameras", cameras, "--views", "0", "1"]
+        assert cli.main([*arguments, "--json"]) == 0
+        told[kind] = json.loads(capsys.readouterr().out)["mean"]
+    assert len(pictures["potr"]) == 2
+    assert pictures["potr"] == pictures["ply"]
+    assert told["potr"] == told["ply"]

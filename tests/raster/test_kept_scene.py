@@ -1,0 +1,85 @@
+"""A scene that stays on the device: the same results, one upload, and nothing left behind."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster import kept_scene, scene_buffers
+from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import SceneBuffers
+from potr_cl.reference.scenes import random_splats, straight_camera
+from tests.devices import FAMILIES, open_device
+
+OPTIONS = EncodeOptions.for_preset("best", prune={"iterations": 8}, compact={"on": True})
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def device(request: pytest.FixtureRequest) -> Iterator[Device]:
+    device = open_device(request.param)
+    yield device
+    assert device.allocated == 0
+
+
+def test_only_the_scene_itself_is_on_its_device(device):
+    scene = random_splats(100)
+    with KeptScene(device, scene) as kept:
+        assert isinstance(kept.drawable(device, scene), SceneBuffers)
+        other = replace(scene)
+        assert kept.drawable(device, other) is other
+        another = Device(device.info, family=device.family)
+        assert kept.drawable(another, scene) is scene
+
+
+def test_a_scene_is_not_kept_where_it_would_take_much_of_the_memory(device, monkeypatch):
+    scene = random_splats(5000)
+    monkeypatch.setattr(device, "info", replace(device.info, memory=2 * scene.nbytes))
+    with KeptScene(device, scene) as kept:
+        assert kept.drawable(device, scene) is scene
+        assert device.allocated == 0
+
+
+def test_other_colours_leave_the_kept_ones_alone(device):
+    scene, camera = random_splats(400, seed=3), straight_camera()
+    other = random_splats(400, seed=4).sh
+    with KeptScene(device, scene) as kept:
+        with Rasterizer(device, kept.drawable(device, scene)) as rasterizer:
+            before = rasterizer.render(camera)[0]
+            assert rasterizer.replace_sh(other) is None  # those of the kept scene are nobody's to free
+            after = rasterizer.render(camera)[0]
+            former = rasterizer.replace_sh(scene.sh)
+            assert former is not None
+            device.free(former)
+            assert np.array_equal(rasterizer.render(camera)[0], before)
+        with Rasterizer(device, replace(scene, sh=other)) as wanted:
+            assert np.array_equal(wanted.render(camera)[0], after)
+            assert not np.array_equal(before, after)
+        with Rasterizer(device, kept.drawable(device, scene)) as rasterizer:
+            assert np.array_equal(rasterizer.render(camera)[0], before)
+
+
+def test_an_encode_uploads_its_scene_once_and_makes_the_same_bytes(
+    device, plush_excerpt, plush_excerpt_cameras, monkeypatch
+):
+    scenes = []
+    real = scene_buffers.SceneBuffers.write_sh
+
+    def counted(self, parameter, sh):
+        scenes.append(sh is plush_excerpt.sh)
+        real(self, parameter, sh)
+
+    monkeypatch.setattr(scene_buffers.SceneBuffers, "write_sh", counted)
+    once = encode(plush_excerpt, plush_excerpt_cameras, OPTIONS, device=device).data
+    assert sum(scenes) == 1
+    monkeypatch.setattr(kept_scene, "_PART", 1 << 40)
+    scenes.clear()
+    assert encode(plush_excerpt, plush_excerpt_cameras, OPTIONS, device=device).data == once
+    assert sum(scenes) > 1
+    assert device.allocated == 0

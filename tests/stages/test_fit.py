@@ -1,0 +1,255 @@
+"""The fit of all parameters: what moves, what stays, and which round is kept."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.errors import UsageError
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.reference.refit_cases import Pictures
+from potr_cl.reference.scenes import ring_of_cameras, visible_scene
+from potr_cl.stages.fit import Fit
+from potr_cl.stages.fitting.fit import FitOptions, Fitted, LeftOut, fit_scene
+from potr_cl.stages.fitting.views import batches, share_out
+from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.stages.stage import State, Workbench
+from tests.devices import FAMILIES, KERNELS, open_device
+
+PARAMETERS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
+STEPS = FitOptions(steps=200, rounds=5)
+
+
+@pytest.fixture(scope="module", params=KERNELS)
+def device(request):
+    device = open_device(request.param)
+    yield device
+    assert device.allocated == 0, "a fit did not give all its memory back"
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def family_device(request):
+    return open_device(request.param)
+
+
+def shaken(scene, seed=0, only=PARAMETERS):
+    """The scene with errors in some kinds of parameters."""
+    rng = np.random.default_rng(seed)
+    of_sh = np.where(np.arange(scene.sh.shape[1]) == 0, 0.1, 0.01)[:, None]
+    sizes = {"means": 0.01, "log_scales": 0.1, "quaternions": 0.1, "opacity_logits": 0.3, "sh": of_sh}
+    changes = {}
+    for name in only:
+        array = getattr(scene, name)
+        changes[name] = (array + rng.normal(scale=sizes[name], size=array.shape)).astype(np.float32)
+    return dataclasses.replace(scene, **changes)
+
+
+def fitted_to(device, source, scene, cameras, options=STEPS, **more):
+    with Rasterizer(device, source) as rasterizer:
+        return fit_scene(device, scene, cameras, RenderedTargets(rasterizer, cameras), options, **more)
+
+
+def mean_error(device, source, scene, cameras):
+    with Rasterizer(device, source) as one, Rasterizer(device, scene) as other:
+        return np.mean([np.mean((one.render(c)[0] - other.render(c)[0]) ** 2) for c in cameras])
+
+
+@pytest.mark.parametrize("only", [*((name,) for name in PARAMETERS), PARAMETERS], ids=lambda names: "+".join(names))
+def test_errors_of_every_kind_are_mended(device, only):
+    """On views that the fit has not seen, too."""
+    source = visible_scene(60, 2, seed=3)
+    cameras = ring_of_cameras(16, size=48)
+    result = fitted_to(device, source, shaken(source, only=only), cameras[::2])
+    assert result.errors[-1] < 0.3 * result.errors[0]
+    unseen = cameras[1::2]
+    assert mean_error(device, source, result.scene, unseen) < 0.5 * mean_error(
+        device, source, shaken(source, only=only), unseen
+    )
+
+
+def test_an_antialiased_scene_is_mended(family_device):
+    source = dataclasses.replace(visible_scene(60, 1, seed=3), antialiased=True)
+    result = fitted_to(family_device, source, shaken(source), ring_of_cameras(8, size=48))
+    assert result.scene.antialiased
+    assert result.errors[-1] < 0.3 * result.errors[0]
+
+
+def test_the_errors_are_those_of_the_views_held_out(family_device):
+    source = visible_scene(60, 1, seed=3)
+    cameras = ring_of_cameras(9, size=40)
+    start = shaken(source)
+    result = fitted_to(family_device, source, start, cameras)
+    _, held_out = share_out(len(cameras), 0)
+    judges = [cameras[number] for number in held_out]
+    assert result.held_out == len(judges) > 0
+    assert result.errors[0] == pytest.approx(mean_error(family_device, source, start, judges), rel=1e-5)
+    assert min(result.errors) == pytest.approx(mean_error(family_device, source, result.scene, judges), rel=1e-4)
+
+
+def test_splats_that_no_view_sees_stay_as_they_are(family_device):
+    source = visible_scene(60, 1, seed=3)
+    source.quaternions[:] *= 3  # of no unit length
+    start = shaken(source)
+    start.means[:5] = (0, 0, 1e4)  # above all cameras, which look at the origin
+    start.opacity_logits[5] = -9
+    result = fitted_to(family_device, source, start, ring_of_cameras(8, size=40))
+    assert result.kept > 0
+    for name in PARAMETERS:
+        before, after = getattr(start, name), getattr(result.scene, name)
+        assert np.array_equal(before[:6], after[:6]), name
+        assert not np.array_equal(before[6:], after[6:]), name
+
+
+def test_the_same_bits_every_time_and_others_from_another_seed(family_device):
+    source = visible_scene(60, 1, seed=3)
+    cameras = ring_of_cameras(8, size=40)
+    results = [
+        fitted_to(family_device, source, shaken(source), cameras, dataclasses.replace(STEPS, seed=seed))
+        for seed in (0, 0, 1)
+    ]
+    for name in PARAMETERS:
+        first, second, third = (getattr(result.scene, name) for result in results)
+        assert np.array_equal(first, second)
+        assert not np.array_equal(first, third)
+
+
+def test_what_does_not_help_is_not_kept(family_device):
+    """A scene that is perfect in the views held out, and targets elsewhere that lead away from it."""
+    source = visible_scene(60, 1, seed=3)
+    cameras = ring_of_cameras(8, size=40)
+    _, held_out = share_out(8, 0)
+    with Rasterizer(family_device, source) as rasterizer:
+        pictures = [rasterizer.render(camera)[0] for camera in cameras]
+    wrong = [picture if number in held_out else 1 - picture for number, picture in enumerate(pictures)]
+    start = shaken(source, only=("sh",))
+    with Pictures(family_device, wrong) as targets:
+        result = fit_scene(family_device, start, cameras, targets, STEPS)
+    assert result.kept == 0
+    assert result.steps < STEPS.steps, "the fit should end before"
+    for name in PARAMETERS:
+        assert np.array_equal(getattr(result.scene, name), getattr(start, name))
+
+
+def test_no_splat_leaves_the_range_of_sizes_and_opacities(family_device):
+    source = visible_scene(60, 1, seed=3)
+    start = shaken(source)
+    black = [np.zeros((40, 40, 3), np.float32)] * 8
+    with Pictures(family_device, black) as targets:
+        options = FitOptions(
+            steps=100, rates=dataclasses.replace(STEPS.rates, log_scales=1.0, opacity_logits=5.0), patience=10
+        )
+        result = fit_scene(family_device, start, ring_of_cameras(8, size=40), targets, options)
+    assert result.kept > 0
+    assert result.scene.log_scales.min() >= start.log_scales.min()
+    assert result.scene.log_scales.max() <= start.log_scales.max()
+    changed = result.scene.opacity_logits != start.opacity_logits
+    assert result.scene.opacity_logits[changed].min() >= -5.5
+
+
+def test_views_of_several_sizes(family_device):
+    source = visible_scene(60, 1, seed=3)
+    cameras = [*ring_of_cameras(8, size=40)[::2], *ring_of_cameras(8, size=72)[1::2]]
+    result = fitted_to(family_device, source, shaken(source), cameras)
+    assert result.errors[-1] < 0.3 * result.errors[0]
+
+
+def test_targets_need_not_all_be_kept(family_device):
+    source = visible_scene(60, 1, seed=3)
+    cameras = ring_of_cameras(8, size=40)
+    wanted = fitted_to(family_device, source, shaken(source), cameras)
+    for memory in (0, 2 * 12 * 40 * 40):
+        found = fitted_to(family_device, source, shaken(source), cameras, dataclasses.replace(STEPS, memory=memory))
+        assert found.errors == wanted.errors
+
+
+def test_added_views_are_never_held_out():
+    for given in range(2, 40):
+        for added in (0, 5):
+            fit_to, held_out = share_out(given, added)
+            assert sorted(fit_to + held_out) == list(range(given + added))
+            assert 0 < len(held_out) <= min(8, given - 1)
+            assert max(held_out) < given
+    assert share_out(1, 3) == ([0, 1, 2, 3], [])
+
+
+def test_every_view_comes_as_often_as_any_other():
+    order = batches(range(3, 10), 4, seed=0)
+    taken = np.concatenate([next(order) for _ in range(7)])
+    assert np.array_equal(np.bincount(taken)[3:], [4] * 7)
+    assert next(batches([5], 4, seed=0)) == [5]
+
+
+def test_progress_and_what_is_told(family_device):
+    source = visible_scene(40, 1, seed=3)
+    told, lines = [], []
+    fitted_to(
+        family_device,
+        source,
+        shaken(source),
+        ring_of_cameras(4, size=40),
+        FitOptions(steps=6, rounds=3),
+        progress=lambda done, steps: told.append((done, steps)),
+        tell=lines.append,
+    )
+    assert told == [(done, 6) for done in range(1, 7)]
+    assert len(lines) == 3
+    assert all("held-out" in line for line in lines)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [{"steps": -1}, {"steps": 10**7}, {"batch": 0}, {"rounds": 0}, {"patience": 0}, {"last": 0}, {"last": 2}],
+    ids=str,
+)
+def test_what_is_out_of_range_is_refused(wrong):
+    with pytest.raises(UsageError, match="the fit"):
+        FitOptions(**wrong)
+
+
+# ------------------------------------------------------------------------------------------ the stage
+
+
+def bench_of(device):
+    return Workbench(HyperParameters.from_quality(0.5, "best"), device=device)
+
+
+def test_the_stage_mends_what_pruning_has_left(family_device):
+    source = visible_scene(120, 1, seed=3)
+    left = np.arange(0, 120, 2)
+    cameras = ring_of_cameras(8, size=48)
+    before = State.of(source, cameras).keeping(left)
+    after = Fit(steps=200).run(before, bench_of(family_device))
+    assert np.array_equal(after.survivors, left)
+    assert after.geometry is None
+    assert isinstance(after.learnt["fit"], Fitted)
+    errors = [mean_error(family_device, source, state.scene, cameras) for state in (before, after)]
+    assert errors[1] < 0.6 * errors[0]
+
+
+def test_one_view_cannot_be_held_out(family_device):
+    source = visible_scene(40, 1)
+    before = State.of(source, ring_of_cameras(1))
+    after = Fit(steps=10).run(before, bench_of(family_device))
+    assert after.scene is before.scene
+    assert isinstance(after.learnt["fit"], LeftOut)
+    assert "two training views" in str(after.learnt["fit"])
+    with pytest.raises(UsageError, match="two training views"):
+        fitted_to(family_device, source, source, ring_of_cameras(1))
+
+
+def test_sparse_colours_stay_sparse(family_device):
+    source = visible_scene(60, 2, seed=3)
+    start = shaken(source)
+    start.sh[:, 4:] = 0
+    before = dataclasses.replace(State.of(source, ring_of_cameras(8, size=40)), scene=start, learnt={"compact": True})
+    after = Fit(steps=30).run(before, bench_of(family_device)).scene
+    assert np.array_equal(after.sh[:, 1:], start.sh[:, 1:])
+    assert not np.array_equal(after.sh[:, 0], start.sh[:, 0])
+
+
+def test_it_is_off_unless_asked_for():
+    assert not Fit().asked_for
+    assert Fit(steps=5).asked_for

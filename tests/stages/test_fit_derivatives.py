@@ -1,0 +1,196 @@
+"""The derivatives of pictures that the kernels find, against float64."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.model.scene import Scene
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT, INRIA
+from potr_cl.reference.derivatives import gradient
+from potr_cl.reference.scenes import plain_splats, ring_of_cameras, straight_camera, tilted_camera, visible_scene
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
+from potr_cl.stages.fitting.derivatives import PictureDerivatives
+from tests.devices import KERNELS, open_device
+
+BACKGROUND = (0.3, 0.6, 0.1)
+
+
+@pytest.fixture(scope="module", params=KERNELS)
+def device(request):
+    device = open_device(request.param)
+    yield device
+    assert device.allocated == 0, "not all memory was given back"
+
+
+def products(device, scene, cameras, values, rules=INRIA, given=True, unit=1.0):
+    """(N, columns) Jᵀ W v of all views together, from the kernels."""
+    with PictureDerivatives(device, scene, rules, BACKGROUND) as derivatives:
+        rows = np.concatenate([each.reshape(-1, 3) for each in values]).astype(np.float32)
+        target = device.upload(rows, "the values")
+        try:
+            derivatives.add(cameras, target, given, unit)
+            return derivatives.read()
+        finally:
+            device.free(target)
+
+
+def of_group(columns, degree):
+    """The gradient's columns by kind of parameter."""
+    names = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
+    return dict(zip(names, np.split(columns, [3, 6, 10, 11], axis=1), strict=True))
+
+
+def wanted(scene, cameras, values, rules=INRIA):
+    """The same in float64."""
+    sums = {}
+    for camera, v in zip(cameras, values, strict=True):
+        weight = REFERENCE_PIXELS / (camera.width * camera.height)
+        found = gradient(scene, camera, rules, v, BACKGROUND)
+        for name, array in vars(found).items():
+            sums[name] = sums.get(name, 0) + weight * array.reshape(len(scene), -1)
+    return sums
+
+
+def agree(found, exact, tolerance=1e-4):
+    for name, array in exact.items():
+        assert np.isfinite(found[name]).all()
+        error = np.linalg.norm(found[name] - array)
+        assert error < tolerance * np.linalg.norm(array), f"{name}: {error / np.linalg.norm(array):.1e}"
+
+
+@pytest.mark.parametrize("degree", [0, 1, 2, 3])
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("rules", [INRIA, GSPLAT], ids=["inria", "gsplat"])
+def test_every_kind_of_parameter(device, degree, antialiased, rules):
+    """Some splats are capped, some colours cut at 0, one splat behind a camera, one transparent. Views differ in size,
+    and do not end where tiles do."""
+    scene = dataclasses.replace(visible_scene(60, degree, seed=degree), antialiased=antialiased)
+    scene.opacity_logits[:6] = 7
+    scene.opacity_logits[6] = -9
+    scene.sh[:8, 0] -= 3
+    cameras = [*ring_of_cameras(4, size=40)[:2], tilted_camera(3, 33, 50)]
+    scene.means[9] = 2 * cameras[0].centre
+    rng = np.random.default_rng(degree)
+    values = [rng.normal(size=(c.height, c.width, 3)) for c in cameras]
+    found = of_group(products(device, scene, cameras, values, rules), degree)
+    agree(found, wanted(scene, cameras, values, rules))
+
+
+def test_differences_to_pictures(device):
+    """v is the picture's difference to a target, whatever it is multiplied by while it is summed up."""
+    scene, other = visible_scene(40, 1), visible_scene(50, 1, seed=7)
+    cameras = ring_of_cameras(3, size=40)
+    with Rasterizer(device, other, background=BACKGROUND) as rasterizer:
+        targets = [rasterizer.render(camera)[0] for camera in cameras]
+    with Rasterizer(device, scene, background=BACKGROUND) as rasterizer:
+        differences = [rasterizer.render(c)[0] - t for c, t in zip(cameras, targets, strict=True)]
+    exact = wanted(scene, cameras, [each.astype(np.float64) for each in differences])
+    for unit in (1.0, 16.0):
+        agree(of_group(products(device, scene, cameras, targets, given=False, unit=unit), 1), exact)
+
+
+def test_lists_of_more_splats_than_are_walked_at_a_time(device):
+    """CPU kernels take 1024 at a time; pixels do not end before."""
+    scene = visible_scene(1400, 1)
+    scene.log_scales[:] -= 0.5
+    scene.opacity_logits[:] = -4.6
+    cameras = ring_of_cameras(1, size=16)
+    values = [np.random.default_rng(0).normal(size=(16, 16, 3))]
+    agree(of_group(products(device, scene, cameras, values), 1), wanted(scene, cameras, values))
+
+
+def test_tiny_values_keep_their_digits(device):
+    """The sums are integers: a unit brings small differences into their range."""
+    scene = visible_scene(40, 1)
+    cameras = ring_of_cameras(1, size=64)
+    rng = np.random.default_rng(0)
+    with Rasterizer(device, scene, background=BACKGROUND) as rasterizer:
+        picture = rasterizer.render(cameras[0])[0]
+    targets = [picture + rng.normal(scale=1e-4, size=picture.shape).astype(np.float32)]
+    exact = wanted(scene, cameras, [(picture - targets[0]).astype(np.float64)])
+    agree(of_group(products(device, scene, cameras, targets, given=False, unit=2.0**12), 1), exact)
+
+
+def test_the_same_bits_every_time(device):
+    scene = visible_scene(300, 3)
+    cameras = ring_of_cameras(5, size=70)
+    values = [np.random.default_rng(0).normal(size=(70, 70, 3)) for _ in cameras]
+    first = products(device, scene, cameras, values)
+    assert first.any()
+    for _ in range(3):
+        assert np.array_equal(products(device, scene, cameras, values), first)
+
+
+def test_a_view_after_another_in_the_same_memory(device):
+    """Views take the place of earlier ones; nothing of these is left."""
+    scene = visible_scene(80, 1)
+    cameras = ring_of_cameras(4, size=40)
+    values = [np.random.default_rng(k).normal(size=(40, 40, 3)) for k in range(4)]
+    with PictureDerivatives(device, scene, INRIA, BACKGROUND) as derivatives:
+        for camera, v in zip(cameras, values, strict=True):
+            target = device.upload(v.astype(np.float32), "the values")
+            derivatives.add([camera], target, given=True)
+            device.free(target)
+        found = of_group(derivatives.read(), 1)
+    agree(found, wanted(scene, cameras, values))
+
+
+def stressful() -> dict[str, Scene]:
+    """Splats at the limits of what a scene can hold."""
+    straight = [[0, 0, 3], [0.3, 0.2, 4], [-0.4, 0.1, 5]]
+    huge = plain_splats(straight, sigma=1e9)
+    needle = plain_splats(straight)
+    needle.log_scales[:] = (-80, -1, 4)
+    line = plain_splats(straight)
+    line.log_scales[:] = (-np.inf, -np.inf, -1)
+    line.log_scales[:] = np.maximum(line.log_scales, -200)
+    bright = plain_splats(straight)
+    bright.sh[:] = 1e30
+    dark = plain_splats(straight)
+    dark.sh[:] = -1e30
+    unturned = plain_splats(straight)
+    unturned.quaternions[:] = 0
+    return {
+        "huge": huge,
+        "immense": plain_splats(straight, sigma=np.exp(80.0)),
+        "tiny": plain_splats(straight, sigma=1e-12),
+        "needle": needle,
+        "line": line,
+        "coincident": plain_splats([[0, 0, 3]] * 300, logit=2.0),
+        "opaque": plain_splats([[0, 0, 3]] * 5, logit=80.0),
+        "transparent": plain_splats(straight, logit=-80.0),
+        "behind": plain_splats([[0, 0, -3], [0, 0, -1e-3]]),
+        "at the near plane": plain_splats([[0, 0, 0.2], [0, 0, np.nextafter(np.float32(0.2), 1)], [0.1, 0, 0.2001]]),
+        "at the camera": plain_splats([[0, 0, 0], [1e-30, 0, 1e-30]]),
+        "far away": plain_splats([[1e15, 0, 1e15], [0, 1e18, 1e18]], sigma=1e15),
+        "bright": bright,
+        "dark": dark,
+        "unturned": unturned,
+    }
+
+
+@pytest.mark.parametrize("antialiased", [False, True])
+@pytest.mark.parametrize("name", stressful())
+def test_everything_is_finite(device, name, antialiased):
+    scene = dataclasses.replace(stressful()[name], antialiased=antialiased)
+    camera = straight_camera()
+    values = [np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))]
+    assert np.isfinite(products(device, scene, [camera], values)).all()
+
+
+@pytest.mark.parametrize("name", ["tiny", "needle", "line", "coincident", "opaque"])
+def test_degenerate_splats_have_their_derivatives(device, name):
+    scene = stressful()[name]
+    camera = straight_camera()
+    values = [np.random.default_rng(0).normal(size=(camera.height, camera.width, 3))]
+    found = of_group(products(device, scene, [camera], values), 0)
+    exact = wanted(scene, [camera], values)
+    scale = max(np.linalg.norm(array) for array in exact.values())
+    for array in exact.values():
+        assert np.isfinite(array).all()
+    for kind, array in exact.items():
+        assert np.linalg.norm(found[kind] - array) < 1e-4 * max(np.linalg.norm(array), 1e-3 * scale), kind
