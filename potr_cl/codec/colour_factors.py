@@ -82,3 +82,8 @@ class ColourFactors:
             levels = [stream.part(start, stop) for stream in by_axis]
             dc[start:stop], ac[start:stop] = steps.classes(levels, opacity.part(start, stop), start)
         return ColourFactors(dc, factors(header.sf_dc, dc), factors(header.sf_ac, ac))
+
+    def of_rows(self, rows: NDArray[np.int64]) -> ColourFactors:
+        """Those of some splats."""
+        dc, ac = (each[rows] if len(each) > 1 else each for each in (self.dc, self.ac))
+        return ColourFactors(self.classes[rows], dc, ac)

@@ -10,8 +10,10 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec.byte_planes import IntegerStream
+from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
-from potr_cl.codec.dequantizer import IntegerStream
+from potr_cl.codec.dequantizer import Dequantizer
 from potr_cl.codec.destination import F32, Destination, SceneArrays
 from potr_cl.codec.versions import FormatVersion
 from potr_cl.model.scene import Scene
@@ -29,6 +31,8 @@ class Sampled:
 
     def __init__(self, header: Header, version: FormatVersion, sh_count: int, rows: NDArray[np.int64]) -> None:
         self._rows = rows
+        self._splats = header.splats
+        self._whole = Dequantizer(header, version)
         self._arrays = SceneArrays(replace(header, splats=len(rows)), version, sh_count)
 
     @property
@@ -48,12 +52,16 @@ class Sampled:
     def take_opacities(self, stream: IntegerStream) -> None:
         self._arrays.take_opacities(_Some(stream, self._rows))
 
-    def take_colours(self, streams: Sequence[IntegerStream], coefficient: int, differences: bool) -> None:
-        if differences:
-            levels = [np.cumsum(stream.part(0, len(stream.joined)), dtype=np.int64) for stream in streams]
-            self._arrays.take_colours([_Levels(level[self._rows]) for level in levels], coefficient, False)
-        else:
-            self._arrays.take_colours(self._some(streams), coefficient, False)
+    def take_colours(
+        self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, factors: ColourFactors
+    ) -> None:
+        if coefficient:
+            self._arrays.take_colours(self._some(streams), coefficient, differences, factors.of_rows(self._rows))
+            return
+        # DC may be what a prediction from the splats before has left.
+        values = np.empty((3, self._splats), np.float32)
+        self._whole.colours(streams, coefficient, differences, factors, values)
+        self._arrays.sh[:, 0] = values[:, self._rows].T
 
     def _some(self, streams: Sequence[IntegerStream]) -> list[IntegerStream]:
         return [_Some(stream, self._rows) for stream in streams]
@@ -81,9 +89,11 @@ class Both:
         for each in self._all:
             each.take_opacities(stream)
 
-    def take_colours(self, streams: Sequence[IntegerStream], coefficient: int, differences: bool) -> None:
+    def take_colours(
+        self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, factors: ColourFactors
+    ) -> None:
         for each in self._all:
-            each.take_colours(streams, coefficient, differences)
+            each.take_colours(streams, coefficient, differences, factors)
 
 
 @dataclass(frozen=True)
@@ -103,13 +113,3 @@ class _Some:
 
     def part(self, start: int, stop: int) -> NDArray[np.integer]:
         return self._values[start:stop]
-
-
-@dataclass(frozen=True)
-class _Levels:
-    """Levels as a stream of integers."""
-
-    joined: NDArray[np.int64]
-
-    def part(self, start: int, stop: int) -> NDArray[np.integer]:
-        return self.joined[start:stop]
