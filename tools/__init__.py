@@ -33,6 +33,7 @@ What a choice costs or brings, against the alternatives (``study``):
 =========================  =============================================================================================
 study.rate_distortion      size against quality: the curves that other studies compare with
 study.ablation             what does each part of the codec contribute?
+study.colour_steps         what does version 3 of the format bring over version 2, part by part?
 study.compare_formats      what would people use instead?
 study.virtual_views        how many virtual views, how large, how wide, at what time and memory?
 study.rates                where do the bits go, and what do they buy?
