@@ -31,7 +31,7 @@ if TYPE_CHECKING:
     from potr_cl.codec.destination import Destination
 
 #: Bundles that NumPy decodes side by side.
-_SIDE_BY_SIDE = 64
+_SIDE_BY_SIDE = 32
 #: Bundles whose integers a thread joins at a time.
 _HANDED = 4
 #: Levels whose values are looked up.

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from potr_cl.codec.bundles.description import Fitted
 from potr_cl.codec.bundles.layout import LANES, Layout
 from potr_cl.codec.context.model import LARGEST_SIZE
-from potr_cl.codec.context.tokens import DIRECT, extra_bits
+from potr_cl.codec.context.tokens import DIRECT, extra_bits, largest_integer
 from potr_cl.codec.rans import CONTEXT_SHIFT, LOWEST, PRECISION, TOTAL, no_words_left
 
 I64 = NDArray[np.int64]
@@ -72,7 +72,9 @@ class Words:
         return bool((self._next == self._ends).all())
 
 
-def decode_stream(layout: Layout, base: I64, fitted: Fitted, states: I64, words: Words) -> tuple[U8, I64]:
+def decode_stream(
+    layout: Layout, base: I64, fitted: Fitted, states: I64, words: Words
+) -> tuple[U8, NDArray[np.signedinteger]]:
     """Decode a stream.
 
     Args:
@@ -123,7 +125,8 @@ def decode_stream(layout: Layout, base: I64, fitted: Fitted, states: I64, words:
             _take_bits(token, states, words, extra[t])
     words.check()
     of_items = tokens.take(layout.taken(slots))
-    return of_items, _integers(of_items, None if extra is None else layout.taken(extra))
+    extras = None if extra is None else layout.taken(extra)
+    return of_items, _integers(of_items, extras, integer_type(fitted.alphabet))
 
 
 def _take_bits(tokens: U8, states: I64, words: Words, extra: I64) -> None:
@@ -138,8 +141,14 @@ def _take_bits(tokens: U8, states: I64, words: Words, extra: I64) -> None:
         shift += CHUNK
 
 
-def _integers(tokens: U8, extra: I64 | None) -> I64:
-    mapped = tokens.astype(np.int64)
+def integer_type(alphabet: int) -> type[np.signedinteger]:
+    """The narrowest type of the integers of so many tokens."""
+    largest = largest_integer(alphabet - 1)
+    return np.int16 if largest < 1 << 14 else np.int32 if largest < 1 << 30 else np.int64
+
+
+def _integers(tokens: U8, extra: I64 | None, dtype: type[np.signedinteger]) -> NDArray[np.signedinteger]:
+    mapped = tokens.astype(dtype)
     if extra is None:
         return mapped
     (large,) = np.nonzero(tokens >= DIRECT)
