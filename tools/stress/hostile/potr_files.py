@@ -35,8 +35,8 @@ _METADATA, _OCCUPANCY, _SEVERAL, _MULTIPLICITY, _TAIL_LENGTH, _TAIL, _STEPS = ra
 _SCALE, _ROTATION, _OPACITY, _SH = range(16, 20)
 _FIRST_PER_SPLAT = 16
 _HEAD = struct.Struct("<II")
-#: Entropy, splats, SH degree, preset and version of the files that are changed: all coders and versions; few splats, as a
-#: file should take no more than a millisecond.
+#: Entropy, splats, SH degree, preset and version of the files that are changed: all coders and versions; few splats, as
+#: a file should take no more than a millisecond.
 _ORIGINALS: list[tuple[str, int, int, Preset, int]] = [
     ("zstd", 7, 3, "paper", 1),
     ("npz", 24, 1, "paper", 1),
