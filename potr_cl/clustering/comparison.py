@@ -63,7 +63,11 @@ class Points(Owner):
             raise
 
     def nearest(
-        self, centres: FloatArray, biases: FloatArray | None = None, cells: U32 | None = None, lists: Lists | None = None
+        self,
+        centres: FloatArray,
+        biases: FloatArray | None = None,
+        cells: U32 | None = None,
+        lists: Lists | None = None,
     ) -> tuple[U32, FloatArray]:
         """The best centre of each point, and its distance less the point's distance to zero, plus the centre's bias.
 

@@ -101,9 +101,7 @@ def rounded_geometry(scene: Scene, parameters: HyperParameters, distances: NDArr
     )
 
 
-def _positions(
-    scene: Scene, tolerance: NDArray[np.float64]
-) -> tuple[FloatArray, FloatArray, NDArray[np.uint16]]:
+def _positions(scene: Scene, tolerance: NDArray[np.float64]) -> tuple[FloatArray, FloatArray, NDArray[np.uint16]]:
     """What the least and the most step mean, and steps (N, 3), multiples of powers of two that are precise enough.
 
     Args:
