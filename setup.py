@@ -19,7 +19,7 @@ setup(
         Extension(
             "potr_cl.codec.native._library",
             sources=sorted(str(source) for source in NATIVE.glob("*.c")),
-            depends=[str(NATIVE / "potr_native.h")],
+            depends=sorted(str(header) for header in NATIVE.glob("*.h")),
             extra_compile_args=OPTIONS_OF_MSVC if sys.platform == "win32" else OPTIONS,
             py_limited_api=True,
             optional=True,

@@ -21,8 +21,11 @@ def main() -> int:
     os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 
     from potr_cl.cli import main as run
+    from potr_cl.host.ending import end_at_once
 
-    return run()
+    code = run()
+    end_at_once(code)
+    return code
 
 
 if __name__ == "__main__":

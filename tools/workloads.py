@@ -61,8 +61,13 @@ def read(folder: Path) -> tuple[Scene, list[Camera]]:
 
 def reduced(scene: Scene, views: Sequence[Camera], options: EncodeOptions, device: Device | None = None) -> Scene:
     """What all stages but the coder leave of a scene; device: the best one there is by default."""
+    return reduced_state(scene, views, options, device).scene
+
+
+def reduced_state(scene: Scene, views: Sequence[Camera], options: EncodeOptions, device: Device | None = None) -> State:
+    """The same with what else the stages have found, and the views that they have looked at."""
     before_coding = [type(stage) for stage in options.stages if not isinstance(stage, Code)]
-    return Run(options, Stopwatch(), device).stages(State.of(scene, views), before_coding).scene
+    return Run(options, Stopwatch(), device).stages(State.of(scene, views), before_coding)
 
 
 def pictures(device: Device, scene: Scene, views: Sequence[Camera]) -> list[FloatArray]:

@@ -3,13 +3,14 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
 from potr_cl.codec.container import MAGIC
 from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.codec.destination import Destination
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene
@@ -72,11 +73,43 @@ def drawable_of(
         As :func:`scene_of`.
         DeviceError: the scene does not fit the device.
     """
-    if encoded_bytes(source) is None and not (isinstance(source, (str, os.PathLike)) and _holds_potr(Path(source))):
+    if not _is_potr(source):
         yield scene_of(source, trust, antialiased)
         return
     with on_device(source, device, trust, antialiased=antialiased) as buffers:  # type: ignore[arg-type]
         yield buffers
+
+
+@contextmanager
+def drawable_to_judge(
+    source: SceneSource, device: Device, trust: bool = False, antialiased: bool | None = None
+) -> Iterator[tuple[Drawable, Scene]]:
+    """As :func:`drawable_of`, and a scene on the host by which cameras are judged as by the whole one.
+
+    See :func:`potr_cl.model.agreement.judge_cameras`.
+    """
+    if not _is_potr(source):
+        scene = scene_of(source, trust, antialiased)
+        yield scene, scene
+        return
+    from potr_cl.codec.sampled import Sampled
+    from potr_cl.model.sightings import looked_at
+
+    samples: list[Sampled] = []
+
+    def sampled(file: PotrFile) -> Sampled:
+        rows = looked_at(file.header.splats)
+        samples.append(Sampled(file.header, file.rules, file.sh_count(), rows))
+        return samples[0]
+
+    with on_device(source, device, trust, antialiased=antialiased, beside=sampled) as buffers:  # type: ignore[arg-type]
+        yield buffers, samples[0].scene
+
+
+def _is_potr(source: SceneSource) -> bool:
+    if encoded_bytes(source) is not None:
+        return True
+    return isinstance(source, (str, os.PathLike)) and _holds_potr(Path(source))
 
 
 def on_device(
@@ -86,22 +119,31 @@ def on_device(
     sh_degree: int | None = None,
     antialiased: bool | None = None,
     threads: int = 0,
+    beside: Callable[[PotrFile], Destination] | None = None,
 ) -> SceneBuffers:
     """The .potr file that a path, bytes or the result of an encode stand for, decoded into a device's memory.
+
+    Args:
+        beside: makes what takes the same splats of the opened file.
+        source, device, trust, sh_degree, antialiased, threads: as of :func:`potr_cl.decode_to_device`.
 
     Raises:
         As :func:`potr_cl.decode_to_device`.
     """
     from potr_cl.ondevice.decode import decode_to_device
 
+    def decoded(file: PotrFile) -> SceneBuffers:
+        also = None if beside is None else beside(file)
+        return decode_to_device(file, device, sh_degree, antialiased, threads, also)
+
     data = encoded_bytes(source)
     if data is not None:
-        return decode_to_device(PotrFile.from_bytes(data, trust), device, sh_degree, antialiased, threads)
+        return decoded(PotrFile.from_bytes(data, trust))
     if not isinstance(source, (str, os.PathLike)):
         raise UsageError(f"a .potr file is wanted, its bytes or an encode to one, not {type(source).__name__}")
     path = os.fspath(source)
     try:
-        return decode_to_device(PotrFile.open(path, trust), device, sh_degree, antialiased, threads)
+        return decoded(PotrFile.open(path, trust))
     except DataError as error:
         raise error if path in str(error) else DataError(f"'{path}': {error}") from None
 

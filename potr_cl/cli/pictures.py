@@ -21,7 +21,7 @@ from potr_cl.cli.options import CAMERAS_HELP, Commands, add_rendering_options, a
 from potr_cl.cli.outputs import WrittenPicture
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
-from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene
+from potr_cl.cli.scenes import add_antialiased_option, add_trust_option, read_scene, read_to_draw
 from potr_cl.cli.terminal import note, say, say_document, say_done
 from potr_cl.cli.views import read_cameras, warn_of_frame
 from potr_cl.errors import UsageError
@@ -36,6 +36,7 @@ from potr_cl.opencl.discovery import list_devices
 from potr_cl.quality.compare import format_sizes, size_report
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RULES
+from potr_cl.raster.scene_buffers import Drawable
 
 
 def _add_viewpoints(p: argparse.ArgumentParser) -> None:
@@ -91,14 +92,15 @@ def _render(args: argparse.Namespace) -> None:
     check_photographs(args, cameras, written)
     device = Device(args.device)
     make_folder(args.output)
-    scene = scene or read_scene(args, args.scene)
-    if args.cameras is not None:
-        warn_of_frame(args.scene, scene, views)
     stage = f"rendering {len(views)} view{'s' if len(views) > 1 else ''}"
-    with (
-        Rasterizer(device, scene, RULES[args.rules], background) as rasterizer,
-        contextlib.closing(Progress()) as progress,
-    ):
+    with contextlib.ExitStack() as stack:
+        if scene is not None:
+            drawable: Drawable = scene
+        else:
+            drawable, judged = stack.enter_context(read_to_draw(args, args.scene, device))
+            warn_of_frame(args.scene, judged, views)
+        rasterizer = stack.enter_context(Rasterizer(device, drawable, RULES[args.rules], background))
+        progress = stack.enter_context(contextlib.closing(Progress()))
         progress(stage, 0.0)
         for done, _ in enumerate(written_pictures(rasterizer, views, written), 1):
             progress(stage, done / len(views))
@@ -127,24 +129,33 @@ def _compare(args: argparse.Namespace) -> None:
         raise UsageError("--truth needs --cameras, the views that the photographs show")
     pictures_asked_for = [args.views, args.split, args.output, args.device] != [None] * 4 or points.asked_for
     cameras = None if args.cameras is None else read_cameras(args)
-    a, b = (read_scene(args, path) for path in (args.a, args.b))
-    files = named(args.a, a), named(args.b, b)
     if cameras is None and not pictures_asked_for and not list_devices():
         # Sizes need no device, and may be all that is wanted of a machine without one.
+        files = [named(path, read_scene(args, path)) for path in (args.a, args.b)]
         _tell(args, size_report(*files), format_sizes(*files))
         note("sizes only: there is no OpenCL device to compare pictures on")
         return
-    cameras = cameras or _cameras(args, points, a)
-    views = chosen_views(cameras, args.views, args.split)
-    if args.cameras is not None:
-        for path, scene in ((args.a, a), (args.b, b)):
-            warn_of_frame(path, scene, views)
     with contextlib.ExitStack() as stack:
+        drawables: list[Drawable] = []
+        if cameras is None:
+            scenes = [read_scene(args, path) for path in (args.a, args.b)]
+            cameras = _cameras(args, points, scenes[0])
+            drawables += scenes
+            views = chosen_views(cameras, args.views, args.split)
+            device = Device(args.device)
+        else:
+            views = chosen_views(cameras, args.views, args.split)
+            device = Device(args.device)
+            for path in (args.a, args.b):
+                drawable, judged = stack.enter_context(read_to_draw(args, path, device))
+                warn_of_frame(path, judged, views)
+                drawables.append(drawable)
+        a, b = drawables
         picture = stack.enter_context(replacing(args.output)) if args.output is not None else None
         progress = stack.enter_context(contextlib.closing(Progress()))
         comparison = compare_scenes(
-            (files[0], a), (files[1], b), views,
-            device=args.device, rules=RULES[args.rules], background=background, truth=args.truth, progress=progress,
+            (named(args.a, a), a), (named(args.b, b), b), views,
+            device=device, rules=RULES[args.rules], background=background, truth=args.truth, progress=progress,
         )  # fmt: skip
         if picture is not None:
             comparison.write_picture(picture)

@@ -8,8 +8,9 @@ import os
 import sys
 from collections.abc import Iterable, Iterator
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
+from potr_cl.api.inputs import drawable_to_judge
 from potr_cl.cli.guard import StandardInput, StandardOutput
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene, scene_writer
@@ -18,9 +19,14 @@ from potr_cl.formats.scenes import spz
 from potr_cl.formats.streams import received, send
 from potr_cl.model.scene import Scene
 
+# What computes on a device is imported where it is needed: other commands do without.
+if TYPE_CHECKING:
+    from potr_cl.opencl.device import Device
+    from potr_cl.raster.scene_buffers import Drawable
+
 FROM_HELP = 'the format that "-", standard input, brings: .ply, .spz …; default: what its content says'
 TO_HELP = "the format to write where no name says it, .ply, .spz …"
-_ANTIALIASED = {"yes": True, "no": False, "auto": None}
+ANTIALIASED = {"yes": True, "no": False, "auto": None}
 
 
 def add_trust_option(p: argparse._ActionsContainer) -> None:
@@ -41,7 +47,7 @@ def add_antialiased_option(p: argparse._ActionsContainer) -> None:
     """``--antialiased``, for every command that renders, encodes or writes the scenes that it reads."""
     p.add_argument(
         "--antialiased",
-        choices=tuple(_ANTIALIASED),
+        choices=tuple(ANTIALIASED),
         default="auto",
         help="whether the scene was trained with antialiasing (gsplat's antialiased mode, Mip-Splatting) and is to be "
         "rendered so; default auto: as its file says, which PLY files of gsplat and nerfstudio do not: give yes",
@@ -72,7 +78,21 @@ def read_scene(args: argparse.Namespace, path: Path) -> Scene:
         As :func:`potr_cl.formats.load_scene`.
     """
     with as_file(path) as file:
-        return load_scene(file, **trust(args), antialiased=_ANTIALIASED[args.antialiased])
+        return load_scene(file, **trust(args), antialiased=ANTIALIASED[args.antialiased])
+
+
+@contextlib.contextmanager
+def read_to_draw(args: argparse.Namespace, path: Path, device: Device) -> Iterator[tuple[Drawable, Scene]]:
+    """The same to be rendered on a device, and a scene on the host by which cameras can be judged.
+
+    Raises:
+        As :func:`potr_cl.api.inputs.drawable_to_judge`.
+    """
+    with (
+        as_file(path) as file,
+        drawable_to_judge(file, device, args.trust, ANTIALIASED[args.antialiased]) as found,
+    ):
+        yield found
 
 
 def write_scene(path: Path, scene: Scene, to: str | None = None, version: int | None = None) -> int:

@@ -5,7 +5,6 @@ from __future__ import annotations
 from dataclasses import dataclass
 
 import numpy as np
-import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.clustering.launch import launcher_for

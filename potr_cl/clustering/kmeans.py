@@ -221,7 +221,8 @@ class _Finder:
         assert self._rate is not None
         several = np.maximum(having, 1)
         paid = np.where(np.arange(len(having)) > 0, self._rate.entry / (several * self._each), 0)
-        return (np.log2(several.sum() / several) + paid).astype(np.float32)
+        bits: FloatArray = (np.log2(several.sum() / several) + paid).astype(np.float32)
+        return bits
 
     def clusters(self) -> Clusters:
         """The centres and the labels of all points."""

@@ -1,7 +1,8 @@
 """Vectors as rows of floats in which a weighted distance is a product of two rows.
 
-A point x has a weight w_g for each group g of coordinates (an SH coefficient: its R, G and B). Its distance to a centre,
-the sum over groups of w_g |x_g − c_g|², is a constant of the point plus the product of [w, −2 w x] and [|c|², c].
+A point x has a weight w_g for each group g of coordinates (an SH coefficient: its R, G and B). Its distance to a
+centre, the sum over groups of w_g |x_g − c_g|², is a constant of the point plus the product of [w, −2 w x] and
+[|c|², c].
 """
 
 from __future__ import annotations
@@ -64,4 +65,5 @@ def centres_of_sums(sums: FloatArray, centres: FloatArray) -> FloatArray:
 
 def errors_at_zero(points: FloatArray, weights: FloatArray) -> NDArray[np.float64]:
     """(N,) the constant of each point: its distance to zero."""
-    return np.einsum("ngc,ngc,ng->n", points, points, weights, dtype=np.float64, optimize=False)
+    errors: NDArray[np.float64] = np.einsum("ngc,ngc,ng->n", points, points, weights, dtype=np.float64, optimize=False)
+    return errors

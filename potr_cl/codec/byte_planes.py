@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 from functools import cached_property
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 from numpy.typing import NDArray
@@ -46,6 +46,17 @@ def unpack_integers(raw: NDArray[np.uint8], planes: int, signed: bool, start: in
     np.subtract(mapped.dtype.type(0), sign, out=sign)
     half ^= sign
     return half.view(half.dtype.str.replace("u", "i"))
+
+
+class IntegerStream(Protocol):
+    """The integers of a stream, one a splat."""
+
+    def part(self, start: int, stop: int) -> NDArray[np.integer]:
+        """Those from one splat to another."""
+
+    @property
+    def joined(self) -> NDArray[Any]:
+        """All of them: uint8, mapped to unsigned, where they are that small; else 32 or 64 bits each."""
 
 
 @dataclass(frozen=True)

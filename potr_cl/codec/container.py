@@ -16,6 +16,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from potr_cl.codec.sections import Coder, Property, Section, context_groups, is_bytes, is_per_splat, stream_count
+from potr_cl.codec.steps.rule import MOST_BESIDE_GROUPS
 from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.claims import check_claim
@@ -29,6 +30,8 @@ _FIXED = struct.Struct("<8sHHIQQBBHI8d8s8s")
 _FACTOR = struct.Struct("<d")
 _ENTRY = struct.Struct("<BBBBIQQ")
 _CRC = struct.Struct("<I")
+#: Of a section in the table.
+ENTRY_BYTES = _ENTRY.size
 
 #: Bits of the header's flags. A reader that does not know one refuses the file: it would show another picture.
 _ANTIALIASED, _MIP_SPLATTING = 1, 2
@@ -45,7 +48,13 @@ MOST_A_BYTE = 8
 _LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 
 #: The most that a coder's format can expand one stored byte to: a claim beyond is a lie, found before memory is taken.
-_MOST_EXPANSION = {Coder.RAW: 1, Coder.ZSTD: 1 << 15, Coder.DEFLATE: 1032, Coder.CONTEXT: 1 << 15}
+_MOST_EXPANSION = {
+    Coder.RAW: 1,
+    Coder.ZSTD: 1 << 15,
+    Coder.DEFLATE: 1032,
+    Coder.CONTEXT: 1 << 15,
+    Coder.BUNDLES: 1 << 16,
+}
 
 
 @dataclass(frozen=True)
@@ -123,9 +132,16 @@ class EntropyCoder:
         return Section(prop, index, coder, zlib.crc32(stored), 1, len(raw) // planes, planes, len(stored)), stored
 
 
-def context_section(prop: Property, index: int, streams: int, integers: int, stored: bytes) -> tuple[Section, bytes]:
-    """A section of coder CONTEXT from its stored bytes; ``integers`` of all streams together."""
-    return Section(prop, index, Coder.CONTEXT, zlib.crc32(stored), streams, integers, 0, len(stored)), stored
+def stream_section(
+    coder: Coder, prop: Property, index: int, streams: int, integers: int, stored: bytes
+) -> tuple[Section, bytes]:
+    """A section of a coder of streams from its stored bytes; ``integers`` of all streams together."""
+    return Section(prop, index, coder, zlib.crc32(stored), streams, integers, 0, len(stored)), stored
+
+
+def most_integers(coder: Coder, stored: bytes) -> int:
+    """How many integers, or bytes, a section of so many stored bytes may hold."""
+    return _MOST_EXPANSION[coder] * len(stored)
 
 
 def stored_bytes(data: bytes | memoryview, section: Section) -> memoryview:
@@ -141,14 +157,14 @@ def stored_bytes(data: bytes | memoryview, section: Section) -> memoryview:
 
 
 def read_section(data: bytes | memoryview, section: Section) -> NDArray[np.uint8]:
-    """A section's bytes before coding, for every coder but CONTEXT: (raw_bytes,) uint8.
+    """A section's bytes before coding, for every coder but those of streams: (raw_bytes,) uint8.
 
     Raises:
         DataError: the stored bytes are damaged.
     """
     stored, size = stored_bytes(data, section), section.raw_bytes
     if size is None:
-        raise DataError(f"section '{section.name}' holds what only the context coder can read")
+        raise DataError(f"section '{section.name}' holds what only another coder can read")
     raw: bytes | memoryview
     try:
         if section.coder == Coder.RAW:
@@ -254,7 +270,7 @@ def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) 
     if not all(1e-3 <= x <= 1e9 for x in (*numbers[4:], sf_ac)):
         raise DataError("the header makes no sense: a scale factor outside 0.001 to 1e9")
     sections = _read_table(data, count, header_bytes, file_bytes, rules, splats, degree)
-    _check_octree_sizes(sections, splats, depth)
+    _check_sizes(sections, splats, depth)
     check_claim(splats, file_bytes, MOST_A_BYTE, trust)
     cells = sum(section.integers for section in sections if section.kind == Property.OCCUPANCY)
     check_claim(cells, file_bytes, MOST_A_BYTE, trust, "octree cells")
@@ -268,14 +284,14 @@ def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) 
 
 def _pack_entry(section: Section) -> bytes:
     """A table entry: one field is the number of streams or of planes, one that of integers or of bytes."""
-    contextual = section.coder == Coder.CONTEXT
+    of_streams = section.coder.of_streams
     return _ENTRY.pack(
         section.kind,
         section.index,
         section.coder,
-        section.streams if contextual else section.planes,
+        section.streams if of_streams else section.planes,
         section.crc,
-        section.integers if contextual else section.planes * section.integers,
+        section.integers if of_streams else section.planes * section.integers,
         section.stored_bytes,
     )
 
@@ -288,9 +304,9 @@ def _read_table(
     for i in range(count):
         # As in _pack_entry: streams or planes, integers or bytes.
         prop, index, coder, number, crc, size, stored_bytes = _ENTRY.unpack_from(data, _FIXED.size + i * _ENTRY.size)
-        contextual = coder == Coder.CONTEXT
-        streams, planes = (number, 0) if contextual else (1, number)
-        integers = size if contextual else size // max(planes, 1)
+        of_streams = coder in (Coder.CONTEXT, Coder.BUNDLES)
+        streams, planes = (number, 0) if of_streams else (1, number)
+        integers = size if of_streams else size // max(planes, 1)
         try:
             section = Section(Property(prop), index, Coder(coder), crc, streams, integers, planes, stored_bytes, offset)
         except ValueError:
@@ -300,14 +316,16 @@ def _read_table(
             raise DataError(f"{what} has an impossible index or stands twice")
         if section.kind == Property.SH and index >= 3 * SH_COEFFICIENTS[degree]:
             raise DataError(f"{what} does not belong to SH degree {degree}")
+        if section.kind == Property.STEPS and not rules.colour_steps:
+            raise DataError(f"{what} does not belong to format version {rules.number}")
         if section.coder not in rules.coders:
             raise DataError(f"{what} is of coder {coder}, which format version {rules.number} does not have")
-        if contextual and (index, streams) not in context_groups(section.kind, degree):
+        if of_streams and (index, streams) not in context_groups(section.kind, degree):
             raise DataError(f"{what} cannot hold {streams} streams of coder {coder}")
-        if not contextual and not 1 <= planes <= (1 if is_bytes(section.kind) else 8):
+        if not of_streams and not 1 <= planes <= (1 if is_bytes(section.kind) else 8):
             raise DataError(f"{what} holds integers of {planes} bytes")
         if size != integers * max(planes, 1) or (is_per_splat(section.kind) and integers != splats * streams):
-            units = "integers" if contextual else "bytes"
+            units = "integers" if of_streams else "bytes"
             raise DataError(f"{what} holds {size} {units}, which does not fit {splats} splats of {number} {units} each")
         if stored_bytes > file_bytes - offset:
             raise DataError(f"{what} reaches beyond the end of the file")
@@ -322,11 +340,14 @@ def _read_table(
         raise DataError("the sections do not fill the file")
     if (Property.OPACITY, 0) not in seen:
         raise DataError("there is no opacity section")
+    bundled = {section.coder == Coder.BUNDLES for section in sections if is_per_splat(section.kind)}
+    if len(bundled) > 1:
+        raise DataError(f"only some sections of splats are of coder {Coder.BUNDLES.value}")
     return tuple(sections)
 
 
-def _check_octree_sizes(sections: tuple[Section, ...], splats: int, depth: int) -> None:
-    """Check that the octree's streams are no longer than some splats can need, before they are unpacked.
+def _check_sizes(sections: tuple[Section, ...], splats: int, depth: int) -> None:
+    """Check that streams that are not one integer a splat are no longer than needed, before they are unpacked.
 
     A level has at most as many cells with splats as there are splats. A crowded cell above the deepest level has a byte
     of occupancy; every cell but the root is such a cell, or a leaf, of which there are no more than splats.
@@ -338,6 +359,7 @@ def _check_octree_sizes(sections: tuple[Section, ...], splats: int, depth: int) 
         Property.MULTIPLICITY: splats // 2,
         Property.TAIL_LENGTH: splats,
         Property.TAIL: 3 * depth * ((splats + 7) // 8),
+        Property.STEPS: MOST_BESIDE_GROUPS + splats,
     }
     for kind, limit in most.items():
         if integers.get(kind, 0) > limit:

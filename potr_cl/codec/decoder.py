@@ -7,10 +7,10 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
-from dataclasses import dataclass
-from functools import partial
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
 
@@ -18,15 +18,19 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import container, metadata, octree, sections
-from potr_cl.codec.byte_planes import PlaneStream, unpack_integers
+from potr_cl.codec.bundled_scene import BundledScene
+from potr_cl.codec.byte_planes import IntegerStream, PlaneStream, unpack_integers
+from potr_cl.codec.colour_factors import ColourFactors, Once
 from potr_cl.codec.container import Header
 from potr_cl.codec.context.decoder import Reader, Stream
 from potr_cl.codec.context.lanes import Lanes
 from potr_cl.codec.context.model import Sizes
-from potr_cl.codec.dequantizer import Dequantizer, IntegerStream
-from potr_cl.codec.destination import Destination, SceneArrays
+from potr_cl.codec.dequantizer import Dequantizer
+from potr_cl.codec.destination import Destination, Fillable, SceneArrays
+from potr_cl.codec.native.bundles import ValueArrays
 from potr_cl.codec.native.library import native
 from potr_cl.codec.sections import Coder, Property, Section
+from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.threads import thread_pool
@@ -132,12 +136,18 @@ class PotrFile:
     def log_scales(self) -> NDArray[np.float32]:
         """(N, 3) float32 natural logarithms of standard deviations. Raises DataError if damaged."""
         out = np.empty((self.header.splats, 3), np.float32)
+        if self._bundled:
+            self._bundled.fill(ValueArrays(log_scales=out))
+            return out
         self._dequantizer.scales(self._streams(Property.SCALE), out)
         return out
 
     def quaternions(self) -> NDArray[np.float32]:
         """(N, 4) float32 unit quaternions w, x, y, z. Raises DataError if damaged."""
         out = np.empty((self.header.splats, 4), np.float32)
+        if self._bundled:
+            self._bundled.fill(ValueArrays(quaternions=out))
+            return out
         scales = self._streams(Property.SCALE) if self.rules.rotations_need_scales else []
         self._dequantizer.rotations(self._streams(Property.ROTATION), scales, out)
         return out
@@ -145,6 +155,9 @@ class PotrFile:
     def opacity_logits(self) -> NDArray[np.float32]:
         """(N,) float32 logits. Raises DataError if damaged."""
         out = np.empty(self.header.splats, np.float32)
+        if self._bundled:
+            self._bundled.fill(ValueArrays(logits=out))
+            return out
         self._dequantizer.opacities(self._streams(Property.OPACITY)[0], out)
         return out
 
@@ -159,10 +172,23 @@ class PotrFile:
             DataError: damaged.
         """
         count = self.sh_count(degree)
-        arrays = SceneArrays(self.header, self.rules, count)
-        for _, job in self._sh_jobs(arrays, count):
+        arrays = SceneArrays(self.header, self.rules, count, zeros=self._bundled is not None)
+        if self._bundled:
+            self._bundled.fill(ValueArrays(sh=arrays.values.sh))
+            return arrays.sh
+        for _, job in self._sh_jobs(arrays, count, _Shared(self)):
             job(_now)
         return arrays.sh
+
+    def colour_steps(self) -> ColourSteps | None:
+        """What fits the steps of colours to each splat; None if all are the same.
+
+        Raises:
+            DataError: damaged.
+        """
+        if self.header.find(Property.STEPS) is None:
+            return None
+        return ColourSteps.from_bytes(self._raw(Property.STEPS).tobytes(), self.header.splats)
 
     def scene(self, threads: int = 0, sh_degree: int | None = None) -> Scene:
         """Decode everything, or all but some SH coefficients.
@@ -176,7 +202,8 @@ class PotrFile:
             DataError: damaged.
         """
         try:
-            arrays = SceneArrays(self.header, self.rules, self.sh_count(sh_degree))
+            zeros = self._bundled is not None
+            arrays = SceneArrays(self.header, self.rules, self.sh_count(sh_degree), zeros)
             self.decode_into(arrays, threads, sh_degree)
         except MemoryError:
             needed = self.header.splats * (11 + 3 * self.sh_count(sh_degree)) * 4
@@ -194,11 +221,17 @@ class PotrFile:
             As :meth:`scene`, and what the destination raises.
         """
         _ = self.metadata  # it takes no part in the scene, but damage anywhere is damage
-        shapes: _Job = partial(self._decode_shapes, destination)
-        opacities: _Job = partial(self._decode_opacities, destination)
+        if self._bundled:
+            self._decode_bundles(
+                self._bundled, destination, threads or min(os.cpu_count() or 1, _MOST_THREADS), sh_degree
+            )
+            return
+        shared = _Shared(self)
+        shapes: _Job = partial(self._decode_shapes, destination, shared)
+        opacities: _Job = partial(self._decode_opacities, destination, shared)
         # The longest first: a pool that ends with a long one ends late.
         jobs = [
-            *self._sh_jobs(destination, self.sh_count(sh_degree)),
+            *self._sh_jobs(destination, self.sh_count(sh_degree), shared),
             (self._contextual(Property.SCALE) or self._contextual(Property.ROTATION), shapes),
             (self._contextual(Property.OPACITY), opacities),
         ]
@@ -254,7 +287,28 @@ class PotrFile:
                     if future.done() and (error := future.exception()) is not None:
                         raise error
 
+    def _decode_bundles(
+        self, scene: BundledScene, destination: Destination, threads: int, sh_degree: int | None
+    ) -> None:
+        def centres() -> None:
+            destination.take_means(self.means())
+
+        if isinstance(destination, Fillable):
+            replace(scene, activation=destination.activation).fill(destination.values, threads, centres)
+            destination.filled()
+            return
+        scene.hand_to(destination, self.sh_count(sh_degree), threads)
+        centres()
+
     # ------------------------------------------------------------------------------------------ inside
+
+    @cached_property
+    def _bundled(self) -> BundledScene | None:
+        """The splats of a file of coder BUNDLES, None for others."""
+        section = self.header.find(Property.OPACITY)
+        if section is None or section.coder != Coder.BUNDLES:
+            return None
+        return BundledScene(self.header, self.data, self.colour_steps)
 
     def _raw(self, prop: Property, index: int = 0) -> NDArray[np.uint8]:
         section = self.header.find(prop, index)
@@ -275,7 +329,7 @@ class PotrFile:
             section.integers // section.streams,
             section.streams,
             sections.is_signed(section.kind),
-            sections.is_predicted(section.kind, section.index),
+            sections.is_predicted(section.kind, section.index) and not self.rules.colour_steps,
             history,
             section.name,
         )
@@ -298,39 +352,70 @@ class PotrFile:
     def _dequantizer(self) -> Dequantizer:
         return Dequantizer(self.header, self.rules)
 
-    def _decode_shapes(self, destination: Destination, submit: _Submit) -> None:
-        scales = self._streams(Property.SCALE)
+    def _decode_shapes(self, destination: Destination, shared: _Shared, submit: _Submit) -> None:
+        scales = shared.scales.get()
         submit(partial(destination.take_scales, scales))
         submit(partial(destination.take_rotations, self._streams(Property.ROTATION), scales))
 
-    def _decode_opacities(self, destination: Destination, submit: _Submit) -> None:
-        submit(partial(destination.take_opacities, self._streams(Property.OPACITY)[0]))
+    def _decode_opacities(self, destination: Destination, shared: _Shared, submit: _Submit) -> None:
+        submit(partial(destination.take_opacities, shared.opacities.get()))
 
-    def _sh_jobs(self, destination: Destination, count: int) -> list[tuple[bool, _Job]]:
+    def _sh_jobs(self, destination: Destination, count: int, shared: _Shared) -> list[tuple[bool, _Job]]:
         """What decodes so many SH coefficients of a channel, and whether it takes the context coder."""
         stop = 3 * count
         contextual = [s for s in self.header.sections if s.kind == Property.SH and s.coder == Coder.CONTEXT]
         chained = [s for s in contextual if 0 < s.index < stop]
         in_chain = {s.index // 3 + m for s in chained for m in range(s.streams // 3)}
         alone = [m for m in range(count) if m not in in_chain]
-        jobs: list[tuple[bool, _Job]] = [(True, partial(self._decode_chain, chained, destination))] if chained else []
+        jobs: list[tuple[bool, _Job]] = (
+            [(True, partial(self._decode_chain, chained, destination, shared))] if chained else []
+        )
         return jobs + [
-            (self._contextual(Property.SH, 3 * m), partial(self._decode_coefficient, m, destination)) for m in alone
+            (self._contextual(Property.SH, 3 * m), partial(self._decode_coefficient, m, destination, shared))
+            for m in alone
         ]
 
-    def _decode_chain(self, chain: list[Section], destination: Destination, submit: _Submit) -> None:
+    def _decode_chain(self, chain: list[Section], destination: Destination, shared: _Shared, submit: _Submit) -> None:
         """AC coefficients whose contexts are made of those before."""
         history = Sizes(Lanes(self.header.splats))
         for section in sorted(chain, key=lambda s: s.index):
             streams = self._context_streams(section, history)
             for m, channels in enumerate(zip(streams, streams, streams, strict=True), start=section.index // 3):
-                submit(partial(destination.take_colours, channels, m, False))
+                submit(partial(_take_colours, destination, channels, m, False, shared))
 
-    def _decode_coefficient(self, m: int, destination: Destination, submit: _Submit) -> None:
+    def _decode_coefficient(self, m: int, destination: Destination, shared: _Shared, submit: _Submit) -> None:
         """The three channels of one SH coefficient."""
         streams = self._streams(Property.SH, range(3 * m, 3 * m + 3))
-        differences = m == 0 and not self._contextual(Property.SH)
-        submit(partial(destination.take_colours, streams, m, differences))
+        differences = m == 0 and not self.rules.colour_steps and not self._contextual(Property.SH)
+        submit(partial(_take_colours, destination, streams, m, differences, shared))
+
+
+class _Shared:
+    """What more than one of a file's properties is made of; any thread may ask for it.
+
+    Args:
+        file: that is decoded.
+
+    Attributes:
+        scales, opacities: their streams.
+        factors: what colours are made with.
+    """
+
+    def __init__(self, file: PotrFile) -> None:
+        self.scales = Once(lambda: file._streams(Property.SCALE))
+        self.opacities = Once(lambda: file._streams(Property.OPACITY)[0])
+        self.factors = Once(self._find_factors)
+        self._file = file
+
+    def _find_factors(self) -> ColourFactors:
+        header, steps = self._file.header, self._file.colour_steps()
+        return ColourFactors.of(header, steps, self.scales.get, self.opacities.get)
+
+
+def _take_colours(
+    destination: Destination, streams: Sequence[IntegerStream], m: int, differences: bool, shared: _Shared
+) -> None:
+    destination.take_colours(streams, m, differences, shared.factors.get())
 
 
 #: Takes what needs no more than what is at hand, to be done now or by another thread.

@@ -8,34 +8,30 @@ from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
+from potr_cl.codec.bundles.levels import Levels
+from potr_cl.codec.byte_planes import IntegerStream
+from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
+from potr_cl.codec.native.bundles import ValueArrays
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import native
+from potr_cl.codec.steps.prediction import from_residuals
+from potr_cl.codec.steps.rule import ColourSteps, factors
 from potr_cl.codec.versions import FormatVersion
 
 F32 = NDArray[np.float32]
+I8 = NDArray[np.int8]
 
 #: Splats worked on at a time: few enough that temporaries stay in a cache, many enough that threads seldom wait.
 _BLOCK = 1 << 15
 #: Levels whose values the native path looks up: small tables for levels of one byte, larger ones for others.
 _SMALL_TABLE, _LARGE_TABLE = 1 << 8, 1 << 16
-
-
-class IntegerStream(Protocol):
-    """The integers of a stream, one a splat."""
-
-    def part(self, start: int, stop: int) -> NDArray[np.integer]:
-        """Those from one splat to another."""
-
-    @property
-    def joined(self) -> NDArray[Any]:
-        """All of them: uint8, mapped to unsigned, where they are that small; else 32 or 64 bits each."""
 
 
 @dataclass(frozen=True)
@@ -90,22 +86,33 @@ class Dequantizer:
         for block, levels in self._blocks([*streams, *needed]):
             quantize.dequantize_rotations(levels[:3], version.rotation_factors(levels[3:], factor), out[block])
 
-    def colours(self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, out: F32) -> None:
+    def colours(
+        self,
+        streams: Sequence[IntegerStream],
+        coefficient: int,
+        differences: bool,
+        fitting: ColourFactors,
+        out: F32,
+    ) -> None:
         """Levels of Y, Co, Cg of an SH coefficient to R, G, B in ``out`` (3, N).
 
         Args:
-            streams: three.
+            streams: three; of DC what is left of its levels, where the version predicts values.
             coefficient: 0 for DC.
             differences: whether integers are the differences of levels of splats that follow each other.
+            fitting: the splats' scale factors.
             out: float32.
         """
-        factor = self.header.sf_dc if coefficient == 0 else self.header.sf_ac
         functions = native()
+        factors = fitting.ac if coefficient else fitting.dc
+        if coefficient == 0 and self.version.colour_steps:
+            self._predicted(streams, fitting.classes, factors, out)
+            return
         if functions is not None:
             levels = [stream.joined for stream in streams]
             if differences:
                 levels = [_summed(functions, level) for level in levels]
-            functions.colours(levels, float(np.float32(factor)), out)
+            functions.colours(levels, factors, out)
             return
         last = [0, 0, 0]
         for block, parts in self._blocks(streams):
@@ -117,7 +124,45 @@ class Dequantizer:
                     last[c] = channel[-1]
             else:
                 channels = _wider(parts)
-            _to_rgb(channels, factor, out[:, block])
+            _to_rgb(channels, _part(factors, block), out[:, block])
+
+    def _predicted(self, streams: Sequence[IntegerStream], classes: I8, factors: F32, out: F32) -> None:
+        """DC from what the prediction has left of its levels."""
+        splats = self.header.splats
+        levels = from_residuals(np.stack([stream.part(0, splats).astype(np.int64) for stream in streams]), classes)
+        functions = native()
+        if functions is not None:
+            functions.colours(list(levels), factors, out)
+            return
+        for start in range(0, splats, _BLOCK):
+            block = slice(start, start + _BLOCK)
+            _to_rgb(list(levels[:, block]), _part(factors, block), out[:, block])
+
+    def of_levels(self, levels: Levels, steps: ColourSteps | None, arrays: ValueArrays) -> None:
+        """The values of some splats' levels, by NumPy, into the arrays that there are, of all of the file's splats."""
+        version, header = self.version, self.header
+        own = slice(levels.start, levels.stop)
+        scales = levels.scales or []
+        if arrays.logits is not None and levels.opacities is not None:
+            arrays.logits[own] = version.dequantize_opacities(levels.opacities, header.sf_opacity)
+        if arrays.log_scales is not None:
+            for axis, level in enumerate(scales):
+                arrays.log_scales[own, axis] = version.dequantize_scales(level, header.sf_scale)
+        if arrays.quaternions is not None and levels.rotations is not None:
+            turning = version.rotation_factors(scales, header.sf_rotation)
+            quantize.dequantize_rotations(levels.rotations, turning, arrays.quaternions[own])
+        if arrays.sh is None or levels.dc is None or levels.opacities is None:
+            return
+        dc, ac = np.zeros((2, levels.stop - levels.start), np.int8)
+        if steps is not None:
+            dc, ac = steps.classes(scales, levels.opacities, levels.start)
+        residuals = np.stack([channel.astype(np.int64) for channel in levels.dc])
+        _to_rgb(list(from_residuals(residuals, dc)), factors(header.sf_dc, dc), arrays.sh[0, :, own])
+        divisors = factors(header.sf_ac, ac)
+        for items in levels.ac:
+            rgb = np.empty(items.channels.shape, np.float32)
+            _to_rgb(list(items.channels.astype(np.int64)), divisors[items.splats], rgb)
+            arrays.sh[items.coefficients, :, levels.start + items.splats] = rgb.T
 
     def _blocks(self, streams: Sequence[IntegerStream]) -> Iterator[tuple[slice, list[NDArray[np.integer]]]]:
         """The integers of some streams side by side, block by block."""
@@ -149,9 +194,12 @@ def _wider(levels: list[NDArray[np.integer]]) -> list[NDArray[Any]]:
     return [level.astype(dtype) for level in levels]
 
 
-def _to_rgb(channels: list[NDArray[Any]], factor: float, out: F32) -> None:
+def _part(factors: F32, block: slice) -> F32:
+    return factors if len(factors) == 1 else factors[block]
+
+
+def _to_rgb(channels: list[NDArray[Any]], divisor: F32, out: F32) -> None:
     """Levels of Y, Co, Cg to R, G, B in ``out`` (3, n)."""
-    divisor = np.float32(factor)
     y, co, cg = channels
     r = y - cg
     np.divide(r + co, divisor, out=out[0], dtype=np.float32, casting="unsafe")

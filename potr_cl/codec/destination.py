@@ -7,14 +7,18 @@ way (:mod:`potr_cl.ondevice.decode` on a device), but must give the same bits.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec.byte_planes import IntegerStream
+from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
-from potr_cl.codec.dequantizer import Dequantizer, IntegerStream
+from potr_cl.codec.dequantizer import Dequantizer
+from potr_cl.codec.native.bundles import ValueArrays
 from potr_cl.codec.versions import FormatVersion
 from potr_cl.model.scene import Scene
 
@@ -36,26 +40,61 @@ class Destination(Protocol):
     def take_opacities(self, stream: IntegerStream) -> None:
         """Levels of the opacities."""
 
-    def take_colours(self, streams: Sequence[IntegerStream], coefficient: int, differences: bool) -> None:
-        """Levels of Y, Co, Cg of an SH coefficient.
+    def take_colours(
+        self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, factors: ColourFactors
+    ) -> None:
+        """Levels of Y, Co, Cg of an SH coefficient; of DC what is left of them where the version predicts its values.
 
         Args:
             streams: three.
             coefficient: 0 for DC.
             differences: whether integers are the differences of levels of splats that follow each other.
+            factors: the splats' scale factors.
         """
 
 
-class SceneArrays:
+class Activation(Protocol):
+    """What a destination wants instead of logarithms of scales and logits of opacities, value by value."""
+
+    def scales(self, log_scales: F32) -> F32:
+        """Instead of natural logarithms of standard deviations, of any shape."""
+
+    def opacities(self, logits: F32) -> F32:
+        """Instead of logits of opacities."""
+
+
+class Fillable(ABC):
+    """A destination with arrays on the host, which values may be written to as they are decoded."""
+
+    @property
+    def activation(self) -> Activation | None:
+        """Of these values; None: none."""
+        return None
+
+    @property
+    @abstractmethod
+    def values(self) -> ValueArrays:
+        """The arrays but the centres."""
+
+    @abstractmethod
+    def take_means(self, means: F32) -> None:
+        """Centres, (N, 3) float32, world units."""
+
+    def filled(self) -> None:  # noqa: B027 (most have nothing left to do)
+        """The arrays are full; the centres were taken."""
+
+
+class SceneArrays(Fillable):
     """Decoded splats as the arrays of a scene.
 
     Args:
         header: of the file.
         version: the rules of the file's version.
         sh_count: SH coefficients of a channel that are wanted.
+        zeros: whether colours are filled in only where they are not 0.
     """
 
-    def __init__(self, header: Header, version: FormatVersion, sh_count: int) -> None:
+    def __init__(self, header: Header, version: FormatVersion, sh_count: int, zeros: bool = False) -> None:
         n = header.splats
         self._header = header
         self._dequantizer = Dequantizer(header, version)
@@ -63,7 +102,12 @@ class SceneArrays:
         self._log_scales = np.empty((n, 3), np.float32)
         self._quaternions = np.empty((n, 4), np.float32)
         self._opacity_logits = np.empty(n, np.float32)
-        self._planar = np.empty((sh_count, 3, n), np.float32)
+        self._planar = (np.zeros if zeros else np.empty)((sh_count, 3, n), np.float32)
+
+    @property
+    def values(self) -> ValueArrays:
+        """The arrays but the centres."""
+        return ValueArrays(self._log_scales, self._quaternions, self._opacity_logits, self._planar)
 
     def take_means(self, means: F32) -> None:
         self._means = means
@@ -77,8 +121,10 @@ class SceneArrays:
     def take_opacities(self, stream: IntegerStream) -> None:
         self._dequantizer.opacities(stream, self._opacity_logits)
 
-    def take_colours(self, streams: Sequence[IntegerStream], coefficient: int, differences: bool) -> None:
-        self._dequantizer.colours(streams, coefficient, differences, self._planar[coefficient])
+    def take_colours(
+        self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, factors: ColourFactors
+    ) -> None:
+        self._dequantizer.colours(streams, coefficient, differences, factors, self._planar[coefficient])
 
     @property
     def sh(self) -> F32:

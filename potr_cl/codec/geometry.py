@@ -15,6 +15,8 @@ from numpy.typing import NDArray
 from potr_cl.codec import octree, quantize
 from potr_cl.codec.native.library import native
 from potr_cl.codec.outliers import check_positions
+from potr_cl.codec.steps.fitting import fit_steps
+from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
@@ -36,6 +38,7 @@ class Geometry:
         scales, rotations: levels of the three axes, (N,) each.
         opacities: (N,) levels.
         antialiased, low_pass: as of the scene.
+        steps: what fits the steps of each splat's colours to it, where something is known of what it shows.
     """
 
     asked: quantize.HyperParameters
@@ -47,6 +50,7 @@ class Geometry:
     opacities: quantize.Integers
     antialiased: bool
     low_pass: float
+    steps: ColourSteps | None = None
 
     def decoded(self, sh: NDArray[np.float32]) -> Scene:
         """What a decoder makes of it, bit for bit, in the order of the scene, with colours (N, M, 3) of that order."""
@@ -64,6 +68,22 @@ class Geometry:
         means = np.empty((n, 3), np.float32)
         means[self.order] = octree.parse(self.tree, n)
         return Scene(means, log_scales, quaternions, opacity_logits, sh, self.antialiased, self.low_pass)
+
+    def colour_classes(self) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+        """(N,) classes of the steps of DC and of AC, in the order of the file: :class:`ColourSteps`; 0 without any."""
+        if self.steps is None:
+            none = np.zeros(len(self.order), np.int8)
+            return none, none
+        return self.steps.classes(self.scales, self.opacities)
+
+    def with_steps(self, effects: NDArray[np.floating]) -> Geometry:
+        """The same with steps of colours by what each splat shows.
+
+        Args:
+            effects: (N,) >= 0 in the order of the scene: by how much an error of its colour shows, in any unit.
+        """
+        steps = fit_steps(self.scales, self.opacities, self.parameters.sf_opacity, effects[self.order])
+        return replace(self, steps=steps)
 
     def with_colour_steps(self, parameters: quantize.HyperParameters) -> Geometry:
         """The same for parameters that differ in the steps of colours alone, which geometry does not depend on."""

@@ -59,7 +59,8 @@ class HyperParameters:
         beta: allowed distance of a centre to its leaf's centre: version 1: as a part of the distance to the nearest
             camera; version 2: as a part of a typical splat's size at that distance.
         gamma: the least such distance, world units.
-        sf_dc, sf_sh: scale factors of constant and of all other SH coefficients; a quantiser step is 1 / SF.
+        sf_dc, sf_sh: scale factors of constant and of all other SH coefficients; a quantiser step is 1 / SF. Version 3:
+            of steps that, the same for all splats, would show as much as the splats' own.
         sf_opacity: of opacities; version 2: of their logits.
         sf_rotation: of quaternions; version 2: times the root of the largest level of the splat's three scales.
         sf_scale: of standard deviations, world units; version 2: steps in a typical splat's size.
@@ -135,14 +136,14 @@ def _balanced(q: float, given: Mapping[str, float]) -> HyperParameters:
     delta_mse_max = 10 ** (-8.3 - 2 * q)
     values = replace(
         _paper(q, {}),
-        version=2,
+        version=3,
         delta_mse_max=delta_mse_max,
         drop=delta_mse_max / 14,
         beta=0.056 / finer,
         gamma=1e-30,
         sf_dc=31 * finer,
-        sf_sh=48 * finer,
-        sf_opacity=5.5 * finer,
+        sf_sh=40 * finer,
+        sf_opacity=3.3 * finer,
         sf_rotation=7.6 * finer,
         sf_scale=8.8 * finer,
     )
@@ -366,8 +367,8 @@ def to_ycocg(rgb: F64) -> tuple[F64, F64, F64]:
     return r * 0.25 + half + b * 0.25, (r - b) * 0.5, half - (r + b) * 0.25
 
 
-def quantize_sh(values: F64, sf_sh: float) -> Integers:
-    """One channel of one SH coefficient (YCoCg) to levels, in steps of 1 / SF."""
+def quantize_sh(values: F64, sf_sh: float | F32) -> Integers:
+    """One channel of one SH coefficient (YCoCg) to levels, in steps of 1 / SF, which may be one a splat."""
     return _to_levels(values, sf_sh, "SH coefficient")
 
 

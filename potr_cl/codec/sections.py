@@ -1,7 +1,7 @@
 """What a file's sections are: the properties that they hold, the streams of each property, and a table entry.
 
-A *stream* is a sequence of integers; most hold one integer a splat. Coder CONTEXT stores several streams in one
-section, every other coder one.
+A *stream* is a sequence of integers; most hold one integer a splat. Coders CONTEXT and BUNDLES store several streams in
+one section, every other coder one.
 """
 
 from __future__ import annotations
@@ -19,6 +19,7 @@ class Property(enum.IntEnum):
     MULTIPLICITY = 3
     TAIL_LENGTH = 4
     TAIL = 5
+    STEPS = 6
     SCALE = 16
     ROTATION = 17
     OPACITY = 18
@@ -32,6 +33,12 @@ class Coder(enum.IntEnum):
     ZSTD = 1
     DEFLATE = 2
     CONTEXT = 3
+    BUNDLES = 4
+
+    @property
+    def of_streams(self) -> bool:
+        """Whether it stores several streams in a section, as integers and not as bytes."""
+        return self in (Coder.CONTEXT, Coder.BUNDLES)
 
 
 _STREAMS = {
@@ -41,6 +48,7 @@ _STREAMS = {
     Property.MULTIPLICITY: 1,
     Property.TAIL_LENGTH: 1,
     Property.TAIL: 1,
+    Property.STEPS: 1,
     Property.SCALE: 3,
     Property.ROTATION: 3,
     Property.OPACITY: 1,
@@ -48,7 +56,14 @@ _STREAMS = {
 }
 _SIGNED = {Property.ROTATION, Property.SH}
 _PER_SPLAT = {Property.SCALE, Property.ROTATION, Property.OPACITY, Property.SH}
-_BYTES = {Property.METADATA, Property.OCCUPANCY, Property.SEVERAL, Property.TAIL_LENGTH, Property.TAIL}
+_BYTES = {
+    Property.METADATA,
+    Property.OCCUPANCY,
+    Property.SEVERAL,
+    Property.TAIL_LENGTH,
+    Property.TAIL,
+    Property.STEPS,
+}
 
 
 @dataclass(frozen=True)
@@ -61,9 +76,9 @@ class Section:
             SH; else 0.
         coder: how it is stored.
         crc: CRC-32 of the stored bytes.
-        streams: number of streams in it; more than one for coder CONTEXT only.
+        streams: number of streams in it; more than one for coders of streams only.
         integers: number of integers in it, those of all streams together; bytes where the property is one of bytes.
-        planes: bytes an integer before the coder; 0 for coder CONTEXT, whose integers are never bytes.
+        planes: bytes an integer before the coder; 0 for coders of streams, whose integers are never bytes.
         stored_bytes: its size in the file.
         offset: of the stored bytes in the file.
     """
@@ -80,8 +95,8 @@ class Section:
 
     @property
     def raw_bytes(self) -> int | None:
-        """Size before the coder; None for coder CONTEXT, where there is no such thing."""
-        return None if self.coder == Coder.CONTEXT else self.planes * self.integers
+        """Size before the coder; None for coders of streams, where there is no such thing."""
+        return None if self.coder.of_streams else self.planes * self.integers
 
     @property
     def indices(self) -> range:
@@ -115,12 +130,12 @@ def is_bytes(prop: Property) -> bool:
 
 
 def is_predicted(prop: Property, index: int) -> bool:
-    """Whether coder CONTEXT stores a property's differences from the splats before."""
+    """Whether coders of streams store a property's differences from the splats before."""
     return prop == Property.SH and index == 0
 
 
 def context_groups(prop: Property, degree: int) -> list[tuple[int, int]]:
-    """The sections of coder CONTEXT that a property can have at an SH degree: index and number of streams of each."""
+    """The sections of coders of streams that a property can have: index and number of streams of each."""
     if prop == Property.SH:
         return [(3 * band**2, 3 * (2 * band + 1)) for band in range(degree + 1)]
     return [(0, _STREAMS[prop])] if prop in _PER_SPLAT else []

@@ -36,11 +36,14 @@ class FormatVersion(abc.ABC):
 
     Attributes:
         number: that stands in the file.
-        coders: that its sections may be stored by. Without CONTEXT, the entropy coder "context" means zstd.
+        coders: that its sections may be stored by; the entropy coder "context" means the one of streams that there is,
+            zstd where there is none.
         separate_ac_factor: whether the header has a scale factor of AC coefficients beside that of DC.
         absolute_leaf_levels: whether tail lengths are levels of the octree, chosen by the tolerance alone
             (``absolute`` of :func:`potr_cl.codec.octree.build`).
         rotations_need_scales: whether rotations can be dequantised only with the levels of the scales at hand.
+        colour_steps: whether a file may give each splat the steps of its colours (:mod:`potr_cl.codec.steps`), so that
+            colours are dequantised with the levels of scales and opacities at hand, and predicted as values.
     """
 
     number: ClassVar[int]
@@ -48,6 +51,12 @@ class FormatVersion(abc.ABC):
     separate_ac_factor: ClassVar[bool]
     absolute_leaf_levels: ClassVar[bool]
     rotations_need_scales: ClassVar[bool]
+    colour_steps: ClassVar[bool] = False
+
+    @property
+    def coder_of_streams(self) -> Coder | None:
+        """What the entropy coder "context" means."""
+        return next((coder for coder in self.coders if coder.of_streams), None)
 
     def check(self, parameters: HyperParameters) -> None:
         """Refuse hyper-parameters that a file of this version cannot tell its decoder.
@@ -137,7 +146,7 @@ class Version2(FormatVersion):
     """Steps of equal worth: finer rotations for longer splats, opacities as logits, lengths in sizes of a splat."""
 
     number = 2
-    coders = frozenset(Coder)
+    coders = frozenset({Coder.RAW, Coder.ZSTD, Coder.DEFLATE, Coder.CONTEXT})
     separate_ac_factor = True
     absolute_leaf_levels = True
     rotations_need_scales = True
@@ -180,13 +189,14 @@ class Version2(FormatVersion):
 
 
 class Version3(Version2):
-    """Not final: no preset writes it yet. It will have another entropy coder, and steps of colours that fit each splat.
+    """Bundles of splats that are decoded side by side, and steps of colours that fit each splat.
 
-    Its quantiser is version 2's so far. What it does with colours may depend on the levels of scales and opacities,
-    which are decoded before them.
+    Geometry is quantised as in version 2.
     """
 
     number = 3
+    coders = frozenset({Coder.RAW, Coder.ZSTD, Coder.DEFLATE, Coder.BUNDLES})
+    colour_steps = True
 
 
 #: All versions that are read, by their number.

@@ -132,7 +132,7 @@ def sample(scene: Scene) -> Sample:
     Args:
         scene: clean, at least one splat.
     """
-    rows = _spread(len(scene), _THINNED)
+    rows = looked_at(len(scene))
     opaque = rows[scene.opacities[rows] > _OPAQUE]
     scene = scene.subset(opaque if len(opaque) else rows)
     means = scene.means.astype(np.float64)
@@ -170,6 +170,11 @@ def _spread(count: int, wanted: int) -> NDArray[np.int64]:
     """Numbers of so many of ``count`` things, or of all, evenly spread and ascending."""
     numbers = np.linspace(0, count - 1, min(count, wanted)).astype(np.int64)
     return numbers[np.diff(numbers, prepend=-1) > 0]
+
+
+def looked_at(count: int) -> NDArray[np.int64]:
+    """Which of so many splats :func:`sample` looks at: of a scene of these alone it makes the same sample."""
+    return _spread(count, _THINNED)
 
 
 def poses(cameras: Sequence[Camera]) -> Poses:

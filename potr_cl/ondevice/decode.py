@@ -7,6 +7,8 @@ and become values there, where a rasterizer takes them.
 from __future__ import annotations
 
 from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.destination import Destination
+from potr_cl.codec.sampled import Both
 from potr_cl.errors import DataError
 from potr_cl.model.scene import LOW_PASS
 from potr_cl.ondevice.dequantiser import DeviceDequantiser
@@ -20,6 +22,7 @@ def decode_to_device(
     sh_degree: int | None = None,
     antialiased: bool | None = None,
     threads: int = 0,
+    beside: Destination | None = None,
 ) -> SceneBuffers:
     """Decode a file into a device's memory: the same bits there as of its scene that was decoded and uploaded.
 
@@ -29,6 +32,7 @@ def decode_to_device(
         sh_degree: leave out SH coefficients of higher degrees; None: none.
         antialiased: whether to take it as an antialiased scene; None: as the file says.
         threads: on the host; 0: one a processor.
+        beside: takes the same splats, or what it wants of them.
 
     Returns:
         The scene, finished; the caller closes it.
@@ -49,9 +53,11 @@ def decode_to_device(
         header.low_pass if as_told else LOW_PASS,
     )
     try:
-        file.decode_into(DeviceDequantiser(header, file.rules, buffers), threads, sh_degree)
-        with device.errors("failed while decoding"):
-            device.queue.finish()
+        destination = DeviceDequantiser(header, file.rules, buffers)
+        try:
+            file.decode_into(destination if beside is None else Both(destination, beside), threads, sh_degree)
+        finally:
+            destination.finish()
     except MemoryError:
         buffers.close()
         raise DataError(f"{header.splats} splats need more memory than the host has, to be decoded") from None

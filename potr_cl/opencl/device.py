@@ -6,7 +6,8 @@ import logging
 import threading
 import warnings
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from typing import Any
 
@@ -14,13 +15,18 @@ import numpy as np
 import pyopencl as cl
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
+from potr_cl.host.threads import in_background
 from potr_cl.opencl import compiler, program_cache, quirks
 from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, compiler_fault, compiles_nothing
+from potr_cl.opencl.foresight import Foresight, Wanted
 from potr_cl.opencl.kernel import Kernel, declared_parameters
 from potr_cl.opencl.loader import new_context
 from potr_cl.opencl.source import kernel_source
 
 logger = logging.getLogger("potr_cl")
+
+#: Held while a program is built or loaded.
+_BUILDING = threading.RLock()
 
 #: How drivers say that there is not enough memory, besides what pyopencl makes a MemoryError of.
 _NO_MEMORY = (
@@ -83,7 +89,8 @@ class Device:
             if not path.is_file():
                 raise FileNotFoundError(f"there is no file '{path}' to read a kernel from")
         self._macros = dict(macros or {})
-        self._programs: dict[tuple[str, tuple[tuple[str, str], ...]], cl.Program] = {}
+        self._programs: dict[Wanted, cl.Program] = {}
+        self._foresight: Foresight | None = None
         self._of_this_thread = threading.local()
         with self.errors("cannot be opened"):
             self.context = new_context(self.info.handle)
@@ -127,14 +134,44 @@ class Device:
             DeviceError: the device's compiler refused it.
         """
         macros = tuple(sorted((name, _literal(value)) for name, value in {**defines, **self._macros}.items()))
-        key = (source, macros)
-        if key not in self._programs:
-            options = ["-cl-std=CL1.2", *self._build_options, *(f"-D{name}={value}" for name, value in macros)]
-            with self.errors(f"failed to build {source}"), warnings.catch_warnings():
-                warnings.simplefilter("ignore")  # some drivers chat without being asked, and a full disk stops no build
-                program = cl.Program(self.context, kernel_source(source, self._variants))
-                self._programs[key] = program.build(options, cache_dir=program_cache.folder())
-        return self._programs[key]
+        built = self._built((source, macros))
+        if self._foresight is not None:
+            self._foresight.note((source, macros))
+        return built
+
+    def prepare_for(self, purpose: str) -> Future[None]:
+        """Load in another thread the programs that were needed for a purpose before, and note those that are now.
+
+        Args:
+            purpose: any text: what was done the last time under the same one is about to be done again.
+
+        Returns:
+            Done when all are loaded. Nobody need wait for it, and it raises nothing.
+        """
+        folder = program_cache.folder()
+        if not isinstance(folder, str) or self._variants or self._macros or self._build_options:
+            return in_background(lambda: None)
+        about = (purpose, self.info.name, self.info.platform, self.info.version, self.family)
+        self._foresight = Foresight(Path(folder), repr(about))
+
+        def load(wanted: Sequence[Wanted]) -> None:
+            for program in wanted:
+                with suppress(DeviceError, OSError):
+                    self._built(program)
+
+        return in_background(load, list(self._foresight.programs))
+
+    def _built(self, wanted: Wanted) -> cl.Program:
+        source, macros = wanted
+        # pyopencl sleeps where two threads want its cache at a time.
+        with _BUILDING:
+            if wanted not in self._programs:
+                options = ["-cl-std=CL1.2", *self._build_options, *(f"-D{name}={value}" for name, value in macros)]
+                with self.errors(f"failed to build {source}"), warnings.catch_warnings():
+                    warnings.simplefilter("ignore")  # some drivers chat unasked, and a full disk stops no build
+                    program = cl.Program(self.context, kernel_source(source, self._variants))
+                    self._programs[wanted] = program.build(options, cache_dir=program_cache.folder())
+        return self._programs[wanted]
 
     def kernel(self, source: str, name: str, **defines: str | int | float) -> Kernel:
         """A new kernel object of :meth:`program`; keep it, making one is slow.
@@ -218,13 +255,22 @@ class Device:
             self.allocated -= buffer.size
         buffer.release()
 
-    def upload(self, array: np.ndarray[Any, Any], what: str) -> cl.Buffer:
-        """A buffer that holds a copy of ``array``, C order."""
+    def upload(self, array: np.ndarray[Any, Any], what: str, pending: list[cl.Event] | None = None) -> cl.Buffer:
+        """A buffer that holds a copy of ``array``, C order.
+
+        Args:
+            array: to be copied.
+            what: it is, for the error's sake.
+            pending: takes the copy as an event, which is only enqueued then: the array must not change before it is
+                done, nor the event be given up. None: it is done when the method returns.
+        """
         array = np.ascontiguousarray(array)
         buffer = self.allocate(array.nbytes, what)
         if array.nbytes:
             with self.errors(f"cannot hold {what}"):
-                cl.enqueue_copy(self.queue, buffer, array, is_blocking=True)
+                event = cl.enqueue_copy(self.queue, buffer, array, is_blocking=pending is None)
+            if pending is not None:
+                pending.append(event)
         return buffer
 
     def download(self, buffer: cl.Buffer, shape: tuple[int, ...], dtype: Any, start: int = 0) -> np.ndarray[Any, Any]:

@@ -59,9 +59,9 @@ class Memory(Owner):
         """A read-write buffer, see :meth:`potr_cl.opencl.device.Device.allocate`."""
         return self.adopt(self._device.allocate(nbytes, what))
 
-    def upload(self, array: np.ndarray[Any, Any], what: str) -> cl.Buffer:
-        """A buffer that holds a copy of ``array``, C order."""
-        return self.adopt(self._device.upload(array, what))
+    def upload(self, array: np.ndarray[Any, Any], what: str, pending: list[cl.Event] | None = None) -> cl.Buffer:
+        """A buffer that holds a copy of ``array``, see :meth:`potr_cl.opencl.device.Device.upload`."""
+        return self.adopt(self._device.upload(array, what, pending))
 
     def adopt(self, buffer: cl.Buffer) -> cl.Buffer:
         """Own a buffer that somebody else took."""

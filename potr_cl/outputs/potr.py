@@ -7,16 +7,18 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
+from potr_cl.codec.colours import rounded_ac
 from potr_cl.codec.decoder import PotrFile, decode
 from potr_cl.codec.encoder import Coded, code_scene
 from potr_cl.codec.geometry import Geometry, quantise_geometry
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import Property
+from potr_cl.codec.versions import VERSIONS
 from potr_cl.errors import DeviceError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.potr import FORMAT
 from potr_cl.host.threads import thread_pool
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output, Request, Rounded
@@ -31,23 +33,39 @@ _NAMES = {
     Property.SCALE: "scale",
     Property.ROTATION: "rotation",
     Property.OPACITY: "opacity",
+    Property.STEPS: "colour: steps",
 }
 
 
 @dataclass(frozen=True)
 class Potr(Output):
-    """A .potr file: :mod:`potr_cl.codec`. AC coefficients are rounded with the others, to steps finer than one sees."""
+    """A .potr file: :mod:`potr_cl.codec`. AC coefficients are rounded to steps finer than one sees."""
 
     format: ClassVar[SceneFormat] = FORMAT
     choices: ClassVar[frozenset[str]] = frozenset(
         {"entropy", "zstd_level"} | {each.name for each in fields(HyperParameters)}
     )
     steps: ClassVar[bool] = True
+    fixes_ac: ClassVar[bool] = True
 
     def geometry(self, scene: Scene, request: Request) -> Geometry:
         """See :func:`potr_cl.codec.geometry.quantise_geometry`."""
         with thread_pool(request.threads) as pool:
             return quantise_geometry(scene, request.parameters, request.views, pool.map)
+
+    def fix_ac(
+        self, rounded: Rounded, sh: FloatArray, worth: FloatArray | None, request: Request
+    ) -> tuple[Rounded, FloatArray]:
+        """Fit the steps of colours to each splat, and round to them, in the versions of the format that have such.
+
+        DC is solved for once more afterwards: it makes up for what the rounding of the others has changed.
+        """
+        assert isinstance(rounded, Geometry)
+        if worth is None or not VERSIONS[request.parameters.version].colour_steps:
+            return rounded, sh
+        geometry = rounded.with_steps(worth[:, 0])
+        with thread_pool(request.threads) as pool:
+            return geometry, rounded_ac(sh, geometry, pool.map)
 
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
         """See :func:`potr_cl.codec.encoder.code_scene`."""
@@ -80,7 +98,7 @@ class Potr(Output):
 
     def properties(self, data: bytes) -> dict[str, int]:
         """Bytes by attribute; the header and the metadata are "other"."""
-        names = ("position", "scale", "rotation", "opacity", "colour: DC", "colour: AC", "other")
+        names = ("position", "scale", "rotation", "opacity", "colour: DC", "colour: AC", "colour: steps", "other")
         sums = dict.fromkeys(names, 0)
         for section in PotrFile.from_bytes(data, trust=True).header.sections:
             if section.kind == Property.SH:

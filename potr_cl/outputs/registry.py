@@ -13,12 +13,14 @@ from potr_cl.outputs.gltf import Gltf
 from potr_cl.outputs.output import Output
 from potr_cl.outputs.ply import Ply
 from potr_cl.outputs.potr import Potr
+from potr_cl.outputs.sog import Sog
 from potr_cl.outputs.spz import Spz
 
 #: In the order in which people are told of them; the first is the usual one.
 OUTPUTS: tuple[type[Output], ...] = (
     Potr,
     Spz,
+    Sog,
     CompressedPly,
     Gltf,
     Ply,
@@ -62,7 +64,8 @@ def encoded_suffix(suffix: str) -> str:
         UsageError: encode does not write such files.
     """
     wanted = "." + suffix.lower().lstrip(".")
-    output_of(Path(f"scene{wanted}"))
+    if not any(wanted in kind.suffixes() for kind in OUTPUTS):
+        raise UsageError(f"'{wanted}' is no suffix of what encode writes: expected {suffixes_encoded()}")
     return wanted
 
 

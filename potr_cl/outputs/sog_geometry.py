@@ -96,7 +96,7 @@ def rounded_geometry(scene: Scene, parameters: HyperParameters, distances: NDArr
         steps[order],
         _rotations(imaginary, factors, (scale_levels == scale_levels[:, :1]).all(axis=1)),
         version.dequantize_scales(book, world.sf_scale),
-        nearest(scale_levels, book.astype(np.float32)).astype(np.uint8),
+        nearest(scale_levels.astype(np.float32), book.astype(np.float32)).astype(np.uint8),
         np.rint(255 / (1 + np.exp(-decoded))).astype(np.uint8),
     )
 

@@ -94,13 +94,16 @@ class SceneBuffers(Owner):
             "log2_opacities": self.log2_opacities,
         }
 
-    def write_rows(self, parameter: cl.Buffer, rows: NDArray[Any], what: str) -> None:
+    def write_rows(
+        self, parameter: cl.Buffer, rows: NDArray[Any], what: str, pending: list[cl.Event] | None = None
+    ) -> None:
         """Set a parameter to rows, one for each splat, which are turned to columns on the device.
 
         Args:
             parameter: one of the buffers.
             rows: (N, columns) of any kind of float.
             what: they are, for errors.
+            pending: as of :meth:`potr_cl.opencl.device.Device.upload`.
 
         Raises:
             DeviceError: there is no room for them beside the scene.
@@ -111,15 +114,24 @@ class SceneBuffers(Owner):
             some = np.ascontiguousarray(rows[first : first + _UPLOADED], np.float32)
             with Memory(device) as memory:
                 turn.bind(
-                    rows=memory.upload(some, what), first=first, width=width, stride=self.stride, result=parameter
+                    rows=memory.upload(some, what, pending),
+                    first=first,
+                    width=width,
+                    stride=self.stride,
+                    result=parameter,
                 )
                 turn.launch((len(some),))
 
-    def write_columns(self, parameter: cl.Buffer, first: int, columns: FloatArray) -> None:
-        """Set some columns of a parameter, from number ``first`` on, to (columns, N) float32, C order."""
+    def write_columns(
+        self, parameter: cl.Buffer, first: int, columns: FloatArray, pending: list[cl.Event] | None = None
+    ) -> None:
+        """Set some columns of a parameter, from number ``first`` on, to (columns, N) float32, C order.
+
+        ``pending`` as of :meth:`potr_cl.opencl.device.Device.upload`.
+        """
         number, splats = columns.shape
         with self.device.errors("cannot take a scene"):
-            cl.enqueue_copy(
+            event = cl.enqueue_copy(
                 self.device.queue,
                 parameter,
                 columns,
@@ -128,8 +140,10 @@ class SceneBuffers(Owner):
                 region=(4 * splats, number, 1),
                 buffer_pitches=(4 * self.stride, 0),
                 host_pitches=(4 * splats, 0),
-                is_blocking=True,
+                is_blocking=pending is None,
             )
+        if pending is not None:
+            pending.append(event)
 
     def write_sh(self, parameter: cl.Buffer, sh: FloatArray) -> None:
         """Set SH coefficients, (N, M, 3) float32 of any strides.

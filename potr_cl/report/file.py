@@ -20,6 +20,7 @@ _GROUPS = {
     Property.SCALE: "scale",
     Property.ROTATION: "rotation",
     Property.OPACITY: "opacity",
+    Property.STEPS: "colour: steps",
 }
 
 #: A line of the table of sections.
@@ -45,6 +46,20 @@ def _contents(sections: Sequence[Section]) -> dict[str, Any]:
     }
 
 
+def _colour_steps(file: PotrFile) -> dict[str, Any] | None:
+    """The numbers of the rule that fits the steps of colours to each splat; None where there is none."""
+    steps = file.colour_steps()
+    if steps is None:
+        return None
+    return {
+        "splats_a_group": 1 << steps.group_bits,
+        "exponents": [power / 16 for power in steps.powers],
+        "scales": list(steps.scales),
+        "opacities": list(steps.opacities),
+        "groups": len(steps.groups),
+    }
+
+
 def file_report(file: PotrFile) -> dict[str, Any]:
     """Counts, parameters, bounding box, and what the sections hold and take.
 
@@ -53,7 +68,7 @@ def file_report(file: PotrFile) -> dict[str, Any]:
     in the file. Of the header the sizes alone.
 
     Raises:
-        DataError: the positions or the metadata are damaged.
+        DataError: the positions, the steps of colours or the metadata are damaged.
     """
     header = file.header
     # A file says of itself what it likes.
@@ -92,6 +107,7 @@ def file_report(file: PotrFile) -> dict[str, Any]:
             "DC": header.sf_dc,
             "AC": header.sf_ac,
         },
+        "colour_steps": _colour_steps(file),
         "gamma": metadata.get("gamma"),
         "beta": metadata.get("beta"),
         "delta_mse_max": metadata.get("delta_mse_max"),
@@ -114,6 +130,16 @@ def antialiasing(report: dict[str, Any]) -> str:
     return f"yes, low-pass filter of {report['low_pass']:g} square pixels" if report["antialiased"] else "no"
 
 
+def _said_of_steps(steps: dict[str, Any] | None) -> str:
+    if steps is None:
+        return "the same for all splats"
+    dc, ac = steps["exponents"]
+    return (
+        f"a splat's own: its weight to the power of {dc:g} (DC) and {ac:g} (AC), from its scales, its opacity and "
+        f"its group of {steps['splats_a_group']} splats"
+    )
+
+
 def format_report(report: dict[str, Any]) -> str:
     """The report as lines for people."""
     low, high = report["bounding_box"]
@@ -126,6 +152,7 @@ def format_report(report: dict[str, Any]) -> str:
         "bounding box    " + " x ".join(f"[{a:.4g}, {b:.4g}]" for a, b in zip(low, high, strict=True)),
         f"octree levels   {report['octree_levels']}",
         "steps a unit    " + ", ".join(f"{name} {factor:g}" for name, factor in report["scale_factors"].items()),
+        f"colour steps    {_said_of_steps(report['colour_steps'])}",
         f"size            {report['bytes']} bytes, {report['bytes_a_splat']:.2f} a splat",
         f"as PLY          {report['ply_bytes']} bytes, {report['ratio_to_ply']:.1f} times as much",
     ]

@@ -83,7 +83,7 @@ class Fit(Stage):
         options = self._options(bench.memory)
         if "compact" in state.learnt:
             options = dataclasses.replace(options, rates=dataclasses.replace(options.rates, ac=0.0))
-        with Rasterizer(bench.opened, state.source, background=bench.background) as rasterizer:
+        with Rasterizer(bench.opened, bench.drawable(state.source), background=bench.background) as rasterizer:
             fitted = fit_scene(
                 bench.opened,
                 state.scene,

@@ -13,7 +13,7 @@ from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import SPREAD, views_between
 from potr_cl.model.virtual_cameras import is_virtual
-from potr_cl.stages.between.amount import needed
+from potr_cl.stages.between.amount import needed, views_where_few
 from potr_cl.stages.between.room import room_for
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
@@ -36,10 +36,13 @@ class Added:
     Attributes:
         given: the number of training views that were given.
         added: of views between them.
+        shown_by: how many given views at most show the quarter of the scene that the fewest show; None if nobody asked,
+            or they show nothing.
     """
 
     given: int
     added: int
+    shown_by: float | None = None
 
     def __str__(self) -> str:
         count = f"{self.added} view{'' if self.added == 1 else 's'}" if self.added else "no view"
@@ -99,15 +102,18 @@ class Between(Stage):
         bench.progress("views between", 0.0)
         with thread_pool(bench.threads) as pool:
             known = GivenViews(state.source, state.views, pool.map)
-            each = self.views
+            each, shown_by = self.views, None
             if each == "auto":
-                each = needed(known.views_of_parts(), given, bench.opened.info.kind == "cpu")
+                each, parts = 0.0, known.views_of_parts()
+                if len(parts):
+                    shown_by = views_where_few(parts)
+                    each = needed(shown_by, given, bench.opened.info.kind == "cpu")
             added = views_between(state.source, state.views, each, self.spread, known=known, run=pool.map)
         if self.views == "auto":
             added = _evenly(added, room_for(added, state, bench))
         bench.progress("views between", 1.0)
         then = replace(state, views=(*state.views, *added), added=len(added))
-        return then.having_learnt(self.name, Added(given, len(added)))
+        return then.having_learnt(self.name, Added(given, len(added), shown_by))
 
 
 def _evenly(views: Sequence[Camera], count: int) -> list[Camera]:

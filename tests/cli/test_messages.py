@@ -16,6 +16,7 @@ from potr_cl import cli
 from potr_cl.cli import command_parser
 from potr_cl.cli.progress import Progress
 from potr_cl.cli.terminal import note, speak
+from potr_cl.errors import UsageError
 from potr_cl.formats.scenes import ply
 from potr_cl.reference.scenes import random_scene
 
@@ -113,11 +114,15 @@ def test_the_device_is_named_first(encode, capsys):
     assert re.match(r"on '.+' \(.+\), kernels for [CG]PUs: 1,500 splats, 9 views of 240 x 180\n", err)
 
 
-def test_a_long_run_says_what_it_will_take(data, tmp_path, capsys):
+def test_a_long_run_says_what_it_will_take(data, tmp_path, capsys, monkeypatch):
+    def far_enough(*_, **__):
+        raise UsageError("far enough")
+
+    monkeypatch.setattr("potr_cl.cli.encode.encode", far_enough)
     ply.save(tmp_path / "a.ply", random_scene(250_000, 0))
     cameras = data / "plush_excerpt_cameras.json"
     encode = ["encode", tmp_path / "a.ply", "--cameras", cameras, "-o", tmp_path / "a.potr"]
-    _, _, err = called(capsys, *encode, "--iterations", "1", "--refit", "off", "--no-quality")
+    _, _, err = called(capsys, *encode, "--iterations", "1", "--refit", "off", "--no-quality", "--cameras-anyway")
     assert re.search(r"kernels for [CG]PUs; about [\d.]+ (s|min|h) and [\d.]+ [MG]B of memory", err.splitlines()[0])
 
 

@@ -64,9 +64,9 @@ def check_within_steps(source: Scene, decoded: Scene, order, parameters, toleran
 
 
 def check_within_balanced_steps(source: Scene, data: bytes, order, tolerance):
-    """The same for version 2: steps as the header and the decoded scales say."""
+    """The same for version 3: steps as the header and the decoded scales say."""
     header, decoded, original = PotrFile.from_bytes(data).header, decode(data), source.subset(order)
-    assert header.version == 2
+    assert header.version == 3
 
     rounding = np.abs(original.means.astype(np.float64)).max(axis=1) * 2.0**-23
     distance = np.linalg.norm(decoded.means.astype(np.float64) - original.means, axis=1)
@@ -103,8 +103,9 @@ def test_within_balanced_steps(degree, entropy, q):
     options = as_it_is("best", entropy, q=q)
     encoded = encode(scene, options=options)
     data = joined(encoded)
-    context = any(s.coder == Coder.CONTEXT for s in PotrFile.from_bytes(data).header.sections)
-    assert context == (entropy.name == "context")
+    bundled = any(s.coder == Coder.BUNDLES for s in PotrFile.from_bytes(data).header.sections)
+    # Of few splats without much to tell, bundles may take more than zstd.
+    assert bundled == (entropy.name == "context") or (not bundled and degree == 0)
     check_within_balanced_steps(scene, data, encoded.order, options.parameters.beta * typical_size(scene))
 
 
@@ -124,7 +125,7 @@ def test_version_1_has_no_context_coder():
     data = joined(encode(random_scene(200), options=as_it_is(entropy=EntropyCoder("context"))))
     file = PotrFile.from_bytes(data)
     assert file.header.version == 1
-    assert all(s.coder != Coder.CONTEXT for s in file.header.sections)
+    assert not any(s.coder.of_streams for s in file.header.sections)
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])

@@ -105,7 +105,7 @@ def test_sections_come_back_as_they_were():
     coded = [
         EntropyCoder("zstd", 3).section(Property.SCALE, 1, bytes(3 * splats), 3),
         EntropyCoder("zstd", 3).section(Property.OPACITY, 0, bytes(range(splats)), 1),
-        container.context_section(Property.SH, 3, 9, 9 * splats, bytes(70)),
+        container.stream_section(Coder.CONTEXT, Property.SH, 3, 9, 9 * splats, bytes(70)),
     ]
     data = b"".join(container.assemble(header, coded))
     scale, opacity, sh = container.read_header(data, len(data)).sections
@@ -119,7 +119,7 @@ def test_sections_come_back_as_they_were():
 
 
 def test_what_the_context_coder_holds_is_not_read_as_bytes():
-    section, stored = container.context_section(Property.OPACITY, 0, 1, 4, zlib.compress(b"abcd"))
+    section, stored = container.stream_section(Coder.CONTEXT, Property.OPACITY, 0, 1, 4, zlib.compress(b"abcd"))
     with pytest.raises(DataError, match="'opacity'"):
         container.read_section(stored, section)
 

@@ -133,12 +133,12 @@ def test_few_splats_may_be_as_alike_as_they_are():
     assert len(decode(made_of(one_leaf(FREE_SPLATS), FREE_SPLATS))) == FREE_SPLATS
 
 
-def test_a_bomb_of_the_context_coder():
+def test_a_bomb_of_bundles():
     """Constant attributes take hardly a bit."""
     splats = 300_000
     scene = random_scene(1, 0).subset(np.zeros(splats, np.int64))
     data = b"".join(code_scene(scene, HyperParameters.from_quality(0.5, "best")).pieces)
-    assert any(s.coder == Coder.CONTEXT for s in PotrFile.from_bytes(data, trust=True).header.sections)
+    assert any(s.coder == Coder.BUNDLES for s in PotrFile.from_bytes(data, trust=True).header.sections)
     assert splats > FREE_SPLATS + MOST_A_BYTE * len(data)
     refused_without_memory(data, "--trust")
 

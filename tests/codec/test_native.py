@@ -279,7 +279,9 @@ def test_arrays_of_other_sizes_are_refused(functions):
     out = np.empty((3, 10), np.float32)
     short, right = np.zeros(9, np.uint8), np.zeros(10, np.uint8)
     with pytest.raises(TypeError, match="takes 10 of uint8"):
-        functions.colours([right, short, right], 1.0, out)
+        functions.colours([right, short, right], np.ones(1, np.float32), out)
+    with pytest.raises(TypeError, match="takes 10 of float32"):
+        functions.colours([right] * 3, np.ones(9, np.float32), out)
     with pytest.raises(TypeError, match="takes 10 of uint8"):
         functions.look_up(short, np.zeros(256, np.float32), out.T.copy(), 0)
     with pytest.raises(TypeError, match="too small"):
@@ -288,7 +290,7 @@ def test_arrays_of_other_sizes_are_refused(functions):
         functions.rotations([right] * 3, np.ones(10), np.empty((10, 4), np.float32))
     out.flags.writeable = False
     with pytest.raises(TypeError, match="read-only"):
-        functions.colours([right] * 3, 1.0, out)
+        functions.colours([right] * 3, np.ones(1, np.float32), out)
 
 
 def test_cells_that_are_not_there_are_refused(functions):

@@ -58,7 +58,7 @@ def test_presets():
     for other in ("fast", "smallest"):
         assert HyperParameters.from_quality(0.3, "best") == HyperParameters.from_quality(0.3, other)
     coarse, fine = (HyperParameters.from_quality(q, "best") for q in (0.2, 0.7))
-    assert coarse.version == fine.version == 2
+    assert coarse.version == fine.version == 3
     for name in ("sf_dc", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale"):
         assert getattr(coarse, name) < getattr(fine, name)
     assert coarse.beta > fine.beta

@@ -33,7 +33,7 @@ def test_files_hold_the_coders_that_their_version_has(preset, entropy):
     file = PotrFile.from_bytes(file_of(random_scene(2000, 1), parameters, entropy=EntropyCoder(entropy)))
     coders = {section.coder for section in file.header.sections}
     assert coders <= VERSIONS[file.header.version].coders
-    assert (Coder.CONTEXT in coders) == (preset == "best" and entropy == "context")
+    assert (Coder.BUNDLES in coders) == (preset == "best" and entropy == "context")
 
 
 def test_factors_of_colours_that_version_1_cannot_tell_are_refused():
@@ -48,6 +48,18 @@ def test_factors_of_colours_that_version_1_cannot_tell_are_refused():
         assert error <= 1.5 / alike.sf_sh + 1e-6  # each of three channels is off by half a step
     best = HyperParameters.from_quality(0.5, "best", sf_dc=30)
     assert PotrFile.from_bytes(file_of(random_scene(20, 1), best)).header.sf_dc == 30
+
+
+@pytest.mark.parametrize("entropy", ["context", "zstd"])
+def test_version_2_is_still_written_where_it_is_asked_for(entropy):
+    parameters = dataclasses.replace(HyperParameters.from_quality(0.5, "best"), version=2)
+    scene = random_scene(600, 2, seed=5)
+    data = file_of(scene, parameters, entropy=EntropyCoder(entropy))
+    assert PotrFile.from_bytes(data).header.version == 2
+    # Without anything known of what its splats show, a file of version 3 has the same values.
+    newest = decode(file_of(scene, dataclasses.replace(parameters, version=3), entropy=EntropyCoder(entropy)))
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        assert np.array_equal(getattr(decode(data), name), getattr(newest, name))
 
 
 class Version4(versions.Version2):

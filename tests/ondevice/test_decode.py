@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import json
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -169,3 +170,27 @@ def test_comparing_files_says_what_comparing_scenes_says(tmp_path, device, plush
     of_scene = potr_cl.compare(plush_excerpt, potr_cl.decode(path), views, device=device)
     assert of_file.psnr == of_scene.psnr
     assert of_file.report()["views"] == of_scene.report()["views"]
+
+
+def test_the_commands_say_the_same_of_a_file_and_of_its_scene(tmp_path, monkeypatch, capsys, plush_excerpt):
+    """Render and compare read the file into the device; as a PLY file it takes the way by the host."""
+    from potr_cl import cli
+
+    data = Path(__file__).parents[1] / "data"
+    cameras = str(data / "plush_excerpt_cameras.json")
+    files = {"potr": tmp_path / "b.potr", "ply": tmp_path / "b.ply"}
+    pieces = code_scene(plush_excerpt, HyperParameters.from_quality(0.3, "best")).pieces
+    files["potr"].write_bytes(b"".join(pieces))
+    potr_cl.decode(files["potr"]).save(files["ply"])
+    pictures, told = {}, {}
+    for kind, path in files.items():
+        folder = tmp_path / kind
+        assert cli.main(["render", str(path), "--cameras", cameras, "--views", "0", "1", "-o", str(folder)]) == 0
+        pictures[kind] = {picture.name: picture.read_bytes() for picture in folder.iterdir()}
+        capsys.readouterr()
+        arguments = ["compare", str(data / "plush_excerpt.ply"), str(path), "--cameras", cameras, "--views", "0", "1"]
+        assert cli.main([*arguments, "--json"]) == 0
+        told[kind] = json.loads(capsys.readouterr().out)["mean"]
+    assert len(pictures["potr"]) == 2
+    assert pictures["potr"] == pictures["ply"]
+    assert told["potr"] == told["ply"]

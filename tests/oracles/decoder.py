@@ -29,20 +29,22 @@ SEVERAL = 2
 MULTIPLICITY = 3
 TAIL_LENGTH = 4
 TAIL = 5
+STEPS = 6
 SCALE = 16
 ROTATION = 17
 OPACITY = 18
 SH = 19
 
-BYTE_STREAMS = (METADATA, OCCUPANCY, SEVERAL, TAIL_LENGTH, TAIL)
+BYTE_STREAMS = (METADATA, OCCUPANCY, SEVERAL, TAIL_LENGTH, TAIL, STEPS)
 ONE_INTEGER_A_SPLAT = (SCALE, ROTATION, OPACITY, SH)
 
 STORED = 0
 ZSTANDARD = 1
 ZLIB = 2
 CONTEXT = 3
+BUNDLES = 4
 LARGEST_SINGLE = (2 - 2.0**-23) * 2.0**127
-LARGEST_EXPANSION = {STORED: 1, ZSTANDARD: 2**15, ZLIB: 1032, CONTEXT: 2**15}
+LARGEST_EXPANSION = {STORED: 1, ZSTANDARD: 2**15, ZLIB: 1032, CONTEXT: 2**15, BUNDLES: 2**16}
 
 
 class Header(NamedTuple):
@@ -135,7 +137,7 @@ def read_header(data: bytes) -> Header:
     (edge,) = struct.unpack_from("<d", data, 64)
     scale_factors = struct.unpack_from("<4d", data, 72)
 
-    check(version in (1, 2), f"version {version} is not supported, only 1 and 2")
+    check(version in (1, 2, 3), f"version {version} is not supported, only 1 to 3")
     check(file_size == len(data), f"the file has {len(data)} bytes, but its header says {file_size}")
     check(header_size == 124 + ENTRY_SIZE * section_count, "the header's size does not fit the number of sections")
     check(header_size <= len(data), "the file ends within the header")
@@ -188,8 +190,11 @@ def read_sections(data: bytes, header: Header) -> Sections:
         OPACITY: 1,
         SH: 3 * header.coefficients,
     }
+    if header.version == 3:
+        number_of_indices[STEPS] = 1
     sections: Sections = {}
     coded: dict[tuple[int, int], bytes] = {}
+    bundled: set[bool] = set()
     start = header.size
     for number in range(header.sections):
         entry = struct.unpack_from("<BBBBIQQ", data, FIXED_HEADER + ENTRY_SIZE * number)
@@ -199,8 +204,10 @@ def read_sections(data: bytes, header: Header) -> Sections:
         check(prop in number_of_indices, f"{name}: unknown property")
         check(index < number_of_indices[prop], f"{name}: unknown index")
         check((prop, index) not in sections, f"{name} stands twice")
-        check(coder in LARGEST_EXPANSION and (coder != CONTEXT or header.version == 2), f"{name}: coder {coder}")
-        if coder == CONTEXT:
+        check(coder in LARGEST_EXPANSION, f"{name}: coder {coder}")
+        check(coder != CONTEXT or header.version == 2, f"{name}: coder {coder}")
+        check(coder != BUNDLES or header.version == 3, f"{name}: coder {coder}")
+        if coder in (CONTEXT, BUNDLES):
             check((prop, index, planes) in CONTEXT_SECTIONS, f"{name}: the context coder has no such section")
             check(index + planes <= number_of_indices[prop], f"{name}: more streams than the property has")
             check(not any((prop, index + k) in sections for k in range(planes)), f"{name} stands twice")
@@ -218,7 +225,9 @@ def read_sections(data: bytes, header: Header) -> Sections:
         stored = data[start : start + stored_size]
         start += stored_size
         check(zlib.crc32(stored) == checksum, f"{name}: wrong checksum")
-        if coder == CONTEXT:
+        if prop in ONE_INTEGER_A_SPLAT:
+            bundled.add(coder == BUNDLES)
+        if coder in (CONTEXT, BUNDLES):
             for k in range(planes):
                 sections[prop, index + k] = Section(planes, b"", [])
             coded[prop, index] = stored
@@ -229,7 +238,11 @@ def read_sections(data: bytes, header: Header) -> Sections:
     check_octree_sizes(sections, header)
     # It also bounds the number of splats by the size of the file, before anything is made for each splat.
     check((OPACITY, 0) in sections, "the opacity section is absent")
-    undo_context_coder(coded, sections, header.splats)
+    check(len(bundled) == 1, "only some sections of splats are of coder 4")
+    if True in bundled:
+        undo_bundles(coded, sections, header)
+    else:
+        undo_context_coder(coded, sections, header)
     return sections
 
 
@@ -246,8 +259,9 @@ def check_octree_sizes(sections: Sections, header: Header) -> None:
         check(len(unsigned_integers(sections[MULTIPLICITY, 0])) <= header.splats / 2, "too many multiplicities")
 
 
-def undo_context_coder(coded: dict[tuple[int, int], bytes], sections: Sections, splats: int) -> None:
+def undo_context_coder(coded: dict[tuple[int, int], bytes], sections: Sections, header: Header) -> None:
     """Decode the sections of the context coder; AC coefficients in the order of their indices."""
+    splats = header.splats
     ac_history = History(splats)
     for prop, index in sorted(coded):
         history = ac_history if prop == SH and index > 0 else History(splats)
@@ -261,6 +275,14 @@ def undo_context_coder(coded: dict[tuple[int, int], bytes], sections: Sections, 
         )
         for k, stream in enumerate(streams):
             sections[prop, index + k] = Section(0, b"", [stream])
+
+
+def undo_bundles(coded: dict[tuple[int, int], bytes], sections: Sections, header: Header) -> None:
+    """Decode the sections of coder 4."""
+    from tests.oracles import bundles
+
+    for (prop, index), integers in bundles.decode_bundles(coded, sections, header).items():
+        sections[prop, index] = Section(0, b"", [integers])
 
 
 def undo_coder(coder: int, stored: bytes, raw_size: int, name: str) -> bytes:
@@ -512,13 +534,17 @@ def read_models(raw: bytes, count: int) -> tuple[list[list[int]], list[Model]]:
     """Return the seven weights of each stream, and the models of the channels."""
     check(len(raw) >= 14 * count, "a description is too short")
     weights = [list(struct.unpack_from("<7h", raw, 14 * number)) for number in range(count)]
-    at = 14 * count
+    return weights, read_models_of(raw, 14 * count, [252] * min(3, count))
+
+
+def read_models_of(raw: bytes, at: int, alphabets: list[int]) -> list[Model]:
+    """Return the models that fill a description from some place on; each has at most so many tokens."""
     models = []
-    for _ in range(min(3, count)):
+    for most in alphabets:
         check(len(raw) >= at + 2, "a description is too short")
         contexts, alphabet = raw[at], raw[at + 1]
         at += 2
-        check(1 <= contexts <= 32 and 1 <= alphabet <= 252, "impossible contexts")
+        check(1 <= contexts <= 32 and 1 <= alphabet <= most, "impossible contexts")
         check(len(raw) >= at + contexts - 1 + 2 * contexts * alphabet, "a description is too short")
         thresholds = list(raw[at : at + contexts - 1])
         at += contexts - 1
@@ -535,7 +561,7 @@ def read_models(raw: bytes, count: int) -> tuple[list[list[int]], list[Model]]:
         at += 2 * contexts * alphabet
         models.append(Model(thresholds, rows))
     check(at == len(raw), "a description is too long")
-    return weights, models
+    return models
 
 
 def extra_bits(token: int) -> int:
@@ -637,7 +663,7 @@ def follow_tails(sections: Sections, header: Header, lone: list[Cell]) -> None:
     lengths = list(raw_bytes(sections, TAIL_LENGTH))
     tail = raw_bytes(sections, TAIL)
     check(len(lengths) == len(lone), f"tail length has {len(lengths)} bytes for {len(lone)} lone splats")
-    if header.version == 2:
+    if header.version >= 2:
         check(max(lengths, default=0) <= header.deepest, "a leaf's level is below the deepest one")
         lengths = [max(level - leaf.level, 0) for level, leaf in zip(lengths, lone, strict=True)]
     for leaf, length in zip(lone, lengths, strict=True):
@@ -692,7 +718,7 @@ def decode_quaternions(sections: Sections, header: Header) -> np.ndarray:
     quaternions = np.zeros((header.splats, 4), dtype=np.float64)
     for n in range(header.splats):
         own_factor = factor
-        if header.version == 2:
+        if header.version >= 2:
             own_factor = factor * math.sqrt(max(1, *(scale[n] for scale in scales)))
         x, y, z = (stream[n] / own_factor for stream in streams)
         w = math.sqrt(max(0.0, 1.0 - x * x - y * y - z * z))
@@ -715,18 +741,72 @@ def decode_opacities(sections: Sections, header: Header) -> np.ndarray:
 def decode_sh(sections: Sections, header: Header) -> np.ndarray:
     """Return the spherical harmonics coefficients as RGB."""
     sh = np.zeros((header.splats, header.coefficients, 3), dtype=np.float64)
+    dc_classes, ac_classes = decode_classes(sections, header)
     for coefficient in range(header.coefficients):
         factor = header.sh_factors[0 if coefficient == 0 else 1]
+        classes = dc_classes if coefficient == 0 else ac_classes
         streams = [signed_stream(sections, SH, 3 * coefficient + channel, header.splats) for channel in range(3)]
         context_coded = (SH, 0) in sections and sections[SH, 0].streams is not None
-        if coefficient == 0 and not context_coded:
+        if coefficient == 0 and header.version == 3:
+            streams = [undo_prediction(stream, classes) for stream in streams]
+        elif coefficient == 0 and not context_coded:
             streams = [running_sums(stream) for stream in streams]
         for n in range(header.splats):
             luma, orange, green = (stream[n] for stream in streams)
-            sh[n, coefficient, 0] = wrapped(luma + orange - green) / factor
-            sh[n, coefficient, 1] = wrapped(luma + green) / factor
-            sh[n, coefficient, 2] = wrapped(luma - orange - green) / factor
+            own_factor = factor * 2.0 ** (classes[n] / 4)
+            sh[n, coefficient, 0] = wrapped(luma + orange - green) / own_factor
+            sh[n, coefficient, 1] = wrapped(luma + green) / own_factor
+            sh[n, coefficient, 2] = wrapped(luma - orange - green) / own_factor
     return sh
+
+
+def decode_classes(sections: Sections, header: Header) -> tuple[list[int], list[int]]:
+    """Return the classes of each splat's steps, of DC and of AC."""
+    if (STEPS, 0) not in sections:
+        return [0] * header.splats, [0] * header.splats
+    raw = raw_bytes(sections, STEPS)
+    check(len(raw) >= 50, "steps is too short")
+    g, h, j, dc_power, ac_power, zero, dc_offset, ac_offset, w1, w2, w3, *t = struct.unpack_from("<6B2h3h17h", raw)
+    check(g <= 40 and h <= 40 and zero == 0, "impossible steps")
+    check(len(raw) == 50 + -(-header.splats // 2**g), "steps does not have a byte for each group")
+    groups = struct.unpack_from(f"<{len(raw) - 50}b", raw, 50)
+    scales = [unsigned_stream(sections, SCALE, axis, header.splats) for axis in range(3)]
+    opacities = unsigned_stream(sections, OPACITY, 0, header.splats)
+    classes: tuple[list[int], list[int]] = ([], [])
+    for n in range(header.splats):
+        a1, a2, a3 = sorted((scale_logarithm(scale[n]) for scale in scales), reverse=True)
+        o = min(max(opacities[n] - 2**h * j, 0), 2**h * 16 - 1)
+        p = o >> h
+        r = o - 2**h * p
+        z = ((w1 * a1 + w2 * a2 + w3 * a3) >> 8) + t[p] + ((r * (t[p + 1] - t[p])) >> h) + 8 * groups[n // 2**g]
+        for own, power, offset in zip(classes, (dc_power, ac_power), (dc_offset, ac_offset), strict=True):
+            own.append(min(max((power * z + offset) >> 6, -32), 31))
+    return classes
+
+
+def scale_logarithm(x: int) -> int:
+    """Return the logarithm of an integer of scale."""
+    v = max(1, 4 * min(x, 2**32 - 1))
+    i = v.bit_length() - 1
+    return 16 * i + 16 * (v - 2**i) // 2**i
+
+
+def undo_prediction(differences: list[int], classes: list[int]) -> list[int]:
+    """Return the values of DC of one channel, in version 3."""
+    values: list[int] = []
+    for n, difference in enumerate(differences):
+        total = 0
+        for k in range(1, 5):
+            if n % 256 - k >= 0:
+                total = wrapped(total + values[n - k] * step_of_class(-classes[n - k]))
+        product = wrapped(step_of_class(classes[n]) * total + 2**33)
+        values.append(wrapped(difference + (product >> 34)))
+    return values
+
+
+def step_of_class(k: int) -> int:
+    """Return 2 to the power of k / 4 with 16 bits behind the point."""
+    return math.floor((65536, 77936, 92682, 110218)[k % 4] * 2.0 ** (k // 4))
 
 
 def running_sums(differences: list[int]) -> list[int]:

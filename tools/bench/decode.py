@@ -3,7 +3,7 @@
     python -m tools.bench.decode [FILE.potr …] [--splats N] [--runs R] [--part PART …] [--device DEVICE …] [--json FILE]
 
 FILEs are .potr files; without any, a scene of N splats (default: a million) is drawn from a real one and coded without
-pruning by the presets best and fast. Parts (default: all but roads):
+pruning by the presets best and fast. Parts (default: all but roads and device):
 
 speed    decodes in this process, in turn by NumPy and by the native path, with one thread and with one a processor;
          wall time and processor time
@@ -11,6 +11,8 @@ memory   host memory that a decode takes at most, beside what it makes; a proces
 command  `decode FILE -o scene.ply` as a fresh process; the decoded scene is written as PLY too
 roads    the tokens of the context coder alone: by NumPy, by the native path, and by OpenCL kernels of both families on
          the devices given, with what a fresh process pays for a context and for loading the kernels
+device   from the file's bytes to buffers of a device, in turn by way of a scene on the host and straight, on the
+         devices given (default: the best one)
 """
 
 from __future__ import annotations
@@ -32,8 +34,11 @@ from typing import Any
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.native.library import VARIABLE
 from potr_cl.formats import load_cameras, load_scene
+from potr_cl.ondevice.decode import decode_to_device
+from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.scene_buffers import uploaded
 from tools.bench.memory import reset_peak, resident
 from tools.make.large_scene import DEFAULT_SCENE, EXCERPT, large_scene
 from tools.results import ROOT, Column, Results
@@ -51,13 +56,15 @@ def main() -> None:
     parser.add_argument("--splats", type=int, default=10**6, metavar="N")
     parser.add_argument("--runs", type=int, default=9, metavar="R", help="of each; default 9")
     parser.add_argument("--part", action="append", choices=list(PARTS), dest="parts")
-    parser.add_argument("--device", action="append", dest="devices", default=[], help="for roads; more than one may be")
+    parser.add_argument(
+        "--device", action="append", dest="devices", default=[], help="for roads and device; more than one"
+    )
     parser.add_argument("--json", type=Path, metavar="FILE", help="keep the figures")
     args = parser.parse_args()
     results = Results(None, args.json)
     with tempfile.TemporaryDirectory() as folder:
         files = args.files or made_files(args.splats, Path(folder))
-        for part in args.parts or [name for name in PARTS if name != "roads"]:
+        for part in args.parts or [name for name in PARTS if name not in ("roads", "device")]:
             PARTS[part](results, files, args)
 
 
@@ -198,11 +205,62 @@ def roads(results: Results, files: Iterable[Path], args: argparse.Namespace) -> 
     decoder_roads.compare(results, list(files), args.devices, args.runs)
 
 
+def device(results: Results, files: Iterable[Path], args: argparse.Namespace) -> None:
+    table = results.table(
+        "device",
+        "From a file's bytes to a device's buffers, in a process that has done so before, medians of wall times",
+        Column("file"),
+        Column("splats", format=","),
+        Column("device"),
+        Column("decoding on the host", "ms", ".1f"),
+        Column("uploading that scene", "ms", ".1f"),
+        Column("both", "ms", ".1f"),
+        Column("straight to the device", "ms", ".1f"),
+        Column("the same, fastest", "ms", ".1f"),
+        Column("of it busy on the device", "ms", ".1f"),
+    )
+    for name in args.devices or [None]:
+        opened, timed = Device(name), Device(name, profiling=True)
+        for path in files:
+            data = path.read_bytes()
+            works = {
+                "host": partial(_on_host, data),
+                "both": partial(_by_way_of_the_host, data, opened),
+                "straight": partial(_straight, data, opened),
+            }
+            in_turn(works, 2)
+            walls = {way: times[0] for way, times in in_turn(works, args.runs).items()}
+            medians = {way: 1e3 * statistics.median(times) for way, times in walls.items()}
+            _straight(data, timed)
+            timed.stage_times()
+            _straight(data, timed)
+            table.add(
+                path.stem, PotrFile.from_bytes(data, True).header.splats, opened.info.name,
+                *(round(each, 2) for each in (medians["host"], medians["both"] - medians["host"], medians["both"])),
+                round(medians["straight"], 2), round(1e3 * min(walls["straight"]), 2),
+                round(1e3 * sum(timed.stage_times().values()), 3),
+            )  # fmt: skip
+
+
+def _on_host(data: bytes) -> None:
+    PotrFile.from_bytes(data, trust=True).scene()
+
+
+def _by_way_of_the_host(data: bytes, opened: Device) -> None:
+    with uploaded(opened, PotrFile.from_bytes(data, trust=True).scene()):
+        opened.queue.finish()
+
+
+def _straight(data: bytes, opened: Device) -> None:
+    decode_to_device(PotrFile.from_bytes(data, trust=True), opened).close()
+
+
 PARTS: dict[str, Callable[[Results, Iterable[Path], argparse.Namespace], None]] = {
     "speed": speed,
     "memory": memory,
     "command": command,
     "roads": roads,
+    "device": device,
 }
 
 

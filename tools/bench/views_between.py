@@ -41,10 +41,14 @@ FEW = (8,)
 
 @dataclass(frozen=True)
 class Point:
-    """One encode: its quality, views, splats, bytes, PSNR on test views and on training views, and seconds."""
+    """One encode: quality, views, splats, bytes, PSNR on test views and on training views, and seconds.
+
+    ``shown_by`` is as :class:`potr_cl.stages.views_between.Added` has it.
+    """
 
     q: float
     added: int
+    shown_by: float | None
     splats: int
     nbytes: int
     test: float
@@ -77,8 +81,8 @@ class Bench:
             self._mean(pictures(self._device, decoded, some), wanted)
             for some, wanted in zip((self._judges, self._seen), self._wanted, strict=True)
         )
-        added = 0 if encoded.between is None else encoded.between.added
-        return Point(q, added, len(encoded.order), encoded.nbytes, test, training, seconds)
+        of_views = (0, None) if encoded.between is None else (encoded.between.added, encoded.between.shown_by)
+        return Point(q, *of_views, len(encoded.order), encoded.nbytes, test, training, seconds)
 
     def _encoded(self, q: float, variant: str) -> tuple[Encoded, float]:
         """An encode and its seconds."""
@@ -125,6 +129,7 @@ def main() -> None:
         Column("scene"),
         Column("training views"),
         Column("between"),
+        Column("views that show a part", format="g"),
         Column("added views", format=","),
         Column("q", format="g"),
         Column("splats", format=","),
@@ -143,7 +148,8 @@ def main() -> None:
             views = [every[round(i)] for i in np.linspace(0, len(every) - 1, count)]
             again = args.repeats - 1 if count == len(every) else 0
             bench = Bench(device, scene, views, judges, options)
-            bench.point(args.qualities[0], "off")  # builds the kernels
+            if count == len(every):
+                bench.point(args.qualities[0], "off")  # builds the kernels
             variants = ("off", *args.variants)
             points = [{variant: bench.point(q, variant, again) for variant in variants} for q in args.qualities]
             for variant in variants:
@@ -151,7 +157,7 @@ def main() -> None:
                 for point, own in zip(curve, [of_variant["off"] for of_variant in points], strict=True):
                     more = 100 * (bytes_at(curve, own.test) / own.nbytes - 1) if len(curve) > 1 else None
                     row = (point.splats, point.nbytes, point.test, point.training, point.seconds)
-                    which = (folder.name, count, variant, point.added, point.q)
+                    which = (folder.name, count, variant, point.shown_by, point.added, point.q)
                     table.add(*which, *row, point.seconds / own.seconds, more)
             print(f"{folder.name}: done with {count} views", file=sys.stderr, flush=True)
 

@@ -87,11 +87,12 @@ class Model:
 
 def write_description(weights: NDArray[np.int16], models: Sequence[Model]) -> bytes:
     """The stored description of a section: (streams, TERMS) weights and a model for each channel."""
-    raw = weights.astype(_WEIGHTS).tobytes() + b"".join(map(_model_bytes, models))
+    raw = weights.astype(_WEIGHTS).tobytes() + b"".join(map(model_bytes, models))
     return zstandard.ZstdCompressor(level=19, write_checksum=False).compress(raw)
 
 
-def _model_bytes(model: Model) -> bytes:
+def model_bytes(model: Model) -> bytes:
+    """A model as descriptions hold it."""
     thresholds = np.flatnonzero(np.diff(model.classes)).astype(np.uint8) + 1
     used = int(np.flatnonzero(model.frequencies.any(axis=0))[-1]) + 1
     planes = np.ascontiguousarray(model.frequencies[:, :used].T.astype("<u2"))
@@ -114,43 +115,64 @@ def read_description(stored: memoryview, streams: int, what: str) -> tuple[I32, 
     Raises:
         DataError: damaged.
     """
-    raw = _inflated(stored, streams, what)
-    impossible = DataError(f"section '{what}' describes impossible contexts")
+    channels = min(CHANNELS, streams)
+    most = 2 * TERMS * streams + channels * (2 + MOST_CONTEXTS - 1 + 2 * MOST_CONTEXTS * ALPHABET)
+    raw = inflate(stored, most, what)
     read = 2 * TERMS * streams
     if len(raw) < read:
-        raise impossible
+        raise _impossible(what)
     weights = np.frombuffer(raw[:read], _WEIGHTS).reshape(-1, TERMS).astype(np.int32)
+    return weights, read_models(raw, read, [ALPHABET] * channels, what)
+
+
+def read_models(raw: bytes, read: int, most_tokens: Sequence[int], what: str) -> list[Model]:
+    """The models that fill some bytes to their end; nothing in them is trusted.
+
+    Args:
+        raw: the bytes.
+        read: how many of them are read already.
+        most_tokens: of each model, at most 255.
+        what: the section, for messages.
+
+    Raises:
+        DataError: damaged.
+    """
     models = []
-    for _ in range(min(CHANNELS, streams)):
+    for most in most_tokens:
         if len(raw) < read + 2:
-            raise impossible
+            raise _impossible(what)
         contexts, used = raw[read], raw[read + 1]
         read += 2
         cells = contexts * used
-        if not (1 <= contexts <= MOST_CONTEXTS and 1 <= used <= ALPHABET) or len(raw) < (
-            read + contexts - 1 + 2 * cells
-        ):
-            raise impossible
+        if not (1 <= contexts <= MOST_CONTEXTS and 1 <= used <= most) or len(raw) < read + contexts - 1 + 2 * cells:
+            raise _impossible(what)
         thresholds = np.frombuffer(raw, np.uint8, contexts - 1, read).astype(np.int64)
         read += contexts - 1
         low, high = (np.frombuffer(raw, np.uint8, cells, read + k * cells).astype(np.int64) for k in (0, 1))
         read += 2 * cells
         frequencies = (low | high << 8).reshape(used, contexts).T
         if (np.diff(thresholds, prepend=0) < 1).any() or (frequencies.sum(axis=1) != rans.TOTAL).any():
-            raise impossible
+            raise _impossible(what)
         classes = np.searchsorted(thresholds, np.arange(LARGEST_SIZE + 1), side="right").astype(np.uint8)
         models.append(Model(classes, frequencies))
     if len(raw) != read:
-        raise impossible
-    return weights, models
+        raise _impossible(what)
+    return models
 
 
-def _inflated(stored: memoryview, streams: int, what: str) -> bytes:
-    models = min(CHANNELS, streams)
-    most = 2 * TERMS * streams + models * (2 + MOST_CONTEXTS - 1 + 2 * MOST_CONTEXTS * ALPHABET)
+def inflate(stored: memoryview, most: int, what: str) -> bytes:
+    """A stored description of at most ``most`` bytes.
+
+    Raises:
+        DataError: damaged.
+    """
     try:
         if not 0 <= zstandard.get_frame_parameters(stored).content_size <= most:
             raise DataError(f"section '{what}' describes its contexts at an impossible length")
         return zstandard.ZstdDecompressor().decompress(stored, allow_extra_data=False)
     except zstandard.ZstdError as error:
         raise DataError(f"section '{what}' does not decompress: {error}") from None
+
+
+def _impossible(what: str) -> DataError:
+    return DataError(f"section '{what}' describes impossible contexts")

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Any
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -12,17 +14,22 @@ Bits = NDArray[np.bool_]
 
 #: Integers of at most this many bits are tokens by themselves.
 _DIRECT_BITS = 7
-_DIRECT = 1 << _DIRECT_BITS
+DIRECT = 1 << _DIRECT_BITS
 #: Integers have at most this many bits, once they are mapped to unsigned ones.
-_MOST_BITS = 38
+MOST_BITS = 38
 #: Tokens there are: 4 for each power of two from the direct ones up.
-ALPHABET = _DIRECT + 4 * (_MOST_BITS - _DIRECT_BITS)
+ALPHABET = DIRECT + 4 * (MOST_BITS - _DIRECT_BITS)
+
+
+def token_floors() -> I64:
+    """(ALPHABET,) the least of the integers, mapped to unsigned ones, that each token stands for."""
+    token = np.arange(ALPHABET)
+    above = np.maximum(token - DIRECT, 0)
+    return np.where(token < DIRECT, token, (4 + above % 4) << (_DIRECT_BITS - 2 + above // 4))
 
 
 def _size_table(signed: bool) -> I32:
-    token = np.arange(ALPHABET)
-    above = np.maximum(token - _DIRECT, 0)
-    mapped = np.where(token < _DIRECT, token, (4 + above % 4) << (_DIRECT_BITS - 2 + above // 4))
+    mapped = token_floors()
     magnitude = (mapped + 1) // 2 if signed else mapped
     sizes: I32 = np.floor(16 * np.log2(1.0 + magnitude) + 0.5).astype(np.int32)
     return sizes
@@ -30,6 +37,18 @@ def _size_table(signed: bool) -> I32:
 
 #: By whether integers are signed: (ALPHABET,) 16 log2(1 + magnitude) of the least integer of each token, rounded.
 SIZES = {signed: _size_table(signed) for signed in (False, True)}
+
+
+def tokens_of(mapped: NDArray[Any]) -> U8:
+    """Tokens of integers, mapped to unsigned, below 2^38."""
+    tokens = mapped.astype(np.uint8)
+    large = np.flatnonzero(mapped >= DIRECT)
+    if len(large):
+        u = mapped.ravel()[large].astype(np.int64)
+        exponent = np.frexp(u.astype(np.float64))[1] - 1  # exact below 2^53
+        leading = u >> (exponent - 2)  # 4 to 7
+        tokens.ravel()[large] = DIRECT + 4 * (exponent - _DIRECT_BITS) + leading - 4
+    return tokens
 
 
 def tokenise(values: NDArray[np.integer], signed: bool) -> tuple[U8, Bits] | None:
@@ -47,27 +66,24 @@ def tokenise(values: NDArray[np.integer], signed: bool) -> tuple[U8, Bits] | Non
     mapped = (values << 1) ^ (values >> (8 * values.itemsize - 1)) if signed else values
     mapped = mapped.view(f"u{values.itemsize}")
     largest = int(mapped.max())
-    if largest >> _MOST_BITS:
+    if largest >> MOST_BITS:
         return None
-    tokens = mapped.astype(np.uint8)
-    if largest < _DIRECT:
+    tokens = tokens_of(mapped)
+    if largest < DIRECT:
         return tokens, np.zeros(0, bool)
-    large = np.flatnonzero(mapped >= _DIRECT)
+    large = np.flatnonzero(tokens >= DIRECT)
     u = mapped.ravel()[large].astype(np.int64)
-    exponent = np.frexp(u.astype(np.float64))[1] - 1  # exact below 2^53
-    extra = exponent - 2
-    leading = u >> extra  # 4 to 7
-    tokens.ravel()[large] = _DIRECT + 4 * (exponent - _DIRECT_BITS) + leading - 4
+    extra = extra_bits(tokens.ravel()[large])
     return tokens, np.concatenate([(u[extra > b] >> b) & 1 for b in range(int(extra.max()))]).astype(bool)
 
 
 def detokenise(tokens: U8, bits: Bits, signed: bool) -> I64:
     """The integers of tokens and the bits beside them, in the tokens' shape: undoes :func:`tokenise`."""
     mapped = tokens.astype(np.int64)
-    where = np.flatnonzero(tokens >= _DIRECT)
+    where = np.flatnonzero(tokens >= DIRECT)
     large = tokens.ravel()[where]
-    extra = _extra_bits(large)
-    u = (4 + (large - _DIRECT) % np.int64(4)) << extra
+    extra = extra_bits(large)
+    u = (4 + (large - DIRECT) % np.int64(4)) << extra
     read = 0
     for b in range(int(extra.max(initial=0))):
         has = extra > b
@@ -81,17 +97,18 @@ def detokenise(tokens: U8, bits: Bits, signed: bool) -> I64:
 def bits_beside(tokens: U8) -> tuple[int, int]:
     """How many bits stand beside some tokens, at least one, and the largest token."""
     largest = int(tokens.max())
-    return (int(_extra_bits(tokens[tokens >= _DIRECT]).sum()) if largest >= _DIRECT else 0), largest
+    return (int(extra_bits(tokens[tokens >= DIRECT]).sum()) if largest >= DIRECT else 0), largest
 
 
 def largest_integer(token: int) -> int:
     """The largest of the integers, mapped to unsigned ones, that a token stands for."""
-    if token < _DIRECT:
+    if token < DIRECT:
         return token
-    above = token - _DIRECT
+    above = token - DIRECT
     return ((5 + above % 4) << (_DIRECT_BITS - 2 + above // 4)) - 1
 
 
-def _extra_bits(large: U8) -> I64:
-    """Of tokens that have some."""
-    return _DIRECT_BITS - 2 + (large.astype(np.int64) - _DIRECT) // 4
+def extra_bits(tokens: NDArray[np.integer]) -> I64:
+    """How many bits stand beside each of some tokens."""
+    wide = tokens.astype(np.int64)
+    return np.where(wide < DIRECT, 0, _DIRECT_BITS - 2 + (wide - DIRECT) // 4)

@@ -38,24 +38,65 @@ POTR_EXPORT void potr_widen(const uint8_t *restrict narrow, size_t n, int is_sig
 JOIN_PLANES(medium, uint32_t)
 JOIN_PLANES(wide, uint64_t)
 
-/* Y, Co, Cg of n splats to R, G, B. Sums of wide levels wrap round. */
+/* Y, Co, Cg of n splats to R, G, B. Sums of wide levels wrap round. divisors: one for each splat, or the same for all
+ * if `each` is 0. */
 #define COLOURS(kind, type, read, number, whole) \
-    POTR_EXPORT void potr_colours_of_##kind( \
-        const type *restrict y, const type *restrict co, const type *restrict cg, size_t n, float divisor, \
-        float *restrict red, float *restrict green, float *restrict blue) \
+    static INLINE void colours_of_##kind( \
+        const type *restrict y, const type *restrict co, const type *restrict cg, size_t n, \
+        const float *restrict divisors, int each, float *restrict red, float *restrict green, float *restrict blue) \
     { \
+        const float same = divisors[0]; \
         for (size_t i = 0; i < n; i++) { \
             const number luma = read(y[i]), orange = read(co[i]), emerald = read(cg[i]); \
             const number rest = luma - emerald; \
+            const float divisor = each ? divisors[i] : same; \
             red[i] = (float)(whole)(rest + orange) / divisor; \
             green[i] = (float)(whole)(luma + emerald) / divisor; \
             blue[i] = (float)(whole)(rest - orange) / divisor; \
         } \
+    } \
+    POTR_EXPORT void potr_colours_of_##kind( \
+        const type *restrict y, const type *restrict co, const type *restrict cg, size_t n, \
+        const float *restrict divisors, int each, float *restrict red, float *restrict green, float *restrict blue) \
+    { \
+        if (n == 0) \
+            return; \
+        if (each) \
+            colours_of_##kind(y, co, cg, n, divisors, 1, red, green, blue); \
+        else \
+            colours_of_##kind(y, co, cg, n, divisors, 0, red, green, blue); \
     }
 
 COLOURS(narrow, uint8_t, from_zigzag, int32_t, int32_t)
 COLOURS(medium, int32_t, , int32_t, int32_t)
 COLOURS(wide, uint64_t, , uint64_t, int64_t)
+
+/* Levels from their differences to what the four splats before predict, in runs of some splats (docs/format.md,
+ * "Prediction"). Sums and products wrap round.
+ *
+ * residuals, levels: (channels, n), each row by itself. classes: of n splats, -32 to 31. steps, inverses: (64,), of each
+ * class. */
+POTR_EXPORT void potr_unpredicted(
+    const int64_t *restrict residuals, size_t channels, size_t n, size_t run, const int8_t *restrict classes,
+    const uint64_t *restrict steps, const uint64_t *restrict inverses, int64_t *restrict levels)
+{
+    for (size_t c = 0; c < channels; c++) {
+        const int64_t *const from = residuals + c * n;
+        int64_t *const to = levels + c * n;
+        for (size_t start = 0; start < n; start += run) {
+            const size_t stop = n - start < run ? n : start + run;
+            uint64_t last[4] = {0, 0, 0, 0}, total = 0;
+            for (size_t i = start; i < stop; i++) {
+                const unsigned k = (unsigned)(classes[i] + 32) & 63;
+                const int64_t mean = (int64_t)(total * inverses[k] + (UINT64_C(1) << 33)) >> 34;
+                const uint64_t level = (uint64_t)from[i] + (uint64_t)mean, value = level * steps[k];
+                to[i] = (int64_t)level;
+                total += value - last[i & 3];
+                last[i & 3] = value;
+            }
+        }
+    }
+}
 
 /* Values of n unsigned levels from a table, every `stride`-th number of `out`. Returns how many are beyond it: these
  * are left as they are. Tables have 256 entries at least, so that no narrow level is. */

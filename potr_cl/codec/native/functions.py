@@ -7,7 +7,7 @@ a function takes are refused before it is called.
 from __future__ import annotations
 
 import ctypes
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -15,11 +15,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.native.arrays import KINDS, address, addresses, kind_of
+from potr_cl.codec.native.bundles import BundledFile, SectionWords
+from potr_cl.codec.native.bundles_encode import BundleEncoder
 from potr_cl.codec.native.declarations import declared
 from potr_cl.codec.native.quantising import Quantising
+from potr_cl.codec.steps.rule import ColourSteps
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
+I8 = NDArray[np.int8]
 I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
@@ -67,6 +71,14 @@ class Functions:
     def __init__(self, library: ctypes.CDLL) -> None:
         self._c = declared(library)
         self.quantising = Quantising(self._c)
+
+    def bundled_file(self, splats: int, sections: Mapping[int, SectionWords], steps: ColourSteps | None) -> BundledFile:
+        """Sections of coder 4, as :class:`potr_cl.codec.native.bundles.BundledFile` takes them."""
+        return BundledFile(self._c, splats, sections, steps)
+
+    def bundle_encoder(self, *integers: Any) -> BundleEncoder:
+        """Integers to code, as :class:`potr_cl.codec.native.bundles_encode.BundleEncoder` takes them."""
+        return BundleEncoder(self._c, *integers)
 
     # -------------------------------------------------------------------------------------- context coder
 
@@ -383,12 +395,39 @@ class Functions:
         )
         return levels
 
-    def colours(self, levels: Sequence[NDArray[Any]], divisor: float, out: F32) -> None:
-        """Levels of Y, Co, Cg to R, G, B in ``out`` (3, n)."""
+    def colours(self, levels: Sequence[NDArray[Any]], divisors: F32, out: F32) -> None:
+        """Levels of Y, Co, Cg to R, G, B in ``out`` (3, n); ``divisors`` are (n,), or (1,) for all the same."""
         number = out.shape[1]
         kind, alike = self._alike(levels)
+        each = len(divisors) != 1
+        where = address(divisors, np.float32, number if each else 1)
         red, green, blue = (address(row, np.float32, number, True) for row in out)
-        self._c[f"potr_colours_of_{kind}"](*addresses(kind, alike, number), number, divisor, red, green, blue)
+        self._c[f"potr_colours_of_{kind}"](*addresses(kind, alike, number), number, where, each, red, green, blue)
+
+    def unpredicted(self, residuals: I64, classes: I8, run: int, steps: I64, inverses: I64) -> I64:
+        """Undo the prediction of DC, :func:`potr_cl.codec.steps.prediction.from_residuals`.
+
+        Args:
+            residuals: (channels, n).
+            classes: (n,), -32 to 31.
+            run: splats after which prediction begins anew, a multiple of 4, at least 4.
+            steps, inverses: (64,) of each class.
+        """
+        channels, number = residuals.shape
+        levels = np.empty((channels, number), np.int64)
+        if run < 4 or run % 4:
+            raise TypeError("the native path was given runs that do not begin where they must")
+        self._c["potr_unpredicted"](
+            address(residuals, np.int64, channels * number),
+            channels,
+            number,
+            run,
+            address(classes, np.int8, number),
+            address(steps, np.int64, 64),
+            address(inverses, np.int64, 64),
+            address(levels, np.int64, channels * number, True),
+        )
+        return levels
 
     def look_up(self, levels: NDArray[Any], table: F32, out: F32, column: int) -> int:
         """Values of unsigned levels from a table into a column of ``out`` (n, columns).

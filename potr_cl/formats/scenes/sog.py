@@ -16,12 +16,10 @@ from typing import Any, BinaryIO
 
 import numpy as np
 
-from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.scene_files import (
     MOST_A_BYTE,
-    arranged,
     cleaned,
     file_in_folder,
     opened,
@@ -29,13 +27,12 @@ from potr_cl.formats.scenes.scene_files import (
     related,
     tell_of_low_pass,
     unfilled,
+    unit_quaternions,
 )
 from potr_cl.formats.scenes.sog_images import (
     ANTIALIASED,
     CODEBOOK,
     DESCRIPTION,
-    FIRST_TAG,
-    OTHER_PARTS,
     PALETTE,
     PALETTE_COLUMNS,
     U8,
@@ -43,7 +40,7 @@ from potr_cl.formats.scenes.sog_images import (
     write_folder,
 )
 from potr_cl.formats.scenes.sog_palette import areas, palette_of
-from potr_cl.formats.scenes.sog_steps import opacity_logits, quantised, unpacked_means, unpacked_rotations
+from potr_cl.formats.scenes.sog_steps import in_order, opacity_logits, quantised, unpacked_means, unpacked_rotations
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.claims import check_claim
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
@@ -95,7 +92,7 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
         PotrError: the system failed to write.
     """
     tell_of_low_pass(path, scene)
-    scene = arranged(scene)
+    scene = in_order(unit_quaternions(scene))
     images = quantised(scene, palette_of(scene), areas(scene))
     if Path(path).name.lower() == DESCRIPTION:
         write_folder(path, images)

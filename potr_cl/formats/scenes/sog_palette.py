@@ -50,8 +50,9 @@ def palette_of(scene: Scene, device: Device | None = None, most: int = PALETTE) 
         from potr_cl.opencl.device import Device
 
         shown = rows.any(axis=1)  # of the others no entry is needed but one
-        clusters = cluster(device or Device(), rows[shown], weights[shown].astype(np.float32), most - 1)
-        sets = np.concatenate([np.zeros((1, rows.shape[1]), np.float32), clusters.centres])
+        mass = np.repeat(weights[shown, None].astype(np.float32), scene.sh.shape[1] - 1, axis=1)
+        clusters = cluster(device or Device(), scene.sh[shown, 1:], mass, most - 1)
+        sets = np.concatenate([np.zeros((1, rows.shape[1]), np.float32), clusters.centres.reshape(-1, rows.shape[1])])
         labels = np.zeros(len(rows), np.int64)
         labels[shown] = clusters.labels.astype(np.int64) + 1
     return coded(sets, labels, np.bincount(labels, weights, len(sets)).astype(np.float64), scene.sh.shape[1])

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.clustering.codebook import codebook, nearest
+from potr_cl.clustering.curve import along_curve
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.codec.quantize import canonical_rotations
 from potr_cl.formats.scenes.sog_images import CODEBOOK, FIRST_TAG, OTHER_PARTS, U8, Palette, SogImages
@@ -16,6 +17,13 @@ STEPS = 65535
 #: Splats worked on at a time: the temporaries stay small.
 _BLOCK = 1 << 16
 _LEAST_OPACITY = np.float32(1e-6)
+
+
+def in_order(scene: Scene) -> Scene:
+    """A scene in the order of a file, in which neighbours in the images are neighbours in space."""
+    logarithms = log_transformed(scene.means)
+    least, most = logarithms.min(axis=0).astype(np.float32), logarithms.max(axis=0).astype(np.float32)
+    return scene.subset(along_curve(position_steps(logarithms, least, most)))
 
 
 def quantised(scene: Scene, palette: Palette | None, weights: NDArray[np.float64] | None = None) -> SogImages:
@@ -71,7 +79,8 @@ def unpacked_means(steps: NDArray[np.uint16], least: FloatArray, most: FloatArra
     extent = np.where(most == least, np.float32(1), most - least)
     logarithms = least + extent * (steps.astype(np.float32) * np.float32(1 / STEPS))
     means = np.copysign(np.expm1(np.abs(logarithms), dtype=np.float64), logarithms)
-    return means.astype(np.float32)
+    single: FloatArray = means.astype(np.float32)
+    return single
 
 
 def packed_rotations(imaginary: NDArray[np.float64]) -> U8:

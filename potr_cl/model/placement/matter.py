@@ -134,16 +134,17 @@ def surroundings(camera_centre: F64, matter: Matter) -> tuple[F32, float]:
 def cell_of(rays: F32) -> NDArray[np.int64]:
     """Number of the cube map's cell in each direction, (3, n), of any length but 0."""
     x, y, z = rays
-    size_x, size_y, size_z = np.abs(rays)
-    along_x = (size_x >= size_y) & (size_x >= size_z)
-    along_y = ~along_x & (size_y >= size_z)
-    major = np.where(along_x, x, np.where(along_y, y, z))
-    scale = np.float32(_CELLS / 2) / np.maximum(np.abs(major), np.float32(1e-30))
-    u = np.where(along_x, y, np.where(along_y, z, x)) * scale + np.float32(_CELLS / 2)
-    v = np.where(along_x, z, np.where(along_y, x, y)) * scale + np.float32(_CELLS / 2)
-    u, v = (np.minimum(c.astype(np.int64), _CELLS - 1) for c in (u, v))
-    axis = np.where(along_x, 0, np.where(along_y, 1, 2))
-    cells: NDArray[np.int64] = ((2 * axis + (major > 0)) * _CELLS + u) * _CELLS + v
+    sizes = np.abs(rays)
+    largest = np.maximum(np.maximum(sizes[0], sizes[1]), sizes[2])
+    along_x = sizes[0] == largest
+    along_z = ~(along_x | (sizes[1] == largest))
+    scale = np.float32(_CELLS / 2) / np.maximum(largest, np.float32(1e-30))
+    u, v = (
+        np.minimum((side * scale + np.float32(_CELLS / 2)).astype(np.int32), _CELLS - 1)
+        for side in (np.where(along_x, y, x), np.where(along_z, y, z))
+    )
+    face = np.where(along_x, x > 0, np.where(along_z, z > 0, y > 0) + np.where(along_z, np.int32(4), np.int32(2)))
+    cells: NDArray[np.int64] = ((face * _CELLS + u) * _CELLS + v).astype(np.int64)
     return cells
 
 

@@ -16,21 +16,29 @@ _MOST = 2.0
 #: An added view takes as much time as a training view. So that an encode takes at most 1.6 times as long, added views
 #: are a part of the training views, and some more where an encode does much besides looking at views, as on GPUs.
 _SHARE = 0.45
-_BESIDES, _BESIDES_ON_CPU = 60, 2
+_BESIDES, _BESIDES_ON_CPU = 60, 4
 
 
-def needed(views_of_parts: NDArray[np.int64], views: int, slow: bool) -> float:
+def needed(shown_by: float, views: int, slow: bool) -> float:
     """How many to add for each training view.
 
     Args:
-        views_of_parts: (K,) how many training views show each part of the scene
-            (:meth:`potr_cl.model.placement.given_views.GivenViews.views_of_parts`).
+        shown_by: how many training views show the scene where few do, as :func:`views_where_few` finds it.
         views: the number of training views.
         slow: whether a CPU has to look at them.
     """
-    few = float(np.quantile(views_of_parts, _PART)) if len(views_of_parts) else float(views)
-    each = min(_ENOUGH / max(few, 1.0) - 1, most_needed(views, slow))
+    each = min(_ENOUGH / max(shown_by, 1.0) - 1, most_needed(views, slow))
     return each if each >= _LEAST else 0.0
+
+
+def views_where_few(views_of_parts: NDArray[np.int64]) -> float:
+    """How many views at most show the quarter of a scene that the fewest show.
+
+    Args:
+        views_of_parts: (K,) how many training views show each part of the scene
+            (:meth:`potr_cl.model.placement.given_views.GivenViews.views_of_parts`), at least one.
+    """
+    return float(np.quantile(views_of_parts, _PART))
 
 
 def most_needed(views: int, slow: bool) -> float:

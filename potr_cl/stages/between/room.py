@@ -16,6 +16,8 @@ from potr_cl.stages.pruning.prepared_views import PreparedViews
 from potr_cl.stages.pruning.sweep_options import default_memory
 from potr_cl.stages.stage import State, Workbench
 
+#: More bytes than a view takes, for each splat and each pixel: where there are so many, nothing has to be measured.
+_SPLAT, _PIXEL = 500, 200
 #: Views whose memory is measured.
 _SAMPLE = 3
 #: Bytes that are enough for them.
@@ -38,7 +40,10 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
     if not added:
         return 0
     budget = default_memory(bench.opened) if bench.memory is None else bench.memory
-    with Rasterizer(bench.opened, state.source, background=bench.background) as rasterizer:
+    pixels = sum(view.width * view.height for view in (*state.views, *added))
+    if budget > _SPLAT * len(state.source) * (len(state.views) + len(added)) + _PIXEL * pixels:
+        return len(added)
+    with Rasterizer(bench.opened, bench.drawable(state.source), background=bench.background) as rasterizer:
         own, more = (_nbytes(rasterizer, views) for views in (state.views, added))
     left = budget - _MARGIN * own * len(state.views)
     return int(min(max(left // (_MARGIN * more), 0), len(added)))

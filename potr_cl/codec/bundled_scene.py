@@ -1,0 +1,231 @@
+"""The values of files of coder BUNDLES, bundle by bundle: :class:`BundledScene`.
+
+Threads share the bundles out. Integers of a bundle become values while they are in a cache.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+from threading import Lock
+from typing import TYPE_CHECKING, Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec import container
+from potr_cl.codec.bundles.decoder import Reader, Wanted, check_said
+from potr_cl.codec.bundles.levels import joined
+from potr_cl.codec.bundles.sections import MAIN, Key
+from potr_cl.codec.colour_factors import ColourFactors
+from potr_cl.codec.container import Header
+from potr_cl.codec.dequantizer import Dequantizer
+from potr_cl.codec.native.bundles import BEYOND_TABLE, BundledFile, Tables, ValueArrays
+from potr_cl.codec.steps import prediction
+from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
+from potr_cl.codec.versions import VERSIONS
+from potr_cl.host.threads import thread_pool
+
+if TYPE_CHECKING:
+    from potr_cl.codec.destination import Activation, Destination
+
+#: Bundles that NumPy decodes side by side.
+_SIDE_BY_SIDE = 64
+#: Bundles whose integers a thread joins at a time.
+_HANDED = 4
+#: Levels whose values are looked up.
+_TABLE = 1 << 16
+
+
+@dataclass(frozen=True)
+class BundledScene:
+    """A file's splats.
+
+    Attributes:
+        header: verified.
+        data: the whole file.
+        open_steps: gives the steps of its colours.
+        activation: what is stored instead of logarithms of scales and logits of opacities; None: these.
+    """
+
+    header: Header
+    data: bytes
+    open_steps: Callable[[], ColourSteps | None]
+    activation: Activation | None = None
+
+    @cached_property
+    def reader(self) -> Reader:
+        """Of the integers."""
+        return Reader(self.header.splats, self._stored, self.open_steps)
+
+    def _stored(self, key: Key) -> tuple[memoryview, str] | None:
+        section = self.header.find(*key)
+        return None if section is None else (container.stored_bytes(self.data, section), section.name)
+
+    def fill(self, arrays: ValueArrays, threads: int = 1, centres: Callable[[], None] | None = None) -> None:
+        """Fill some arrays; sections of others are not looked at.
+
+        Args:
+            arrays: what to decode.
+            threads: to work with.
+            centres: what else to do meanwhile.
+
+        Raises:
+            DataError: damaged.
+        """
+        works: list[Callable[[], None]] = [*self._jobs(arrays, threads)]
+        if centres is not None:
+            works.insert(0, centres)
+        if threads == 1:
+            for work in works:
+                work()
+            return
+        with thread_pool(threads) as pool:
+            for future in [pool.submit(work) for work in works]:
+                future.result()
+
+    def hand_to(self, destination: Destination, sh_count: int, threads: int) -> None:
+        """Hand all integers but those of the centres to a destination, with so many SH coefficients of a channel.
+
+        Raises:
+            DataError: damaged.
+        """
+        wanted = self._wanted_of(sh_count, True)
+        native = self.reader.bundled_file(wanted) is not None
+        number, at_once = self.reader.bundles.number, _HANDED if native else _SIDE_BY_SIDE
+        with thread_pool(threads if native else 1) as pool:
+            parts = pool.map(
+                lambda first: self.reader.levels(first, min(first + at_once, number), wanted),
+                range(0, number, at_once),
+            )
+            levels = joined(list(parts))
+        scales = [LevelStream(level, False) for level in levels.scales or []]
+        opacities = LevelStream(levels.opacities if levels.opacities is not None else np.zeros(0), False)
+        fitting = ColourFactors.of(self.header, self.reader.steps, lambda: [*scales], lambda: opacities)
+        destination.take_scales(scales)
+        destination.take_rotations([LevelStream(level, True) for level in levels.rotations or []], scales)
+        destination.take_opacities(opacities)
+        destination.take_colours([LevelStream(level, True) for level in levels.dc or []], 0, False, fitting)
+        for coefficient in range(1, sh_count):
+            planes = levels.coefficient(coefficient)
+            destination.take_colours([LevelStream(level, True) for level in planes], coefficient, False, fitting)
+
+    @cached_property
+    def tables(self) -> Tables:
+        """What makes values of levels."""
+        header, activation = self.header, self.activation
+        version = VERSIONS[header.version]
+        levels = np.arange(_TABLE)
+        classes = np.arange(-CLASSES, CLASSES).astype(np.int8)
+        scales = version.dequantize_scales(levels, header.sf_scale)
+        opacities = version.dequantize_opacities(levels, header.sf_opacity)
+        return Tables(
+            scales if activation is None else activation.scales(scales),
+            opacities if activation is None else activation.opacities(opacities),
+            factors(header.sf_dc, classes),
+            factors(header.sf_ac, classes),
+            *prediction.tables(),
+            header.sf_rotation,
+        )
+
+    def _jobs(self, arrays: ValueArrays, threads: int) -> list[Job]:
+        wanted = self._wanted(arrays)
+        file = self.reader.bundled_file(wanted)
+        if file is not None:
+            _ = self.tables  # made once, before threads ask for them
+        share = _Share(self.reader.bundles.number, 1 if file is not None else _SIDE_BY_SIDE)
+        return [Job(self, arrays, wanted, file, share) for _ in range(threads if file is not None else 1)]
+
+    def _wanted(self, arrays: ValueArrays) -> Wanted:
+        rotations = arrays.quaternions is not None
+        if arrays.sh is not None:
+            return self._wanted_of(len(arrays.sh), rotations)
+        return Wanted(2 if rotations or arrays.log_scales is not None else 1, rotations)
+
+    def _wanted_of(self, sh_count: int, rotations: bool) -> Wanted:
+        degree = round(sh_count**0.5) - 1
+        # To the end of the chain where all is asked for: so its end is checked.
+        return Wanted(len(MAIN) if degree == self.header.sh_degree else 3 + degree, rotations)
+
+
+@dataclass(frozen=True)
+class LevelStream:
+    """Levels as a stream of integers.
+
+    Attributes:
+        levels: (n,) of any type.
+        signed: whether they may be negative.
+    """
+
+    levels: NDArray[Any]
+    signed: bool
+
+    def part(self, start: int, stop: int) -> NDArray[np.integer]:
+        """Those from one splat to another."""
+        return self.levels[start:stop]
+
+    @cached_property
+    def joined(self) -> NDArray[Any]:
+        """All of them: uint8, mapped to unsigned, where they are that small; else 32 or 64 bits each."""
+        least, largest = int(self.levels.min()), int(self.levels.max())
+        if not self.signed:
+            return self.levels.astype(np.uint8 if largest < 1 << 8 else _wide(largest), copy=False)
+        if least >= -(1 << 7) and largest < 1 << 7:
+            narrow = self.levels.astype(np.int8)
+            return ((narrow << 1) ^ (narrow >> 7)).view(np.uint8)
+        return self.levels.astype(_wide(max(largest, -least)), copy=False)
+
+
+def _wide(largest: int) -> type[np.generic]:
+    return np.int32 if largest < 1 << 29 else np.int64
+
+
+class _Share:
+    """Gives every thread the next bundles."""
+
+    def __init__(self, number: int, at_once: int) -> None:
+        self._number, self._at_once = number, at_once
+        self._next, self._lock = 0, Lock()
+
+    def take(self) -> range:
+        with self._lock:
+            first = self._next
+            self._next = min(first + self._at_once, self._number)
+            return range(first, self._next)
+
+
+@dataclass(frozen=True)
+class Job:
+    """A thread's part of a decode: calling it takes bundles until none are left."""
+
+    scene: BundledScene
+    arrays: ValueArrays
+    wanted: Wanted
+    file: BundledFile | None
+    share: _Share
+
+    def __call__(self) -> None:
+        """Raises DataError if damaged."""
+        work = None if self.file is None else self.file.work()
+        while len(bundles := self.share.take()):
+            if self.file is None or work is None:
+                self._by_numpy(bundles)
+                continue
+            said, section = self.file.values(
+                bundles.start, self.wanted.sections, self.wanted.rotations, work, self.arrays, self.scene.tables
+            )
+            if said == BEYOND_TABLE:
+                self._by_numpy(bundles)
+            else:
+                check_said(self.scene.reader, said, section)
+
+    def _by_numpy(self, bundles: range) -> None:
+        header = self.scene.header
+        levels = self.scene.reader.levels(bundles.start, bundles.stop, self.wanted)
+        Dequantizer(header, VERSIONS[header.version]).of_levels(levels, self.scene.reader.steps, self.arrays)
+        activation, own = self.scene.activation, slice(levels.start, levels.stop)
+        if activation is not None and self.arrays.log_scales is not None:
+            self.arrays.log_scales[own] = activation.scales(self.arrays.log_scales[own])
+        if activation is not None and self.arrays.logits is not None:
+            self.arrays.logits[own] = activation.opacities(self.arrays.logits[own])

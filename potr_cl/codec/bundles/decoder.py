@@ -1,0 +1,296 @@
+"""The decoder of coder BUNDLES: :class:`Reader`, from the sections of a file, which it does not trust, to integers.
+
+Bundles are decoded one by one by the native path, and side by side by NumPy.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+from functools import cached_property
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.bundles.description import Fitted
+from potr_cl.codec.bundles.layout import BUNDLE, LANES, Bundles, Layout
+from potr_cl.codec.bundles.levels import Items, Levels, joined
+from potr_cl.codec.bundles.ranges import Words, decode_stream
+from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Key, Section
+from potr_cl.codec.bundles.streams import band, differences, step_terms, streams_of
+from potr_cl.codec.native.bundles import FINE, TOO_FEW_WORDS, BundledFile
+from potr_cl.codec.native.library import native
+from potr_cl.codec.rans import LOWEST, check_end, no_words_left
+from potr_cl.codec.sections import Property
+from potr_cl.codec.steps.rule import ColourSteps
+from potr_cl.errors import DataError
+
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class Wanted:
+    """What to decode. Later parts of a chain need the earlier ones.
+
+    Attributes:
+        sections: of the main chain, so many.
+        rotations: whether rotations are.
+    """
+
+    sections: int = len(MAIN)
+    rotations: bool = True
+
+    def __post_init__(self) -> None:
+        if not 1 <= self.sections <= len(MAIN) or (self.rotations and self.sections < 2):
+            raise ValueError("rotations need the scales, and all need the opacities")
+
+    @property
+    def keys(self) -> list[Key]:
+        """Of the sections that it takes, in the order of decoding."""
+        return [*MAIN[: self.sections], *([ROTATION] if self.rotations else [])]
+
+
+EVERYTHING = Wanted()
+
+
+class Reader:
+    """A file's splats, bundle by bundle.
+
+    Args:
+        splats: n of the file.
+        open_section: gives the stored bytes of a section and its name, None if the file has none; called when it is
+            needed.
+        open_steps: gives the steps of colours, None if the file has none; called when they are needed.
+
+    Raises:
+        DataError: damaged.
+    """
+
+    def __init__(
+        self,
+        splats: int,
+        open_section: Callable[[Key], tuple[memoryview, str] | None],
+        open_steps: Callable[[], ColourSteps | None],
+    ) -> None:
+        self.bundles = Bundles(splats)
+        self._open_section, self._open_steps = open_section, open_steps
+        self._sections: dict[Key, Section | None] = {}
+        self._files: dict[Wanted, BundledFile | None] = {}
+
+    @cached_property
+    def steps(self) -> ColourSteps | None:
+        """The steps of colours.
+
+        Raises:
+            DataError: damaged.
+        """
+        return self._open_steps()
+
+    def section(self, key: Key) -> Section | None:
+        """A section; None if the file has none.
+
+        Raises:
+            DataError: damaged.
+        """
+        if key not in self._sections:
+            found = self._open_section(key)
+            self._sections[key] = None if found is None else Section(key, found[0], self.bundles, found[1])
+        return self._sections[key]
+
+    def levels(self, first: int, last: int, wanted: Wanted = EVERYTHING) -> Levels:
+        """Decode some bundles.
+
+        Args:
+            first, last: the first bundle, and the one behind the last.
+            wanted: what of them.
+
+        Raises:
+            DataError: damaged.
+        """
+        file = self.bundled_file(wanted)
+        if file is not None:
+            work = file.work()
+            return joined([_levels_of(self, file, bundle, wanted, work) for bundle in range(first, last)])
+        run = _Run(self, first, last)
+        for key in wanted.keys:
+            run.decode(key)
+        run.check_end(wanted)
+        return run.levels
+
+    def bundled_file(self, wanted: Wanted = EVERYTHING) -> BundledFile | None:
+        """What the native path decodes bundles from; None where NumPy is to be taken.
+
+        Raises:
+            DataError: damaged.
+        """
+        functions = native()
+        # By whatever path, they are looked at before anything is decoded.
+        sections = {ORDER.index(key): self.section(key) for key in wanted.keys}
+        steps = self.steps if wanted.sections > 2 else None
+        if functions is None:
+            return None
+        if wanted not in self._files:
+            there = {number: section for number, section in sections.items() if section is not None}
+            fit = all(section.fits for section in there.values())
+            words = {number: section.for_native() for number, section in there.items()}
+            self._files[wanted] = functions.bundled_file(self.bundles.splats, words, steps) if fit else None
+        return self._files[wanted]
+
+
+class _Run:
+    """Some bundles that are decoded side by side."""
+
+    def __init__(self, reader: Reader, first: int, last: int) -> None:
+        start, stop = first * BUNDLE, min(last * BUNDLE, reader.bundles.splats)
+        self._reader, self._first, self._last = reader, first, last
+        self._bundles = Bundles(stop - start)
+        self._terms: dict[str, I64] = {}
+        self._states = {key: self._states_of(key) for key in (MAIN[0], ROTATION)}
+        self.levels = Levels(start, stop)
+
+    def _states_of(self, key: Key) -> I64:
+        """(columns,) states of a chain at its beginning; lanes that are not there rest at the end."""
+        columns = np.full(LANES * self._bundles.number, LOWEST, np.int64)
+        section = self._reader.section(key)
+        if section is not None:
+            lanes = self._reader.bundles.lanes
+            start = int(lanes[: self._first].sum())
+            there = np.arange(LANES) < self._bundles.lanes[:, None]
+            columns[there.ravel()] = section.states[start : start + int(self._bundles.lanes.sum())]
+        return columns
+
+    def decode(self, key: Key) -> None:
+        prop, index = key
+        if prop == Property.OPACITY:
+            (self.levels.opacities,) = self._dense(key)
+        elif prop == Property.SCALE:
+            self.levels.scales = self._dense(key)
+        elif prop == Property.ROTATION:
+            scales = [self._terms[f"scale {axis}"] for axis in range(3)]
+            self._terms.update({f"difference {k}": each for k, each in enumerate(differences(scales))})
+            self.levels.rotations = [_signed(values) for values in self._dense(key)]
+        elif index == 0:
+            self._find_steps()
+            self.levels.dc = [_signed(values) for values in self._dense(key)]
+        else:
+            self._decode_band(key)
+
+    def check_end(self, wanted: Wanted) -> None:
+        """Check that every lane of the chains that were read to their ends is back where its encoder began."""
+        for key, read in ((ROTATION, wanted.rotations), (MAIN[0], wanted.sections == len(MAIN))):
+            section = self._reader.section(key) if read else None
+            if section is not None:
+                check_end(True, self._states[key].astype(np.uint32), section.what)
+
+    def _chain(self, key: Key) -> I64:
+        return self._states[ROTATION if key == ROTATION else MAIN[0]]
+
+    def _dense(self, key: Key) -> list[I64]:
+        """Integers of the streams of an item a splat."""
+        section = self._reader.section(key)
+        splats = self._bundles.splats
+        if section is None:
+            for stream in streams_of(*key):
+                self._terms[stream.name] = np.full(splats, stream.sizes[0], np.int64)
+            return [np.zeros(splats, np.int64) for _ in streams_of(*key)]
+        words = section.of(self._first, self._last)
+        return [self._stream(key, words, fitted, self._bundles.dense, self._terms) for fitted in section.streams] + (
+            self._finished(words, section)
+        )
+
+    def _finished(self, words: Words, section: Section) -> list[I64]:
+        if not words.all_taken:
+            raise DataError(f"section '{section.what}' does not end where its last token does")
+        return []
+
+    def _stream(
+        self, key: Key, words: Words, fitted: Fitted, layout: Layout, terms: dict[str, I64], which: I64 | None = None
+    ) -> I64:
+        """Integers of a stream, mapped to unsigned; their sizes become a term."""
+        base = np.full(int(layout.counts.sum()), fitted.constant, np.int64)
+        for name, weight in zip(fitted.stream.terms, fitted.terms.tolist(), strict=True):
+            if weight:
+                base += weight * terms[name]
+        if which is not None:
+            base += fitted.biases[which]
+        tokens, integers = decode_stream(layout, base, fitted, self._chain(key), words)
+        terms[fitted.stream.name] = fitted.stream.sizes.take(tokens).astype(np.int64)
+        return integers
+
+    def _find_steps(self) -> None:
+        """What the steps of splats' colours tell of them."""
+        steps, levels = self._reader.steps, self.levels
+        classes = np.zeros(self._bundles.splats, np.int8)
+        if steps is not None and levels.scales is not None and levels.opacities is not None:
+            classes, _ = steps.classes(levels.scales, levels.opacities, levels.start)
+        self._terms["step"] = step_terms(classes)
+
+    def _decode_band(self, key: Key) -> None:
+        """The AC coefficients of a degree."""
+        terms = self._terms
+        splats = self._bundles.splats
+        for c in range(3):
+            terms.setdefault(f"sum {c}", np.zeros(splats, np.int64))
+        section = self._reader.section(key)
+        if section is None:
+            return
+        first, end = band(key[1])
+        words = section.of(self._first, self._last)
+        mask, pattern, *values = section.streams
+        masks = self._stream(key, words, mask, self._bundles.dense, terms)
+        splat, which = np.nonzero(masks[:, None] >> np.arange(end - first) & 1)
+        at_items = {name: terms[name][splat] for name in (*(f"sum {c}" for c in range(3)), "mask", "step")}
+        layout = self._bundles.items(splat)
+        patterns = self._stream(key, words, pattern, layout, at_items, which)
+        channels = np.zeros((3, len(splat)), np.int64)
+        sizes = [np.zeros(len(splat), np.int64) for _ in range(3)]
+        for c, fitted in enumerate(values):
+            (there,) = np.nonzero(patterns >> c & 1)
+            at_values = {name: at_items[name][there] for name in at_items}
+            at_values.update({f"value {b}": sizes[b][there] for b in range(c)})
+            integers = self._stream(key, words, fitted, self._bundles.items(splat[there]), at_values, which[there])
+            sizes[c][there] = at_values[f"value {c}"]
+            channels[c, there] = _signed(integers + 1)
+        self._finished(words, section)
+        for c in range(3):
+            terms[f"sum {c}"] += np.bincount(splat, weights=sizes[c], minlength=splats).astype(np.int64)
+        self.levels.ac.append(Items(splat, which + first, channels))
+
+
+def _levels_of(reader: Reader, file: BundledFile, bundle: int, wanted: Wanted, work: NDArray[np.uint8]) -> Levels:
+    """A bundle's levels by the native path."""
+    said, number, found = file.integers(bundle, wanted.sections, wanted.rotations, work)
+    check_said(reader, said, number)
+    levels = Levels(bundle * BUNDLE, min((bundle + 1) * BUNDLE, reader.bundles.splats), found.opacities)
+    if wanted.sections > 1:
+        levels.scales = list(found.scales)
+    if wanted.sections > 2:
+        levels.dc = list(found.dc)
+    if wanted.rotations:
+        levels.rotations = list(found.rotations)
+    ends = np.cumsum((0, *found.items))
+    for k, key in enumerate(MAIN[3 : wanted.sections]):
+        if reader.section(key) is not None:
+            own = slice(ends[k], ends[k + 1])
+            splats = found.splats[own].astype(np.int64)
+            levels.ac.append(Items(splats, found.coefficients[own].astype(np.int64), found.channels[:, own]))
+    return levels
+
+
+def check_said(reader: Reader, said: int, number: int) -> None:
+    """What the native path says of a bundle, and of the section at fault.
+
+    Raises:
+        DataError: damaged.
+    """
+    if said == FINE:
+        return
+    section = reader.section(ORDER[number])
+    what = "" if section is None else section.what
+    if said == TOO_FEW_WORDS:
+        raise no_words_left(what)
+    check_end(False, np.zeros(0, np.uint32), what)
+
+
+def _signed(mapped: I64) -> I64:
+    return (mapped >> 1) ^ -(mapped & 1)

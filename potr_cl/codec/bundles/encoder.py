@@ -1,0 +1,161 @@
+"""The encoder of coder BUNDLES: :func:`encode`, from a file's integers to the stored bytes of its sections."""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.bundles.description import Fitted
+from potr_cl.codec.bundles.fitting import expected_sizes, fit_model, products, recent_sizes, samples, solve
+from potr_cl.codec.bundles.layout import LANES, Bundles, Layout
+from potr_cl.codec.bundles.native_encoder import encode_natively, narrow
+from potr_cl.codec.bundles.ranges import Tokens, encode_section
+from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Key, stored_section
+from potr_cl.codec.bundles.streams import Stream, band, differences, step_terms, streams_of
+from potr_cl.codec.context.tokens import MOST_BITS, tokens_of
+from potr_cl.codec.native.library import native
+from potr_cl.codec.rans import LOWEST
+from potr_cl.codec.sections import Property, is_signed
+from potr_cl.host.threads import Run
+
+I64 = NDArray[np.int64]
+Values = Sequence[NDArray[np.integer]]
+
+
+def encode(
+    values: Mapping[Key, Values],
+    classes: NDArray[np.int8],
+    run: Run = map,
+    progress: Callable[[float], None] | None = None,
+) -> dict[Key, bytes] | None:
+    """Code all integers of splats that a file holds.
+
+    Args:
+        values: of each section its integers, (n,) each; the opacity's at least. Sections whose integers are all 0 may
+            be left out. Of DC what its prediction has left.
+        classes: (n,) of the steps of DC.
+        run: in place of :func:`map`, to work with several threads.
+        progress: told which part is done.
+
+    Returns:
+        The stored bytes of each section; None if an integer is too large.
+    """
+    report = progress or (lambda done: None)
+    functions = native()
+    arrays = None if functions is None else narrow(values)
+    if functions is not None and arrays is not None:
+        return encode_natively(functions, arrays, classes, run, report)
+    drafts = _Drafts(Bundles(len(classes)), classes)
+    keys = [key for key in ORDER if key in values]
+    sections: dict[Key, list[Tokens]] = {}
+    for done, key in enumerate(keys):
+        made = drafts.section(key, values[key])
+        if made is None:
+            return None
+        sections[key] = made
+        report(0.6 * (done + 1) / len(keys))
+    coded: dict[Key, bytes] = {}
+    lanes = (np.arange(LANES) < drafts.bundles.lanes[:, None]).ravel()
+    for chain in (MAIN, (ROTATION,)):
+        states = np.full(LANES * drafts.bundles.number, LOWEST, np.int64)
+        for key in reversed([key for key in chain if key in sections]):
+            counts, words = encode_section(sections[key], states)
+            first = states[lanes] if key == chain[0] else None
+            coded[key] = stored_section([tokens.fitted for tokens in sections[key]], first, counts, words)
+    report(1.0)
+    return coded
+
+
+class _Drafts:
+    """Sections on their way to bytes: what was coded before tells the contexts of the next.
+
+    Args:
+        bundles: of the file.
+        classes: (n,) of the steps of DC.
+    """
+
+    def __init__(self, bundles: Bundles, classes: NDArray[np.int8]) -> None:
+        self.bundles = bundles
+        self._terms: dict[str, I64] = {"step": step_terms(classes)}
+
+    def section(self, key: Key, values: Values) -> list[Tokens] | None:
+        """A section's streams; None if an integer is too large."""
+        prop, index = key
+        streams = streams_of(*key)
+        if prop == Property.SH and index:
+            return self._band(streams, index, values)
+        if prop == Property.ROTATION:
+            scales = [self._term(f"scale {axis}") for axis in range(3)]
+            self._terms.update({f"difference {k}": each for k, each in enumerate(differences(scales))})
+        layout = self.bundles.dense
+        made = []
+        for stream, integers in zip(streams, values, strict=True):
+            wide = integers.astype(np.int64)
+            tokens = self._stream(stream, layout, _mapped(wide) if is_signed(prop) else wide, self._terms)
+            if tokens is None:
+                return None
+            made.append(tokens)
+        return made
+
+    def _term(self, name: str) -> I64:
+        """(n,) a term of a stream of an item a splat: 0 where its section is left out."""
+        return self._terms.setdefault(name, np.zeros(self.bundles.splats, np.int64))
+
+    def _band(self, streams: Sequence[Stream], index: int, values: Values) -> list[Tokens] | None:
+        """The streams of the AC coefficients of a degree."""
+        first, end = band(index)
+        channels = np.array(values).reshape(end - first, 3, -1)
+        there = channels.any(axis=1)
+        mask, pattern, *of_channels = streams
+        masks = (there << np.arange(end - first)[:, None]).sum(axis=0)
+        made = [self._stream(mask, self.bundles.dense, masks, self._terms)]
+        splat, which = np.nonzero(there.T)
+        items = channels[which, :, splat].T.astype(np.int64)
+        at_items = {name: self._term(name)[splat] for name in (*(f"sum {c}" for c in range(3)), "mask", "step")}
+        patterns = ((items != 0) << np.arange(3)[:, None]).sum(axis=0)
+        made.append(self._stream(pattern, self.bundles.items(splat), patterns, at_items, which))
+        sizes = [np.zeros(len(splat), np.int64) for _ in range(3)]
+        for c, stream in enumerate(of_channels):
+            (has,) = np.nonzero(items[c])
+            at_values = {name: term[has] for name, term in at_items.items()}
+            at_values.update({f"value {b}": sizes[b][has] for b in range(c)})
+            mapped = _mapped(items[c, has]) - 1
+            made.append(self._stream(stream, self.bundles.items(splat[has]), mapped, at_values, which[has]))
+            if made[-1] is not None:
+                sizes[c][has] = at_values[stream.name]
+        for c in range(3):
+            added = np.bincount(splat, weights=sizes[c], minlength=self.bundles.splats)
+            self._terms[f"sum {c}"] = self._term(f"sum {c}") + added.astype(np.int64)
+        whole = [tokens for tokens in made if tokens is not None]
+        return whole if len(whole) == len(made) else None
+
+    def _stream(
+        self, stream: Stream, layout: Layout, mapped: I64, terms: dict[str, I64], which: I64 | None = None
+    ) -> Tokens | None:
+        """A stream of integers, mapped to unsigned; the sizes of its tokens become a term."""
+        if int(mapped.max(initial=0)) >> MOST_BITS or int(mapped.min(initial=0)) < 0:
+            return None
+        tokens = tokens_of(mapped)
+        sizes = stream.sizes.take(tokens).astype(np.int64)
+        missing = [name for name in stream.terms if name not in terms]
+        terms.update({name: np.zeros(len(tokens), np.int64) for name in missing})
+        columns = [*(terms[name] for name in stream.terms), recent_sizes(layout, sizes)]
+        terms[stream.name] = sizes
+        alphabet = int(tokens.max(initial=0)) + 1
+        if not len(tokens):
+            tokens, columns, which = np.zeros(1, np.uint8), [np.zeros(1, np.int64) for _ in columns], None
+            numbers = np.zeros(stream.weights, np.int64)
+        else:
+            some = samples(layout.counts)
+            chosen = None if which is None else which[some]
+            numbers = solve(products([c[some] for c in columns], chosen, stream.coefficients, sizes[some]))
+        cells = (expected_sizes(columns, which, numbers) * alphabet + tokens).astype(np.uint16)
+        fitted = Fitted(stream, numbers, fit_model(cells, alphabet))
+        return Tokens(layout, cells[: len(mapped)], mapped, fitted)
+
+
+def _mapped(values: I64) -> I64:
+    """0, −1, 1, −2, … to 0, 1, 2, 3, …"""
+    return (values << 1) ^ (values >> 63)

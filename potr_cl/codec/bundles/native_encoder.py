@@ -1,0 +1,108 @@
+"""The encoder of coder BUNDLES by the native path: :func:`encode_natively` gives the same bytes as NumPy.
+
+Threads share the bundles out three times: for what weights are fitted to, for what contexts are made of, and to code.
+"""
+
+from __future__ import annotations
+
+from collections import deque
+from collections.abc import Callable, Mapping, Sequence
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.bundles.description import Fitted
+from potr_cl.codec.bundles.fitting import log_table, samples_of_bundle, solve
+from potr_cl.codec.bundles.layout import Bundles
+from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Key, stored_section
+from potr_cl.codec.bundles.streams import Stream, streams_of
+from potr_cl.codec.context.model import Model
+from potr_cl.codec.context.tokens import tokens_of
+from potr_cl.codec.native.bundles import fits
+from potr_cl.codec.native.bundles_encode import BundleEncoder
+from potr_cl.codec.native.bundles_encode import Model as NativeModel
+from potr_cl.codec.native.functions import Functions
+from potr_cl.codec.rans import TOTAL
+from potr_cl.codec.sections import Property
+from potr_cl.host.threads import Run
+
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+
+#: Names of the sections of an item a splat.
+_DENSE = {"opacity": MAIN[0], "scales": MAIN[1], "dc": MAIN[2], "rotations": ROTATION}
+#: Of a stream without an item.
+_NOTHING = NativeModel(np.zeros(256, np.uint8), np.full((1, 1), TOTAL, np.uint16))
+
+
+def encode_natively(
+    functions: Functions,
+    values: Mapping[Key, list[I32]],
+    classes: NDArray[np.int8],
+    run: Run,
+    report: Callable[[float], None],
+) -> dict[Key, bytes]:
+    """:func:`potr_cl.codec.bundles.encoder.encode` of integers that :func:`narrow` lets through."""
+    bundles = Bundles(len(values[MAIN[0]][0]))
+    streams = [stream for key in ORDER for stream in streams_of(*key)]
+    of_degrees = [(index, section) for (prop, index), section in values.items() if prop == Property.SH and index]
+    encoder = functions.bundle_encoder(
+        bundles.splats,
+        {name: values[key] for name, key in _DENSE.items() if key in values},
+        {index - 3 + k: stream for index, section in of_degrees for k, stream in enumerate(section)},
+        [stream.sizes for stream in streams],
+        [len(stream.terms) for stream in streams],
+        [stream.coefficients for stream in streams],
+        np.ascontiguousarray(classes),
+    )
+    at_least = samples_of_bundle(bundles.number)
+    deque(run(lambda bundle: encoder.survey(bundle, at_least), range(bundles.number)), 0)
+    report(0.3)
+    numbers = [_solved(stream, gram) for stream, gram in zip(streams, encoder.grams(), strict=True)]
+    encoder.take_numbers([some.tolist() for some in numbers])
+    deque(run(encoder.count, range(bundles.number)), 0)
+    report(0.6)
+    alphabets = tokens_of(encoder.largest().astype(np.int64)).astype(int) + 1
+    contexts = zip(encoder.counts(), alphabets.tolist(), strict=True)
+    models = list(run(lambda job: _fitted_model(encoder, *job), contexts))
+    encoder.take_models(models)
+    coded = list(run(encoder.code, range(bundles.number)))
+    fitted = [
+        Fitted(stream, some, Model(model.classes, model.frequencies.astype(np.int64)))
+        for stream, some, model in zip(streams, numbers, models, strict=True)
+    ]
+    stored: dict[Key, bytes] = {}
+    for number, key in enumerate(ORDER):
+        if key in values:
+            own = [each for each in fitted if each.stream in streams_of(*key)]
+            first = None
+            if key in (MAIN[0], ROTATION):
+                states = [bundle.states if key == MAIN[0] else bundle.rotation_states for bundle in coded]
+                first = np.concatenate([part[:lanes] for part, lanes in zip(states, bundles.lanes, strict=True)])
+            words = [bundle.words[number] for bundle in coded]
+            counts = np.array([len(part) for part in words])
+            stored[key] = stored_section(own, first, counts, np.concatenate(words))
+    report(1.0)
+    return stored
+
+
+def narrow(values: Mapping[Key, Sequence[NDArray[np.integer]]]) -> dict[Key, list[I32]] | None:
+    """The integers as the native path takes them; None if one is too large for it."""
+    for streams in values.values():
+        largest = max(max(int(stream.max()), -int(stream.min())) for stream in streams)
+        # Mapped to unsigned an integer has another bit.
+        if not fits(2 * largest + 1):
+            return None
+    return {key: [np.ascontiguousarray(stream, np.int32) for stream in streams] for key, streams in values.items()}
+
+
+def _solved(stream: Stream, gram: I64) -> I64:
+    constant = len(stream.terms) + 1
+    if not gram[constant, constant]:
+        return np.zeros(stream.weights, np.int64)
+    used = range(stream.weights + 1)
+    return solve(gram[np.ix_(used, used)])
+
+
+def _fitted_model(encoder: BundleEncoder, counts: NDArray[np.uint32], alphabet: int) -> NativeModel:
+    return encoder.contexts(counts, alphabet, log_table()) if counts.any() else _NOTHING

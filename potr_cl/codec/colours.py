@@ -1,0 +1,103 @@
+"""A scene's colours as the levels of a file (:func:`colour_levels`), and rounded as its readers will see them."""
+
+from __future__ import annotations
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec import quantize
+from potr_cl.codec.geometry import Geometry
+from potr_cl.codec.steps.rule import factors
+from potr_cl.host.threads import Run
+from potr_cl.model.scene import FloatArray
+
+#: Splats whose SH coefficients are quantised at a time: few enough for the temporaries to stay in a cache.
+_BLOCK = 1 << 14
+
+
+def colour_levels(
+    sh: FloatArray,
+    order: NDArray[np.int64],
+    parameters: quantize.HyperParameters,
+    classes: tuple[NDArray[np.int8], NDArray[np.int8]],
+    run: Run,
+) -> NDArray[np.signedinteger]:
+    """Quantise the colours of a scene.
+
+    Args:
+        sh: (N, M, 3) R, G, B in the order of the scene.
+        order: (N,) index in the scene of each splat of the file.
+        parameters: the scale factors of colours count.
+        classes: (N,) of the steps of DC, and of AC, in the order of the file.
+        run: in place of :func:`map`, to work with several threads.
+
+    Returns:
+        (M, 3, N) levels of the SH coefficients' Y, Co, Cg in the order of the file.
+
+    Raises:
+        DataError: a coefficient is too large to quantise.
+    """
+    count = sh.shape[1]
+    columns = sh.transpose(1, 2, 0)
+    # Coefficients that are contiguous each, as a re-fit leaves them, are picked from each.
+    contiguous = columns.strides[2] == columns.itemsize
+    levels: NDArray[np.signedinteger] = np.empty((count, 3, len(sh)), np.int16)
+    wide: list[tuple[tuple[int, int, slice], quantize.Integers]] = []
+
+    def take(start: int) -> None:
+        rows = order[start : start + _BLOCK]
+        block = slice(start, start + len(rows))
+        planar = (
+            np.array([[column.take(rows) for column in rgb] for rgb in columns])
+            if contiguous
+            else np.ascontiguousarray(sh[rows].transpose(1, 2, 0))
+        )
+        of_dc, of_ac = (
+            # A factor that is the same for all is not rounded: so versions without steps have always been written.
+            factors(scale_factor, part[block]) if part.any() else scale_factor
+            for scale_factor, part in zip((parameters.sf_dc, parameters.sf_sh), classes, strict=True)
+        )
+        for m, rgb in enumerate(planar):
+            factor = of_ac if m else of_dc
+            for c, values in enumerate(quantize.to_ycocg(rgb.astype(np.float64).T)):
+                made = quantize.quantize_sh(values, factor)
+                if made.dtype == levels.dtype:
+                    levels[m, c, block] = made
+                else:
+                    wide.append(((m, c, block), made))
+
+    list(run(take, range(0, len(sh), _BLOCK)))
+    if wide:
+        levels = levels.astype(np.result_type(*{made.dtype for _, made in wide}))
+        for where, made in wide:
+            levels[where] = made
+    return levels
+
+
+def rounded_ac(sh: FloatArray, geometry: Geometry, run: Run = map) -> FloatArray:
+    """The same colours with AC coefficients rounded to the steps of their splats.
+
+    Args:
+        sh: (N, M, 3) R, G, B in the order of the scene.
+        geometry: of the scene, with its steps.
+        run: in place of :func:`map`, to work with several threads.
+
+    Raises:
+        DataError: a coefficient is too large to quantise.
+    """
+    classes = np.empty(len(sh), np.int8)
+    classes[geometry.order] = geometry.colour_classes()[1]
+    rounded = np.empty((sh.shape[1], 3, len(sh)), np.float32).transpose(2, 0, 1)
+    rounded[:, :1] = sh[:, :1]
+
+    def take(start: int) -> None:
+        rows = slice(start, start + _BLOCK)
+        divisors = factors(geometry.parameters.sf_sh, classes[rows])
+        for m in range(1, sh.shape[1]):
+            channels = quantize.to_ycocg(sh[rows, m].astype(np.float64))
+            y, co, cg = (quantize.quantize_sh(channel, divisors) / divisors for channel in channels)
+            for c, channel in enumerate((y - cg + co, y + cg, y - cg - co)):
+                rounded[rows, m, c] = channel
+
+    list(run(take, range(0, len(sh), _BLOCK)))
+    return rounded

@@ -1,0 +1,526 @@
+/* Coder 4 (docs/format.md, "Bundles"): a bundle's integers from the words of its sections.
+ *
+ * All streams of a bundle are decoded one after another while what they need of each other stays in a cache. Arrays of
+ * an item a splat are in *rows*: the lanes of a step side by side, so that loops over lanes become vectors; splat s is
+ * in row s mod 256, column s / 256, and its *place* is the number of both. */
+
+#include <string.h>
+
+#include "bundles.h"
+
+typedef struct {
+    const uint8_t *words;
+    size_t read, available;
+} reader;
+
+/* Gives each of `count` states that is below 2^16 a word. Returns 0, or 1 if there are too few words. */
+static int renormalise(reader *r, uint32_t *states, size_t count)
+{
+    for (size_t i = 0; i < count; i++)
+        if (states[i] < LOWEST) {
+            if (r->read == r->available)
+                return 1;
+            uint16_t word;
+            memcpy(&word, r->words + 2 * r->read++, 2);
+            states[i] = states[i] << 16 | word;
+        }
+    return 0;
+}
+
+/* The bits beside the tokens of a row. Bits beyond the 32nd are lost: the caller knows that there are none. */
+static int take_bits(reader *r, uint32_t *states, size_t count, const uint8_t *tokens, uint32_t *extra)
+{
+    memset(extra, 0, count * sizeof *extra);
+    for (unsigned shift = 0;; shift += CHUNK) {
+        int more = 0;
+        for (size_t i = 0; i < count; i++) {
+            const unsigned all = extra_bits(tokens[i]);
+            if (all <= shift)
+                continue;
+            const unsigned bits = all - shift < CHUNK ? all - shift : CHUNK;
+            extra[i] |= (states[i] & ((1u << bits) - 1)) << shift;
+            states[i] >>= bits;
+            more = 1;
+        }
+        if (!more)
+            return 0;
+        if (renormalise(r, states, count))
+            return 1;
+    }
+}
+
+/* A row of `count` tokens, at most LANES, whose expected sizes are known. Words are read without asking whether there
+ * are more: `count` of them at least are there. Returns how many were read.
+ *
+ * Whether a state takes a word is as good as chance, and processors foretell such branches wrongly: so every lane is
+ * given the next word, and only those that need it go on to the one after. */
+static INLINE size_t row_of_tokens(
+    const stream_model *model, const uint8_t *restrict expected, const uint8_t *restrict words,
+    uint32_t *restrict states, int32_t *restrict recent, uint8_t *restrict tokens, size_t count)
+{
+    uint32_t found[LANES], next[LANES], place[LANES];
+    int32_t sizes[LANES];
+    uint16_t low[LANES];
+    const uint8_t *const classes = model->classes, *const slots = model->slots;
+    const uint32_t *const intervals = model->intervals;
+    const int16_t *const size_of = model->sizes;
+    for (size_t i = 0; i < count; i++)
+        place[i] = states[i] & (TOTAL - 1);
+    for (size_t i = 0; i < count; i++) {
+        const uint32_t context = classes[expected[i]];
+        const uint32_t token = slots[context << PRECISION | place[i]];
+        found[i] = intervals[context << 8 | token];
+        tokens[i] = (uint8_t)token;
+        sizes[i] = size_of[token];
+    }
+    for (size_t i = 0; i < count; i++)
+        next[i] = (found[i] & 0xffff) * (states[i] >> PRECISION) + place[i] - (found[i] >> 16);
+    size_t read = 0;
+    for (size_t i = 0; i < count; i++) {
+        memcpy(&low[i], words + 2 * read, 2);
+        read += next[i] < LOWEST;
+    }
+    for (size_t i = 0; i < count; i++)
+        states[i] = next[i] < LOWEST ? next[i] << 16 | low[i] : next[i];
+    for (size_t i = 0; i < count; i++)
+        recent[i] += 2 * sizes[i] - (recent[i] >> 2);
+    return read;
+}
+
+static INLINE void expected_sizes(
+    const int32_t *restrict base, int32_t weight, const int32_t *restrict recent, uint8_t *restrict expected,
+    size_t count)
+{
+    for (size_t i = 0; i < count; i++) {
+        const int32_t size = (base[i] + weight * recent[i]) >> 8;
+        expected[i] = (uint8_t)(size < 0 ? 0 : size > LARGEST_SIZE ? LARGEST_SIZE : size);
+    }
+}
+
+/* A stream of some items: from w->expected, where the sums of terms, constant and bias stand in rows, to w->tokens and,
+ * where tokens have bits beside them, w->extra. Returns 0, or 1 if there are too few words. */
+POTR_WIDE_INTEGERS
+static int decode_items(
+    const stream_model *model, reader *r, uint32_t *states, size_t lanes, size_t items, work *w)
+{
+    int32_t recent[LANES] = { 0 };
+    uint8_t expected[LANES];
+    const size_t steps = (items + lanes - 1) / lanes;
+    for (size_t step = 0; step < steps; step++) {
+        const size_t count = (items - step + steps - 1) / steps;
+        const int32_t *const base = w->expected + step * LANES;
+        uint8_t *const tokens = w->tokens + step * LANES;
+        if (count == LANES && r->available - r->read >= LANES) {
+            expected_sizes(base, model->recent, recent, expected, LANES);
+            r->read += row_of_tokens(model, expected, r->words + 2 * r->read, states, recent, tokens, LANES);
+        } else {
+            expected_sizes(base, model->recent, recent, expected, count);
+            /* Near the end: a lane at a time, with a word to spare or one that must not be needed. */
+            for (size_t i = 0; i < count; i++) {
+                static const uint8_t none[2] = { 0, 0 };
+                const int left = r->available > r->read;
+                const size_t needed = row_of_tokens(
+                    model, expected + i, left ? r->words + 2 * r->read : none, states + i, recent + i, tokens + i, 1);
+                if (needed && !left)
+                    return 1;
+                r->read += needed;
+            }
+        }
+        if (model->alphabet > DIRECT) {
+            uint8_t any = 0;
+            for (size_t i = 0; i < count; i++)
+                any |= tokens[i];
+            if (any & DIRECT && take_bits(r, states, count, tokens, w->extra + step * LANES))
+                return 1;
+        }
+    }
+    return 0;
+}
+
+static INLINE int32_t integer_of(const work *w, size_t at)
+{
+    const uint32_t token = w->tokens[at];
+    if (token < DIRECT)
+        return (int32_t)token;
+    return (int32_t)((4 + (token - DIRECT) % 4) << extra_bits(token) | w->extra[at]);
+}
+
+static INLINE int32_t from_zigzag(int32_t u)
+{
+    return (int32_t)((uint32_t)u >> 1) ^ -(u & 1);
+}
+
+/* Weighted sums of terms in rows. */
+POTR_WIDE_INTEGERS
+static void add_terms(
+    int32_t *restrict sums, int32_t constant, const int32_t *weights, const int16_t *const *terms, size_t number,
+    size_t places)
+{
+    for (size_t first = 0; first < places; first += LANE) {
+        int32_t *const part = sums + first;
+        for (size_t i = 0; i < LANE; i++)
+            part[i] = constant;
+        for (size_t k = 0; k < number; k++) {
+            const int32_t weight = weights[k];
+            const int16_t *const term = terms[k] + first;
+            if (weight)
+                for (size_t i = 0; i < LANE; i++)
+                    part[i] += weight * term[i];
+        }
+    }
+}
+
+/* The sizes of the tokens of a stream of an item a splat, and its integers. */
+static void keep_dense(const stream_model *model, const work *w, size_t places, int is_signed, int16_t *sizes,
+    int32_t *integers)
+{
+    for (size_t i = 0; i < places; i++)
+        sizes[i] = model->sizes[w->tokens[i]];
+    if (model->alphabet <= DIRECT) {
+        for (size_t i = 0; i < places; i++)
+            integers[i] = is_signed ? from_zigzag(w->tokens[i]) : w->tokens[i];
+        return;
+    }
+    for (size_t i = 0; i < places; i++)
+        integers[i] = is_signed ? from_zigzag(integer_of(w, i)) : integer_of(w, i);
+}
+
+/* Streams of an item a splat: `known` terms, and then those of the streams before. */
+static int dense_section(
+    const stream_model *models, size_t number, const int16_t *const *known, size_t known_number, int is_signed,
+    reader *r, uint32_t *states, size_t lanes, size_t splats, work *w, int16_t sizes[][BUNDLE],
+    int32_t integers[][BUNDLE])
+{
+    const size_t steps = steps_of(splats), places = LANES * steps;
+    const size_t whole = (places + LANE - 1) / LANE * LANE;
+    const int16_t *terms[TERMS];
+    for (size_t k = 0; k < known_number; k++)
+        terms[k] = known[k];
+    for (size_t s = 0; s < number; s++) {
+        add_terms(w->expected, models[s].constant, models[s].weights, terms, known_number + s, whole);
+        memset(w->tokens, 0, whole);
+        if (decode_items(&models[s], r, states, lanes, splats, w))
+            return TOO_FEW_WORDS;
+        keep_dense(&models[s], w, whole, is_signed, sizes[s], integers[s]);
+        terms[known_number + s] = sizes[s];
+    }
+    return r->read == r->available ? FINE : TOO_MANY_WORDS;
+}
+
+/* About 16 · log2(4 · level), linear between powers of two; 0 for level 0. Levels are below 2^30. */
+static INLINE int32_t logarithm(int32_t level)
+{
+    const uint32_t quarters = level > 0 ? 4 * (uint32_t)level : 1;
+    int exponent = 0;
+    for (uint32_t rest = quarters >> 1; rest; rest >>= 1)
+        exponent++;
+    return 16 * exponent + (int32_t)(((uint64_t)(quarters - (1u << exponent)) * 16) >> exponent);
+}
+
+static INLINE uint8_t class_of(int64_t weight, int32_t power, int32_t offset)
+{
+    const int64_t class = (weight * power + offset) >> 6;
+    return (uint8_t)((class < -CLASSES ? -CLASSES : class > CLASSES - 1 ? CLASSES - 1 : class) + CLASSES);
+}
+
+/* Classes of the steps of splats' colours (docs/format.md, "Steps of colours"). */
+static void find_steps(const colour_steps *steps, uint64_t begin, size_t splats, work *w)
+{
+    if (!steps->groups) {
+        memset(w->dc_classes, CLASSES, sizeof w->dc_classes);
+        memset(w->ac_classes, CLASSES, sizeof w->ac_classes);
+    } else {
+        const int64_t first = (int64_t)steps->first_knot << steps->knot_shift;
+        const int64_t most = first + ((int64_t)1 << (4 + steps->knot_shift)) - 1;
+        const size_t rows = steps_of(splats);
+        for (size_t splat = 0, place = 0, lane = 0, step = 0; splat < splats; splat++) {
+            const int32_t x = w->scales[0][place], y = w->scales[1][place], z = w->scales[2][place];
+            const int32_t a = x < ENOUGH ? w->logarithms[x] : logarithm(x);
+            const int32_t b = y < ENOUGH ? w->logarithms[y] : logarithm(y);
+            const int32_t c = z < ENOUGH ? w->logarithms[z] : logarithm(z);
+            const int32_t low = a < b ? a : b, high = a < b ? b : a;
+            const int32_t largest = high > c ? high : c, smallest = low < c ? low : c;
+            const int32_t between = a + b + c - largest - smallest;
+            int64_t level = w->opacity[place] < most ? w->opacity[place] : most;
+            level = level > first ? level - first : 0;
+            const int64_t knot = level >> steps->knot_shift, part = level - (knot << steps->knot_shift);
+            int64_t weight = (steps->scales[0] * largest + steps->scales[1] * between + steps->scales[2] * smallest) >> 8;
+            weight += steps->knots[knot];
+            weight += (part * (steps->knots[knot + 1] - steps->knots[knot])) >> steps->knot_shift;
+            weight += 8 * steps->groups[(begin + splat) >> steps->group_bits];
+            w->dc_classes[place] = class_of(weight, steps->powers[0], steps->offsets[0]);
+            w->ac_classes[place] = class_of(weight, steps->powers[1], steps->offsets[1]);
+            place += LANES;
+            if (++step == rows) {
+                step = 0;
+                place = ++lane;
+            }
+        }
+    }
+    for (size_t i = 0; i < BUNDLE; i++)
+        w->step_sizes[i] = (int16_t)(STEP_SIZE * w->dc_classes[i]);
+}
+
+/* The mask of each splat to places and coefficients of its items. Returns their number. */
+static size_t list_items(work *w, size_t lanes, size_t steps, size_t splats, uint16_t *places, uint8_t *coefficients)
+{
+    size_t number = 0;
+    for (size_t lane = 0; lane < lanes; lane++) {
+        const size_t end = splats - lane * steps < steps ? splats - lane * steps : steps;
+        for (size_t step = 0; step < end; step++) {
+            const size_t place = step * LANES + lane;
+            const uint8_t mask = w->tokens[place];
+            /* Room for eight is always there, and what is too much is written over. */
+            memcpy(coefficients + number, &w->coefficient_bytes[mask], 8);
+            for (size_t k = 0; k < 8; k++)
+                places[number + k] = (uint16_t)place;
+            unsigned bits = mask - (mask >> 1 & 0x55u);
+            bits = (bits & 0x33u) + (bits >> 2 & 0x33u);
+            number += (bits + (bits >> 4)) & 0x0fu;
+        }
+    }
+    return number;
+}
+
+/* The AC coefficients of a degree. */
+static int decode_band(
+    const stream_model *models, size_t band, reader *r, uint32_t *states, size_t lanes, size_t splats, work *w)
+{
+    const size_t steps = steps_of(splats), places = LANES * steps;
+    const size_t whole = (places + LANE - 1) / LANE * LANE;
+    const int16_t *const known[11] = { w->opacity_sizes, w->scale_sizes[0], w->scale_sizes[1], w->scale_sizes[2],
+        w->step_sizes, w->dc_sizes[0], w->dc_sizes[1], w->dc_sizes[2], w->sums[0], w->sums[1], w->sums[2] };
+    const int16_t *const of_items[5] = { w->sums[0], w->sums[1], w->sums[2], w->mask_sizes, w->step_sizes };
+    const stream_model *model = &models[MASK_STREAM];
+    add_terms(w->expected, model->constant, model->weights, known, 11, whole);
+    memset(w->tokens, 0, whole);
+    if (decode_items(model, r, states, lanes, splats, w))
+        return TOO_FEW_WORDS;
+    for (size_t i = 0; i < whole; i++)
+        w->mask_sizes[i] = model->sizes[w->tokens[i]];
+    uint16_t *const place = w->places[band];
+    uint8_t *const coefficient = w->coefficients[band];
+    const size_t items = list_items(w, lanes, steps, splats, place, coefficient);
+    w->items[band] = (uint32_t)items;
+
+    model = &models[PATTERN_STREAM];
+    add_terms(w->of_splats, model->constant, model->weights, of_items, 5, whole);
+    size_t item_steps = (items + lanes - 1) / lanes;
+    for (size_t lane = 0, i = 0; i < items; lane++)
+        for (size_t at = lane, end = i + item_steps < items ? i + item_steps : items; i < end; i++, at += LANES)
+            w->expected[at] = w->of_splats[place[i]] + model->biases[coefficient[i]];
+    if (decode_items(model, r, states, lanes, items, w))
+        return TOO_FEW_WORDS;
+    for (size_t lane = 0, i = 0; i < items; lane++)
+        for (size_t at = lane, end = i + item_steps < items ? i + item_steps : items; i < end; i++, at += LANES)
+            w->patterns[i] = w->tokens[at];
+
+    for (size_t c = 0; c < 3; c++) {
+        model = &models[VALUE_STREAM + c];
+        int32_t *const channel = w->channels[band][c];
+        memset(channel, 0, items * sizeof *channel);
+        memset(w->value_sizes[c], 0, items * sizeof *w->value_sizes[c]);
+        size_t chosen = 0;
+        for (size_t i = 0; i < items; i++) {
+            w->chosen[chosen] = (uint32_t)i;
+            chosen += w->patterns[i] >> c & 1;
+        }
+        add_terms(w->of_splats, model->constant, model->weights, of_items, 5, whole);
+        const int32_t chroma = model->weights[5] * CHROMA_SIZE;
+        item_steps = (chosen + lanes - 1) / lanes;
+        for (size_t lane = 0, k = 0; k < chosen; lane++)
+            for (size_t at = lane, end = k + item_steps < chosen ? k + item_steps : chosen; k < end; k++, at += LANES) {
+                const size_t i = w->chosen[k];
+                int32_t sum = w->of_splats[place[i]] + model->biases[coefficient[i]];
+                sum += w->patterns[i] > 1 ? chroma : 0;
+                for (size_t b = 0; b < c; b++)
+                    sum += model->weights[6 + b] * w->value_sizes[b][i];
+                w->expected[at] = sum;
+            }
+        if (decode_items(model, r, states, lanes, chosen, w))
+            return TOO_FEW_WORDS;
+        for (size_t lane = 0, k = 0; k < chosen; lane++)
+            for (size_t at = lane, end = k + item_steps < chosen ? k + item_steps : chosen; k < end; k++, at += LANES) {
+                const size_t i = w->chosen[k];
+                channel[i] = from_zigzag(integer_of(w, at) + 1);
+                w->value_sizes[c][i] = model->sizes[w->tokens[at]];
+            }
+    }
+    for (size_t c = 0; c < 3; c++)
+        for (size_t i = 0; i < items; i++)
+            w->sums[c][place[i]] += w->value_sizes[c][i];
+    return r->read == r->available ? FINE : TOO_MANY_WORDS;
+}
+
+static int at_end(const uint32_t *states, size_t lanes)
+{
+    for (size_t l = 0; l < lanes; l++)
+        if (states[l] != LOWEST)
+            return BAD_END;
+    return FINE;
+}
+
+int decode_bundle(
+    const bundled_file *file, uint64_t bundle, int sections, int rotations, work *w, int *section)
+{
+    const size_t splats = splats_of(file, bundle), lanes = lanes_of(splats);
+    uint32_t states[LANES];
+    memcpy(states, file->states + bundle * LANES, lanes * sizeof *states);
+    memset(w->sums, 0, sizeof w->sums);
+    memset(w->items, 0, sizeof w->items);
+    const int16_t *const known[5] = { w->opacity_sizes, w->scale_sizes[0], w->scale_sizes[1], w->scale_sizes[2],
+        w->step_sizes };
+    for (int s = 0; s < SECTIONS; s++) {
+        if (s == ROTATION ? !rotations : s >= sections)
+            continue;
+        *section = s;
+        reader r = { NULL, 0, 0 };
+        const int there = file->words[s] != NULL;
+        if (there) {
+            r.words = file->words[s] + 2 * file->starts[s][bundle];
+            r.available = (size_t)(file->starts[s][bundle + 1] - file->starts[s][bundle]);
+        }
+        const stream_model *const models = file->streams;
+        int wrong = FINE;
+        if (s == DC)
+            find_steps(&file->steps, bundle * BUNDLE, splats, w);
+        if (s == OPACITY) {
+            wrong = dense_section(models + OPACITY_STREAM, 1, NULL, 0, 0, &r, states, lanes, splats, w,
+                &w->opacity_sizes, &w->opacity);
+        } else if (s == SCALE && there) {
+            wrong = dense_section(models + SCALE_STREAM, 3, NULL, 0, 0, &r, states, lanes, splats, w, w->scale_sizes,
+                w->scales);
+        } else if (s == SCALE) {
+            memset(w->scale_sizes, 0, sizeof w->scale_sizes);
+            memset(w->scales, 0, sizeof w->scales);
+        } else if (s == DC && there) {
+            wrong = dense_section(
+                models + DC_STREAM, 3, known, 5, 1, &r, states, lanes, splats, w, w->dc_sizes, w->dc);
+        } else if (s == DC) {
+            memset(w->dc_sizes, 0, sizeof w->dc_sizes);
+            memset(w->dc, 0, sizeof w->dc);
+        } else if (s < ROTATION && there) {
+            const size_t band = (size_t)(s - BAND_1);
+            wrong = decode_band(
+                models + BAND_STREAM + BAND_STREAMS * band, band, &r, states, lanes, splats, w);
+        } else if (s == ROTATION && there) {
+            const int16_t *terms[9] = { w->scale_sizes[0], w->scale_sizes[1], w->scale_sizes[2] };
+            for (size_t k = 0; k < 3; k++) {
+                const int16_t *const a = w->scale_sizes[k == 2 ? 0 : k], *const b = w->scale_sizes[k == 2 ? 2 : k + 1];
+                for (size_t i = 0; i < BUNDLE; i++)
+                    w->difference_sizes[k][i] = (int16_t)(a[i] < b[i] ? b[i] - a[i] : a[i] - b[i]);
+                terms[3 + k] = w->difference_sizes[k];
+            }
+            uint32_t own[LANES];
+            memcpy(own, file->rotation_states + bundle * LANES, lanes * sizeof *own);
+            wrong = dense_section(models + ROTATION_STREAM, 3, terms, 6, 1, &r, own, lanes, splats, w,
+                w->rotation_sizes, w->rotations);
+            if (!wrong)
+                wrong = at_end(own, lanes);
+        } else if (s == ROTATION) {
+            memset(w->rotations, 0, sizeof w->rotations);
+        }
+        if (wrong)
+            return wrong;
+    }
+    *section = OPACITY;
+    return sections == ROTATION ? at_end(states, lanes) : FINE;
+}
+
+/* What each slot of a model's contexts stands for, and the interval of each token.
+ *
+ * frequencies: (contexts, alphabet). slots: (contexts · 4096). intervals: (contexts · 256). Returns 0, or 1 where a
+ * context's frequencies do not add up to 4096. */
+POTR_EXPORT int potr_bundles_table(
+    const uint16_t *frequencies, size_t contexts, size_t alphabet, uint8_t *slots, uint32_t *intervals)
+{
+    for (size_t context = 0; context < contexts; context++) {
+        const uint16_t *row = frequencies + context * alphabet;
+        uint32_t at = 0;
+        for (size_t token = 0; token < alphabet; token++) {
+            const uint32_t frequency = row[token];
+            if (frequency > TOTAL - at)
+                return 1;
+            memset(slots + context * TOTAL + at, (int)token, frequency);
+            intervals[context * TOKENS + token] = at << 16 | frequency;
+            at += frequency;
+        }
+        if (at != TOTAL)
+            return 1;
+    }
+    return 0;
+}
+
+/* Bytes of what a bundle's decoding works with. */
+POTR_EXPORT size_t potr_bundles_work(void)
+{
+    return sizeof(work);
+}
+
+/* Makes it ready, once; it holds zeros. */
+POTR_EXPORT void potr_bundles_begin(work *w)
+{
+    for (unsigned mask = 0; mask < 128; mask++) {
+        uint8_t bytes[8] = { 0 };
+        for (unsigned bit = 0, number = 0; bit < 7; bit++)
+            if (mask >> bit & 1)
+                bytes[number++] = (uint8_t)bit;
+        memcpy(&w->coefficient_bytes[mask], bytes, 8);
+    }
+    for (int32_t level = 0; level < ENOUGH; level++)
+        w->logarithms[level] = (int16_t)logarithm(level);
+}
+
+/* Where a bundle's integers go. */
+typedef struct {
+    int32_t *opacity;      /* (splats of the bundle) */
+    int32_t *scales;       /* (3, splats) */
+    int32_t *rotations;    /* (3, splats) */
+    int32_t *dc;           /* (3, splats) */
+    uint16_t *item_splats; /* (15 · splats) of each item, counted from the bundle's first */
+    uint8_t *item_coefficients; /* (15 · splats) 1 to 15 */
+    int32_t *item_channels;     /* (3, 15 · splats) */
+    uint64_t items[3];     /* of each degree */
+} bundle_levels;
+
+static void to_splats(const int32_t *rows, size_t steps, size_t splats, int32_t *out)
+{
+    for (size_t s = 0; s < splats; s++)
+        out[s] = rows[s % steps * LANES + s / steps];
+}
+
+/* The integers of a bundle: so many sections of the chain that begins with opacities, and rotations or none.
+ *
+ * *section becomes the one at fault, in the order of `words`. Returns 0; 1 where there are too few words, 2 where there
+ * are too many, 3 where a lane does not end where it should. */
+POTR_EXPORT int potr_bundles_levels(
+    const bundled_file *file, uint64_t bundle, int sections, int rotations, work *w, bundle_levels *out, int *section)
+{
+    const int wrong = decode_bundle(file, bundle, sections, rotations, w, section);
+    if (wrong)
+        return wrong;
+    const size_t splats = splats_of(file, bundle), steps = steps_of(splats);
+    to_splats(w->opacity, steps, splats, out->opacity);
+    for (size_t k = 0; k < 3; k++) {
+        if (sections > SCALE)
+            to_splats(w->scales[k], steps, splats, out->scales + k * splats);
+        if (sections > DC)
+            to_splats(w->dc[k], steps, splats, out->dc + k * splats);
+        if (rotations)
+            to_splats(w->rotations[k], steps, splats, out->rotations + k * splats);
+    }
+    size_t number = 0;
+    for (size_t band = 0; band < 3; band++) {
+        const size_t items = w->items[band], first = (band + 1) * (band + 1);
+        out->items[band] = items;
+        for (size_t i = 0; i < items; i++) {
+            const size_t place = w->places[band][i];
+            out->item_splats[number + i] = (uint16_t)(place % LANES * steps + place / LANES);
+            out->item_coefficients[number + i] = (uint8_t)(first + w->coefficients[band][i]);
+        }
+        for (size_t c = 0; c < 3; c++)
+            memcpy(out->item_channels + c * 15 * splats + number, w->channels[band][c], items * sizeof(int32_t));
+        number += items;
+    }
+    return FINE;
+}

@@ -1,0 +1,398 @@
+"""Bundles by C: :class:`BundledFile` is a file's sections of coder 4 as C takes them.
+
+C trusts what it is told: that is made here, of arrays whose sizes are checked.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.native.arrays import address
+from potr_cl.codec.steps.rule import CLASSES, KNOTS, ColourSteps
+
+F32 = NDArray[np.float32]
+U8 = NDArray[np.uint8]
+U32 = NDArray[np.uint32]
+
+_TOTAL, _TOKENS = 4096, 256
+_BUNDLE, _LANE = 8192, 256
+_WEIGHTS, _BIASES = 12, 8
+#: Where the streams of each section begin, in the order of decoding, and how many there are; rotations come last.
+_STREAMS = (0, 1, 4, 7, 12, 17, 22, 25)
+SECTIONS, STREAMS = len(_STREAMS) - 1, _STREAMS[-1]
+#: Integers of a bundle are below this in magnitude, so that sums of three fit.
+_LARGEST = 1 << 29
+_COEFFICIENTS = 15
+
+_POINTER, _WORD, _NUMBER = ctypes.c_void_p, ctypes.c_uint64, ctypes.c_int32
+
+
+class _Stream(ctypes.Structure):
+    _fields_ = (
+        ("classes", _POINTER),
+        ("slots", _POINTER),
+        ("intervals", _POINTER),
+        ("sizes", _POINTER),
+        ("weights", _NUMBER * _WEIGHTS),
+        ("biases", _NUMBER * _BIASES),
+        ("recent", _NUMBER),
+        ("constant", _NUMBER),
+        ("alphabet", _NUMBER),
+        ("unused", _NUMBER),
+    )
+
+
+class _Steps(ctypes.Structure):
+    _fields_ = (
+        ("groups", _POINTER),
+        ("group_bits", _NUMBER),
+        ("knot_shift", _NUMBER),
+        ("first_knot", _NUMBER),
+        ("powers", _NUMBER * 2),
+        ("offsets", _NUMBER * 2),
+        ("scales", _NUMBER * 3),
+        ("knots", _NUMBER * KNOTS),
+    )
+
+
+class _File(ctypes.Structure):
+    _fields_ = (
+        ("streams", _Stream * STREAMS),
+        ("words", _POINTER * SECTIONS),
+        ("starts", _POINTER * SECTIONS),
+        ("states", _POINTER),
+        ("rotation_states", _POINTER),
+        ("splats", _WORD),
+        ("steps", _Steps),
+    )
+
+
+class _Levels(ctypes.Structure):
+    _fields_ = (
+        ("opacity", _POINTER),
+        ("scales", _POINTER),
+        ("rotations", _POINTER),
+        ("dc", _POINTER),
+        ("item_splats", _POINTER),
+        ("item_coefficients", _POINTER),
+        ("item_channels", _POINTER),
+        ("items", _WORD * 3),
+    )
+
+
+class _Values(ctypes.Structure):
+    _fields_ = (
+        ("log_scales", _POINTER),
+        ("quaternions", _POINTER),
+        ("logits", _POINTER),
+        ("dc", _POINTER),
+        ("ac", _POINTER),
+        ("scale_table", _POINTER),
+        ("opacity_table", _POINTER),
+        ("scale_levels", _WORD),
+        ("opacity_levels", _WORD),
+        ("sf_dc", _POINTER),
+        ("sf_ac", _POINTER),
+        ("step", _POINTER),
+        ("inverse", _POINTER),
+        ("sf_rotation", ctypes.c_float),
+        ("unused", ctypes.c_float),
+    )
+
+
+@dataclass(frozen=True)
+class StreamModel:
+    """What C takes of a stream.
+
+    Attributes:
+        classes: (256,) uint8 context of each expected size, below the number of contexts.
+        frequencies: (contexts, tokens), at most 32 and 252.
+        sizes: (tokens,) of the tokens, below 2^15; as many as there are frequencies, or more.
+        terms: weights of its terms, at most 12.
+        biases: by coefficient, at most 8.
+        recent, constant: weight of the recent sizes, and what is added.
+    """
+
+    classes: U8
+    frequencies: NDArray[np.integer]
+    sizes: NDArray[np.integer]
+    terms: Sequence[int]
+    biases: Sequence[int]
+    recent: int
+    constant: int
+
+
+@dataclass(frozen=True)
+class SectionWords:
+    """What C takes of a section.
+
+    Attributes:
+        models: of its streams.
+        words: bytes of 16-bit words.
+        counts: (bundles,) int64 words of each.
+        states: (lanes of all bundles,) uint32, for the sections that begin a chain.
+    """
+
+    models: Sequence[StreamModel]
+    words: U8
+    counts: NDArray[np.int64]
+    states: U32
+
+
+@dataclass(frozen=True)
+class ValueArrays:
+    """Where the values of a file's N splats go, float32 and contiguous; None for what is not asked for.
+
+    Attributes:
+        log_scales: (N, 3).
+        quaternions: (N, 4).
+        logits: (N,).
+        sh: (M, 3, N), which holds zeros.
+    """
+
+    log_scales: F32 | None = None
+    quaternions: F32 | None = None
+    logits: F32 | None = None
+    sh: F32 | None = None
+
+
+@dataclass(frozen=True)
+class Tables:
+    """What makes values of levels.
+
+    Attributes:
+        scales, opacities: value of each level from 0 on.
+        sf_dc, sf_ac: (64,) scale factors of each class of steps.
+        steps, inverses: (64,) int64 of each class of steps, of the prediction of DC.
+        sf_rotation: scale factor.
+    """
+
+    scales: F32
+    opacities: F32
+    sf_dc: F32
+    sf_ac: F32
+    steps: NDArray[np.int64]
+    inverses: NDArray[np.int64]
+    sf_rotation: float
+
+
+@dataclass(frozen=True)
+class BundleIntegers:
+    """Integers of a bundle's n splats, int32; the first ones only, where no others were asked for.
+
+    Attributes:
+        opacities: (n,).
+        scales, rotations, dc: (3, n); of DC what its prediction has left.
+        splats, coefficients: (K,) of the AC coefficients that are not 0, degree by degree.
+        channels: (3, K).
+        items: of each degree.
+    """
+
+    opacities: NDArray[np.int32]
+    scales: NDArray[np.int32]
+    rotations: NDArray[np.int32]
+    dc: NDArray[np.int32]
+    splats: NDArray[np.uint16]
+    coefficients: U8
+    channels: NDArray[np.int32]
+    items: tuple[int, int, int]
+
+
+#: What C says of a bundle, and the section at fault.
+FINE, TOO_FEW_WORDS, TOO_MANY_WORDS, BAD_END, BEYOND_TABLE = range(5)
+
+
+class BundledFile:
+    """A file's sections, from which bundles are decoded one by one, by any thread.
+
+    Args:
+        functions: of the library.
+        splats: N of the file.
+        sections: by their place in the order of decoding (opacity, scale, DC, degrees 1 to 3, rotation); opacity's at
+            least.
+        steps: of colours, for files that have them.
+    """
+
+    def __init__(
+        self,
+        functions: Mapping[str, Any],
+        splats: int,
+        sections: Mapping[int, SectionWords],
+        steps: ColourSteps | None = None,
+    ) -> None:
+        self._c = functions
+        self._splats = splats
+        self._kept: list[NDArray[Any]] = []
+        self._file = _File()
+        self._file.splats = splats
+        bundles, lanes = -(-splats // _BUNDLE), splats // _BUNDLE * (_BUNDLE // _LANE) + -(-(splats % _BUNDLE) // _LANE)
+        for number, section in sections.items():
+            first, end = _STREAMS[number : number + 2]
+            if len(section.models) != end - first or len(section.counts) != bundles or int(section.counts.min()) < 0:
+                raise TypeError("the native path was given a section without all of its parts")
+            for k, model in enumerate(section.models, start=first):
+                self._describe(self._file.streams[k], model)
+            starts = np.zeros(bundles + 1, np.uint64)
+            np.cumsum(section.counts, out=starts[1:])
+            self._file.words[number] = self._keep(section.words, np.uint8, 2 * int(starts[-1]))
+            if not self._file.words[number]:
+                self._file.words[number] = self._keep(np.zeros(2, np.uint8), np.uint8, 2)
+            self._file.starts[number] = self._keep(starts, np.uint64, bundles + 1)
+        self._file.states = self._keep(sections[0].states.astype(np.uint32), np.uint32, lanes)
+        if SECTIONS - 1 in sections:
+            self._file.rotation_states = self._keep(sections[SECTIONS - 1].states.astype(np.uint32), np.uint32, lanes)
+
+        if steps is not None:
+            self._take_steps(steps)
+
+    def _take_steps(self, steps: ColourSteps) -> None:
+        to = self._file.steps
+        # Both are checked where steps are read, and once more: C shifts by them.
+        if not 0 <= steps.group_bits <= 40 or not 0 <= steps.knot_shift <= 40:
+            raise TypeError("the native path was given impossible steps")
+        to.groups = self._keep(np.ascontiguousarray(steps.groups), np.int8, -(-self._splats >> steps.group_bits))
+        to.group_bits, to.knot_shift, to.first_knot = steps.group_bits, steps.knot_shift, steps.first_knot
+        to.powers[:], to.offsets[:] = list(steps.powers), list(steps.offsets)
+        to.scales[:], to.knots[:] = list(steps.scales), list(steps.opacities)
+
+    def _keep(self, array: NDArray[Any], dtype: type[np.generic], number: int) -> int:
+        self._kept.append(array)
+        return address(array, dtype, number)
+
+    def _describe(self, to: _Stream, model: StreamModel) -> None:
+        contexts, alphabet = model.frequencies.shape
+        if int(model.classes.max()) >= contexts or alphabet > min(len(model.sizes), _TOKENS):
+            raise TypeError("the native path was given contexts without frequencies, or tokens without sizes")
+        if len(model.terms) > _WEIGHTS or len(model.biases) > _BIASES:
+            raise TypeError("the native path was given too many weights")
+        slots, intervals = np.empty(contexts * _TOTAL, np.uint8), np.empty(contexts * _TOKENS, np.uint32)
+        frequencies = np.ascontiguousarray(model.frequencies, np.uint16)
+        sizes = np.zeros(_TOKENS, np.int16)
+        sizes[: len(model.sizes)] = model.sizes
+        if self._c["potr_bundles_table"](
+            address(frequencies, np.uint16, frequencies.size),
+            contexts,
+            alphabet,
+            address(slots, np.uint8, len(slots), True),
+            address(intervals, np.uint32, len(intervals), True),
+        ):
+            raise TypeError("the native path was given frequencies that do not add up")
+        to.classes = self._keep(model.classes, np.uint8, 256)
+        to.slots = self._keep(slots, np.uint8, len(slots))
+        to.intervals = self._keep(intervals, np.uint32, len(intervals))
+        to.sizes = self._keep(sizes, np.int16, _TOKENS)
+        to.weights[: len(model.terms)] = list(model.terms)
+        to.biases[: len(model.biases)] = list(model.biases)
+        to.recent, to.constant, to.alphabet = model.recent, model.constant, alphabet
+
+    def work(self) -> U8:
+        """What a thread needs to decode bundles, one at a time."""
+        work = np.zeros(self._c["potr_bundles_work"]() + 64, np.uint8)
+        start = -work.ctypes.data % 64
+        aligned = work[start : len(work) - 64 + start]
+        self._c["potr_bundles_begin"](address(aligned, np.uint8, len(aligned), True))
+        return aligned
+
+    def integers(self, bundle: int, sections: int, rotations: bool, work: U8) -> tuple[int, int, BundleIntegers]:
+        """Decode a bundle.
+
+        Args:
+            bundle: which.
+            sections: so many of the chain that begins with opacities.
+            rotations: whether these are decoded; then the scales must be.
+            work: of :meth:`work`.
+
+        Returns:
+            What C says, the section at fault, and the integers, if nothing is.
+        """
+        n = self._size(bundle, sections, rotations)
+        integers = [np.zeros((k, n), np.int32) for k in (1, 3, 3, 3)]
+        splats, coefficients = np.empty(_COEFFICIENTS * n, np.uint16), np.empty(_COEFFICIENTS * n, np.uint8)
+        channels = np.empty((3, _COEFFICIENTS * n), np.int32)
+        out = _Levels(
+            *(address(array, np.int32, array.size, True) for array in integers),
+            address(splats, np.uint16, splats.size, True),
+            address(coefficients, np.uint8, coefficients.size, True),
+            address(channels, np.int32, channels.size, True),
+        )
+        section = ctypes.c_int()
+        said = self._c["potr_bundles_levels"](
+            ctypes.byref(self._file),
+            bundle,
+            sections,
+            rotations,
+            address(work, np.uint8, len(work), True),
+            ctypes.byref(out),
+            ctypes.byref(section),
+        )
+        opacities, scales, turned, dc = integers
+        items = (int(out.items[0]), int(out.items[1]), int(out.items[2]))
+        number = sum(items)
+        found = BundleIntegers(
+            opacities[0], scales, turned, dc, splats[:number], coefficients[:number], channels[:, :number], items
+        )
+        return said, section.value, found
+
+    def values(
+        self, bundle: int, sections: int, rotations: bool, work: U8, arrays: ValueArrays, tables: Tables
+    ) -> tuple[int, int]:
+        """Decode a bundle to values, as :meth:`integers` does to integers.
+
+        Returns:
+            What C says, and the section at fault. BEYOND_TABLE: values of the bundle are not whole.
+        """
+        self._size(bundle, sections, rotations)
+        n = self._splats
+        planes = 0 if arrays.sh is None else len(arrays.sh)
+        bands = [number - 2 for number in range(3, sections) if self._file.words[number]]
+        if arrays.sh is not None and planes < (max(bands, default=0) + 1) ** 2:
+            raise TypeError("the native path was given no place for coefficients")
+        dc = 0 if arrays.sh is None or not planes else address(arrays.sh, np.float32, planes * 3 * n, True)
+        out = _Values(
+            _optional(arrays.log_scales, 3 * n),
+            _optional(arrays.quaternions, 4 * n),
+            _optional(arrays.logits, n),
+            dc or None,
+            dc + 12 * n if planes > 1 else None,
+            address(tables.scales, np.float32, len(tables.scales)),
+            address(tables.opacities, np.float32, len(tables.opacities)),
+            len(tables.scales),
+            len(tables.opacities),
+            address(tables.sf_dc, np.float32, 2 * CLASSES),
+            address(tables.sf_ac, np.float32, 2 * CLASSES),
+            address(tables.steps, np.int64, 2 * CLASSES),
+            address(tables.inverses, np.int64, 2 * CLASSES),
+            tables.sf_rotation,
+        )
+        section = ctypes.c_int()
+        said = self._c["potr_bundles_values"](
+            ctypes.byref(self._file),
+            bundle,
+            sections,
+            rotations,
+            address(work, np.uint8, len(work), True),
+            ctypes.byref(out),
+            ctypes.byref(section),
+        )
+        return said, section.value
+
+    def _size(self, bundle: int, sections: int, rotations: bool) -> int:
+        """Splats of a bundle."""
+        if not 0 <= bundle * _BUNDLE < self._splats or not 1 <= sections < SECTIONS or (rotations and sections < 2):
+            raise TypeError("the native path was asked for what is not there")
+        return min(self._splats - bundle * _BUNDLE, _BUNDLE)
+
+
+def _optional(array: F32 | None, number: int) -> int | None:
+    return None if array is None else address(array, np.float32, number, True)
+
+
+def fits(largest: int) -> bool:
+    """Whether C can take integers of at most some magnitude."""
+    return largest < _LARGEST

@@ -1,0 +1,277 @@
+"""The encoder of bundles by C: :class:`BundleEncoder`. Its input is the encoder's own, whose sizes are checked here."""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
+from dataclasses import dataclass
+from typing import Any, Generic, TypeVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.native.arrays import address
+from potr_cl.codec.native.bundles import SECTIONS, STREAMS
+
+I32 = NDArray[np.int32]
+I64 = NDArray[np.int64]
+U8 = NDArray[np.uint8]
+U16 = NDArray[np.uint16]
+U32 = NDArray[np.uint32]
+T = TypeVar("T")
+
+#: Rows of the sums of products, and numbers of a stream.
+COLUMNS, NUMBERS = 22, 21
+_TOKENS = 256
+_LANES, _BUNDLE = 32, 8192
+_MOST_ALPHABET, _GROUPS, _LOGS = 252, 64, 4096
+#: Words that a bundle can have at most, for each splat: of 13 streams of splats, and of 15 coefficients' patterns and
+#: values. A token and its bits take four at most.
+_WORDS = 4 * (13 + 15 * 4)
+
+_POINTER, _WORD, _NUMBER = ctypes.c_void_p, ctypes.c_uint64, ctypes.c_int32
+
+
+class _Integers(ctypes.Structure):
+    _fields_ = (
+        ("opacity", _POINTER),
+        ("scales", _POINTER * 3),
+        ("rotations", _POINTER * 3),
+        ("dc", _POINTER * 3),
+        ("ac", _POINTER * 45),
+        ("classes", _POINTER),
+        ("splats", _WORD),
+    )
+
+
+class _Stream(ctypes.Structure):
+    _fields_ = (
+        ("sizes", _POINTER),
+        ("classes", _POINTER),
+        ("intervals", _POINTER),
+        ("numbers", _NUMBER * NUMBERS),
+        ("terms", _NUMBER),
+        ("coefficients", _NUMBER),
+        ("unused", _NUMBER),
+    )
+
+
+@dataclass(frozen=True)
+class Model:
+    """What was fitted to a stream, but for its numbers.
+
+    Attributes:
+        classes: (256,) context of each expected size.
+        frequencies: (contexts, alphabet) uint16.
+    """
+
+    classes: U8
+    frequencies: U16
+
+
+@dataclass(frozen=True)
+class CodedBundle:
+    """A bundle as it is stored.
+
+    Attributes:
+        words: of each section, in the order of decoding.
+        states: (32,) of the lanes of the chain that begins with opacities.
+        rotation_states: (32,) of the other.
+    """
+
+    words: Sequence[U16]
+    states: U32
+    rotation_states: U32
+
+
+class _Pool(Generic[T]):
+    """Room that threads work in: as many as there are threads at work."""
+
+    def __init__(self, make: Callable[[], T]) -> None:
+        self._make = make
+        self._free: list[T] = []
+
+    @contextmanager
+    def taken(self) -> Iterator[T]:
+        try:
+            room = self._free.pop()
+        except IndexError:
+            room = self._make()
+        yield room
+        self._free.append(room)
+
+    def all(self) -> list[T]:
+        """All that was made, while nobody is at work."""
+        return self._free
+
+
+class BundleEncoder:
+    """A file's integers, whose bundles any thread may go through.
+
+    Args:
+        functions: of the library.
+        splats: N.
+        dense: integers of opacity, scales, rotations and DC, int32 (N,) each, by the names "opacity", "scales",
+            "rotations", "dc"; sections that are left out are 0.
+        ac: by coefficient and channel, from 0 to 44; whole degrees.
+        sizes: (tokens,) of the tokens of each stream.
+        terms, coefficients: how many each has.
+        classes: (N,) of the steps of DC, -32 to 31.
+    """
+
+    def __init__(
+        self,
+        functions: Mapping[str, Any],
+        splats: int,
+        dense: Mapping[str, Sequence[I32]],
+        ac: Mapping[int, I32],
+        sizes: Sequence[NDArray[np.integer]],
+        terms: Sequence[int],
+        coefficients: Sequence[int],
+        classes: NDArray[np.int8],
+    ) -> None:
+        self._c = functions
+        self._splats = splats
+        self._kept: list[NDArray[Any]] = []
+        self._integers = _Integers()
+        self._integers.splats = splats
+        (opacity,) = dense["opacity"]
+        self._integers.opacity = self._keep(opacity, np.int32, splats)
+        self._integers.classes = self._keep(classes, np.int8, splats)
+        for name in ("scales", "rotations", "dc"):
+            for k, values in enumerate(dense.get(name, ())):
+                getattr(self._integers, name)[k] = self._keep(values, np.int32, splats)
+        for k, values in ac.items():
+            self._integers.ac[k] = self._keep(values, np.int32, splats)
+        if any(len({k in ac for k in degree}) > 1 for degree in (range(9), range(9, 24), range(24, 45))):
+            raise TypeError("the native path was given a part of a degree")
+        self._streams = (_Stream * STREAMS)()
+        self._work = _Pool(lambda: np.zeros(functions["potr_bundles_encoding"](), np.uint8))
+        self._sums = _Pool(lambda: (np.zeros((STREAMS, COLUMNS, COLUMNS), np.int64), np.zeros(STREAMS, np.uint32)))
+        self._counts = _Pool(lambda: np.zeros((STREAMS, _TOKENS, _TOKENS), np.uint32))
+        self._words = _Pool(lambda: np.empty(_WORDS * _BUNDLE + 2, np.uint16))
+        for to, size, number, some in zip(self._streams, sizes, terms, coefficients, strict=True):
+            if number > 12 or number + some > NUMBERS - 2:
+                raise TypeError("the native path was given too many terms")
+            all_sizes = np.zeros(_TOKENS, np.int16)
+            all_sizes[: len(size)] = size
+            to.sizes = self._keep(all_sizes, np.int16, _TOKENS)
+            to.terms, to.coefficients = number, some
+
+    def _keep(self, array: NDArray[Any], dtype: type[np.generic], number: int) -> int:
+        self._kept.append(array)
+        return address(array, dtype, number)
+
+    def survey(self, bundle: int, at_least: int) -> None:
+        """Add a bundle to what weights are fitted to.
+
+        Args:
+            bundle: which.
+            at_least: samples that are taken of a stream, where it has as many.
+        """
+        with self._sums.taken() as (grams, largest), self._work.taken() as work:
+            self._c["potr_bundles_survey"](
+                ctypes.byref(self._integers),
+                self._checked(bundle),
+                self._streams,
+                work.ctypes.data,
+                at_least,
+                address(grams, np.int64, grams.size, True),
+                address(largest, np.uint32, STREAMS, True),
+            )
+
+    def grams(self) -> I64:
+        """(25, 22, 22) sums of products of terms, recent sizes, constant, coefficients and size; not those below the
+        diagonals."""
+        total: I64 = np.sum([grams for grams, _ in self._sums.all()], axis=0)
+        return total
+
+    def largest(self) -> U32:
+        """(25,) the largest integer of each stream, mapped to unsigned."""
+        most: U32 = np.max([largest for _, largest in self._sums.all()], axis=0)
+        return most
+
+    def take_numbers(self, numbers: Sequence[Sequence[int]]) -> None:
+        """What tells the contexts of each stream: weights of terms and of recent sizes, constant, biases."""
+        for to, some in zip(self._streams, numbers, strict=True):
+            if len(some) != to.terms + 2 + to.coefficients:
+                raise TypeError("the native path was given too few numbers")
+            to.numbers[: len(some)] = list(some)
+
+    def count(self, bundle: int) -> None:
+        """Add a bundle to the counts that contexts are made of."""
+        with self._counts.taken() as counts, self._work.taken() as work:
+            self._c["potr_bundles_count"](
+                ctypes.byref(self._integers),
+                self._checked(bundle),
+                self._streams,
+                work.ctypes.data,
+                address(counts, np.uint32, counts.size, True),
+            )
+
+    def counts(self) -> U32:
+        """(25, 256, 256) how often each expected size of each stream has each token."""
+        first, *others = self._counts.all()
+        for other in others:
+            first += other
+        return first
+
+    def contexts(self, counts: U32, alphabet: int, logs: I64) -> Model:
+        """Contexts of a stream and their frequencies.
+
+        Args:
+            counts: (256, 256), at least one.
+            alphabet: more than the largest token.
+            logs: (4096,) log₂ of each number, in units of 2^-16.
+        """
+        if not 0 < alphabet <= _MOST_ALPHABET or not counts.any():
+            raise TypeError("the native path was given no tokens, or too many")
+        room = np.empty(self._c["potr_bundles_grouping"](), np.uint8)
+        classes, frequencies = np.empty(_TOKENS, np.uint8), np.empty(_GROUPS * alphabet, np.uint16)
+        number = self._c["potr_bundles_contexts"](
+            address(counts, np.uint32, _TOKENS * _TOKENS),
+            alphabet,
+            address(logs, np.int64, _LOGS),
+            room.ctypes.data,
+            address(classes, np.uint8, _TOKENS, True),
+            address(frequencies, np.uint16, len(frequencies), True),
+        )
+        return Model(classes, frequencies[: number * alphabet].reshape(number, alphabet))
+
+    def take_models(self, models: Sequence[Model]) -> None:
+        """What :meth:`code` codes with; every token of the counted bundles has a frequency."""
+        for to, model in zip(self._streams, models, strict=True):
+            contexts, alphabet = model.frequencies.shape
+            if int(model.classes.max()) >= contexts:
+                raise TypeError("the native path was given contexts without frequencies")
+            intervals = np.ones((contexts, _TOKENS), np.uint32)
+            wide = model.frequencies.astype(np.uint32)
+            intervals[:, :alphabet] = (np.cumsum(wide, axis=1, dtype=np.uint32) - wide) << np.uint32(16) | wide
+            np.maximum(intervals, 1, out=intervals)
+            to.intervals = self._keep(intervals, np.uint32, contexts * _TOKENS)
+            to.classes = self._keep(model.classes, np.uint8, _TOKENS)
+
+    def code(self, bundle: int) -> CodedBundle:
+        """Code a bundle."""
+        counts = np.zeros(SECTIONS, np.uint64)
+        states, turned = np.empty(_LANES, np.uint32), np.empty(_LANES, np.uint32)
+        with self._words.taken() as words, self._work.taken() as work:
+            first = self._c["potr_bundles_code"](
+                ctypes.byref(self._integers),
+                self._checked(bundle),
+                self._streams,
+                work.ctypes.data,
+                address(words, np.uint16, len(words), True),
+                len(words),
+                address(counts, np.uint64, SECTIONS, True),
+                address(states, np.uint32, _LANES, True),
+                address(turned, np.uint32, _LANES, True),
+            )
+            ends = np.cumsum(counts.astype(np.int64))
+            return CodedBundle(np.split(words[first:].copy(), ends[:-1]), states, turned)
+
+    def _checked(self, bundle: int) -> int:
+        if not 0 <= bundle * _BUNDLE < self._splats:
+            raise TypeError("the native path was asked for a bundle that is not there")
+        return bundle

@@ -1,0 +1,154 @@
+/* Bundles' integers to single precision values (docs/format.md, "Single precision"), while they are in a cache.
+ *
+ * As in dequantize.c each operation is rounded by itself: nothing here may be compiled for several processors. */
+
+#include <math.h>
+#include <string.h>
+
+#include "bundles.h"
+
+/* Where the values of a file's splats go; NULL where they are not asked for. */
+typedef struct {
+    float *log_scales;  /* (N, 3) */
+    float *quaternions; /* (N, 4) w, x, y, z */
+    float *logits;      /* (N) */
+    float *dc;          /* (3, N) R, G, B */
+    float *ac;          /* (coefficients, 3, N), from coefficient 1 on; it holds zeros */
+    const float *scale_table;   /* value of each level, */
+    const float *opacity_table; /* and so many levels each */
+    uint64_t scale_levels, opacity_levels;
+    const float *sf_dc, *sf_ac;      /* (64) scale factors of each class of steps */
+    const uint64_t *step, *inverse;  /* (64) of each class of steps, of the prediction of DC */
+    float sf_rotation, unused;
+} scene_values;
+
+/* Values of a table for the levels in rows, every `stride`-th number of `out`; whether a level is beyond the table. */
+static int look_up(
+    const int32_t *rows, size_t lanes, size_t steps, size_t splats, const float *table, uint64_t levels, float *out,
+    size_t stride)
+{
+    uint32_t most = 0;
+    for (size_t i = 0; i < LANES * steps; i++)
+        most = (uint32_t)rows[i] > most ? (uint32_t)rows[i] : most;
+    if (most >= levels)
+        return 1;
+    for (size_t lane = 0, splat = 0; lane < lanes; lane++)
+        for (size_t step = 0; step < steps && splat < splats; step++, splat++)
+            out[splat * stride] = table[rows[step * LANES + lane]];
+    return 0;
+}
+
+static void rotations(const work *w, float factor, size_t lanes, size_t steps, size_t splats, float *out)
+{
+    float x[LANE], y[LANE], z[LANE], factors[LANE], rest[LANE];
+    for (size_t lane = 0; lane < lanes; lane++) {
+        const size_t begin = lane * steps, number = splats - begin < steps ? splats - begin : steps;
+        for (size_t step = 0; step < number; step++) {
+            const size_t place = step * LANES + lane;
+            int32_t largest = w->scales[0][place];
+            largest = w->scales[1][place] > largest ? w->scales[1][place] : largest;
+            largest = w->scales[2][place] > largest ? w->scales[2][place] : largest;
+            factors[step] = (float)(largest > 1 ? largest : 1);
+            x[step] = (float)w->rotations[0][place];
+            y[step] = (float)w->rotations[1][place];
+            z[step] = (float)w->rotations[2][place];
+        }
+        for (size_t i = 0; i < number; i++)
+            factors[i] = sqrtf(factors[i]) * factor;
+        for (size_t i = 0; i < number; i++) {
+            x[i] /= factors[i];
+            y[i] /= factors[i];
+            z[i] /= factors[i];
+        }
+        for (size_t i = 0; i < number; i++) {
+            float left = 1.0f - x[i] * x[i];
+            left -= y[i] * y[i];
+            left -= z[i] * z[i];
+            rest[i] = sqrtf(left > 0 ? left : 0);
+        }
+        for (size_t i = 0; i < number; i++) {
+            float *const to = out + 4 * (begin + i);
+            to[0] = rest[i];
+            to[1] = x[i];
+            to[2] = y[i];
+            to[3] = z[i];
+        }
+    }
+}
+
+/* DC from what its prediction has left (docs/format.md, "Prediction"). Sums and products wrap round. */
+static void colours_of_dc(const work *w, const scene_values *out, size_t steps, size_t splats, float *to, uint64_t all)
+{
+    uint64_t last[4][3], total[3] = { 0, 0, 0 };
+    for (size_t splat = 0, place = 0, lane = 0, step = 0; splat < splats; splat++) {
+        if (splat % LANE == 0) {
+            memset(last, 0, sizeof last);
+            memset(total, 0, sizeof total);
+        }
+        const unsigned class = w->dc_classes[place];
+        const uint64_t inverse = out->inverse[class], one = out->step[class];
+        const float divisor = out->sf_dc[class];
+        uint64_t level[3];
+        for (size_t c = 0; c < 3; c++) {
+            const int64_t mean = (int64_t)(total[c] * inverse + (UINT64_C(1) << 33)) >> 34;
+            level[c] = (uint64_t)(int64_t)w->dc[c][place] + (uint64_t)mean;
+            const uint64_t value = level[c] * one;
+            total[c] += value - last[splat & 3][c];
+            last[splat & 3][c] = value;
+        }
+        const uint64_t rest = level[0] - level[2];
+        to[splat] = (float)(int64_t)(rest + level[1]) / divisor;
+        to[splat + all] = (float)(int64_t)(level[0] + level[2]) / divisor;
+        to[splat + 2 * all] = (float)(int64_t)(rest - level[1]) / divisor;
+        place += LANES;
+        if (++step == steps) {
+            step = 0;
+            place = ++lane;
+        }
+    }
+}
+
+static void colours_of_items(const work *w, size_t band, const float *divisors, size_t steps, float *out, uint64_t all)
+{
+    const uint16_t *const places = w->places[band];
+    const uint8_t *const coefficients = w->coefficients[band];
+    const int32_t *const y = w->channels[band][0], *const co = w->channels[band][1], *const cg = w->channels[band][2];
+    const size_t first = (band + 1) * (band + 1) - 1;
+    for (size_t i = 0; i < w->items[band]; i++) {
+        float *const to = out + 3 * (first + coefficients[i]) * all + places[i] % LANES * steps + places[i] / LANES;
+        const float divisor = divisors[w->ac_classes[places[i]]];
+        const int32_t rest = y[i] - cg[i];
+        to[0] = (float)(rest + co[i]) / divisor;
+        to[all] = (float)(y[i] + cg[i]) / divisor;
+        to[2 * all] = (float)(rest - co[i]) / divisor;
+    }
+}
+
+/* The values of a bundle. What potr_bundles_levels takes and returns; and 4 where a level is beyond its table: then
+ * the bundle's values are not whole. */
+POTR_EXPORT int potr_bundles_values(
+    const bundled_file *file, uint64_t bundle, int sections, int rotating, work *w, const scene_values *out,
+    int *section)
+{
+    const int wrong = decode_bundle(file, bundle, sections, rotating, w, section);
+    if (wrong)
+        return wrong;
+    const size_t splats = splats_of(file, bundle), lanes = lanes_of(splats), steps = steps_of(splats);
+    const uint64_t first = bundle * BUNDLE, all = file->splats;
+    int beyond = 0;
+    if (out->logits)
+        beyond |= look_up(
+            w->opacity, lanes, steps, splats, out->opacity_table, out->opacity_levels, out->logits + first, 1);
+    if (out->log_scales && sections > SCALE)
+        for (size_t axis = 0; axis < 3; axis++)
+            beyond |= look_up(w->scales[axis], lanes, steps, splats, out->scale_table, out->scale_levels,
+                out->log_scales + 3 * first + axis, 3);
+    if (out->quaternions && rotating)
+        rotations(w, out->sf_rotation, lanes, steps, splats, out->quaternions + 4 * first);
+    if (out->dc && sections > DC)
+        colours_of_dc(w, out, steps, splats, out->dc + first, all);
+    if (out->ac)
+        for (size_t band = 0; band < 3; band++)
+            colours_of_items(w, band, out->sf_ac, steps, out->ac + first, all);
+    return beyond ? BEYOND_TABLE : FINE;
+}

@@ -1,0 +1,145 @@
+"""SOG files (PlayCanvas, .sog) as an output: a palette of AC coefficients by rate and distortion, and coarse steps."""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass, replace
+from typing import ClassVar
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.clustering.kmeans import Rate, assigned, cluster
+from potr_cl.codec.encoder import Coded
+from potr_cl.codec.geometry import distances_to_views
+from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.scenes import sog
+from potr_cl.formats.scenes.sog_images import PALETTE, Palette, SogImages, bundle
+from potr_cl.formats.scenes.sog_palette import areas
+from potr_cl.host.threads import thread_pool
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.opencl.device import Device
+from potr_cl.outputs.graded_levels import STEP_OF_BIT, graded
+from potr_cl.outputs.output import Output, Request, Rounded, RoundedScene
+from potr_cl.outputs.sog_geometry import SogGeometry, rounded_geometry
+
+#: Bits that a splat takes, about: with what a splat may cost in error they say what a bit may.
+_BITS_A_SPLAT = 90
+#: Bits that an entry of the palette has to be worth; and the most entries to begin with, as a part of the splats. An
+#: entry takes some 60 bits: but points leave a dear one all at once.
+_BITS_AN_ENTRY, _MOST_A_SPLAT = 20, 0.75
+#: Steps of R, G and B that are as coarse as those of Y, Co and Cg of 1.
+_STEP_OF_CHANNEL = math.sqrt(8 / 3)
+
+
+@dataclass(frozen=True)
+class SogRounded(RoundedScene):
+    """:class:`RoundedScene` with what the file has of it.
+
+    Attributes:
+        geometry: all but colours, in the order of the file.
+        worth: (N, M) bits that an error of 1 in a coefficient of one channel is worth; None before :meth:`Sog.fix_ac`.
+        palette: None before that, and for a scene of SH degree 0.
+    """
+
+    geometry: SogGeometry | None = None
+    worth: FloatArray | None = None
+    palette: Palette | None = None
+
+
+@dataclass(frozen=True)
+class Sog(Output):
+    """A .sog file, version 2."""
+
+    format: ClassVar[SceneFormat] = sog.FORMAT
+    choices: ClassVar[frozenset[str]] = frozenset(
+        {"gamma", "beta", "sf_opacity", "sf_rotation", "sf_scale", "sf_dc", "sf_sh"}
+    )
+    fixes_ac: ClassVar[bool] = True
+    bytes_a_splat: ClassVar[float] = 1.1
+
+    def geometry(self, scene: Scene, request: Request) -> SogRounded:
+        """See :func:`potr_cl.outputs.sog_geometry.rounded_geometry`."""
+        with thread_pool(request.threads) as pool:
+            distances = distances_to_views(scene.means, request.views, pool.map)
+        geometry = rounded_geometry(scene, request.parameters, distances)
+        return SogRounded(request.parameters, geometry.order, geometry.seen(scene), geometry=geometry)
+
+    def fix_ac(
+        self, rounded: Rounded, sh: FloatArray, worth: FloatArray | None, request: Request
+    ) -> tuple[SogRounded, FloatArray]:
+        """A palette whose entries and labels are worth the bytes that they take."""
+        assert isinstance(rounded, SogRounded)
+        bits = _worth_in_bits(rounded, sh, worth, request)
+        if sh.shape[1] == 1:
+            return replace(rounded, worth=bits), sh
+        device = request.device or Device()
+        order = rounded.order
+        points, weights = np.ascontiguousarray(sh[order, 1:]), np.ascontiguousarray(bits[order, 1:])
+        most = min(max(int(len(points) * _MOST_A_SPLAT), 1), PALETTE)
+        found = cluster(device, points, weights, most, Rate(_BITS_AN_ENTRY))
+        palette = _coded(device, points, weights, found.centres, found.labels)
+        fixed = sh.copy()
+        fixed[order, 1:] = palette.book[palette.entries][palette.labels]
+        return replace(rounded, worth=bits, palette=palette), fixed
+
+    def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
+        """Levels of the constant coefficients, then the images."""
+        request.progress("pack", 0.0)
+        rounded, sh = self.prepared(scene, rounded, request)
+        assert isinstance(rounded, SogRounded)
+        geometry, worth = rounded.geometry, rounded.worth
+        assert geometry is not None
+        assert worth is not None
+        order = rounded.order
+        constant = graded(sh[order, 0], worth[order, 0])
+        images = SogImages(
+            geometry.least,
+            geometry.most,
+            geometry.steps,
+            geometry.quaternions,
+            geometry.scale_book,
+            geometry.scales,
+            constant.book,
+            np.concatenate([constant.levels, geometry.opacities[:, None]], axis=1),
+            rounded.palette,
+            scene.antialiased,
+        )
+        pieces = [bundle(images)]
+        request.progress("pack", 1.0)
+        return Coded(pieces, order)
+
+
+def _worth_in_bits(rounded: SogRounded, sh: FloatArray, worth: FloatArray | None, request: Request) -> FloatArray:
+    """(N, M) float32: bits that an error of 1 in a coefficient of one channel is worth.
+
+    Without views a splat's errors count as much as it covers, and on average as the scale factors of colours say.
+    """
+    parameters = request.parameters
+    if worth is not None:
+        return worth * np.float32(_BITS_A_SPLAT / max(parameters.delta_mse_max, 1e-30))
+    shown = areas(rounded.scene)
+    shown = (shown / max(float(shown.mean()), 1e-30)).astype(np.float32)
+    factors = np.full(sh.shape[1], parameters.sf_sh / _STEP_OF_CHANNEL, np.float32)
+    factors[0] = parameters.sf_dc / _STEP_OF_CHANNEL
+    bits: FloatArray = (shown[:, None] * np.square(factors) * STEP_OF_BIT).astype(np.float32)
+    return bits
+
+
+def _coded(
+    device: Device, points: FloatArray, weights: FloatArray, centres: FloatArray, labels: NDArray[np.uint32]
+) -> Palette:
+    """A palette of some sets, whose coefficients are rounded; then each splat takes the best one once more."""
+    count = len(centres)
+    mass = np.stack([np.bincount(labels, column, count) for column in weights.T], axis=1)
+    levels = graded(centres, mass.astype(np.float32))
+    having = np.bincount(labels, minlength=count)
+    with np.errstate(divide="ignore"):
+        bits = np.minimum(-np.log2(having / len(points)), 64).astype(np.float32)
+    labels = assigned(device, points, weights, levels.values, bits)
+    having = np.bincount(labels, minlength=count)
+    order = np.argsort(-having, kind="stable")
+    order = order[having[order] > 0]
+    places = np.empty(count, np.int64)
+    places[order] = np.arange(len(order))
+    return Palette(levels.book, levels.levels[order], places[labels].astype(np.uint16))

@@ -1,0 +1,319 @@
+"""Coder BUNDLES: integers come back, by NumPy and by the native path alike, and damage is found."""
+
+from __future__ import annotations
+
+import struct
+import zlib
+
+import numpy as np
+import pytest
+from hypothesis import HealthCheck, given, settings
+from hypothesis import strategies as st
+
+from potr_cl.codec.bundles import encoder
+from potr_cl.codec.bundles.decoder import Reader, Wanted
+from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION
+from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.native.library import VARIABLE, native
+from potr_cl.codec.sections import Property
+from potr_cl.codec.steps.rule import KNOTS, ColourSteps
+from potr_cl.errors import DataError
+
+PATHS = {"numpy": "0", "native": "1"}
+DEGREES = {3: 9, 12: 15, 27: 21}
+NONE = lambda: None  # noqa: E731
+#: Around where bundles and lanes begin and end.
+SIZES = (1, 2, 255, 256, 257, 300, 7937, 8191, 8192, 8193, 8448, 16385)
+
+
+@pytest.fixture(params=PATHS)
+def path(request, monkeypatch):
+    monkeypatch.delenv(VARIABLE, raising=False)
+    if request.param == "native" and native() is None:
+        pytest.skip("the compiled library is not there: python -m tools.make.native, or pip install -e .")
+    monkeypatch.setenv(VARIABLE, PATHS[request.param])
+    return request.param
+
+
+def integers(splats: int, seed: int = 1, density: float = 0.1, spread: int = 20) -> dict:
+    """Integers of a file of all sections: neighbours alike, most AC coefficients 0."""
+    rng = np.random.default_rng(seed)
+    size = np.repeat(rng.integers(1, spread + 1, splats // 50 + 1), 50)[:splats]
+
+    def some(signed=False):
+        values = rng.geometric(1 / (1 + size)) - 1
+        return values * rng.choice((-1, 1), splats) if signed else values
+
+    values = {
+        MAIN[0]: [some()],
+        MAIN[1]: [some() for _ in range(3)],
+        MAIN[2]: [some(True) for _ in range(3)],
+        ROTATION: [some(True) for _ in range(3)],
+    }
+    for index, streams in DEGREES.items():
+        values[Property.SH, index] = [some(True) * (rng.random(splats) < density) for _ in range(streams)]
+    return values
+
+
+def steps_of(splats: int) -> ColourSteps:
+    groups = np.random.default_rng(5).integers(-3, 4, -(-splats // 16)).astype(np.int8)
+    return ColourSteps(4, 1, 1, (8, 5), (20, -300), (188, -86, 55), tuple(range(-160, -160 + 20 * KNOTS, 20)), groups)
+
+
+def classes_of(values: dict, steps: ColourSteps | None) -> np.ndarray:
+    splats = len(values[MAIN[0]][0])
+    nothing = [np.zeros(splats, np.int64)] * 3
+    if steps is None:
+        return np.zeros(splats, np.int8)
+    return steps.classes(values.get(MAIN[1], nothing), values[MAIN[0]][0])[0]
+
+
+def reader_of(stored: dict, splats: int, steps: ColourSteps | None = None) -> Reader:
+    def opened(key):
+        return (memoryview(stored[key]), f"{key[0].name.lower()} {key[1]}") if key in stored else None
+
+    return Reader(splats, opened, lambda: steps)
+
+
+def assert_same(values: dict, levels) -> None:
+    splats = levels.stop - levels.start
+    none = [np.zeros(splats, np.int64)] * 3
+    assert np.array_equal(levels.opacities, values[MAIN[0]][0])
+    for key, found in ((MAIN[1], levels.scales), (MAIN[2], levels.dc), (ROTATION, levels.rotations)):
+        assert all(np.array_equal(a, b) for a, b in zip(values.get(key, none), found, strict=True))
+    for index, streams in DEGREES.items():
+        for k in range(streams):
+            m, c = divmod(index + k, 3)
+            there = (Property.SH, index) in values
+            wanted = values[Property.SH, index][k] if there else none[0]
+            assert np.array_equal(levels.coefficient(m)[c], wanted)
+
+
+@pytest.mark.parametrize("splats", SIZES)
+@pytest.mark.parametrize("adapted", [False, True], ids=["same steps", "steps"])
+def test_integers_come_back(path, splats, adapted):
+    values = integers(splats, splats)
+    steps = steps_of(splats) if adapted else None
+    stored = encoder.encode(values, classes_of(values, steps))
+    reader = reader_of(stored, splats, steps)
+    assert_same(values, reader.levels(0, reader.bundles.number))
+
+
+@pytest.mark.parametrize("largest", [127, 128, 1 << 12, (1 << 29) - 1, 1 << 29, (1 << 37) - 1])
+def test_large_integers_come_back(path, largest):
+    """Those that one path leaves to the other too."""
+    values = integers(700)
+    rng = np.random.default_rng(2)
+    for key, streams in values.items():
+        for stream in streams:
+            where = rng.integers(0, 700, 9)
+            stream[where] = rng.integers(largest // 2, largest + 1, 9)
+            if key not in MAIN[:2]:
+                stream[where[:4]] *= -1
+    stored = encoder.encode(values, np.zeros(700, np.int8))
+    assert_same(values, reader_of(stored, 700).levels(0, 1))
+
+
+def test_integers_beyond_38_bits_are_left_to_others(path):
+    values = integers(40)
+    values[ROTATION][1][7] = -(1 << 37) - 1
+    assert encoder.encode(values, np.zeros(40, np.int8)) is None
+
+
+@pytest.mark.parametrize(
+    "left", [(), (0, 1), (0, 6), (0, 3), (0, 2, 4), (0, 1, 2, 3, 4, 6)], ids=lambda left: "".join(map(str, left)) or "o"
+)
+def test_sections_may_be_absent(path, left):
+    values = {key: streams for number, (key, streams) in enumerate(ordered(integers(900))) if number in {0, *left}}
+    stored = encoder.encode(values, classes_of(values, steps_of(900)))
+    assert set(stored) == set(values)
+    assert_same(values, reader_of(stored, 900, steps_of(900)).levels(0, 1))
+
+
+def ordered(values: dict) -> list:
+    return [(key, values[key]) for key in ORDER]
+
+
+@pytest.mark.parametrize("density", [0.0, 0.001, 1.0])
+def test_channels_without_a_value_and_full_ones(path, density):
+    values = integers(600, density=density)
+    values[Property.SH, 12][4][:] = 0
+    values[Property.SH, 12][4][77] = 3
+    stored = encoder.encode(values, np.zeros(600, np.int8))
+    assert_same(values, reader_of(stored, 600).levels(0, 1))
+
+
+@pytest.mark.parametrize("splats", [1, 300, 8200, 20000])
+@pytest.mark.parametrize("spread", [3, 300])
+def test_both_paths_write_the_same_bytes(monkeypatch, splats, spread):
+    monkeypatch.delenv(VARIABLE, raising=False)
+    if native() is None:
+        pytest.skip("the compiled library is not there")
+    values = integers(splats, spread, spread=spread)
+    classes = classes_of(values, steps_of(splats))
+    coded = []
+    for way in PATHS.values():
+        monkeypatch.setenv(VARIABLE, way)
+        coded.append(encoder.encode(values, classes))
+    assert coded[0] == coded[1]
+
+
+def test_a_part_of_the_bundles_and_of_the_sections(path):
+    """Bundles need no other, and chains are read as far as one likes: what is behind is not opened."""
+    splats = 3 * 8192 + 100
+    values = integers(splats, spread=5)
+    stored = encoder.encode(values, np.zeros(splats, np.int8))
+    del stored[ROTATION], stored[MAIN[4]], stored[MAIN[5]]
+    reader = reader_of(stored, splats)
+    levels = reader.levels(1, 3, Wanted(4, False))
+    own = slice(8192, 3 * 8192)
+    assert np.array_equal(levels.opacities, values[MAIN[0]][0][own])
+    assert np.array_equal(levels.dc[2], values[MAIN[2]][2][own])
+    assert levels.rotations is None
+    assert np.array_equal(levels.coefficient(2)[1], values[MAIN[3]][4][own])
+
+
+def test_it_is_small():
+    """Not far above the entropy of what it codes: 7.0 bits of a token of 128 equally likely values, and next to nothing
+    for streams of zeros."""
+    rng = np.random.default_rng(1)
+    splats = 1 << 15
+    values = integers(splats, density=0)
+    values[MAIN[0]] = [rng.integers(0, 128, splats)]
+    values[MAIN[1]] = [np.zeros(splats, np.int64), np.full(splats, 5), np.zeros(splats, np.int64)]
+    stored = encoder.encode(values, np.zeros(splats, np.int8))
+    assert len(stored[MAIN[0]]) < 1.03 * 7 / 8 * splats
+    assert len(stored[MAIN[1]]) < 200
+    assert sum(len(stored[Property.SH, index]) for index in DEGREES) < 600
+
+
+# ------------------------------------------------------------------------------------------------ damage
+
+
+def outcome(stored: dict, splats: int, steps: ColourSteps | None):
+    """What a path makes of sections: their levels, or that they are damaged."""
+    try:
+        reader = reader_of(stored, splats, steps)
+        levels = reader.levels(0, reader.bundles.number)
+    except DataError:
+        return None
+    rows = [levels.opacities, *levels.scales, *levels.rotations, *levels.dc]
+    rows += [channel for m in range(1, 16) for channel in levels.coefficient(m)]
+    return np.array([row.astype(np.int64) for row in rows])
+
+
+@pytest.fixture(scope="module")
+def small():
+    values = integers(400, spread=200)
+    steps = steps_of(400)
+    return encoder.encode(values, classes_of(values, steps)), steps
+
+
+@settings(max_examples=150, deadline=None, suppress_health_check=[HealthCheck.function_scoped_fixture])
+@given(data=st.data())
+def test_both_paths_say_the_same_of_damaged_sections(monkeypatch, small, data):
+    monkeypatch.delenv(VARIABLE, raising=False)
+    if native() is None:
+        pytest.skip("the compiled library is not there")
+    stored, steps = dict(small[0]), small[1]
+    for _ in range(data.draw(st.integers(1, 3))):
+        key = data.draw(st.sampled_from(sorted(stored)))
+        section = bytearray(stored[key])
+        # Often the states, counts and words, which come last.
+        at = data.draw(st.integers(0, len(section) - 1))
+        how = data.draw(st.sampled_from(["flip", "cut", "more", "set"]))
+        if how == "flip":
+            section[at] ^= 1 << data.draw(st.integers(0, 7))
+        elif how == "set":
+            section[at] = data.draw(st.integers(0, 255))
+        elif how == "cut":
+            del section[-2 * data.draw(st.integers(1, 4)) :]
+        else:
+            section += bytes(2 * data.draw(st.integers(1, 4)))
+        stored[key] = bytes(section)
+    found = []
+    for way in PATHS.values():
+        monkeypatch.setenv(VARIABLE, way)
+        found.append(outcome(stored, 400, steps))
+    assert (found[0] is None) == (found[1] is None)
+    assert found[0] is None or np.array_equal(found[0], found[1])
+
+
+def taken_apart(section: bytes, first: bool) -> list[bytes]:
+    """Of a file of one bundle: description, states, count of words, words."""
+    (described,) = struct.unpack_from("<I", section)
+    at = 4 + described
+    states = 4 * 2 if first else 0
+    parts = [section[4:at], section[at : at + states], section[at + states : at + states + 4]]
+    return [*parts, section[at + states + 4 :]]
+
+
+def put_together(parts: list[bytes]) -> bytes:
+    return struct.pack("<I", len(parts[0])) + b"".join(parts)
+
+
+def test_words_too_few_or_too_many_are_refused(path, small):
+    stored, steps = small
+    for key in ORDER:
+        described, states, count, words = taken_apart(stored[key], key in (MAIN[0], ROTATION))
+        (number,) = struct.unpack("<I", count)
+        for change in (-1, 1):
+            part = words[:-2] if change < 0 else words + b"\0\0"
+            counted = struct.pack("<I", number + change)
+            damaged = {**stored, key: put_together([described, states, counted, part])}
+            assert outcome(damaged, 400, steps) is None
+            # A count that the words contradict.
+            damaged[key] = put_together([described, states, counted, words])
+            assert outcome(damaged, 400, steps) is None
+
+
+def test_states_that_no_encoder_leaves_are_refused(path, small):
+    stored, steps = small
+    for key in (MAIN[0], ROTATION):
+        described, states, count, words = taken_apart(stored[key], True)
+        low = struct.pack("<I", 0xFFFF) + states[4:]
+        assert outcome({**stored, key: put_together([described, low, count, words])}, 400, steps) is None
+        # Another start ends elsewhere.
+        (state,) = struct.unpack_from("<I", states)
+        other = struct.pack("<I", state ^ 0x00100000) + states[4:]
+        assert outcome({**stored, key: put_together([described, other, count, words])}, 400, steps) is None
+
+
+# ------------------------------------------------------------------------------------------------ files
+
+
+def version_3(plush_excerpt) -> bytes:
+    from potr_cl.codec.encoder import code_scene
+    from potr_cl.codec.quantize import HyperParameters
+
+    return b"".join(code_scene(plush_excerpt, HyperParameters.from_quality(0.5, "best")).pieces)
+
+
+def test_sections_of_this_coder_come_all_together(plush_excerpt):
+    """One whose coder is another is refused, before anything is decoded."""
+    data = bytearray(version_3(plush_excerpt))
+    file = PotrFile.from_bytes(bytes(data))
+    number = next(k for k, s in enumerate(file.header.sections) if s.kind == Property.ROTATION)
+    # The entry's coder becomes 1: a frame of three planes; its size fits.
+    struct.pack_into("<B", data, 120 + 24 * number + 2, 1)
+    end = 120 + 24 * len(file.header.sections)
+    struct.pack_into("<I", data, end, zlib.crc32(data[:end]))
+    with pytest.raises(DataError, match="only some sections of splats are of coder 4"):
+        PotrFile.from_bytes(bytes(data))
+
+
+@pytest.mark.parametrize("threads", [1, 3])
+def test_threads_and_paths_decode_the_same_bits(monkeypatch, plush_excerpt, threads):
+    monkeypatch.delenv(VARIABLE, raising=False)
+    data = version_3(plush_excerpt)
+    scenes = []
+    for way in PATHS.values() if native() is not None else ["0"]:
+        monkeypatch.setenv(VARIABLE, way)
+        scenes.append(PotrFile.from_bytes(data).scene(threads))
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        assert all(np.array_equal(getattr(scenes[0], name), getattr(scene, name)) for scene in scenes)
+    alone = PotrFile.from_bytes(data)
+    assert np.array_equal(alone.quaternions(), scenes[0].quaternions)
+    assert np.array_equal(alone.log_scales(), scenes[0].log_scales)
+    assert np.array_equal(alone.opacity_logits(), scenes[0].opacity_logits)
+    assert np.array_equal(alone.sh(1), scenes[0].sh[:, :4])
