@@ -135,3 +135,11 @@ def test_hardly_any_splats(tmp_path, plush_excerpt, device):
 def test_options_of_other_formats_are_refused(tmp_path, plush_excerpt):
     with pytest.raises(potr_cl.UsageError, match="entropy"):
         encode(plush_excerpt, q=0.5, output=tmp_path / "a.sog", prune=False, refit="off", entropy="zstd")
+
+
+def test_bytes_are_told_by_what_they_are_for(tmp_path, plush_excerpt):
+    encoded = encode(plush_excerpt, q=0.5, prune=False, refit="off", compact=False, output=tmp_path / "a.sog")
+    properties = Sog().properties(encoded.data)
+    assert sum(properties.values()) == encoded.nbytes
+    assert min(properties.values()) > 0
+    assert len(properties) == 6

@@ -2,9 +2,9 @@
 
     python -m tools.bench.palettes SCENE.ply [--splats N] [--entries K] [--steps S …] [--all N] [--json OUT.json]
 
-The scene's splats are repeated, each time a little changed, until there are N. Every step count is a run of its own, after
-one that builds the kernels. ``--all`` compares with clusters for which every splat is compared with every entry, of so
-many splats: the root of the mean squared error of a splat's coefficients, by both ways.
+The scene's splats are repeated, each time a little changed, until there are N. Errors are roots of the mean squared
+error of a splat's coefficients. ``--all N`` compares with clusters for which each of N splats is compared with each
+entry.
 """
 
 from __future__ import annotations
@@ -13,9 +13,9 @@ import argparse
 import os
 import time
 from pathlib import Path
-from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from potr_cl import load_scene
 from potr_cl.clustering import kmeans
@@ -23,7 +23,7 @@ from potr_cl.clustering.kmeans import Rate, cluster
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import choose_device
-from tools.results import circumstances, write_json
+from tools.results import Column, Results
 
 
 def main() -> None:
@@ -40,38 +40,48 @@ def main() -> None:
     points = repeated(load_scene(options.scene).sh[:, 1:], options.splats)
     weights = np.ones(points.shape[:2], np.float32)
     cluster(device, points[:2000], weights[:2000], 600, steps=1)
-    runs = []
+    results = Results(device.info, options.json)
+    table = results.table(
+        "palettes",
+        f"Palettes of {options.entries} entries at most for {options.splats} splats of SH degree 3",
+        Column("entries and labels"),
+        Column("steps", format="d"),
+        Column("entries", format="d"),
+        Column("time", "s", ".2f"),
+        Column("processor time", "s", ".2f"),
+        Column("error of a splat", format=".4f"),
+    )
     for steps in options.steps:
         for rate in (None, Rate(20.0)):
-            runs.append(measured(device, points, weights, options.entries, steps, rate))
-            print(runs[-1], flush=True)
-    against = None
+            table.add(
+                "cost bits" if rate else "are free",
+                steps,
+                *measured(device, points, weights, options.entries, steps, rate),
+            )
     if options.all:
-        against = compared(device, points[: options.all], weights[: options.all])
-        print(against)
-    if options.json:
-        write_json(options.json, {"circumstances": circumstances(device), "runs": runs, "all": against})
+        table = results.table(
+            "comparisons",
+            "Errors of clusters in two levels, and of those for which each splat is compared with each entry",
+            Column("splats", format="d"),
+            Column("entries", format="d"),
+            Column("two levels", format=".4f"),
+            Column("all", format=".4f"),
+        )
+        table.add(*compared(device, points[: options.all], weights[: options.all]))
 
 
 def measured(
     device: Device, points: FloatArray, weights: FloatArray, entries: int, steps: int, rate: Rate | None
-) -> dict[str, Any]:
-    """Seconds and processor seconds of one clustering, and its error."""
+) -> tuple[int, float, float, float]:
+    """Entries, seconds and processor seconds of one clustering, and its error."""
     began, used = time.perf_counter(), sum(os.times()[:2])
     found = cluster(device, points, weights, entries, rate, steps)
-    return {
-        "splats": len(points),
-        "entries": len(found.centres),
-        "steps": steps,
-        "entries and labels cost": rate is not None,
-        "seconds": round(time.perf_counter() - began, 2),
-        "processor seconds": round(sum(os.times()[:2]) - used, 2),
-        "error": error(points, found.centres, found.labels),
-    }
+    seconds, processor = time.perf_counter() - began, sum(os.times()[:2]) - used
+    return len(np.unique(found.labels)), seconds, processor, error(points, found.centres, found.labels)
 
 
-def compared(device: Device, points: FloatArray, weights: FloatArray) -> dict[str, Any]:
-    """Errors of clusters in two levels, and of those for which everything is compared."""
+def compared(device: Device, points: FloatArray, weights: FloatArray) -> tuple[int, int, float, float]:
+    """Splats, entries, the error of clusters in two levels, and of those for which everything is compared."""
     entries = len(points) // 16
     two_levels = cluster(device, points, weights, entries)
     few, kmeans._FEW = kmeans._FEW, entries + 1
@@ -79,15 +89,11 @@ def compared(device: Device, points: FloatArray, weights: FloatArray) -> dict[st
         everything = cluster(device, points, weights, entries)
     finally:
         kmeans._FEW = few
-    return {
-        "splats": len(points),
-        "entries": entries,
-        "two levels": error(points, two_levels.centres, two_levels.labels),
-        "all": error(points, everything.centres, everything.labels),
-    }
+    first, second = (error(points, found.centres, found.labels) for found in (two_levels, everything))
+    return len(points), entries, first, second
 
 
-def error(points: FloatArray, centres: FloatArray, labels: Any) -> float:
+def error(points: FloatArray, centres: FloatArray, labels: NDArray[np.uint32]) -> float:
     """The root of the mean squared distance."""
     total = 0.0
     for start in range(0, len(points), 1 << 16):
