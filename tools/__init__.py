@@ -35,6 +35,7 @@ What a choice costs or brings, against the alternatives (``study``):
 study.rate_distortion      size against quality: the curves that other studies compare with
 study.ablation             what does each part of the codec contribute?
 study.compare_formats      what would people use instead?
+study.output_formats       how small are encodes to the formats that viewers open, and what do others read of them?
 study.virtual_views        how many virtual views, how large, how wide, at what time and memory?
 study.rates                where do the bits go, and what do they buy?
 study.antialiasing         what is lost if an antialiased scene is encoded as a classic one?

@@ -28,7 +28,7 @@ from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import thread_pool
 
 if TYPE_CHECKING:
-    from potr_cl.codec.destination import Destination
+    from potr_cl.codec.destination import Activation, Destination
 
 #: Bundles that NumPy decodes side by side.
 _SIDE_BY_SIDE = 64
@@ -46,11 +46,13 @@ class BundledScene:
         header: verified.
         data: the whole file.
         open_steps: gives the steps of its colours.
+        activation: what is stored instead of logarithms of scales and logits of opacities; None: these.
     """
 
     header: Header
     data: bytes
     open_steps: Callable[[], ColourSteps | None]
+    activation: Activation | None = None
 
     @cached_property
     def reader(self) -> Reader:
@@ -109,9 +111,29 @@ class BundledScene:
             planes = levels.coefficient(coefficient)
             destination.take_colours([LevelStream(level, True) for level in planes], coefficient, False, fitting)
 
+    @cached_property
+    def tables(self) -> Tables:
+        """What makes values of levels."""
+        header, activation = self.header, self.activation
+        version = VERSIONS[header.version]
+        levels = np.arange(_TABLE)
+        classes = np.arange(-CLASSES, CLASSES).astype(np.int8)
+        scales = version.dequantize_scales(levels, header.sf_scale)
+        opacities = version.dequantize_opacities(levels, header.sf_opacity)
+        return Tables(
+            scales if activation is None else activation.scales(scales),
+            opacities if activation is None else activation.opacities(opacities),
+            factors(header.sf_dc, classes),
+            factors(header.sf_ac, classes),
+            *prediction.tables(),
+            header.sf_rotation,
+        )
+
     def _jobs(self, arrays: ValueArrays, threads: int) -> list[Job]:
         wanted = self._wanted(arrays)
         file = self.reader.bundled_file(wanted)
+        if file is not None:
+            _ = self.tables  # made once, before threads ask for them
         share = _Share(self.reader.bundles.number, 1 if file is not None else _SIDE_BY_SIDE)
         return [Job(self, arrays, wanted, file, share) for _ in range(threads if file is not None else 1)]
 
@@ -191,29 +213,19 @@ class Job:
                 self._by_numpy(bundles)
                 continue
             said, section = self.file.values(
-                bundles.start, self.wanted.sections, self.wanted.rotations, work, self.arrays, self._tables
+                bundles.start, self.wanted.sections, self.wanted.rotations, work, self.arrays, self.scene.tables
             )
             if said == BEYOND_TABLE:
                 self._by_numpy(bundles)
             else:
                 check_said(self.scene.reader, said, section)
 
-    @cached_property
-    def _tables(self) -> Tables:
-        header = self.scene.header
-        version = VERSIONS[header.version]
-        levels = np.arange(_TABLE)
-        classes = np.arange(-CLASSES, CLASSES).astype(np.int8)
-        return Tables(
-            version.dequantize_scales(levels, header.sf_scale),
-            version.dequantize_opacities(levels, header.sf_opacity),
-            factors(header.sf_dc, classes),
-            factors(header.sf_ac, classes),
-            *prediction.tables(),
-            header.sf_rotation,
-        )
-
     def _by_numpy(self, bundles: range) -> None:
         header = self.scene.header
         levels = self.scene.reader.levels(bundles.start, bundles.stop, self.wanted)
         Dequantizer(header, VERSIONS[header.version]).of_levels(levels, self.scene.reader.steps, self.arrays)
+        activation, own = self.scene.activation, slice(levels.start, levels.stop)
+        if activation is not None and self.arrays.log_scales is not None:
+            self.arrays.log_scales[own] = activation.scales(self.arrays.log_scales[own])
+        if activation is not None and self.arrays.logits is not None:
+            self.arrays.logits[own] = activation.opacities(self.arrays.logits[own])

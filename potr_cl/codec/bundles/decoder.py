@@ -111,8 +111,6 @@ class Reader:
         if file is not None:
             work = file.work()
             return joined([_levels_of(self, file, bundle, wanted, work) for bundle in range(first, last)])
-        for key in wanted.keys:
-            self.section(key)
         run = _Run(self, first, last)
         for key in wanted.keys:
             run.decode(key)
@@ -126,14 +124,15 @@ class Reader:
             DataError: damaged.
         """
         functions = native()
+        # By whatever path, they are looked at before anything is decoded.
+        sections = {ORDER.index(key): self.section(key) for key in wanted.keys}
+        steps = self.steps if wanted.sections > 2 else None
         if functions is None:
             return None
         if wanted not in self._files:
-            sections = {ORDER.index(key): self.section(key) for key in wanted.keys}
             there = {number: section for number, section in sections.items() if section is not None}
             fit = all(section.fits for section in there.values())
             words = {number: section.for_native() for number, section in there.items()}
-            steps = self.steps if wanted.sections > 2 else None
             self._files[wanted] = functions.bundled_file(self.bundles.splats, words, steps) if fit else None
         return self._files[wanted]
 
