@@ -9,6 +9,7 @@ do with the same options (docs/python.md has examples):
 - :func:`render`, :func:`compare`: pictures of a scene, and one scene judged by another's;
 - :func:`read_scene`, :func:`read_cameras`, :func:`save`, :func:`convert`, :func:`info`: files, of all formats;
 - :func:`place_cameras`, :func:`look_around`, :func:`turntable`: views for a scene that comes without any;
+- :func:`encode_ladder`, a scene at several qualities; :func:`view`, a page in the browser that shows scenes;
 - :func:`encode_to_target` with a :class:`Target`: what a search for a size or a PSNR has tried;
 - :class:`Scene`, :class:`Camera`: what they work on;
 - :class:`PotrError` and its subclasses: what they raise.
@@ -30,7 +31,9 @@ if TYPE_CHECKING:
     from potr_cl.api.encoding import encode
     from potr_cl.api.files import convert, decode, decode_to_device, save
     from potr_cl.api.fitting import FittedScene, fit
+    from potr_cl.api.ladder import encode_ladder
     from potr_cl.api.pictures import Rendering, Renderings, preview, render
+    from potr_cl.api.viewing import view
     from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, PotrError, UnreachableError, UsageError
     from potr_cl.formats import load_cameras, load_scene, read_cameras, read_scene
     from potr_cl.model.camera import Camera
@@ -71,6 +74,7 @@ __all__ = [
     "decode",
     "decode_to_device",
     "encode",
+    "encode_ladder",
     "encode_to_target",
     "fit",
     "info",
@@ -86,6 +90,7 @@ __all__ = [
     "render",
     "save",
     "turntable",
+    "view",
 ]
 
 #: Imported on first use: the OpenCL loader and NumPy are not everybody's who asks for the version.
@@ -115,6 +120,7 @@ _HOMES = {
     "decode": "api.files",
     "decode_to_device": "api.files",
     "encode": "api.encoding",
+    "encode_ladder": "api.ladder",
     "encode_to_target": "pipeline.search",
     "fit": "api.fitting",
     "info": "api.describing",
@@ -130,6 +136,7 @@ _HOMES = {
     "render": "api.pictures",
     "save": "api.files",
     "turntable": "model.viewpoints",
+    "view": "api.viewing",
 }
 
 

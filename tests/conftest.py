@@ -2,7 +2,11 @@
 
 from __future__ import annotations
 
+import os
+import shutil
+from collections.abc import Iterator
 from pathlib import Path
+from typing import Any
 
 import pytest
 
@@ -10,6 +14,8 @@ from potr_cl import Camera, Scene
 from potr_cl.formats import load_cameras, load_scene
 
 DATA = Path(__file__).parent / "data"
+#: Where Chromium is, if it has another name than systems give it.
+CHROMIUM_VARIABLE = "POTR_CL_CHROMIUM"
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"
 
 
@@ -62,3 +68,20 @@ def _whole_scene(name: str) -> Path:
     if not (folder / "point_cloud.ply").exists():
         pytest.skip(f"the scene {name} is not in {SCENES}")
     return folder
+
+
+@pytest.fixture(scope="session")
+def browser() -> Iterator[Any]:
+    """Chromium of the system, driven by Playwright; WebGL is computed on the CPU."""
+    library = pytest.importorskip("playwright.sync_api", reason="the extra browser is not installed")
+    names = ("chromium", "chromium-browser", "google-chrome")
+    path = os.environ.get(CHROMIUM_VARIABLE) or next(filter(None, map(shutil.which, names)), None)
+    if path is None:
+        pytest.skip(f"no Chromium is installed, and {CHROMIUM_VARIABLE} names none")
+    arguments = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--ignore-gpu-blocklist"]
+    if hasattr(os, "geteuid") and os.geteuid() == 0:
+        arguments.append("--no-sandbox")
+    with library.sync_playwright() as play:
+        chromium = play.chromium.launch(executable_path=path, args=arguments)
+        yield chromium
+        chromium.close()

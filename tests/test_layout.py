@@ -23,20 +23,21 @@ FOLDERS: dict[str, set[str]] = {
     "codec": {"errors", "host", "model"},
     "ondevice": {"errors", "host", "model", "opencl", "raster", "codec"},
     "clustering": {"errors", "model", "opencl"},
-    "formats": {"errors", "host", "model", "opencl", "codec", "clustering"},
+    "formats": {"plain_text", "errors", "host", "model", "opencl", "codec", "clustering"},
     "quality": {"errors", "host", "model", "opencl", "raster", "formats"},
     "outputs": {"errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "clustering"},
     "stages": {"errors", "host", "model", "opencl", "raster", "codec", "quality", "outputs"},
     "pipeline": {"errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality", "outputs"},
     "report": {"plain_text", "errors", "host", "model", "opencl", "codec", "formats", "quality", "pipeline"},
+    "viewer": {"plain_text", "errors", "host", "model", "opencl", "raster", "formats", "quality", "report"},
     "reference": {"errors", "model", "opencl", "raster", "stages"},
     "api": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages",
-        "quality", "pipeline", "report", "outputs",
+        "quality", "pipeline", "report", "outputs", "viewer",
     },
     "cli": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages",
-        "quality", "pipeline", "report", "api", "outputs",
+        "quality", "pipeline", "report", "viewer", "api", "outputs",
     },
 }  # fmt: skip
 #: They offer the whole package under short names, and start it.

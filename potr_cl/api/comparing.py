@@ -4,9 +4,9 @@ from __future__ import annotations
 
 import os
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from potr_cl.api.inputs import (
     CamerasSource,
@@ -49,6 +49,9 @@ from potr_cl.raster.rules import RULES, RasterRules
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.labels import U8, comparison_picture, shrunk
 
+if TYPE_CHECKING:
+    from potr_cl.viewer.server import Viewer
+
 #: Pixels that a notebook's picture is wide at most: it is kept in the notebook.
 _SHOWN = 960
 
@@ -64,6 +67,7 @@ class SceneComparison:
         factor: by which the difference is amplified in it.
         settings: device, rules and background.
         notes: what else there is to say, a line each.
+        compared: what :meth:`show` shows, keywords of :func:`potr_cl.view`.
     """
 
     a: SceneFile
@@ -73,6 +77,7 @@ class SceneComparison:
     factor: int
     settings: dict[str, Any]
     notes: list[str]
+    compared: dict[str, Any] = field(default_factory=dict)
 
     @property
     def mean(self) -> ViewFigures:
@@ -121,6 +126,19 @@ class SceneComparison:
         """Write the picture of the worst view as PNG to an open binary file."""
         names = f"A is {self.a.path.name}, B is {self.b.path.name}"
         write_png(file, self.picture, plain(f"{self.caption}; {names}"))
+
+    def show(self, **choices: Any) -> Viewer:
+        """Show both scenes in the browser, in a notebook below the cell, as :func:`potr_cl.view` does.
+
+        Args:
+            choices: keywords of :func:`potr_cl.view`.
+
+        Raises:
+            As :func:`potr_cl.view`.
+        """
+        from potr_cl.api.viewing import view
+
+        return view(**{**self.compared, **choices})
 
     def __repr__(self) -> str:
         views = f"{len(self.figures.views)} view{'s' if len(self.figures.views) > 1 else ''}"
@@ -259,4 +277,13 @@ def compare_scenes(
     picture, factor = comparison_picture(pictures[0], pictures[1], worst.name, psnr, (a[0].path.name, b[0].path.name))
     called = next((name for name, known in RULES.items() if known == rules), "own")
     settings = {"device": opened.info.name, "rules": called, "background": background}
-    return SceneComparison(a[0], b[0], figures, picture, factor, settings, told_of)
+    shown = {
+        "a": a[1],
+        "b": b[1],
+        "cameras": list(views),
+        "truth": truth,
+        "device": opened,
+        "rules": rules,
+        "background": background,
+    }
+    return SceneComparison(a[0], b[0], figures, picture, factor, settings, told_of, shown)

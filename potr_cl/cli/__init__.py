@@ -33,10 +33,11 @@ COMMANDS = {
     "convert": "convert",
     "render": "pictures",
     "compare": "pictures",
+    "view": "view",
     "devices": "devices",
 }
 #: Those that need an OpenCL device.
-_ON_A_DEVICE = {"encode", "prune", "compact", "refit", "fit", "render", "compare", "devices"}
+_ON_A_DEVICE = {"encode", "prune", "compact", "refit", "fit", "render", "compare", "view", "devices"}
 #: Set to anything, it has errors that nobody foresaw shown with where they come from.
 TRACEBACK_VARIABLE = "POTR_CL_TRACEBACK"
 

@@ -19,6 +19,7 @@ from potr_cl.api.encoding import (
 from potr_cl.cli.batch import add_to_option, for_each_scene, jobs
 from potr_cl.cli.forecasts import tell_what_is_ahead
 from potr_cl.cli.guard import StandardOutput, read_file
+from potr_cl.cli.ladder import encode_ladder
 from potr_cl.cli.options import Commands, add_device_options, add_memory_option
 from potr_cl.cli.outputs import WrittenEncoded, WrittenPage, place, writing
 from potr_cl.cli.parser import whole_number
@@ -58,9 +59,10 @@ from potr_cl.report.summary import encode_report, format_encode_report, search_r
 from potr_cl.stages.refit import Refit
 
 
-def _options(args: argparse.Namespace, source_bytes: int | None = None) -> EncodeOptions:
+def _options(args: argparse.Namespace, source_bytes: int | None = None, output: Output | None = None) -> EncodeOptions:
     return encode_options(
-        None, args.preset, stage_choices(args), output=_output(args), q=args.quality, background=args.background,
+        None, args.preset, stage_choices(args), output=output or _output(args), q=args.quality,
+        background=args.background,
         memory=args.memory, threads=args.threads, source_bytes=source_bytes, cameras_anyway=args.cameras_anyway,
     )  # fmt: skip
 
@@ -71,6 +73,11 @@ def _output(args: argparse.Namespace) -> Output:
     if isinstance(args.output, StandardOutput):
         return output_of_suffix(args.to, **choices)
     return output_of(args.output, **choices)
+
+
+def _output_of_ladder(args: argparse.Namespace) -> Output:
+    """The kind of file that a ladder has for each quality: what ``-o`` names is a folder."""
+    return output_of_suffix(args.to or OUTPUTS[0].suffixes()[0], version=args.spz_version)
 
 
 def _looks(args: argparse.Namespace, options: EncodeOptions) -> bool:
@@ -97,6 +104,9 @@ class _Shared:
 
 
 def _encode(args: argparse.Namespace) -> None:
+    if args.ladder is not None:
+        encode_ladder(args, _options(args, output=_output_of_ladder(args)))
+        return
     works = jobs(args, WrittenEncoded, OUTPUTS[0].suffixes()[0])
     options, target = _options(works[0]), encode_target(None, args.max_size, args.min_psnr)
     refit = options.stage(Refit)
@@ -274,6 +284,12 @@ def add_encode(commands: Commands) -> None:
         metavar="DB",
         help="find the quality that just reaches this mean PSNR against the uncompressed scene, on the views that the "
         "result is judged by",
+    )
+    goal.add_argument(
+        "--ladder",
+        metavar="Q,Q,…",
+        help="a file for each of these qualities, 0.1,0.3,0.5, and a ladder.json with their sizes and PSNR, into the "
+        "folder -o: the command view has a slider to choose among them by eye",
     )
     p.add_argument(
         "--preset",

@@ -26,7 +26,7 @@ if TYPE_CHECKING:
 
 FROM_HELP = 'the format that "-", standard input, brings: .ply, .spz …; default: what its content says'
 TO_HELP = "the format to write where no name says it, .ply, .spz …"
-_ANTIALIASED = {"yes": True, "no": False, "auto": None}
+ANTIALIASED = {"yes": True, "no": False, "auto": None}
 
 
 def add_trust_option(p: argparse._ActionsContainer) -> None:
@@ -47,7 +47,7 @@ def add_antialiased_option(p: argparse._ActionsContainer) -> None:
     """``--antialiased``, for every command that renders, encodes or writes the scenes that it reads."""
     p.add_argument(
         "--antialiased",
-        choices=tuple(_ANTIALIASED),
+        choices=tuple(ANTIALIASED),
         default="auto",
         help="whether the scene was trained with antialiasing (gsplat's antialiased mode, Mip-Splatting) and is to be "
         "rendered so; default auto: as its file says, which PLY files of gsplat and nerfstudio do not: give yes",
@@ -78,7 +78,7 @@ def read_scene(args: argparse.Namespace, path: Path) -> Scene:
         As :func:`potr_cl.formats.load_scene`.
     """
     with as_file(path) as file:
-        return load_scene(file, **trust(args), antialiased=_ANTIALIASED[args.antialiased])
+        return load_scene(file, **trust(args), antialiased=ANTIALIASED[args.antialiased])
 
 
 @contextlib.contextmanager
@@ -90,7 +90,7 @@ def read_to_draw(args: argparse.Namespace, path: Path, device: Device) -> Iterat
     """
     with (
         as_file(path) as file,
-        drawable_to_judge(file, device, args.trust, _ANTIALIASED[args.antialiased]) as found,
+        drawable_to_judge(file, device, args.trust, ANTIALIASED[args.antialiased]) as found,
     ):
         yield found
 

@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 import os
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -142,6 +143,22 @@ class Scene:
         import potr_cl
 
         potr_cl.save(self, path)
+
+    def show(self, **choices: Any) -> Any:
+        """Show the scene in the browser, in a notebook below the cell, as :func:`potr_cl.view` does.
+
+        Args:
+            choices: keywords of :func:`potr_cl.view`.
+
+        Returns:
+            A :class:`potr_cl.viewer.server.Viewer`.
+
+        Raises:
+            As :func:`potr_cl.view`.
+        """
+        import potr_cl
+
+        return potr_cl.view(self, **choices)
 
     def _repr_png_(self) -> bytes | None:
         """For notebooks: the scene from four sides, or nothing where no device renders it."""

@@ -358,14 +358,32 @@ def side_by_side(a: NDArray[Any], b: NDArray[Any]) -> tuple[NDArray[np.uint8], i
 
 
 def difference_map(a: NDArray[Any], b: NDArray[Any]) -> tuple[FloatArray, int]:
-    """Each pixel's largest difference of a channel, amplified, from black over red and yellow to white.
+    """The :func:`heat_map` of two pictures, amplified as much as their differences allow.
 
     Returns:
         (H, W, 3) float32, and the factor: the largest of 1, 2, 5, 10 … that leaves all but a thousandth of the pixels
         below full white.
     """
-    difference = np.abs(np.clip(a, 0, 1) - np.clip(b, 0, 1)).max(axis=-1)
+    difference = _largest_difference(a, b)
     largest = float(np.quantile(difference, 0.999))
     factor = max(f for f in _FACTORS if f == 1 or f * largest <= 1)
-    heat = np.clip(3 * factor * difference[..., None] - np.array([0, 1, 2]), 0, 1)
-    return heat.astype(np.float32), factor
+    return _heat(difference, factor), factor
+
+
+def heat_map(a: NDArray[Any], b: NDArray[Any], factor: int) -> FloatArray:
+    """Each pixel's largest difference of a channel times a factor, from black over red and yellow to white.
+
+    Returns:
+        (H, W, 3) float32.
+    """
+    return _heat(_largest_difference(a, b), factor)
+
+
+def _largest_difference(a: NDArray[Any], b: NDArray[Any]) -> NDArray[Any]:
+    difference: NDArray[Any] = np.abs(np.clip(a, 0, 1) - np.clip(b, 0, 1)).max(axis=-1)
+    return difference
+
+
+def _heat(difference: NDArray[Any], factor: int) -> FloatArray:
+    heat: NDArray[Any] = np.clip(3 * factor * difference[..., None] - np.array([0, 1, 2]), 0, 1)
+    return heat.astype(np.float32)

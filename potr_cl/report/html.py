@@ -12,7 +12,6 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass
 from html import escape
-from string import Template
 from typing import Any
 
 import numpy as np
@@ -23,10 +22,10 @@ from potr_cl.formats.images import to_8_bits
 from potr_cl.model.scene import FloatArray
 from potr_cl.plain_text import plain
 from potr_cl.quality.compare import difference_map
+from potr_cl.report.colours import ACCENT, SERIES, STAGE
 from potr_cl.report.labels import BEFORE_AND_AFTER, difference_label, view_label
+from potr_cl.report.page import PAGE
 from potr_cl.report.summary import decibels
-
-_COLOURS = ("#4269d0", "#efb118", "#ff725c", "#6cc5b0", "#3ca951", "#ff8ab7", "#a463f2", "#97bbf5", "#9c6b4e")
 
 #: Pixels along a side of a WebP picture.
 _WIDEST_WEBP = 16383
@@ -87,7 +86,7 @@ def html_report(report: dict[str, Any], pictures: Sequence[PicturePair]) -> str:
         _section("Command, time, device, versions", _circumstances(report)),
     ]
     title = f"{_text(source['file'])} → {_text(report['file'])}"
-    return _PAGE.substitute(title=title, body="\n".join(filter(None, sections)))
+    return PAGE.substitute(title=title, accent=ACCENT, stage=STAGE, body="\n".join(filter(None, sections)))
 
 
 def _text(text: object) -> str:
@@ -125,7 +124,7 @@ def _sizes(report: dict[str, Any]) -> str:
     total, splats = report["bytes"], report["splats"]
     bar, rows = [], []
     left = 0.0
-    for colour, (name, nbytes) in zip(_COLOURS, report["properties"].items(), strict=False):
+    for colour, (name, nbytes) in zip(SERIES, report["properties"].items(), strict=False):
         width = 100 * nbytes / total
         tip = f"<title>{_text(name)}: {nbytes:,} bytes</title>"
         bar.append(f'<rect x="{left:.3f}" width="{width:.3f}" height="6" fill="{colour}">{tip}</rect>')
@@ -268,7 +267,7 @@ def _chart(title: str, series: Sequence[tuple[str, Sequence[float]]], logarithmi
     for iteration in sorted({first, round((first + last) / 2), last}):
         at = x(iteration)
         parts.append(f'<text x="{at:.1f}" y="{height - 8}" text-anchor="middle">{iteration}</text>')
-    for (name, line), colour in zip(points, _COLOURS[::2], strict=False):
+    for (name, line), colour in zip(points, SERIES[::2], strict=False):
         path = " ".join(f"{x(iteration):.1f},{y(value):.1f}" for iteration, value in line)
         parts.append(f'<polyline points="{path}" stroke="{colour}" class="line"/>')
         if name:
@@ -324,54 +323,3 @@ def _circumstances(report: dict[str, Any]) -> str:
         facts = {"device": device["name"], "platform": f"{device['platform']}, {device['version']}"} | facts
     rows = [[_text(name), _text(value)] for name, value in facts.items()]
     return command + f'<div class="columns">{_table(["stage", "time"], times)}{_table(["", ""], rows)}</div>'
-
-
-_PAGE = Template("""<!DOCTYPE html>
-<html lang="en">
-<head>
-<meta charset="utf-8">
-<meta name="viewport" content="width=device-width, initial-scale=1">
-<meta http-equiv="Content-Security-Policy" content="default-src 'none'; img-src data:; style-src 'unsafe-inline'; \
-script-src 'unsafe-inline'">
-<title>$title</title>
-<style>
-:root { color-scheme: light dark; --line: #8884; --soft: #8882; }
-body { font: 15px/1.5 system-ui, sans-serif; max-width: 1100px; margin: 0 auto; padding: 1rem; }
-h1 { font-size: 1.2rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.15rem; margin: 2.2rem 0 .6rem; border-bottom: 1px solid var(--line); }
-h3 { font-size: 1rem; margin: 1.4rem 0 .4rem; overflow-wrap: anywhere; }
-.cards { display: flex; flex-wrap: wrap; gap: .8rem; }
-.cards div { background: var(--soft); border-radius: .5rem; padding: .6rem 1rem; }
-.cards b { display: block; font-size: 1.5rem; }
-.bar { width: 100%; height: 2.2rem; border-radius: .3rem; }
-.wide { overflow-x: auto; }
-table { border-collapse: collapse; margin: .6rem 0; }
-th, td { text-align: left; padding: .15rem 1.2rem .15rem 0; border-bottom: 1px solid var(--line); vertical-align: top; }
-td { font-variant-numeric: tabular-nums; }
-td i { display: inline-block; width: .8em; height: .8em; border-radius: .2em; margin-right: .5em; }
-td:has(.meter) { min-width: 12rem; }
-.meter { display: inline-block; height: .6em; background: #4269d0; border-radius: .2em; }
-.pair, .columns, .charts { display: grid; gap: 1rem;
-  grid-template-columns: repeat(auto-fit, minmax(min(100%, 22rem), 1fr)); }
-.columns, .charts { align-items: start; }
-figure { margin: 0; }
-figcaption { opacity: .75; }
-img { display: block; max-width: 100%; height: auto; }
-.slider { position: relative; --at: 50%; width: fit-content; max-width: 100%; }
-.slider .after { position: absolute; inset: 0; clip-path: inset(0 0 0 var(--at)); }
-.slider input { position: absolute; inset: 0; width: 100%; height: 100%; margin: 0; opacity: 0; cursor: ew-resize; }
-.slider::after { content: ""; position: absolute; top: 0; bottom: 0; left: var(--at); width: 2px; background: #fff;
-  box-shadow: 0 0 3px #000; pointer-events: none; }
-.slider:focus-within { outline: 2px solid #4269d0; }
-.charts svg { width: 100%; }
-svg text { font-size: 11px; fill: currentColor; }
-svg .title { font-size: 13px; font-weight: 600; }
-svg .grid { stroke: var(--line); }
-svg .line { fill: none; stroke-width: 2; }
-</style>
-</head>
-<body>
-$body
-</body>
-</html>
-""")

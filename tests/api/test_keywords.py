@@ -34,6 +34,7 @@ COMMAND_LINE_ONLY = {
     "--verbose": "as --quiet",
     "--from": "for standard input",
     "--to": "for standard output and folders of scenes",
+    "--ladder": "encode_ladder makes several files, encode one",
     "--no-quality": "nothing is judged unless a report is asked for: compare() judges",
 }
 #: Of each option what is typed, and the same in Python; {name} stands for a path of the test's files. What has the
@@ -142,6 +143,8 @@ def flag_of(action: argparse.Action) -> str:
     return next(name for name in action.option_strings if name.startswith("--"))
 
 
+#: Those that serve until they are ended: their options are keywords too, what comes out is a page.
+SERVING = ("view",)
 CASES = [(command, flag_of(action)) for command in COMMANDS for action in options_of(command)]
 CASES = [(command, flag) for command, flag in CASES if flag not in COMMAND_LINE_ONLY]
 
@@ -293,6 +296,21 @@ def test_and_means_the_same(command, flag, files, known, tmp_path, capsys):
     if key not in known:
         known[key], _ = called(command, base, files, tmp_path / "without", capsys)
     assert typed != known[key], f"{flag} changes nothing here: the test does not see what it means"
+
+
+@pytest.mark.parametrize("command", SERVING)
+def test_every_option_of_a_server_is_a_keyword(command) -> None:
+    flags = {flag_of(action) for action in options_of(command)} - set(COMMAND_LINE_ONLY)
+    unknown = {flag for flag in flags if keyword(command, flag) not in keywords_of(command)}
+    assert not unknown
+
+
+def test_a_ladder_takes_the_options_of_an_encode() -> None:
+    only_of_one_file = {"--quality", "--max-size", "--min-psnr", "--report", "--report-view"}
+    wanted = {
+        keyword("encode", flag) for command, flag in CASES if command == "encode" and flag not in only_of_one_file
+    }
+    assert wanted - keywords_of("encode_ladder") == set()
 
 
 def test_choices_of_stages_by_name() -> None:

@@ -21,7 +21,7 @@ from tools.results import Cell, Column, Results
 
 ROOT = Path(__file__).parents[2]
 #: Those that users may want; the others are for developers.
-EXTRAS = ("intel-cpu", "pocl", "convert", "completion")
+EXTRAS = ("intel-cpu", "pocl", "convert", "view", "completion")
 PYTHONS = ("3.10", "3.11", "3.12", "3.13", "3.14")
 #: Platforms as people call them, and the tags that pip accepts wheels for there, of systems that are still maintained.
 PLATFORMS = {

@@ -41,6 +41,7 @@ _PUBLIC = {
         "EncodeOptions",
         "encode_to_target",
         "Target",
+        "encode_ladder",
         "decode",
         "decode_to_device",
     ),
@@ -54,7 +55,7 @@ _PUBLIC = {
         "fit",
         "FittedScene",
     ),
-    "Pictures": ("render", "Rendering", "Renderings", "preview", "compare", "SceneComparison"),
+    "Pictures": ("render", "Rendering", "Renderings", "preview", "compare", "SceneComparison", "view"),
     "Views for scenes without cameras": ("place_cameras", "look_around", "turntable"),
     "Errors": ("PotrError", "DataError", "UsageError", "DeviceError", "DeviceMemoryError", "UnreachableError"),
 }

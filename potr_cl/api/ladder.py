@@ -1,0 +1,160 @@
+"""A scene at several qualities in one call (:func:`encode_ladder`): files for a user to choose from by eye."""
+
+from __future__ import annotations
+
+import os
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+
+from potr_cl.api.encoding import Judge, encode_options, output_choice, views_or_placed
+from potr_cl.api.inputs import (
+    CamerasSource,
+    ColourSource,
+    DeviceSource,
+    SceneSource,
+    bytes_of_source,
+    cameras_of,
+    device_of,
+    name_of,
+    scene_of,
+)
+from potr_cl.codec.quantize import Preset
+from potr_cl.errors import UsageError
+from potr_cl.formats.ladder import DESCRIPTION, Ladder, Rung, qualities
+from potr_cl.formats.registry import stem_of_scene
+from potr_cl.host.atomic_write import replacing
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import Stopwatch, proved
+from potr_cl.pipeline.encode import encode as run_stages
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.quality.evaluator import EvaluationViews
+from potr_cl.report.summary import decibels
+from potr_cl.stages.stage import Progress
+
+
+def encode_ladder(
+    scene: SceneSource,
+    output: str | os.PathLike[str],
+    ladder: str | Sequence[float],
+    cameras: CamerasSource | None = None,
+    options: EncodeOptions | None = None,
+    progress: Progress | None = None,
+    device: DeviceSource = None,
+    *,
+    preset: Preset | None = None,
+    virtual_views: int | None = None,
+    to: str | None = None,
+    spz_version: int | None = None,
+    background: ColourSource | None = None,
+    memory: float | None = None,
+    threads: int | None = None,
+    trust: bool = False,
+    antialiased: bool | None = None,
+    cameras_anyway: bool | None = None,
+    tell: Callable[[str], None] | None = None,
+    **choices: Any,
+) -> Ladder:
+    """Encode a scene at several qualities, and judge each, as the command ``encode --ladder`` does.
+
+    Each file has the bytes that :func:`potr_cl.encode` makes at its q. The result is what ``potr_cl.view(scene,
+    result)`` shows with a slider.
+
+    Args:
+        scene: to encode, or its file.
+        output: a folder for the files and their ladder.json; it is made if need be.
+        ladder: the qualities, 0 to 1: a list, or a text such as "0.1,0.3,0.5".
+        cameras, options, progress, device, preset, virtual_views, background, memory, threads, trust, antialiased,
+            cameras_anyway, choices: as of :func:`potr_cl.encode`.
+        to, spz_version: the kind of files, as of :func:`potr_cl.encode`.
+        tell: told a line about each file that is written.
+
+    Raises:
+        UsageError: an option is out of range or contradicts another, or the folder cannot be written to.
+        DataError, DeviceError: as of :func:`potr_cl.encode`.
+    """
+    steps = qualities(ladder)
+    settings = encode_options(
+        options, preset, choices, output=output_choice(None, to, version=spz_version), background=background,
+        memory=memory, threads=threads,
+        source_bytes=bytes_of_source(scene), cameras_anyway=cameras_anyway,
+    )  # fmt: skip
+    given = cameras_of(cameras)
+    what = scene_of(scene, trust, antialiased)
+    looks = settings.look_at_views(what)
+    opened = device_of(device) if looks or given is not None else None
+    views = views_or_placed(what, given, virtual_views) if looks else given
+    name = name_of(scene)
+    return make_ladder(what, name, views, settings, steps, Path(output), opened, progress, tell, trust)
+
+
+def ladder_files(folder: Path, scene: Path, steps: Sequence[float], suffix: str) -> list[Path]:
+    """The files that a ladder consists of: those of the qualities, then the description.
+
+    Args:
+        folder: that they are in.
+        scene: the uncompressed scene's file, which the others are named after.
+        steps: the qualities.
+        suffix: of the kind of file that is encoded to.
+
+    Raises:
+        UsageError: two qualities would have one file.
+    """
+    stem = stem_of_scene(scene) if scene.suffix or scene.is_dir() else "scene"
+    names = [f"{stem}_q{q:g}{suffix}" for q in steps]
+    if len(set(names)) < len(names):
+        raise UsageError("--ladder names qualities that are the same to six digits")
+    return [folder / name for name in [*names, DESCRIPTION]]
+
+
+def make_ladder(
+    scene: Scene,
+    name: Path,
+    cameras: Sequence[Camera] | None,
+    options: EncodeOptions,
+    steps: Sequence[float],
+    folder: Path,
+    device: Device | None,
+    progress: Progress | None = None,
+    tell: Callable[[str], None] | None = None,
+    trust: bool = False,
+    judged: bool = True,
+) -> Ladder:
+    """The same for a scene that has been read and views that have been chosen.
+
+    Args:
+        name: of the scene's file.
+        steps: the qualities, rising.
+        device: None if nothing is to be rendered.
+        judged: whether to judge each file.
+
+    Raises:
+        As :func:`encode_ladder`.
+    """
+    files = ladder_files(folder, name, steps, options.output.suffix)
+    try:
+        folder.mkdir(parents=True, exist_ok=True)
+    except OSError as error:
+        raise UsageError(f"cannot make the folder '{folder}': {error.strerror}") from None
+    views = EvaluationViews.of(list(cameras)) if cameras is not None and device is not None and judged else None
+    rungs = []
+    for q, file in zip(steps, files[:-1], strict=True):
+        encoded = run_stages(scene, cameras, options.changed(q=q), progress, device)
+        psnr = ssim = None
+        judged_on = None if views is None else encoded.device or device
+        with proved(encoded, trust, judged_on) as written:
+            nbytes, splats = len(written.data), len(written.scene)
+            with replacing(file) as opened:
+                opened.write(written.data)
+            if views is not None and judged_on is not None:
+                quality, _ = Judge(views, judged_on, options.background)(scene, written.scene, Stopwatch(progress))
+                psnr, ssim = quality["psnr"], quality["ssim"]
+        rungs.append(Rung(q, file.name, nbytes, splats, psnr, ssim))
+        if tell is not None:
+            figure = "" if views is None else f", {decibels(psnr)}"
+            tell(f"{file}: q {q:g}, {nbytes:,} bytes, {splats:,} splats{figure}")
+    ladder = Ladder(files[-1], name.name, options.source_bytes, "" if views is None else str(views), tuple(rungs))
+    ladder.save()
+    return ladder

@@ -1,0 +1,188 @@
+"""What the page says and is told beyond viser (:class:`Channel`): the divider, the flicker key, clicks on the list of
+views, dropped files.
+
+A connection is a tab's second one. It names the tab by a key that viser's page of that tab was given, and speaks JSON:
+
+- from the page: ``{"divider": 0.4}``, ``{"swap": true}``, ``{"fly": 3}``, ``{"rung": 2}``, ``{"mode": "heat map"}``,
+  ``{"cameras": true}`` to show or hide them, and ``{"file": {"name", "size", "as"}}``, after which the file follows
+  as binary messages;
+- to the page: ``{"state": {…}}`` and ``{"upload": {…}}``.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import contextlib
+import json
+import math
+from collections.abc import Callable
+from concurrent.futures import Executor
+from typing import Any, Protocol
+from urllib.parse import parse_qs, urlsplit
+
+from potr_cl.errors import PotrError
+from potr_cl.plain_text import plain
+from potr_cl.viewer.session import Exhibit, Which
+from potr_cl.viewer.uploads import Upload
+
+#: Bytes after which the page is told how much has come.
+_TOLD_EVERY = 4 << 20
+#: Files that may be on their way at a time, of all tabs.
+_MOST_UPLOADS = 2
+
+
+class Tab(Protocol):
+    """What a channel's messages are for."""
+
+    def divide(self, at: float) -> None:
+        """The divider was drawn to a part of the width."""
+
+    def swap(self, swapped: bool) -> None:
+        """The flicker key was pressed, or let go."""
+
+    def fly(self, view: int) -> None:
+        """A view of the list was clicked."""
+
+    def climb(self, rung: int) -> None:
+        """A rung of the ladder was clicked."""
+
+    def choose_mode(self, mode: str) -> None:
+        """A key chose how to compare."""
+
+    def toggle_cameras(self) -> None:
+        """A key shows or hides the cameras."""
+
+    def dropped(self, which: Which, exhibit: Exhibit) -> None:
+        """A scene was dropped on the page."""
+
+    def connected(self, send: Callable[[dict[str, Any]], None]) -> None:
+        """The channel is there; ``send`` may be called by any thread."""
+
+
+class Channel:
+    """Takes the page's connections.
+
+    Args:
+        find: the tab of a key.
+        readers: threads that read dropped files.
+        antialiased: as of :func:`potr_cl.load_scene`.
+    """
+
+    def __init__(self, find: Callable[[str], Tab | None], readers: Executor, antialiased: bool | None) -> None:
+        self._find = find
+        self._readers = readers
+        self._antialiased = antialiased
+        self._uploads = 0
+
+    async def serve(self, connection: Any) -> None:
+        """Serve one connection until it is closed."""
+        key = parse_qs(urlsplit(connection.request.path).query).get("key", [""])[0]
+        tab = self._find(key)
+        if tab is None:
+            await connection.close(1008, "no such tab")
+            return
+        loop, mail = asyncio.get_running_loop(), _Mail()
+
+        def send(message: dict[str, Any]) -> None:
+            with contextlib.suppress(RuntimeError):  # the server has ended
+                loop.call_soon_threadsafe(mail.put, message)
+
+        async def deliver() -> None:
+            while True:
+                await connection.send(json.dumps(await mail.take()))
+
+        delivering = asyncio.ensure_future(deliver())
+        try:
+            tab.connected(send)
+            async for message in connection:
+                if isinstance(message, str):
+                    content = _parsed(message)
+                    if isinstance(content.get("file"), dict):
+                        await self._receive(connection, tab, content["file"], mail.put)
+                    else:
+                        _obey(tab, content)
+        except Exception as error:
+            if type(error).__module__.split(".")[0] != "websockets":  # it has been closed: nothing is wrong
+                raise
+        finally:
+            delivering.cancel()
+
+    async def _receive(
+        self, connection: Any, tab: Tab, announced: dict[str, Any], put: Callable[[dict[str, Any]], None]
+    ) -> None:
+        which: Which = "A" if announced.get("as") == "A" else "B"
+        if self._uploads >= _MOST_UPLOADS:
+            put({"upload": {"error": "other files are on their way: wait until they are there"}})
+            return
+        self._uploads += 1
+        try:
+            with Upload(announced.get("name"), announced.get("size")) as upload:
+                put({"upload": {"ready": True}})
+                told = 0
+                while not upload.is_complete:
+                    part = await connection.recv()
+                    if isinstance(part, str):
+                        if "cancel" in _parsed(part):
+                            put({"upload": {"error": f"'{upload.name}' was cancelled"}})
+                            return
+                        _obey(tab, _parsed(part))
+                        continue
+                    upload.take(part)
+                    if upload.received - told >= _TOLD_EVERY:
+                        told = upload.received
+                        put({"upload": {"name": upload.name, "received": told, "size": upload.size}})
+                put({"upload": {"reading": upload.name}})
+                loop = asyncio.get_running_loop()
+                exhibit = await loop.run_in_executor(self._readers, upload.read, self._antialiased)
+            tab.dropped(which, exhibit)
+            put({"upload": {"shown": f"{exhibit.name} is {which}"}})
+        except PotrError as error:
+            put({"upload": {"error": plain(error)}})
+        except MemoryError:
+            put({"upload": {"error": "not enough memory for this scene"}})
+        finally:
+            self._uploads -= 1
+
+
+class _Mail:
+    """What the page has not been told yet; what is out of date by then it is never told."""
+
+    def __init__(self) -> None:
+        self._waiting: dict[str, dict[str, Any]] = {}
+        self._some = asyncio.Event()
+
+    def put(self, message: dict[str, dict[str, Any]]) -> None:
+        for kind, content in message.items():
+            self._waiting[kind] = {**self._waiting.get(kind, {}), **content} if kind == "state" else content
+        self._some.set()
+
+    async def take(self) -> dict[str, dict[str, Any]]:
+        await self._some.wait()
+        self._some.clear()
+        taken, self._waiting = self._waiting, {}
+        return taken
+
+
+def _parsed(message: str) -> dict[str, Any]:
+    """What a message says; nothing if it is none of ours."""
+    try:
+        content = json.loads(message) if len(message) < 1 << 16 else None
+    except (ValueError, RecursionError):
+        content = None
+    return content if isinstance(content, dict) else {}
+
+
+def _obey(tab: Tab, content: dict[str, Any]) -> None:
+    divider, view = content.get("divider"), content.get("fly")
+    if isinstance(divider, (int, float)) and not isinstance(divider, bool) and math.isfinite(divider):
+        tab.divide(min(max(float(divider), 0.0), 1.0))
+    if isinstance(content.get("swap"), bool):
+        tab.swap(content["swap"])
+    if isinstance(content.get("mode"), str):
+        tab.choose_mode(content["mode"])
+    if isinstance(view, int) and not isinstance(view, bool):
+        tab.fly(view)
+    if content.get("cameras") is True:
+        tab.toggle_cameras()
+    if isinstance(content.get("rung"), int) and not isinstance(content["rung"], bool):
+        tab.climb(content["rung"])

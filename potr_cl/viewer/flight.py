@@ -1,0 +1,69 @@
+"""A browser's camera flies to a view (:func:`fly`), and the photograph of the view fades over the picture."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Callable
+from typing import Any
+
+import numpy as np
+
+from potr_cl.viewer.pose import F64, Gaze
+
+#: Seconds of a flight, and of the photograph's coming, staying and going.
+FLIGHT, FADE, STAY = 0.6, 0.7, 1.2
+_STEP = 0.04
+
+
+def fly(camera: Any, goal: Gaze, goes_on: Callable[[], bool]) -> None:
+    """Move a browser's camera; returns when it is there.
+
+    Args:
+        camera: viser's handle of it.
+        goal: where to.
+        goes_on: asked before each step; a flight that is not to go on ends where it is.
+    """
+    from viser import transforms
+
+    start = np.asarray(camera.position, np.float64), transforms.SO3(np.asarray(camera.wxyz)), float(camera.fov)
+    end = transforms.SO3.from_matrix(goal.rotation)
+    turn = (start[1].inverse() @ end).log()
+    began = time.monotonic()
+    while goes_on():
+        part = min((time.monotonic() - began) / FLIGHT, 1.0)
+        smooth = part * part * (3 - 2 * part)
+        rotation = end if part == 1 else start[1] @ transforms.SO3.exp(turn * smooth)
+        put(camera, start[0] + (goal.position - start[0]) * smooth, rotation.as_matrix(), goal.fov)
+        if part == 1:
+            return
+        time.sleep(_STEP)
+
+
+def put(camera: Any, position: F64, rotation: F64, fov: float) -> None:
+    """Set a browser's camera at once: (3,), (3, 3) camera to world, vertical angle in radians."""
+    from viser import transforms
+
+    with camera.client.atomic():
+        camera.fov = fov
+        camera.position = position
+        # The controls turn around an axis of their own; up in the view is up in the picture, whatever they thought.
+        camera.up_direction = -rotation[:, 1]
+        camera.wxyz = transforms.SO3.from_matrix(rotation).wxyz
+
+
+def fade(show: Callable[[float], None], goes_on: Callable[[], bool]) -> None:
+    """Let something come, stay and go.
+
+    Args:
+        show: given how much of it shows, 0 to 1; at last 0.
+        goes_on: asked before each step.
+    """
+    began = time.monotonic()
+    while goes_on():
+        passed = time.monotonic() - began
+        left = 2 * FADE + STAY - passed
+        if left <= 0:
+            show(0.0)
+            return
+        show(max(0.0, min(1.0, passed / FADE, left / FADE)))
+        time.sleep(_STEP)

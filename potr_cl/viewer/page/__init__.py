@@ -1,0 +1,44 @@
+"""The viewer's own part of the page: :func:`head` for the page's head, and the :func:`assets` that it asks for."""
+
+from __future__ import annotations
+
+from importlib.resources import files
+from string import Template
+
+from potr_cl.report import colours
+from potr_cl.viewer.access import Asset
+
+_FOLDER = "/potr_cl"
+#: Where the page's own WebSocket connects to.
+CHANNEL = f"{_FOLDER}/channel"
+
+
+def head() -> str:
+    """HTML that makes a page of viser's load what is ours.
+
+    Where WebGL is slow, viser lowers its resolution in steps, and asks for as much smaller pictures. Ours are rendered
+    elsewhere and cost the browser little: they keep the resolution of the page.
+    """
+    return (
+        "<title>potr_cl</title>"
+        '<script>{ const here = new URL(location); here.searchParams.set("fixedDpr", "1");'
+        ' history.replaceState(null, "", here); }</script>'
+        f'<link rel="stylesheet" href="{_FOLDER}/page.css"><script src="{_FOLDER}/page.js" defer></script>'
+    )
+
+
+def assets() -> dict[str, Asset]:
+    """The files of the page by their paths."""
+    folder = files(__package__)
+    style = Template(folder.joinpath("page.css").read_text("utf-8")).substitute(
+        accent=colours.ACCENT,
+        warning=colours.WARNING,
+        stage=colours.STAGE,
+        training=colours.TRAINING_VIEW,
+        test=colours.TEST_VIEW,
+    )
+    script = folder.joinpath("page.js").read_bytes()
+    return {
+        f"{_FOLDER}/page.css": Asset("text/css; charset=utf-8", style.encode()),
+        f"{_FOLDER}/page.js": Asset("text/javascript; charset=utf-8", script),
+    }

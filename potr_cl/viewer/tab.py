@@ -1,0 +1,291 @@
+"""One tab of a browser as the server knows it (:class:`TabHandle`): viser's client, its panel, and its visitor."""
+
+from __future__ import annotations
+
+import secrets
+import threading
+import time
+from collections.abc import Callable
+from html import escape
+from typing import Any, Protocol
+
+import numpy as np
+
+from potr_cl.model.camera import Camera, camera_centres
+from potr_cl.viewer.comparison import FACTORS, MODES
+from potr_cl.viewer.flight import fade, fly, put
+from potr_cl.viewer.frusta import add_frusta
+from potr_cl.viewer.losses import Losses
+from potr_cl.viewer.painter import Painter, decibels
+from potr_cl.viewer.pose import Gaze, gaze_on, rotation_of
+from potr_cl.viewer.session import Exhibit, Which
+from potr_cl.viewer.visitor import Shown, Visitor
+
+#: Qualities of the pictures that are sent while the camera moves, and when it stands.
+_QUICK, _GOOD = 75, 95
+#: Frusta nearer than so many times their own size are not drawn.
+_NEAR = 4.0
+
+
+class House(Protocol):
+    """What a tab asks the server for."""
+
+    painter: Painter
+    losses: Losses
+
+    def is_pair(self) -> bool:
+        """Whether there are two scenes to compare."""
+
+    def put(self, which: Which, exhibit: Exhibit) -> None:
+        """Show a scene to all tabs."""
+
+    def climb(self, rung: int) -> None:
+        """Show a rung of the ladder to all tabs."""
+
+    def state(self) -> dict[str, Any]:
+        """What all tabs are told."""
+
+
+class TabHandle:
+    """Fills a tab's panel, takes what its user does, and sends its pictures.
+
+    Args:
+        client: viser's.
+        house: the server.
+        cameras: of the scene, if there are any.
+    """
+
+    def __init__(self, client: Any, house: House, cameras: list[Camera]) -> None:
+        self.key = secrets.token_urlsafe(16)
+        self._client = client
+        self._house = house
+        self._cameras = cameras
+        self._send: Callable[[dict[str, Any]], None] = lambda _message: None
+        self._flights = 0
+        self._lock = threading.Lock()
+        self._here = True
+        self._goal: int | None = None
+        self._said = ""
+        self.visitor = Visitor(client.client_id, self._show, self._tell)
+        self._add_panel()
+        self._frusta = add_frusta(client.scene, cameras, self.fly)
+        self._centres = camera_centres(cameras)
+        self.restate()
+        client.camera.on_update(self._moved)
+        if house.losses.views:  # viser has only the first view's place and direction, not what its picture holds
+            self._goal = 0
+            camera = client.camera
+            gaze = gaze_on(house.losses.views[0], camera.image_width / max(camera.image_height, 1))
+            put(camera, gaze.position, gaze.rotation, gaze.fov)
+
+    def _add_panel(self) -> None:
+        gui = self._client.gui
+        # The key is in the page alone: only a page that viser serves can find its tab.
+        gui.add_html(f'<div data-potr-key="{escape(self.key)}" hidden></div>', order=-2)
+        gui.add_html(_box("error"), order=-1)
+        self._mode = gui.add_dropdown(
+            "show",
+            MODES,
+            initial_value=self.visitor.mode,
+            order=3,
+            hint="keys 1 to 6; hold F to swap A and B",
+        )
+        self._mode.on_update(lambda _: self.choose_mode(self._mode.value))
+        self._factor = gui.add_dropdown("amplify", FACTORS, initial_value="auto", order=4)
+        self._factor.on_update(lambda _: self._amplify())
+        gui.add_html(_box("figures"), order=5)
+        self._photograph = gui.add_slider(
+            "photograph", 0.0, 1.0, 0.01, 0.0, order=6, hint="how much of the photograph shows over the picture"
+        )
+        self._photograph.on_update(lambda event: self._fade(event))
+        # Off at first: they would hide what is to be compared.
+        self._shows_frusta = gui.add_checkbox(
+            "cameras", False, order=7, visible=bool(self._cameras), hint="key C; a click on one flies there"
+        )
+        self._shows_frusta.on_update(lambda _: self._arrange())
+        gui.add_html(_box("views"), order=8)
+
+    # ------------------------------------------------------------------------------- what the user does
+
+    def divide(self, at: float) -> None:
+        self.visitor.divider = at
+        self._house.painter.wake(self.visitor)
+
+    def swap(self, swapped: bool) -> None:
+        self.visitor.swapped = swapped
+        self._house.painter.wake(self.visitor, look=self.visitor.mode in ("A", "B"))
+        self.restate(everything=False)
+
+    def toggle_cameras(self) -> None:
+        self._shows_frusta.value = not self._shows_frusta.value
+        self._arrange()
+
+    def choose_mode(self, mode: str) -> None:
+        chosen = next((each for each in MODES if each == mode), None)
+        if chosen is None or chosen == self.visitor.mode:
+            return
+        self.visitor.mode = chosen
+        self.visitor.is_still = False
+        if self._mode.value != chosen:
+            self._mode.value = chosen
+        self._house.painter.wake(self.visitor, look=True)
+        self.restate(everything=False)
+
+    def climb(self, rung: int) -> None:
+        self._house.climb(rung)
+
+    def dropped(self, which: Which, exhibit: Exhibit) -> None:
+        self._house.put(which, exhibit)
+
+    def connected(self, send: Callable[[dict[str, Any]], None]) -> None:
+        self._send = send
+        self.restate()
+        self._house.painter.wake(self.visitor)
+
+    def fly(self, view: int) -> None:
+        if not 0 <= view < len(self._house.losses.views):
+            return
+        with self._lock:
+            self._flights += 1
+            number = self._flights
+        self._goal = None
+        threading.Thread(target=self._fly, args=(view, number), name="potr_cl flight", daemon=True).start()
+
+    def leave(self) -> None:
+        """The tab is closed."""
+        self._here = False
+
+    # ------------------------------------------------------------------------------- what the user sees
+
+    def restate(self, everything: bool = True) -> None:
+        """Tell the page what it shows beside the picture: everything, or only what is this tab's own."""
+        pair, swapped = self._house.is_pair(), self.visitor.swapped
+        names = ("B", "A") if swapped else ("A", "B")
+        labels = {
+            "divider": names,
+            "side by side": names,
+            "A": (names[0], ""),
+            "B": (names[1], ""),
+        }.get(self.visitor.mode, ("A – B", ""))
+        self._send(
+            {
+                "state": {
+                    **(self._house.state() if everything else {}),
+                    "mode": self.visitor.mode,
+                    "divider": self.visitor.divider,
+                    "labels": labels if pair else None,
+                    "at": self.visitor.view,
+                }
+            }
+        )
+        self._arrange()
+
+    def _arrange(self) -> None:
+        """Show in the panel what is of use now."""
+        pair, view = self._house.is_pair(), self.visitor.view
+        self._mode.visible = pair
+        self._factor.visible = pair and self.visitor.mode in ("difference", "heat map")
+        self._photograph.visible = view is not None and self._house.losses.has_photograph(view)
+        # Beside each other both pictures are half as wide, and what viser draws over them would fit neither.
+        seen = self._shows_frusta.value and not (pair and self.visitor.mode == "side by side")
+        gaze = self.visitor.gaze
+        for number, frustum in self._frusta.items():
+            # One that the camera stands in or beside is only a line across the picture.
+            near = gaze is not None and np.linalg.norm(self._centres[number] - gaze.position) < _NEAR * frustum.scale
+            visible = bool(seen and number != view and not near)
+            if frustum.visible != visible:
+                frustum.visible = visible
+
+    def _show(self, shown: Shown) -> None:
+        if not self._here:
+            return
+        self._client.scene.set_background_image(
+            shown.picture, format="jpeg", jpeg_quality=_GOOD if shown.still else _QUICK
+        )
+        if shown.still:
+            self._arrange()
+        look, height, width = shown.look, *shown.picture.shape[:2]
+        values = []
+        if look.psnr is not None and look.ssim is not None:
+            values = [["PSNR", decibels(look.psnr)], ["SSIM", f"{look.ssim:.4f}"]]
+        if values or shown.still or not self._house.is_pair():
+            mode = self.visitor.mode
+            heat = f"difference {1 / shown.factor:g} of 1" if mode == "heat map" else None
+            note = f"{width} × {height}" + (f", difference × {shown.factor}" if mode == "difference" else "")
+            self._last = {"values": values, "note": note}
+            self._send({"state": {"figures": {**self._last, "old": False}, "heat": heat}})
+        else:
+            self._send({"state": {"figures": {**getattr(self, "_last", {"values": [], "note": ""}), "old": True}}})
+
+    def _tell(self, said: str) -> None:
+        if said != self._said:
+            self._said = said
+            self._send({"state": {"error": said}})
+
+    # ------------------------------------------------------------------------------- the camera
+
+    async def _moved(self, camera: Any) -> None:
+        """viser has heard from the browser's camera. In viser's own thread, so that the last word stays the last."""
+        gaze = Gaze(np.array(camera.position, np.float64), rotation_of(np.array(camera.wxyz)), float(camera.fov))
+        visitor = self.visitor
+        size = int(camera.image_width), int(camera.image_height)
+        if min(size) < 1 or not all(np.isfinite(part).all() for part in (gaze.position, gaze.rotation, gaze.fov)):
+            return
+        if visitor.gaze is not None and size == (visitor.width, visitor.height) and gaze.is_near(visitor.gaze):
+            if not np.array_equal(gaze.position, visitor.gaze.position):
+                visitor.gaze = gaze
+            return
+        visitor.width, visitor.height = size
+        visitor.gaze, visitor.moved, visitor.is_still = gaze, time.monotonic(), False
+        if visitor.view is not None and not self._is_at(visitor.view):
+            visitor.view, visitor.fade = None, 0.0
+            self.restate(everything=False)
+        elif self._goal is not None and self._is_at(self._goal):
+            visitor.view, self._goal = self._goal, None
+            self.restate(everything=False)
+        self._house.painter.wake(visitor, look=True)
+
+    def _is_at(self, view: int) -> bool:
+        visitor = self.visitor
+        if visitor.gaze is None:
+            return False
+        return visitor.gaze.is_near(gaze_on(self._house.losses.views[view], visitor.width / visitor.height))
+
+    def _fly(self, view: int, number: int) -> None:
+        def goes_on() -> bool:
+            return self._here and self._flights == number
+
+        visitor = self.visitor
+        if visitor.gaze is None:
+            return
+        self._goal = view
+        fly(self._client.camera, gaze_on(self._house.losses.views[view], visitor.width / visitor.height), goes_on)
+        landed = time.monotonic()
+        while goes_on() and visitor.view != view and time.monotonic() - landed < 3:
+            time.sleep(0.02)
+        if visitor.view != view or not goes_on():
+            return
+        if self._house.losses.has_photograph(view):
+            fade(lambda part: self._fade_to(part, on_slider=True), lambda: goes_on() and visitor.view == view)
+
+    def _fade(self, event: Any) -> None:
+        if event.client is not None:  # the user, and not the program, has moved the slider
+            with self._lock:
+                self._flights += 1
+            self._fade_to(float(self._photograph.value))
+
+    def _fade_to(self, part: float, on_slider: bool = False) -> None:
+        self.visitor.fade = part
+        if on_slider:
+            self._photograph.value = round(part, 2)
+        self._house.painter.wake(self.visitor)
+
+    def _amplify(self) -> None:
+        value = self._factor.value
+        self.visitor.factor = None if value == "auto" else int(value)
+        self._house.painter.wake(self.visitor)
+
+
+def _box(name: str) -> str:
+    """A place in the panel that page.js fills."""
+    return f'<div class="potr-box" data-potr="{name}"></div>'

@@ -1,0 +1,75 @@
+"""Encoding to a ladder: the files of plain encodes, and what they lost."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+
+import potr_cl
+from potr_cl.cli import main
+from potr_cl.formats.ladder import read_ladder
+from tests.api.test_keywords import files  # noqa: F401  (a fixture: a small scene and its views)
+
+pytestmark = pytest.mark.one_runtime
+
+
+def test_a_ladder_has_the_files_of_plain_encodes(files, tmp_path, capsys):  # noqa: F811
+    told: list[str] = []
+    ladder = potr_cl.encode_ladder(
+        files["scene"], tmp_path / "new" / "ladder", "0.8,0.2", files["cameras"], preset="fast", tell=told.append
+    )
+    assert len(told) == 2
+    assert ladder == read_ladder(ladder.path)
+    assert ladder.scene == "scene.ply"
+    assert ladder.scene_bytes == files["scene"].stat().st_size
+    for q, rung in zip((0.2, 0.8), ladder.rungs, strict=True):
+        plain = potr_cl.encode(files["scene"], files["cameras"], q=q, preset="fast")
+        data = ladder.file(rung).read_bytes()
+        assert (rung.q, rung.file, rung.bytes, rung.splats) == (q, f"scene_q{q}.potr", len(data), len(plain.order))
+        assert data == plain.data
+        compared = potr_cl.compare(files["scene"], ladder.file(rung), files["cameras"])
+        assert rung.psnr == pytest.approx(compared.psnr, abs=1e-3)
+        assert rung.ssim == pytest.approx(compared.ssim, abs=1e-5)
+    # The command does the same.
+    typed = ["encode", str(files["scene"]), "-o", str(tmp_path / "typed"), "--cameras", str(files["cameras"])]
+    assert main([*typed, "--ladder", "0.2,0.8", "--preset", "fast", "--json"]) == 0
+    assert json.loads(capsys.readouterr().out) == ladder.document()
+    for path in ladder.path.parent.iterdir():
+        assert (tmp_path / "typed" / path.name).read_bytes() == path.read_bytes()
+
+
+def test_without_views_nothing_is_judged(files, tmp_path):  # noqa: F811
+    scene = potr_cl.read_scene(files["scene"])
+    ladder = potr_cl.encode_ladder(scene, tmp_path, [0.5], prune=False, refit=False, compact=False)
+    assert (ladder.rungs[0].psnr, ladder.rungs[0].ssim, ladder.judged_by) == (None, None, "")
+    assert np.isfinite(potr_cl.decode(ladder.file(ladder.rungs[0])).means).all()
+
+
+@pytest.mark.parametrize(
+    ("words", "said"),
+    [
+        (["--ladder", "0.1,x"], "--ladder is '0.1,x'"),
+        (["--ladder", "0.5", "--report", "page.html"], "--report is about one file"),
+        (["--ladder", "0.5", "-o", "a.potr"], "a folder"),
+        (["--ladder", "0.5", "-o", "-"], "a folder"),
+    ],
+)
+def test_what_a_ladder_cannot_do_is_told(files, tmp_path, monkeypatch, capsys, words, said):  # noqa: F811
+    monkeypatch.chdir(tmp_path)
+    given = [] if "-o" in words else ["-o", "folder"]
+    assert main(["encode", str(files["scene"]), *words, *given]) == 2
+    assert said in capsys.readouterr().err
+    assert list(tmp_path.iterdir()) == []
+
+
+def test_no_input_is_replaced(files, tmp_path, capsys):  # noqa: F811
+    """A scene that has the name of a rung."""
+    scene = tmp_path / "a_q0.5.potr"
+    scene.write_bytes(files["potr"].read_bytes())
+    link = tmp_path / "a.potr"
+    link.symlink_to(scene)
+    assert main(["encode", str(link), "-o", f"{tmp_path}/", "--ladder", "0.5", "--no-prune", "--refit", "off"]) == 2
+    assert "is an input too" in capsys.readouterr().err
+    assert scene.read_bytes() == files["potr"].read_bytes()

@@ -1,0 +1,303 @@
+"""The page in a real browser: what a user sees and does."""
+
+from __future__ import annotations
+
+import io
+import time
+from collections.abc import Callable, Iterator
+from typing import Any
+
+import numpy as np
+import pytest
+from PIL import Image
+
+import potr_cl
+from potr_cl.quality.metrics import psnr
+from potr_cl.viewer.pose import camera_of
+
+pytestmark = [pytest.mark.browser, pytest.mark.slow, pytest.mark.one_runtime]
+
+WIDTH, HEIGHT = 760, 480
+#: Of the page, what neither labels nor viser's notes nor the panel cover: rows and columns.
+CLEAR = (slice(220, 460), slice(20, 420))
+HOSTILE = '<img src=x onerror="document.title=1">\u202e.ply'
+
+
+@pytest.fixture(scope="module")
+def viewer(ladder, data) -> Iterator[Any]:
+    with potr_cl.view(data / "plush_excerpt.ply", ladder, data / "plush_excerpt_cameras.json") as viewer:
+        yield viewer
+
+
+@pytest.fixture(scope="module")
+def tab(viewer, browser) -> Iterator[Any]:
+    """A tab that shows the viewer; an error on its console fails the last test."""
+    yield from opened(browser, viewer)
+
+
+@pytest.fixture
+def page(viewer, tab) -> Any:
+    """The same tab for all tests, for it takes long to load; as it is at the beginning."""
+    tab.keyboard.press("1")
+    if tab.get_by_role("checkbox").first.is_checked():
+        tab.keyboard.press("c")
+    viewer.climb(1)
+    viewer.painter.visitors[0].divider = 0.5
+    tab.locator("[data-view='0']").click()
+    until(lambda: viewer.painter.visitors[0].view == 0)
+    return tab
+
+
+def opened(browser: Any, viewer: Any) -> Iterator[Any]:
+    context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
+    tab = context.new_page()
+    errors: list[str] = []
+    tab.on("console", lambda message: errors.append(message.text) if message.type == "error" else None)
+    tab.on("pageerror", lambda error: errors.append(str(error)))
+    tab.goto(viewer.url)
+    until(lambda: tab.locator(".potr-figures b").count() > 0)
+    before = len(viewer.painter.visitors)
+    yield tab
+    context.close()
+    until(lambda: len(viewer.painter.visitors) < before)
+    assert errors == []
+
+
+def until(condition: Callable[[], bool], seconds: float = 60) -> None:
+    end = time.monotonic() + seconds
+    while not condition():
+        assert time.monotonic() < end, "it has not come"
+        time.sleep(0.05)
+
+
+def still(viewer: Any, page: Any) -> Any:
+    """The visitor of a page, once its picture is as good as it gets and nothing is on its way."""
+    until(lambda: bool(viewer.painter.visitors))
+    visitor = viewer.painter.visitors[-1]
+    until(
+        lambda: visitor.is_still and not visitor.stale_look and not visitor.stale_picture and visitor.look is not None
+    )
+    page.wait_for_timeout(700)
+    until(lambda: visitor.is_still and not visitor.stale_picture)
+    page.wait_for_timeout(300)
+    return visitor
+
+
+def seen(page: Any) -> Any:
+    """(H, W, 3) float, what the tab shows where nothing covers the picture."""
+    return np.asarray(Image.open(io.BytesIO(page.screenshot())).convert("RGB"))[CLEAR].astype(np.float64) / 255
+
+
+def rendered(viewer: Any, visitor: Any, which: str) -> Any:
+    camera = camera_of(visitor.gaze, visitor.width, visitor.height)
+    exhibit = viewer.session.exhibit(which)
+    image = potr_cl.render(exhibit.scene, camera).pixels.astype(np.float64) / 255
+    assert image.shape == (HEIGHT, WIDTH, 3), "the picture fills the page"
+    return image[CLEAR]
+
+
+def test_the_picture_is_that_of_render(viewer, page):
+    page.keyboard.press("3")
+    visitor = still(viewer, page)
+    assert visitor.mode == "A"
+    expected = rendered(viewer, visitor, "A")
+    assert expected.std() > 0.05, "something is to be seen"
+    assert psnr(seen(page), expected) > 34  # a JPEG of quality 95, its colours at half the resolution
+    page.keyboard.press("4")
+    visitor = still(viewer, page)
+    assert psnr(seen(page), rendered(viewer, visitor, "B")) > 34
+
+
+def test_the_divider_is_drawn(viewer, page):
+    page.locator("[data-potr=scenes]").wait_for()
+    slide(page, 0)
+    until(lambda: "_q0." in viewer.session.exhibit("B").name)
+    page.locator("[data-view='4']").click()  # there the scene fills the picture
+    until(lambda: viewer.painter.visitors[0].view == 4)
+    visitor = still(viewer, page)
+    grip = page.locator(".potr-grip").bounding_box()
+    assert grip["x"] + grip["width"] / 2 == pytest.approx(WIDTH / 2, abs=2)
+    page.mouse.move(WIDTH / 2, HEIGHT / 2)
+    page.mouse.down()
+    page.mouse.move(280, HEIGHT / 2, steps=5)
+    page.mouse.up()
+    until(lambda: abs(visitor.divider - 280 / WIDTH) < 0.01)
+    still(viewer, page)
+    picture, a, b = seen(page), rendered(viewer, visitor, "A"), rendered(viewer, visitor, "B")
+    column = 280 - CLEAR[1].start
+    left, right = slice(0, column - 30), slice(column + 30, None)
+    assert psnr(picture[:, left], a[:, left]) > psnr(picture[:, left], b[:, left]) + 1
+    assert psnr(picture[:, right], b[:, right]) > psnr(picture[:, right], a[:, right]) + 1
+
+
+def slide(page: Any, rung: int) -> None:
+    """Choose the first or the last quality."""
+    page.locator("[role=slider]:not(.potr-grip)").first.focus()
+    page.keyboard.press("End" if rung else "Home")
+
+
+def test_the_slider_chooses_a_quality(viewer, page, ladder):
+    sizes = [(ladder / f"plush_excerpt_q{q}.potr").stat().st_size for q in ("0", "0.5", "1")]
+    slide(page, 0)
+    until(lambda: viewer.session.exhibit("B").nbytes == sizes[0])
+    low = float(figure(viewer, page).split()[0])
+    slide(page, 2)
+    until(lambda: viewer.session.exhibit("B").nbytes == sizes[2])
+    high = float(figure(viewer, page).split()[0])
+    assert high > low + 3
+    assert page.locator("[data-potr=scenes]").inner_text().count("plush_excerpt_q1.potr") == 1
+
+
+def figure(viewer: Any, page: Any) -> str:
+    still(viewer, page)
+    return page.locator(".potr-figures b").first.inner_text()
+
+
+def test_figures_are_those_of_compare(viewer, page):
+    visitor = still(viewer, page)
+    camera = camera_of(visitor.gaze, visitor.width, visitor.height)
+    a, b = (viewer.session.exhibit(which).scene for which in "AB")
+    expected = potr_cl.compare(a, b, [camera])
+    shown = page.locator(".potr-figures b").all_inner_texts()
+    assert shown == [f"{expected.psnr:.2f} dB", f"{expected.ssim:.4f}"]
+
+
+def test_heat_map_and_difference(viewer, page):
+    slide(page, 0)
+    page.keyboard.press("6")
+    visitor = still(viewer, page)
+    page.get_by_text("equal", exact=True).wait_for()
+    hot = seen(page)
+    assert hot.max() > 0.5
+    # Its colours go from black over red to yellow: green only where there is red.
+    assert (hot[..., 1] <= hot[..., 0] + 0.2).all()
+    page.keyboard.press("5")
+    visitor = still(viewer, page)
+    a, b = rendered(viewer, visitor, "A"), rendered(viewer, visitor, "B")
+    factor = int(page.locator("[data-potr=figures] .potr-note").inner_text().split("× ")[-1])
+    assert psnr(seen(page), np.clip(factor * abs(a - b), 0, 1)) > 25
+
+
+def test_side_by_side_and_the_flicker_key(viewer, page):
+    page.keyboard.press("2")
+    visitor = still(viewer, page)
+    assert visitor.look.a.shape == visitor.look.b.shape == (HEIGHT, WIDTH // 2, 3)
+    assert psnr(seen(page)[:, : WIDTH // 2 - 60], visitor.look.a[CLEAR][:, : WIDTH // 2 - 60].astype(float)) > 30
+    page.keyboard.press("3")
+    visitor = still(viewer, page)
+    page.keyboard.down("f")
+    until(lambda: visitor.swapped)
+    page.get_by_text("B", exact=True).first.wait_for()
+    page.keyboard.up("f")
+    until(lambda: not visitor.swapped)
+
+
+def test_a_click_flies_to_a_view(viewer, page):
+    visitor = still(viewer, page)
+    assert visitor.view == 0
+    page.locator("[data-view='5']").click()
+    until(lambda: visitor.view == 5)
+    camera = viewer.losses.views[5]
+    assert visitor.gaze.position == pytest.approx(camera.centre, abs=1e-3)
+    assert visitor.gaze.rotation == pytest.approx(camera.rotation.T, abs=1e-3)
+    page.locator("[data-view='5'].at").wait_for()
+
+
+def test_a_click_on_a_frustum_flies_there(viewer, page):
+    visitor = still(viewer, page)
+    page.keyboard.press("3")
+    page.keyboard.press("c")
+    until(page.get_by_role("checkbox").first.is_checked)
+    page.mouse.move(200, 300)
+    for _ in range(8):
+        page.mouse.wheel(0, 400)
+        page.wait_for_timeout(60)
+    visitor = still(viewer, page)
+    camera = camera_of(visitor.gaze, visitor.width, visitor.height)
+    places = {}
+    for number, view in enumerate(viewer.losses.views):
+        x, y, z = camera.rotation @ view.centre + camera.translation
+        if z > 0:
+            places[number] = (camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy)
+    clear = [at for at in places.values() if 10 < at[0] < 420 and 10 < at[1] < 470]
+    assert clear, "no frustum is in the picture"
+    for x, y in clear:
+        # As a hand does it: viser has to see that the mouse is over it, at the few pictures a second of this WebGL.
+        page.mouse.move(x - 3, y - 3)
+        page.wait_for_timeout(300)
+        page.mouse.move(x, y)
+        page.wait_for_timeout(500)
+        page.mouse.down()
+        page.wait_for_timeout(150)
+        page.mouse.up()
+        page.wait_for_timeout(1000)
+        if np.linalg.norm(visitor.gaze.position - camera.centre) > 1e-3:
+            until(lambda: visitor.view is not None)
+            return
+    raise AssertionError("no click flew anywhere")
+
+
+def test_a_second_tab_and_the_end_of_the_work(viewer, browser, page):
+    first = still(viewer, page)
+    second = opened(browser, viewer)
+    other = next(second)
+    assert len(viewer.painter.visitors) == 2
+    other.keyboard.press("4")
+    until(lambda: [visitor.mode for visitor in viewer.painter.visitors] == ["divider", "B"])
+    for _ in second:  # closes it
+        pass
+    assert viewer.painter.visitors == [first]
+
+
+def test_a_dropped_file_is_shown_and_hostile_names_are_text(viewer, page, data):
+    exhibit = viewer.session.exhibit("B")
+    scene = potr_cl.read_scene(data / "plush_excerpt.ply")
+    content = (data / "plush_excerpt.ply").read_bytes()
+    drop(page, HOSTILE, content, "B")
+    until(lambda: len(viewer.session.exhibit("B").scene) == len(scene))
+    page.locator("[data-potr=scenes]", has_text="<img src=x").wait_for()
+    assert page.locator("img[src=x]").count() == 0
+    assert page.title() != "1"
+    viewer.put("B", exhibit)
+    until(lambda: viewer.session.exhibit("B") is exhibit)
+
+
+def test_a_bad_file_is_told(viewer, page):
+    before = viewer.session.exhibit("B")
+    drop(page, "scene.ply", b"this is no scene", "B")
+    page.locator(".potr-toast.bad", has_text="scene.ply").wait_for()
+    drop(page, "scene.docx", b"neither is this", "A")
+    page.locator(".potr-toast.bad", has_text="no scene that is known by its name").wait_for()
+    assert viewer.session.exhibit("B") is before
+
+
+def drop(page: Any, name: str, content: bytes, which: str) -> None:
+    """What a browser does when a file is dropped; the file is made in the page, for no mouse brings one."""
+    page.evaluate(
+        """([name, content, which]) => {
+            const data = new DataTransfer();
+            data.items.add(new File([Uint8Array.from(atob(content), c => c.charCodeAt(0))], name));
+            const event = kind => new DragEvent(kind, { dataTransfer: data, bubbles: true, cancelable: true });
+            document.body.dispatchEvent(event("dragenter"));
+            document.querySelector(`[data-as=${which}]`).dispatchEvent(event("drop"));
+        }""",
+        [name, __import__("base64").b64encode(content).decode(), which],
+    )
+
+
+def test_an_error_of_the_device_is_shown_and_the_server_lives_on(viewer, page, monkeypatch):
+    from potr_cl.raster.rasterizer import Rasterizer
+
+    visitor = still(viewer, page)
+
+    def failing(*_: Any) -> None:
+        raise potr_cl.DeviceError("the device <b>broke</b>")
+
+    with monkeypatch.context() as patch:
+        patch.setattr(Rasterizer, "render_into", failing)
+        page.locator("[data-view='3']").click()
+        page.locator(".potr-error", has_text="the device <b>broke</b>").wait_for()
+    page.locator("[data-view='4']").click()
+    until(lambda: visitor.view == 4)
+    still(viewer, page)
+    assert page.locator(".potr-error").count() == 0

@@ -1,0 +1,207 @@
+"""Files that are dropped on the page, and the other things that it says."""
+
+from __future__ import annotations
+
+import asyncio
+import json
+import os
+from concurrent.futures import ThreadPoolExecutor
+from pathlib import Path
+from typing import Any
+
+import pytest
+
+import potr_cl
+from potr_cl.viewer import uploads
+from potr_cl.viewer.channel import Channel
+from potr_cl.viewer.uploads import MOST_BYTES, Upload
+
+pytestmark = pytest.mark.one_runtime
+
+
+class Tab:
+    """Notes what it is told."""
+
+    def __init__(self) -> None:
+        self.heard: list[tuple[str, Any]] = []
+        self.exhibits: list[tuple[str, Any]] = []
+
+    def __getattr__(self, name: str) -> Any:
+        return lambda value: self.heard.append((name, value))
+
+    def connected(self, send: Any) -> None:
+        send({"state": {"a": 1}})
+        send({"state": {"b": 2}})
+
+    def dropped(self, which: str, exhibit: Any) -> None:
+        self.exhibits.append((which, exhibit))
+
+
+class Connection:
+    """What a page sends, one message after the other; then it is closed, once all answers are there."""
+
+    def __init__(self, messages: list[str | bytes], key: str = "right") -> None:
+        self.request = type("Request", (), {"path": f"/potr_cl/channel?key={key}"})
+        self.messages = messages
+        self.sent: list[dict[str, Any]] = []
+        self.closed: int | None = None
+
+    async def send(self, message: str) -> None:
+        self.sent.append(json.loads(message))
+
+    async def close(self, code: int, _reason: str) -> None:
+        self.closed = code
+
+    async def recv(self) -> str | bytes:
+        await asyncio.sleep(0)
+        return self.messages.pop(0)
+
+    def __aiter__(self) -> Connection:
+        return self
+
+    async def __anext__(self) -> str | bytes:
+        await asyncio.sleep(0.05)
+        if not self.messages:
+            raise StopAsyncIteration
+        return self.messages.pop(0)
+
+
+def spoken(messages: list[Any], key: str = "right") -> tuple[Tab, Connection]:
+    tab, connection = Tab(), Connection([m if isinstance(m, bytes) else json.dumps(m) for m in messages], key)
+    with ThreadPoolExecutor(1) as readers:
+        channel = Channel(lambda given: tab if given == "right" else None, readers, None)
+        asyncio.run(channel.serve(connection))
+    return tab, connection
+
+
+def uploads_told(connection: Connection) -> list[dict[str, Any]]:
+    return [message["upload"] for message in connection.sent if "upload" in message]
+
+
+def test_what_the_page_says_is_obeyed() -> None:
+    tab, connection = spoken(
+        [{"divider": 0.25}, {"divider": 7}, {"swap": True}, {"fly": 3}, {"rung": 1}, {"mode": "heat map"}]
+    )
+    assert tab.heard == [
+        ("divide", 0.25), ("divide", 1.0), ("swap", True), ("fly", 3), ("climb", 1), ("choose_mode", "heat map")
+    ]  # fmt: skip
+    assert connection.sent[0] == {"state": {"a": 1, "b": 2}}, "what waits is told at once"
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    [
+        {"divider": "x"}, {"divider": True}, {"divider": float("nan")}, {"swap": 1}, {"fly": True}, {"fly": 1.5}, [], 7,
+        None, {"mode": 3}, {"rung": "1"}, b"bytes that nobody waits for", {"unknown": {}}, {"file": "name"},
+    ],
+)  # fmt: skip
+def test_nonsense_is_passed_over(nonsense) -> None:
+    tab, connection = spoken([nonsense, {"fly": 1}])
+    assert tab.heard == [("fly", 1)]
+    assert connection.closed is None
+
+
+def test_json_that_is_none_is_passed_over() -> None:
+    tab, connection = Tab(), Connection(["{", "[" * 20000, '{"fly": 2}'])
+    with ThreadPoolExecutor(1) as readers:
+        asyncio.run(Channel(lambda _: tab, readers, None).serve(connection))
+    assert tab.heard == [("fly", 2)]
+
+
+def test_without_the_key_nothing_is_heard() -> None:
+    tab, connection = spoken([{"fly": 1}], key="wrong")
+    assert connection.closed == 1008
+    assert tab.heard == []
+
+
+@pytest.mark.parametrize("part", [1 << 20, 10_000])
+def test_a_dropped_scene_is_read(data, part) -> None:
+    content = (data / "plush_excerpt.ply").read_bytes()
+    parts = [content[k : k + part] for k in range(0, len(content), part)]
+    announced = {"file": {"name": "x\u202e<b>.PLY", "size": len(content), "as": "A"}}
+    tab, connection = spoken([announced, *parts, {"fly": 1}])
+    ((which, exhibit),) = tab.exhibits
+    assert which == "A"
+    assert len(exhibit.scene) == 1500
+    assert exhibit.nbytes == len(content)
+    assert exhibit.name.isprintable()
+    assert uploads_told(connection)[-1] == {"shown": f"{exhibit.name} is A"}
+    assert tab.heard == [("fly", 1)], "it goes on afterwards"
+
+
+@pytest.mark.parametrize(
+    ("name", "size", "said"),
+    [
+        ("scene.ply", MOST_BYTES + 1, "GB: name the file on the command line"),
+        ("scene.ply", -1, "how large"),
+        ("scene.ply", "7", "how large"),
+        ("scene.ply", True, "how large"),
+        ("scene.exe", 7, "no scene that is known by its name"),
+        ("ply", 7, "no scene that is known by its name"),
+        (None, 7, "no scene that is known by its name"),
+        (["scene.ply"], 7, "no scene that is known by its name"),
+    ],
+)
+def test_what_is_no_scene_is_refused_before_a_byte_comes(name, size, said) -> None:
+    tab, connection = spoken([{"file": {"name": name, "size": size}}, {"fly": 1}])
+    assert said in uploads_told(connection)[-1]["error"]
+    assert not tab.exhibits
+    assert tab.heard == [("fly", 1)]
+
+
+def test_more_bytes_than_announced_are_refused(data) -> None:
+    tab, connection = spoken([{"file": {"name": "scene.ply", "size": 10}}, b"0123456789012"])
+    assert "more bytes" in uploads_told(connection)[-1]["error"]
+    assert not tab.exhibits
+
+
+def test_a_damaged_file_is_told_by_its_own_name_and_leaves_nothing(tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    tab, connection = spoken([{"file": {"name": "mine.ply", "size": 7}}, b"no ply!"])
+    error = uploads_told(connection)[-1]["error"]
+    assert "'mine.ply'" in error
+    assert str(tmp_path) not in error
+    assert os.listdir(tmp_path) == []
+    assert not tab.exhibits
+
+
+def test_a_cancelled_file_is_forgotten() -> None:
+    tab, connection = spoken([{"file": {"name": "mine.ply", "size": 7}}, b"no", {"cancel": True}, {"fly": 1}])
+    assert "cancelled" in uploads_told(connection)[-1]["error"]
+    assert tab.heard == [("fly", 1)]
+
+
+@pytest.mark.parametrize("name", ["../../x.ply", "/etc/passwd.ply", "C:\\x.ply", "a/b.spz", ".ply", "x.ply.gz"])
+def test_names_lead_nowhere(name, tmp_path, monkeypatch) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    with Upload(name, 3) as upload:
+        upload.take(b"abc")
+        files = [path for path in tmp_path.rglob("*") if path.is_file()]
+        assert [path.stem.split(".")[0] for path in files] == ["scene"]
+        assert upload.is_complete
+    assert os.listdir(tmp_path) == []
+
+
+def test_a_full_disk_is_told(monkeypatch, tmp_path) -> None:
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+
+    class Full:
+        def write(self, _: bytes) -> None:
+            raise OSError(28, "No space left on device")
+
+        def close(self) -> None: ...
+
+    with Upload("x.ply", 3) as upload:
+        monkeypatch.setattr(upload, "_file", Full())
+        with pytest.raises(potr_cl.UsageError, match="No space left"):
+            upload.take(b"abc")
+
+
+def test_a_potr_file_may_be_dropped(ladder: Path) -> None:
+    content = (ladder / "plush_excerpt_q0.5.potr").read_bytes()
+    tab, _ = spoken([{"file": {"name": "a.potr", "size": len(content), "as": "B"}}, content])
+    assert [which for which, _ in tab.exhibits] == ["B"]
+
+
+def test_the_limit_is_what_the_documentation_says() -> None:
+    assert uploads.MOST_BYTES == 2 << 30
