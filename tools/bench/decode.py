@@ -158,12 +158,12 @@ def versions(results: Results, files: Iterable[Path], args: argparse.Namespace) 
         Column("file"),
         Column("splats", format=","),
         Column("threads"),
-        Column("version 2", "bytes", ","),
-        Column("version 3", "bytes", ","),
+        Column("size, version 2", "bytes", ","),
+        Column("size, version 3", "bytes", ","),
         Column("coding version 2, processor time", "ms", ".0f"),
         Column("coding version 3, processor time", "ms", ".0f"),
-        Column("version 2", "million splats/s", ".2f"),
-        Column("version 3", "million splats/s", ".2f"),
+        Column("rate, version 2", "million splats/s", ".2f"),
+        Column("rate, version 3", "million splats/s", ".2f"),
         Column("times as fast", format=".2f"),
     )
     os.environ[VARIABLE] = PATHS["native"]
