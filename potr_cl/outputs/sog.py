@@ -33,6 +33,8 @@ _BITS_AN_ENTRY, _MOST_A_SPLAT = 20, 0.75
 #: What an error is worth at least, as a part of what it were if the constant coefficient could not make up for it:
 #: other views than those of the re-fit may tell them better apart.
 _LEAST_WORTH = 0.02
+#: An entry has many splats if it has so many.
+_MANY = 4
 #: What the images hold.
 _IMAGES = {
     "means_l": "position",
@@ -181,7 +183,10 @@ def _coded(
         bits = np.minimum(-np.log2(having / len(points)), 64).astype(np.float32)
     labels = assigned(device, points, weights, levels.values, bits)
     having = np.bincount(labels, minlength=count)
-    order = np.argsort(-having, kind="stable")
+    first = np.full(count, len(labels))
+    np.minimum.at(first, labels, np.arange(len(labels)))
+    # Those of many splats first, as few bits tell them; of others, those that are used near each other stand together.
+    order = np.lexsort([first, -np.minimum(having, _MANY)])
     order = order[having[order] > 0]
     places = np.empty(count, np.int64)
     places[order] = np.arange(len(order))
