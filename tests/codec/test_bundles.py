@@ -14,8 +14,10 @@ from potr_cl.codec.bundles import encoder
 from potr_cl.codec.bundles.decoder import Reader, Wanted
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION
 from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.library import VARIABLE, native
-from potr_cl.codec.sections import Property
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.sections import Coder, Property
 from potr_cl.codec.steps.rule import KNOTS, ColourSteps
 from potr_cl.errors import DataError
 
@@ -283,9 +285,6 @@ def test_states_that_no_encoder_leaves_are_refused(path, small):
 
 
 def version_3(plush_excerpt) -> bytes:
-    from potr_cl.codec.encoder import code_scene
-    from potr_cl.codec.quantize import HyperParameters
-
     return b"".join(code_scene(plush_excerpt, HyperParameters.from_quality(0.5, "best")).pieces)
 
 
@@ -317,3 +316,22 @@ def test_threads_and_paths_decode_the_same_bits(monkeypatch, plush_excerpt, thre
     assert np.array_equal(alone.log_scales(), scenes[0].log_scales)
     assert np.array_equal(alone.opacity_logits(), scenes[0].opacity_logits)
     assert np.array_equal(alone.sh(1), scenes[0].sh[:, :4])
+
+
+def test_levels_beyond_what_is_looked_up(monkeypatch, plush_excerpt):
+    """Scales and opacities of so many steps that the native path leaves some values to NumPy."""
+    monkeypatch.delenv(VARIABLE, raising=False)
+    if native() is None:
+        pytest.skip("the compiled library is not there")
+    parameters = HyperParameters.from_quality(0.5, "best", sf_scale=1e5, sf_opacity=1e4)
+    data = b"".join(code_scene(plush_excerpt, parameters).pieces)
+    file = PotrFile.from_bytes(data)
+    assert file.header.find(Property.OPACITY).coder == Coder.BUNDLES
+    scenes = []
+    for way in PATHS.values():
+        monkeypatch.setenv(VARIABLE, way)
+        scenes.append(PotrFile.from_bytes(data).scene(1))
+    for name in ("log_scales", "quaternions", "opacity_logits", "sh"):
+        assert np.array_equal(getattr(scenes[0], name), getattr(scenes[1], name))
+    largest = np.exp(scenes[0].log_scales.max()) * file.header.sf_scale
+    assert largest > 1 << 16

@@ -258,7 +258,10 @@ def _whole_command(path: Path, way: str, output: Path) -> None:
 def roads(results: Results, files: Iterable[Path], args: argparse.Namespace) -> None:
     from tools.study import decoder_roads
 
-    decoder_roads.compare(results, list(files), args.devices, args.runs)
+    of_version_2 = [path for path in files if PotrFile.open(path).header.version == 2]
+    if not of_version_2:
+        sys.exit("the context coder is in files of version 2 only: give some")
+    decoder_roads.compare(results, of_version_2, args.devices, args.runs)
 
 
 def device(results: Results, files: Iterable[Path], args: argparse.Namespace) -> None:
