@@ -17,9 +17,11 @@ bench.whole_command    what is the time of a fresh command `encode` made of?
 bench.codec            speed, memory and size of the codec alone
 bench.search           what does encoding to a size or a PSNR cost, against one plain encode?
 bench.virtual_cameras  what does encoding without cameras cost?
+bench.viewer           how many pictures a second does the viewer show while a camera moves?
 bench.forecast         how far off is what an encode says beforehand of its time and memory?
 bench.install          what does an installation take, and where are there wheels?
 bench.views_between    what do views between the training views bring, and what do they take?
+bench.palettes         how long does a palette of SH coefficients take, and how near does it come?
 bench.needs            what is a scene charged for splats, views and tiles that nobody needs?
 bench.busy             how busy is the device during an encode, stage by stage?
 bench.kernels          processor time of each kernel, on machines that do other work too
@@ -33,7 +35,9 @@ What a choice costs or brings, against the alternatives (``study``):
 =========================  =============================================================================================
 study.rate_distortion      size against quality: the curves that other studies compare with
 study.ablation             what does each part of the codec contribute?
+study.colour_steps         what does version 3 of the format bring over version 2, part by part?
 study.compare_formats      what would people use instead?
+study.output_formats       how small are encodes to the formats that viewers open, and what do others read of them?
 study.virtual_views        how many virtual views, how large, how wide, at what time and memory?
 study.rates                where do the bits go, and what do they buy?
 study.antialiasing         what is lost if an antialiased scene is encoded as a classic one?
@@ -51,6 +55,7 @@ What happens at the limits (``stress``):
 =================  =====================================================================================================
 stress.run         every kernel against float64 on the worst inputs: what error is the kernel's own?
 stress.platforms   the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
+stress.viewer      do the viewer's memory and time stay bounded, however long its cameras move?
 stress.fuzz        does any changed file do more than be refused or decode to finite numbers?
 stress.native      does the compiled decoder touch memory that is not its own, or differ from NumPy's, on changed files?
 =================  =====================================================================================================
@@ -61,6 +66,7 @@ What tests and pages are made of (``make``):
 make.large_scene      a scene of any size with the statistics of a real one
 make.test_data        the excerpts in tests/data
 make.release          a wheel and an sdist that are ready for a package index
+make.viewer_pictures  the pictures of the viewer in README and docs
 make.readme_picture   the picture at the top of the README
 make.foreign_files    the excerpt in splat-transform's formats
 make.other_tools      some splats in the formats of six tools, and how splat-transform reads them
@@ -71,6 +77,7 @@ make.benchmark_pages  the tables and plots of docs/benchmarks, from the results 
 ====================  ==================================================================================================
 
 Shared: :mod:`tools.results` (tables that say what they are of), :mod:`tools.workloads` (scenes, views, repeated work),
+:mod:`tools.viewer_tab` (a browser's tab without the browser),
 :mod:`tools.study.evaluation` (what a candidate loses to its scene), :mod:`tools.study.pruning_baselines` (the orders of
 other pruners), :mod:`tools.stress.cases` (inputs at their worst). Tools import the package and its float64 definitions
 (:mod:`potr_cl.reference`), never the tests; kernels of their own are given to a

@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec import container
 from potr_cl.codec.bundles.decoder import Reader, Wanted, check_said
+from potr_cl.codec.bundles.layout import BUNDLE
 from potr_cl.codec.bundles.levels import joined
 from potr_cl.codec.bundles.sections import MAIN, Key
 from potr_cl.codec.colour_factors import ColourFactors
@@ -31,9 +32,11 @@ if TYPE_CHECKING:
     from potr_cl.codec.destination import Activation, Destination
 
 #: Bundles that NumPy decodes side by side.
-_SIDE_BY_SIDE = 64
+_SIDE_BY_SIDE = 32
 #: Bundles whose integers a thread joins at a time.
 _HANDED = 4
+#: Bundles that each thread decodes before it is told which values are there.
+_ROUNDS = 2
 #: Levels whose values are looked up.
 _TABLE = 1 << 16
 
@@ -63,26 +66,39 @@ class BundledScene:
         section = self.header.find(*key)
         return None if section is None else (container.stored_bytes(self.data, section), section.name)
 
-    def fill(self, arrays: ValueArrays, threads: int = 1, centres: Callable[[], None] | None = None) -> None:
+    def fill(
+        self,
+        arrays: ValueArrays,
+        threads: int = 1,
+        centres: Callable[[], None] | None = None,
+        filled: Callable[[int, int], None] = lambda start, stop: None,
+    ) -> None:
         """Fill some arrays; sections of others are not looked at.
 
         Args:
             arrays: what to decode.
             threads: to work with.
             centres: what else to do meanwhile.
+            filled: told from one splat to another which values are there; others are decoded meanwhile.
 
         Raises:
             DataError: damaged.
         """
-        works: list[Callable[[], None]] = [*self._jobs(arrays, threads)]
-        if centres is not None:
-            works.insert(0, centres)
-        if threads == 1:
-            for work in works:
-                work()
-            return
+        number, splats = self.reader.bundles.number, self.header.splats
+        parts = max(number // (_ROUNDS * threads), 1)
+        ends = [number * (part + 1) // parts for part in range(parts)]
+        ready = 0
         with thread_pool(threads) as pool:
-            for future in [pool.submit(work) for work in works]:
+            first = [] if centres is None else [pool.submit(centres)]
+            for start, end in zip([0, *ends], ends, strict=False):
+                futures = [pool.submit(work) for work in self._jobs(arrays, threads, range(start, end))]
+                if ready < start * BUNDLE:
+                    filled(ready, start * BUNDLE)
+                    ready = start * BUNDLE
+                for future in futures:
+                    future.result()
+            filled(ready, splats)
+            for future in first:
                 future.result()
 
     def hand_to(self, destination: Destination, sh_count: int, threads: int) -> None:
@@ -129,12 +145,12 @@ class BundledScene:
             header.sf_rotation,
         )
 
-    def _jobs(self, arrays: ValueArrays, threads: int) -> list[Job]:
+    def _jobs(self, arrays: ValueArrays, threads: int, bundles: range) -> list[Job]:
         wanted = self._wanted(arrays)
         file = self.reader.bundled_file(wanted)
         if file is not None:
             _ = self.tables  # made once, before threads ask for them
-        share = _Share(self.reader.bundles.number, 1 if file is not None else _SIDE_BY_SIDE)
+        share = _Share(bundles, 1 if file is not None else _SIDE_BY_SIDE)
         return [Job(self, arrays, wanted, file, share) for _ in range(threads if file is not None else 1)]
 
     def _wanted(self, arrays: ValueArrays) -> Wanted:
@@ -184,14 +200,14 @@ def _wide(largest: int) -> type[np.generic]:
 class _Share:
     """Gives every thread the next bundles."""
 
-    def __init__(self, number: int, at_once: int) -> None:
-        self._number, self._at_once = number, at_once
-        self._next, self._lock = 0, Lock()
+    def __init__(self, bundles: range, at_once: int) -> None:
+        self._stop, self._at_once = bundles.stop, at_once
+        self._next, self._lock = bundles.start, Lock()
 
     def take(self) -> range:
         with self._lock:
             first = self._next
-            self._next = min(first + self._at_once, self._number)
+            self._next = min(first + self._at_once, self._stop)
             return range(first, self._next)
 
 

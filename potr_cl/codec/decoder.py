@@ -294,8 +294,9 @@ class PotrFile:
             destination.take_means(self.means())
 
         if isinstance(destination, Fillable):
-            replace(scene, activation=destination.activation).fill(destination.values, threads, centres)
-            destination.filled()
+            replace(scene, activation=destination.activation).fill(
+                destination.values, threads, centres, destination.filled
+            )
             return
         scene.hand_to(destination, self.sh_count(sh_degree), threads)
         centres()

@@ -80,8 +80,8 @@ class Fillable(ABC):
     def take_means(self, means: F32) -> None:
         """Centres, (N, 3) float32, world units."""
 
-    def filled(self) -> None:  # noqa: B027 (most have nothing left to do)
-        """The arrays are full; the centres were taken."""
+    def filled(self, start: int, stop: int) -> None:  # noqa: B027 (most have nothing left to do)
+        """The arrays hold the values from one splat to another; told once of each, in their order."""
 
 
 class SceneArrays(Fillable):

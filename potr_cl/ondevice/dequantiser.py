@@ -101,7 +101,9 @@ class DeviceDequantiser(Fillable):
     def take_rotations(self, streams: Sequence[IntegerStream], scales: Sequence[IntegerStream]) -> None:
         quaternions = np.empty((self._header.splats, 4), np.float32)
         self._on_host.rotations(streams, scales, quaternions)
-        self._upload_rotations(quaternions)
+        units = _units(quaternions)
+        with self._lock:
+            self._buffers.write_rows(self._buffers.quaternions, units, "the rotations", self._pending)
 
     @property
     def activation(self) -> Activated:
@@ -116,27 +118,20 @@ class DeviceDequantiser(Fillable):
         made = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
         return ValueArrays(**made, sh=np.zeros((self._buffers.sh_count, 3, n), np.float32))
 
-    def filled(self) -> None:
-        """Upload the arrays."""
-        arrays, buffers = self.values, self._buffers
+    def filled(self, start: int, stop: int) -> None:
+        """Upload these splats' values."""
+        arrays, buffers, pending = self.values, self._buffers, self._pending
         assert arrays.log_scales is not None
         assert arrays.logits is not None
         assert arrays.quaternions is not None
         assert arrays.sh is not None
-        buffers.write_columns(buffers.sh, 0, arrays.sh.reshape(3 * buffers.sh_count, -1), self._pending)
-        buffers.write_rows(buffers.scales, arrays.log_scales, "the scales", self._pending)
-        buffers.write_columns(buffers.log2_opacities, 0, arrays.logits[None], self._pending)
-        self._upload_rotations(arrays.quaternions)
-
-    def _upload_rotations(self, quaternions: F32) -> None:
-        functions = native()
-        units: NDArray[Any]
-        if functions is None:
-            units = unit_quaternions(quaternions)
-        else:
-            units = functions.quantising.unit_quaternions(quaternions)
+        own = slice(start, stop)
+        units = _units(arrays.quaternions[own])
         with self._lock:
-            self._buffers.write_rows(self._buffers.quaternions, units, "the rotations", self._pending)
+            buffers.write_columns(buffers.sh, 0, arrays.sh.reshape(3 * buffers.sh_count, -1), pending, own)
+            buffers.write_columns(buffers.log2_opacities, 0, arrays.logits[None], pending, own)
+            buffers.write_rows(buffers.scales, arrays.log_scales[own], "the scales", pending, start)
+            buffers.write_rows(buffers.quaternions, units, "the rotations", pending, start)
 
     def take_colours(
         self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, factors: ColourFactors
@@ -188,6 +183,12 @@ class DeviceDequantiser(Fillable):
             stride=buffers.stride,
             **arguments,
         ).launch((buffers.stride,), (SPLAT_GROUP,))
+
+
+def _units(quaternions: F32) -> NDArray[Any]:
+    """Quaternions of unit length."""
+    functions = native()
+    return unit_quaternions(quaternions) if functions is None else functions.quantising.unit_quaternions(quaternions)
 
 
 def _summed_up(streams: Sequence[IntegerStream], differences: bool) -> tuple[NDArray[Any] | None, bool, int]:

@@ -11,7 +11,6 @@ from dataclasses import dataclass, replace
 from typing import ClassVar
 
 import numpy as np
-from numpy.typing import NDArray
 
 from potr_cl.codec.encoder import Coded
 from potr_cl.formats.declaration import SceneFormat
@@ -87,5 +86,5 @@ class CompressedPly(Output):
         return compressed_ply.scene_of(data)
 
 
-def _quantise(coefficient: int, wanted: NDArray[np.float64], splats: slice) -> NDArray[np.float64]:
-    return compressed_ply_values.unpacked_sh(compressed_ply_values.packed_sh(wanted)).astype(np.float64)
+def _quantise(coefficient: int, wanted: FloatArray, splats: slice) -> FloatArray:
+    return compressed_ply_values.unpacked_sh(compressed_ply_values.packed_sh(wanted))

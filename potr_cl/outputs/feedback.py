@@ -18,8 +18,6 @@ from numpy.typing import NDArray
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
 
-F64 = NDArray[np.float64]
-
 #: Added to a block's diagonal, as a part of its mean: what no view tells apart is not moved far.
 _DAMPING = 1e-2
 #: Splats worked on at a time: the temporaries stay small.
@@ -27,7 +25,7 @@ _BLOCK = 1 << 12
 
 #: Rounds coefficient m of some splats: called with m, the wanted values (n, 3) and which splats they are of, returns
 #: the values (n, 3) that the file can hold.
-Quantise = Callable[[int, F64, slice], F64]
+Quantise = Callable[[int, FloatArray, slice], FloatArray]
 
 
 def rounded_in_turn(sh: FloatArray, packed: FloatArray, quantise: Quantise, threads: int = 0) -> FloatArray:
@@ -49,7 +47,7 @@ def rounded_in_turn(sh: FloatArray, packed: FloatArray, quantise: Quantise, thre
     def turn(start: int) -> None:
         rows = slice(start, start + _BLOCK)
         upper = _factors(packed[:, rows], count)
-        wanted, error = sh[rows].astype(np.float64), np.zeros(sh[rows].shape)
+        wanted, error = sh[rows], np.zeros(sh[rows].shape, np.float32)
         for m in range(count - 1, -1, -1):
             own = upper[:, m, m]
             moved = wanted[:, m]
@@ -67,8 +65,12 @@ def rounded_in_turn(sh: FloatArray, packed: FloatArray, quantise: Quantise, thre
 def _factors(packed: FloatArray, count: int) -> NDArray[Any]:
     """(n, M, M) upper triangular U with UᵀU = block: the last coefficient's own part stands apart from all others'."""
     rows, columns = np.triu_indices(count)
-    blocks = np.empty((packed.shape[1], count, count))
+    blocks = np.empty((packed.shape[1], count, count), np.float32)
     blocks[:, rows, columns] = blocks[:, columns, rows] = packed.T
     diagonal = np.einsum("nmm->nm", blocks)
-    diagonal += np.maximum(_DAMPING * diagonal.mean(axis=1, keepdims=True), 1e-30)
+    size = diagonal.mean(axis=1)
+    seen = size > 1e-30
+    blocks /= np.where(seen, size, 1)[:, None, None]  # only ratios of the factors are looked at
+    blocks[~seen] = 0
+    diagonal += np.float32(_DAMPING)
     return np.linalg.cholesky(blocks).transpose(0, 2, 1)

@@ -143,8 +143,9 @@ class Spz(Output):
                 some = slice(None, None, max(len(sh) // _SAMPLE, 1))
                 table = LevelTable(levels[some], cost[some])
 
-                def quantise(coefficient: int, wanted: NDArray[np.float64], splats: slice) -> NDArray[np.float64]:
-                    return (table(_ac_levels(wanted), cost[splats, coefficient - 1]).astype(np.float64) - 128) / 128
+                def quantise(coefficient: int, wanted: FloatArray, splats: slice) -> FloatArray:
+                    chosen = table(_ac_levels(wanted), cost[splats, coefficient - 1])
+                    return (chosen.astype(np.float32) - np.float32(128)) / np.float32(128)
 
                 fixed = rounded_in_turn(sh, request.blocks(), quantise, request.threads)
                 levels = _ac_levels(fixed[:, 1:])

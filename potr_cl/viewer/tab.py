@@ -71,6 +71,7 @@ class TabHandle:
         self._frusta = add_frusta(client.scene, cameras, self.fly)
         self._centres = camera_centres(cameras)
         self.restate()
+        self._look(client.camera)  # what the browser has said before anybody listened
         client.camera.on_update(self._moved)
         if house.losses.views:  # viser has only the first view's place and direction, not what its picture holds
             self._goal = 0
@@ -226,6 +227,9 @@ class TabHandle:
 
     async def _moved(self, camera: Any) -> None:
         """viser has heard from the browser's camera. In viser's own thread, so that the last word stays the last."""
+        self._look(camera)
+
+    def _look(self, camera: Any) -> None:
         gaze = Gaze(np.array(camera.position, np.float64), rotation_of(np.array(camera.wxyz)), float(camera.fov))
         visitor = self.visitor
         size = int(camera.image_width), int(camera.image_height)

@@ -136,7 +136,7 @@ def refit_colours(
         constant = np.zeros(fixed.shape, bool)
         constant[:, 0] = True
         few = replace(options, drop=0.0, steps=_CONSTANT_STEPS)
-        again = refit.solve(fixed, targets, few, constant, hold=True)
+        again = refit.solve(fixed, targets, few, constant, hold=True, again=True)
         again.sh[:, 1:] = fixed[:, 1:]  # they were rounded once more on their way through Y, Co, Cg
         return Refitted(again.sh, (found.errors[0], again.errors[1]), found.steps + again.steps)
 
@@ -191,6 +191,7 @@ class ColourRefit(Owner):
         active: NDArray[np.bool_] | None = None,
         hold: bool = False,
         progress: Callable[[int, int], None] | None = None,
+        again: bool = False,
     ) -> Refitted:
         """Re-fit the active coefficients, after choosing among them if the options say so.
 
@@ -201,6 +202,7 @@ class ColourRefit(Owner):
             active: (N, M, 3) in Y, Co, Cg: the coefficients that may change; all by default.
             hold: whether the other coefficients keep their values; if not, they become 0.
             progress: called with the steps done and their greatest number.
+            again: whether the solution before was for nearly the same colours: it saves some work.
 
         Raises:
             DeviceError: the device failed.
@@ -219,7 +221,7 @@ class ColourRefit(Owner):
             if progress is not None:
                 progress(steps, total)
 
-        solved = solver.solve(self.colour_map, targets, descent, selection, after_step)
+        solved = solver.solve(self.colour_map, targets, descent, selection, after_step, again)
         return Refitted(coefficients.read_sh(solver.x), solved.errors, solved.steps)
 
     def worth(self) -> FloatArray:

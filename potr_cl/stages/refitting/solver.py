@@ -133,6 +133,7 @@ class ColourSolver(Owner):
         descent: Descent,
         selection: Selection | None = None,
         after_step: Callable[[int], None] = lambda steps: None,
+        known: bool = False,
     ) -> Solved:
         """Solve for the active coefficients, after choosing among them if there is to be a choice.
 
@@ -142,14 +143,18 @@ class ColourSolver(Owner):
             descent: to the solution.
             selection: what comes first.
             after_step: called with the number of steps done.
+            known: whether the splats' blocks are taken from the solution before, of nearly the same colours: they are
+                only what the steps are preconditioned with.
 
         Raises:
             DeviceError: the device failed.
         """
         problem = _Problem(colour_map, targets)
-        self.blocks.zero()
+        if not known:
+            self.blocks.zero()
         self._coefficients.copy(self._start, self.x)
-        first = self._linearise(problem, (selection.descent if selection else descent).ridge, self.blocks)
+        ridge = (selection.descent if selection else descent).ridge
+        first = self._linearise(problem, ridge, None if known else self.blocks)
         state, steps = first, 0
         if selection is not None:
             state, steps = self._choose(problem, first, selection, descent.ridge, after_step)
