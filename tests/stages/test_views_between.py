@@ -19,11 +19,9 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Target
-from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.prepared_views import PreparedViews
-from potr_cl.stages.refitting.targets import GroundTruthTargets, PartlyPhotographed, RenderedTargets
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.stages.views_between import Between
 
@@ -150,32 +148,6 @@ def test_it_is_left_out_where_nothing_else_looks_at_views(plush_excerpt, plush_e
     chosen = options(3, refit=False, compact=False).changed(prune=False)
     assert not chosen.look_at_views(plush_excerpt)
     assert encode(plush_excerpt, plush_excerpt_cameras, chosen).device is None
-
-
-@pytest.mark.parametrize("numbers", [range(0, 3), range(2, 6), range(5, 7)])
-def test_photographs_are_targets_of_the_views_that_have_them(
-    device, plush_excerpt, plush_excerpt_cameras, tmp_path, numbers
-):
-    given = train_views(plush_excerpt_cameras)[:4]
-    views = [*given, *views_between(plush_excerpt, given, 2)]
-    with Rasterizer(device, plush_excerpt) as shown:
-        for camera in given:
-            with (tmp_path / f"{camera.name}.png").open("wb") as file:
-                write_png(file, to_8_bits(np.full((camera.height, camera.width, 3), 0.25, np.float32)))
-        photographs = GroundTruthTargets(device, GroundTruth(tmp_path, given), views)
-        targets = PartlyPhotographed(photographs, len(given), RenderedTargets(shown, views))
-        shape = (len(numbers), views[0].height, views[0].width, 3)
-        buffer = device.allocate(4 * int(np.prod(shape)), "pictures")
-        try:
-            targets.into(numbers, buffer)
-            pictures = device.download(buffer, shape, np.float32)
-        finally:
-            device.free(buffer)
-        for number, picture in zip(numbers, pictures, strict=True):
-            if number < len(given):
-                assert np.allclose(picture, 64 / 255, atol=1e-6)
-            else:
-                assert np.array_equal(picture, shown.render(views[number])[0])
 
 
 def test_photographs_are_only_asked_for_of_given_views(device, plush_excerpt, plush_excerpt_cameras, tmp_path):

@@ -85,30 +85,6 @@ class GroundTruthTargets:
             start += picture.nbytes
 
 
-class PartlyPhotographed:
-    """Photographs of the first views, and another scene's pictures of the others.
-
-    Args:
-        photographs: of the first views.
-        count: how many they are.
-        rendered: of all views.
-    """
-
-    def __init__(self, photographs: GroundTruthTargets, count: int, rendered: RenderedTargets) -> None:
-        self._photographs, self._count, self._rendered = photographs, count, rendered
-
-    def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
-        """See :meth:`Targets.into`."""
-        # Renders are written from the buffer's beginning on, so all views are rendered, and photographs put over them.
-        first = [number for number in numbers if number < self._count]
-        if len(first) < len(numbers):
-            self._rendered.into(numbers, buffer)
-        if list(numbers[: len(first)]) != first:
-            raise ValueError("photographed views come before the others")
-        if first:
-            self._photographs.into(first, buffer)
-
-
 class Budget(Protocol):
     """Bytes of device memory that several share."""
 
