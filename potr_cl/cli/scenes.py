@@ -105,7 +105,7 @@ def write_scene(path: Path, scene: Scene, to: str | None = None, version: int | 
         version: of the format.
 
     Returns:
-        The number of bytes.
+        The number of bytes, of all files where the format has several.
 
     Raises:
         As :func:`potr_cl.formats.save_scene`.
@@ -114,7 +114,7 @@ def write_scene(path: Path, scene: Scene, to: str | None = None, version: int | 
         suffix = to or ".ply"
         return send(path.stream, suffix, lambda file: scene_writer(file, version)(scene))
     scene_writer(path, version)(scene)
-    return os.stat(path).st_size
+    return bytes_of_scene(path) or os.stat(path).st_size
 
 
 def size_of_file(path: Path) -> int | None:

@@ -10,6 +10,7 @@ import numpy as np
 import pytest
 
 from potr_cl import DataError, Scene, convert, load_scene
+from potr_cl.cli import main
 from potr_cl.formats.scenes import sog
 from potr_cl.formats.scenes.sog_images import members, write_folder
 from potr_cl.formats.scenes.sog_palette import distinct_rows, palette_of
@@ -170,3 +171,10 @@ def test_another_reader_sees_the_same(tmp_path, plush_excerpt):
     assert np.allclose(theirs.sh0, ours.sh[:, 0], atol=1e-6)
     assert np.allclose(theirs.shN, ours.sh[:, 1:], atol=1e-6)
     assert np.allclose(np.abs((theirs.quats * ours.quaternions).sum(axis=1)), 1, atol=1e-4)
+
+
+def test_convert_tells_the_bytes_of_all_files_of_a_folder(tmp_path, data, capsys):
+    assert main(["convert", str(data / "plush_excerpt.ply"), str(tmp_path / "meta.json")]) == 0
+    whole = sum(path.stat().st_size for path in tmp_path.iterdir())
+    told = capsys.readouterr()
+    assert f"{whole} bytes" in told.out + told.err
