@@ -21,6 +21,7 @@ bench.viewer           how many pictures a second does the viewer show while a c
 bench.forecast         how far off is what an encode says beforehand of its time and memory?
 bench.install          what does an installation take, and where are there wheels?
 bench.views_between    what do views between the training views bring, and what do they take?
+bench.palettes         how long does a palette of SH coefficients take, and how near does it come?
 bench.needs            what is a scene charged for splats, views and tiles that nobody needs?
 bench.busy             how busy is the device during an encode, stage by stage?
 bench.kernels          processor time of each kernel, on machines that do other work too
@@ -34,7 +35,9 @@ What a choice costs or brings, against the alternatives (``study``):
 =========================  =============================================================================================
 study.rate_distortion      size against quality: the curves that other studies compare with
 study.ablation             what does each part of the codec contribute?
+study.colour_steps         what does version 3 of the format bring over version 2, part by part?
 study.compare_formats      what would people use instead?
+study.output_formats       how small are encodes to the formats that viewers open, and what do others read of them?
 study.virtual_views        how many virtual views, how large, how wide, at what time and memory?
 study.rates                where do the bits go, and what do they buy?
 study.antialiasing         what is lost if an antialiased scene is encoded as a classic one?

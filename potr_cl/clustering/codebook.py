@@ -17,8 +17,9 @@ _F64 = NDArray[np.float64]
 _STEPS = 60
 #: It begins with intervals that hold equal parts of this power of the density's: what is best for many entries.
 _DENSITY_POWER = 1 / 3
-#: Numbers in the histogram from which the density is taken.
-_BINS = 4096
+#: Parts of the histogram from which the density is taken: few where it is even, many where it has a peak. The best end
+#: is taken.
+_BINS = (256, 1024, 4096)
 #: Digits of an entry: as many as its error asks for and few more, since files hold entries as text.
 _DIGITS = 6
 
@@ -44,9 +45,21 @@ def codebook(values: FloatArray, weights: _F64 | None, entries: int) -> FloatArr
     each = np.ones(len(values)) if weights is None else weights[order].astype(np.float64)
     each = np.maximum(each, each.mean() * 1e-9 or 1.0)  # of numbers that count for nothing the nearest is taken too
     mass = np.add.reduceat(each, first)
+    ends = [_descended(distinct, mass, _first_centres(distinct, mass, entries, bins)) for bins in _BINS]
+    best = min(ends, key=lambda end: end[1])[0]
+    return np.unique(_rounded(best))
+
+
+def nearest(values: FloatArray, book: FloatArray) -> NDArray[np.intp]:
+    """The number of the entry of an ascending ``book`` that is nearest to each of the values; of their shape."""
+    middles = (book[1:].astype(np.float64) + book[:-1]) / 2
+    return np.searchsorted(middles, values, side="left")
+
+
+def _descended(distinct: _F64, mass: _F64, centres: _F64) -> tuple[_F64, float]:
+    """Centres after Lloyd's algorithm, ascending, and their error."""
     masses = np.concatenate([[0.0], np.cumsum(mass)])
     moments = np.concatenate([[0.0], np.cumsum(mass * distinct)])
-    centres = _first_centres(distinct, mass, entries)
     for _ in range(_STEPS):
         ends = np.searchsorted(distinct, (centres[1:] + centres[:-1]) / 2)
         bounds = np.concatenate([[0], ends, [len(distinct)]])
@@ -56,19 +69,14 @@ def codebook(values: FloatArray, weights: _F64 | None, entries: int) -> FloatArr
         if np.array_equal(moved, centres):
             break
         centres = np.sort(moved)
-    return np.unique(_rounded(centres))
+    own = np.searchsorted((centres[1:] + centres[:-1]) / 2, distinct)
+    return centres, float((mass * np.square(distinct - centres[own])).sum())
 
 
-def nearest(values: FloatArray, book: FloatArray) -> NDArray[np.intp]:
-    """The number of the entry of an ascending ``book`` that is nearest to each of the values; of their shape."""
-    middles = (book[1:].astype(np.float64) + book[:-1]) / 2
-    return np.searchsorted(middles, values, side="left")
-
-
-def _first_centres(distinct: _F64, mass: _F64, entries: int) -> _F64:
+def _first_centres(distinct: _F64, mass: _F64, entries: int, bins: int) -> _F64:
     """Ascending centres of intervals that hold equal parts of a power of the density."""
     low, high = distinct[0], distinct[-1]
-    counts, edges = np.histogram(distinct, _BINS, (low, high), weights=mass)
+    counts, edges = np.histogram(distinct, bins, (low, high), weights=mass)
     growth = np.concatenate([[0.0], np.cumsum(counts**_DENSITY_POWER)])
     centres: _F64 = np.interp((np.arange(entries) + 0.5) / entries * growth[-1], growth, edges)
     return centres

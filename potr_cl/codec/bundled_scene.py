@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec import container
 from potr_cl.codec.bundles.decoder import Reader, Wanted, check_said
+from potr_cl.codec.bundles.layout import BUNDLE
 from potr_cl.codec.bundles.levels import joined
 from potr_cl.codec.bundles.sections import MAIN, Key
 from potr_cl.codec.colour_factors import ColourFactors
@@ -28,12 +29,14 @@ from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import thread_pool
 
 if TYPE_CHECKING:
-    from potr_cl.codec.destination import Destination
+    from potr_cl.codec.destination import Activation, Destination
 
 #: Bundles that NumPy decodes side by side.
-_SIDE_BY_SIDE = 64
+_SIDE_BY_SIDE = 32
 #: Bundles whose integers a thread joins at a time.
 _HANDED = 4
+#: Bundles that each thread decodes before it is told which values are there.
+_ROUNDS = 2
 #: Levels whose values are looked up.
 _TABLE = 1 << 16
 
@@ -46,11 +49,13 @@ class BundledScene:
         header: verified.
         data: the whole file.
         open_steps: gives the steps of its colours.
+        activation: what is stored instead of logarithms of scales and logits of opacities; None: these.
     """
 
     header: Header
     data: bytes
     open_steps: Callable[[], ColourSteps | None]
+    activation: Activation | None = None
 
     @cached_property
     def reader(self) -> Reader:
@@ -61,26 +66,39 @@ class BundledScene:
         section = self.header.find(*key)
         return None if section is None else (container.stored_bytes(self.data, section), section.name)
 
-    def fill(self, arrays: ValueArrays, threads: int = 1, centres: Callable[[], None] | None = None) -> None:
+    def fill(
+        self,
+        arrays: ValueArrays,
+        threads: int = 1,
+        centres: Callable[[], None] | None = None,
+        filled: Callable[[int, int], None] = lambda start, stop: None,
+    ) -> None:
         """Fill some arrays; sections of others are not looked at.
 
         Args:
             arrays: what to decode.
             threads: to work with.
             centres: what else to do meanwhile.
+            filled: told from one splat to another which values are there; others are decoded meanwhile.
 
         Raises:
             DataError: damaged.
         """
-        works: list[Callable[[], None]] = [*self._jobs(arrays, threads)]
-        if centres is not None:
-            works.insert(0, centres)
-        if threads == 1:
-            for work in works:
-                work()
-            return
+        number, splats = self.reader.bundles.number, self.header.splats
+        parts = max(number // (_ROUNDS * threads), 1)
+        ends = [number * (part + 1) // parts for part in range(parts)]
+        ready = 0
         with thread_pool(threads) as pool:
-            for future in [pool.submit(work) for work in works]:
+            first = [] if centres is None else [pool.submit(centres)]
+            for start, end in zip([0, *ends], ends, strict=False):
+                futures = [pool.submit(work) for work in self._jobs(arrays, threads, range(start, end))]
+                if ready < start * BUNDLE:
+                    filled(ready, start * BUNDLE)
+                    ready = start * BUNDLE
+                for future in futures:
+                    future.result()
+            filled(ready, splats)
+            for future in first:
                 future.result()
 
     def hand_to(self, destination: Destination, sh_count: int, threads: int) -> None:
@@ -109,10 +127,30 @@ class BundledScene:
             planes = levels.coefficient(coefficient)
             destination.take_colours([LevelStream(level, True) for level in planes], coefficient, False, fitting)
 
-    def _jobs(self, arrays: ValueArrays, threads: int) -> list[Job]:
+    @cached_property
+    def tables(self) -> Tables:
+        """What makes values of levels."""
+        header, activation = self.header, self.activation
+        version = VERSIONS[header.version]
+        levels = np.arange(_TABLE)
+        classes = np.arange(-CLASSES, CLASSES).astype(np.int8)
+        scales = version.dequantize_scales(levels, header.sf_scale)
+        opacities = version.dequantize_opacities(levels, header.sf_opacity)
+        return Tables(
+            scales if activation is None else activation.scales(scales),
+            opacities if activation is None else activation.opacities(opacities),
+            factors(header.sf_dc, classes),
+            factors(header.sf_ac, classes),
+            *prediction.tables(),
+            header.sf_rotation,
+        )
+
+    def _jobs(self, arrays: ValueArrays, threads: int, bundles: range) -> list[Job]:
         wanted = self._wanted(arrays)
         file = self.reader.bundled_file(wanted)
-        share = _Share(self.reader.bundles.number, 1 if file is not None else _SIDE_BY_SIDE)
+        if file is not None:
+            _ = self.tables  # made once, before threads ask for them
+        share = _Share(bundles, 1 if file is not None else _SIDE_BY_SIDE)
         return [Job(self, arrays, wanted, file, share) for _ in range(threads if file is not None else 1)]
 
     def _wanted(self, arrays: ValueArrays) -> Wanted:
@@ -162,14 +200,14 @@ def _wide(largest: int) -> type[np.generic]:
 class _Share:
     """Gives every thread the next bundles."""
 
-    def __init__(self, number: int, at_once: int) -> None:
-        self._number, self._at_once = number, at_once
-        self._next, self._lock = 0, Lock()
+    def __init__(self, bundles: range, at_once: int) -> None:
+        self._stop, self._at_once = bundles.stop, at_once
+        self._next, self._lock = bundles.start, Lock()
 
     def take(self) -> range:
         with self._lock:
             first = self._next
-            self._next = min(first + self._at_once, self._number)
+            self._next = min(first + self._at_once, self._stop)
             return range(first, self._next)
 
 
@@ -191,29 +229,19 @@ class Job:
                 self._by_numpy(bundles)
                 continue
             said, section = self.file.values(
-                bundles.start, self.wanted.sections, self.wanted.rotations, work, self.arrays, self._tables
+                bundles.start, self.wanted.sections, self.wanted.rotations, work, self.arrays, self.scene.tables
             )
             if said == BEYOND_TABLE:
                 self._by_numpy(bundles)
             else:
                 check_said(self.scene.reader, said, section)
 
-    @cached_property
-    def _tables(self) -> Tables:
-        header = self.scene.header
-        version = VERSIONS[header.version]
-        levels = np.arange(_TABLE)
-        classes = np.arange(-CLASSES, CLASSES).astype(np.int8)
-        return Tables(
-            version.dequantize_scales(levels, header.sf_scale),
-            version.dequantize_opacities(levels, header.sf_opacity),
-            factors(header.sf_dc, classes),
-            factors(header.sf_ac, classes),
-            *prediction.tables(),
-            header.sf_rotation,
-        )
-
     def _by_numpy(self, bundles: range) -> None:
         header = self.scene.header
         levels = self.scene.reader.levels(bundles.start, bundles.stop, self.wanted)
         Dequantizer(header, VERSIONS[header.version]).of_levels(levels, self.scene.reader.steps, self.arrays)
+        activation, own = self.scene.activation, slice(levels.start, levels.stop)
+        if activation is not None and self.arrays.log_scales is not None:
+            self.arrays.log_scales[own] = activation.scales(self.arrays.log_scales[own])
+        if activation is not None and self.arrays.logits is not None:
+            self.arrays.logits[own] = activation.opacities(self.arrays.logits[own])

@@ -9,7 +9,7 @@ import os
 import stat
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import FIRST_EXCEPTION, Future, wait
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 from typing import Any
@@ -26,7 +26,7 @@ from potr_cl.codec.context.decoder import Reader, Stream
 from potr_cl.codec.context.lanes import Lanes
 from potr_cl.codec.context.model import Sizes
 from potr_cl.codec.dequantizer import Dequantizer
-from potr_cl.codec.destination import Destination, SceneArrays
+from potr_cl.codec.destination import Destination, Fillable, SceneArrays
 from potr_cl.codec.native.bundles import ValueArrays
 from potr_cl.codec.native.library import native
 from potr_cl.codec.sections import Coder, Property, Section
@@ -293,8 +293,10 @@ class PotrFile:
         def centres() -> None:
             destination.take_means(self.means())
 
-        if isinstance(destination, SceneArrays):
-            scene.fill(destination.values, threads, centres)
+        if isinstance(destination, Fillable):
+            replace(scene, activation=destination.activation).fill(
+                destination.values, threads, centres, destination.filled
+            )
             return
         scene.hand_to(destination, self.sh_count(sh_degree), threads)
         centres()

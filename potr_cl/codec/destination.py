@@ -7,6 +7,7 @@ way (:mod:`potr_cl.ondevice.decode` on a device), but must give the same bits.
 
 from __future__ import annotations
 
+from abc import ABC, abstractmethod
 from collections.abc import Sequence
 from typing import Protocol
 
@@ -52,7 +53,38 @@ class Destination(Protocol):
         """
 
 
-class SceneArrays:
+class Activation(Protocol):
+    """What a destination wants instead of logarithms of scales and logits of opacities, value by value."""
+
+    def scales(self, log_scales: F32) -> F32:
+        """Instead of natural logarithms of standard deviations, of any shape."""
+
+    def opacities(self, logits: F32) -> F32:
+        """Instead of logits of opacities."""
+
+
+class Fillable(ABC):
+    """A destination with arrays on the host, which values may be written to as they are decoded."""
+
+    @property
+    def activation(self) -> Activation | None:
+        """Of these values; None: none."""
+        return None
+
+    @property
+    @abstractmethod
+    def values(self) -> ValueArrays:
+        """The arrays but the centres."""
+
+    @abstractmethod
+    def take_means(self, means: F32) -> None:
+        """Centres, (N, 3) float32, world units."""
+
+    def filled(self, start: int, stop: int) -> None:  # noqa: B027 (most have nothing left to do)
+        """The arrays hold the values from one splat to another; told once of each, in their order."""
+
+
+class SceneArrays(Fillable):
     """Decoded splats as the arrays of a scene.
 
     Args:

@@ -3,12 +3,14 @@
 Devices need not divide, take roots or logarithms exactly, so nothing is computed there but sums of integers: what a
 level, or a sum of three, stands for is looked up in a table that the host has made. Where levels are too large for a
 table, and for rotations and colours whose steps differ from splat to splat, the host finds the values and uploads them.
+So it does for all of a file whose bundles become values while they are in a cache, which is quicker.
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -19,6 +21,9 @@ from potr_cl.codec.byte_planes import IntegerStream
 from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
 from potr_cl.codec.dequantizer import Dequantizer
+from potr_cl.codec.destination import Fillable
+from potr_cl.codec.native.bundles import ValueArrays
+from potr_cl.codec.native.library import native
 from potr_cl.codec.versions import FormatVersion
 from potr_cl.errors import DataError
 from potr_cl.opencl.memory import Memory
@@ -34,7 +39,17 @@ _MOST_LEVELS, _FARTHEST_SUM = 1 << 19, 1 << 19
 _TYPES = {np.uint8: "uchar", np.uint16: "ushort", np.int16: "short", np.int32: "int"}
 
 
-class DeviceDequantiser:
+class Activated:
+    """Values as the projection takes them (:class:`potr_cl.codec.destination.Activation`)."""
+
+    def scales(self, log_scales: F32) -> F32:
+        return activated_scales(log_scales).astype(np.float32)
+
+    def opacities(self, logits: F32) -> F32:
+        return log2_opacities(logits).astype(np.float32)
+
+
+class DeviceDequantiser(Fillable):
     """Takes a file's splats (:class:`potr_cl.codec.destination.Destination`) into a device's buffers.
 
     Args:
@@ -48,6 +63,7 @@ class DeviceDequantiser:
         self._on_host = Dequantizer(header, version)
         # Threads decode; one after the other tells the device what to do with it.
         self._lock = threading.Lock()
+        self._activated = Activated()
         # Copies that the device has not made yet; while it makes them, threads go on decoding.
         self._pending: list[cl.Event] = []
 
@@ -70,7 +86,7 @@ class DeviceDequantiser:
         factor = self._header.sf_scale
 
         def values(levels: NDArray[Any]) -> F32:
-            return activated_scales(self._version.dequantize_scales(levels, factor)).astype(np.float32)
+            return self.activation.scales(self._version.dequantize_scales(levels, factor))
 
         self._look_up([stream.joined for stream in streams], values, self._buffers.scales, "the scales")
 
@@ -78,16 +94,44 @@ class DeviceDequantiser:
         factor = self._header.sf_opacity
 
         def values(levels: NDArray[Any]) -> F32:
-            return log2_opacities(self._version.dequantize_opacities(levels, factor)).astype(np.float32)
+            return self.activation.opacities(self._version.dequantize_opacities(levels, factor))
 
         self._look_up([stream.joined], values, self._buffers.log2_opacities, "the opacities")
 
     def take_rotations(self, streams: Sequence[IntegerStream], scales: Sequence[IntegerStream]) -> None:
         quaternions = np.empty((self._header.splats, 4), np.float32)
         self._on_host.rotations(streams, scales, quaternions)
-        units = unit_quaternions(quaternions)
+        units = _units(quaternions)
         with self._lock:
             self._buffers.write_rows(self._buffers.quaternions, units, "the rotations", self._pending)
+
+    @property
+    def activation(self) -> Activated:
+        """Standard deviations and logarithms of opacities, as the projection takes them."""
+        return self._activated
+
+    @cached_property
+    def values(self) -> ValueArrays:
+        """Arrays of the host, for files whose integers become values as they are decoded."""
+        n = self._header.splats
+        shapes = {"log_scales": (n, 3), "quaternions": (n, 4), "logits": (n,)}
+        made = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
+        return ValueArrays(**made, sh=np.zeros((self._buffers.sh_count, 3, n), np.float32))
+
+    def filled(self, start: int, stop: int) -> None:
+        """Upload these splats' values."""
+        arrays, buffers, pending = self.values, self._buffers, self._pending
+        assert arrays.log_scales is not None
+        assert arrays.logits is not None
+        assert arrays.quaternions is not None
+        assert arrays.sh is not None
+        own = slice(start, stop)
+        units = _units(arrays.quaternions[own])
+        with self._lock:
+            buffers.write_columns(buffers.sh, 0, arrays.sh.reshape(3 * buffers.sh_count, -1), pending, own)
+            buffers.write_columns(buffers.log2_opacities, 0, arrays.logits[None], pending, own)
+            buffers.write_rows(buffers.scales, arrays.log_scales[own], "the scales", pending, start)
+            buffers.write_rows(buffers.quaternions, units, "the rotations", pending, start)
 
     def take_colours(
         self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, factors: ColourFactors
@@ -139,6 +183,12 @@ class DeviceDequantiser:
             stride=buffers.stride,
             **arguments,
         ).launch((buffers.stride,), (SPLAT_GROUP,))
+
+
+def _units(quaternions: F32) -> NDArray[Any]:
+    """Quaternions of unit length."""
+    functions = native()
+    return unit_quaternions(quaternions) if functions is None else functions.quantising.unit_quaternions(quaternions)
 
 
 def _summed_up(streams: Sequence[IntegerStream], differences: bool) -> tuple[NDArray[Any] | None, bool, int]:

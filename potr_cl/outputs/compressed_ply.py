@@ -18,6 +18,7 @@ from potr_cl.formats.scenes import compressed_ply, compressed_ply_values
 from potr_cl.formats.scenes.scene_files import arrangement, unit_quaternions
 from potr_cl.model.scene import LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
 from potr_cl.outputs.degrees import worthwhile_degree
+from potr_cl.outputs.feedback import rounded_in_turn
 from potr_cl.outputs.output import Output, Request, Rounded, RoundedScene
 
 #: Bytes of a splat without AC coefficients, its part of the bounds included, and of a coefficient.
@@ -60,8 +61,11 @@ class CompressedPly(Output):
         """Round them; degrees that are not worth their bytes become zero and are not written."""
         assert isinstance(rounded, CompressedPlyRounded)
         kept = SH_COEFFICIENTS[worthwhile_degree(sh, worth, _COEFFICIENT, _SPLAT, request)]
-        levels = compressed_ply_values.packed_sh(sh[:, 1:kept])
-        fixed = np.zeros_like(sh)
+        whole, sh = sh, sh[:, :kept]
+        if request.blocks is not None and kept == whole.shape[1]:
+            sh = rounded_in_turn(sh, request.blocks(), _quantise, request.threads)
+        levels = compressed_ply_values.packed_sh(sh[:, 1:])
+        fixed = np.zeros_like(whole)
         fixed[:, 0] = sh[:, 0]
         fixed[:, 1:kept] = compressed_ply_values.unpacked_sh(levels)
         return replace(rounded, ac=levels), fixed
@@ -76,3 +80,11 @@ class CompressedPly(Output):
         pieces = compressed_ply.pieces(rounded.packed, colours, rounded.ac[rounded.order], scene.antialiased)
         request.progress("pack", 1.0)
         return Coded(pieces, rounded.order)
+
+    def read(self, data: bytes, trust: bool = False) -> Scene:
+        """See :func:`potr_cl.formats.scenes.compressed_ply.scene_of`."""
+        return compressed_ply.scene_of(data)
+
+
+def _quantise(coefficient: int, wanted: FloatArray, splats: slice) -> FloatArray:
+    return compressed_ply_values.unpacked_sh(compressed_ply_values.packed_sh(wanted))

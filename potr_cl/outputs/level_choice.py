@@ -30,6 +30,24 @@ _ROUNDS = 12
 _BLOCK = 1 << 14
 
 
+class LevelTable:
+    """What :func:`chosen_levels` does, with frequencies that some coefficients have told.
+
+    Args:
+        levels: (n, K, C), the nearest ones of some coefficients.
+        bits_of_error: (n, K), as of :func:`chosen_levels`.
+    """
+
+    def __init__(self, levels: U8, bits_of_error: NDArray[np.floating]) -> None:
+        pairs = _classes(bits_of_error)[..., None] << 8 | levels
+        self._table = _table(np.bincount(pairs.ravel(), minlength=_CLASSES << 8).reshape(_CLASSES, 256)).ravel()
+
+    def __call__(self, levels: NDArray[np.integer], bits_of_error: NDArray[np.floating]) -> U8:
+        """The levels to take: (n, C) for nearest levels (n, C) and weights (n,)."""
+        chosen: U8 = self._table.take(_classes(bits_of_error)[..., None] << 8 | levels)
+        return chosen
+
+
 def chosen_levels(levels: U8, bits_of_error: FloatArray, threads: int = 0) -> U8:
     """Levels near the given ones that are coded in fewer bits.
 
@@ -45,8 +63,7 @@ def chosen_levels(levels: U8, bits_of_error: FloatArray, threads: int = 0) -> U8
     classes = np.empty(bits_of_error.shape, np.uint8)
 
     def count(block: slice) -> NDArray[np.int64]:
-        doublings = np.log2(np.maximum(bits_of_error[block], np.float32(_LEAST)) / np.float32(_LEAST))
-        classes[block] = np.minimum(doublings * np.float32(_A_DOUBLING), _CLASSES - 1)
+        classes[block] = _classes(bits_of_error[block])
         pairs = classes[block, :, None].astype(np.int32) << 8 | levels[block]
         return np.bincount(pairs.ravel(), minlength=_CLASSES << 8)
 
@@ -60,6 +77,12 @@ def chosen_levels(levels: U8, bits_of_error: FloatArray, threads: int = 0) -> U8
 
         list(pool.map(choose, blocks))
     return chosen
+
+
+def _classes(bits_of_error: NDArray[np.floating]) -> NDArray[np.int32]:
+    doublings = np.log2(np.maximum(bits_of_error, _LEAST) / _LEAST)
+    classes: NDArray[np.int32] = np.minimum(doublings * _A_DOUBLING, _CLASSES - 1).astype(np.int32)
+    return classes
 
 
 def _table(counts: NDArray[np.int64]) -> U8:

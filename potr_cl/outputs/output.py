@@ -42,6 +42,8 @@ class Request:
         metadata: how the file was made, for formats that hold it.
         entropy: the entropy coder, for formats that leave a choice.
         progress: called with what is being done and the part of it that is done.
+        blocks: for :meth:`Output.fix_ac` after a re-fit: returns (M (M + 1) / 2, N) float32, the upper triangles, row
+            by row, of what errors of a splat's coefficients cost together; ``worth`` are their diagonals.
     """
 
     parameters: HyperParameters
@@ -52,6 +54,7 @@ class Request:
     metadata: bytes = b""
     entropy: EntropyCoder = field(default_factory=EntropyCoder)
     progress: Callable[[str, float], None] = lambda what, done: None
+    blocks: Callable[[], FloatArray] | None = None
 
 
 class Rounded(Protocol):

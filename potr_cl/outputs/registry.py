@@ -64,7 +64,8 @@ def encoded_suffix(suffix: str) -> str:
         UsageError: encode does not write such files.
     """
     wanted = "." + suffix.lower().lstrip(".")
-    output_of(Path(f"scene{wanted}"))
+    if not any(wanted in kind.suffixes() for kind in OUTPUTS):
+        raise UsageError(f"'{wanted}' is no suffix of what encode writes: expected {suffixes_encoded()}")
     return wanted
 
 

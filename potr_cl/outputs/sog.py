@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+import io
 import math
+import zipfile
 from dataclasses import dataclass, replace
 from typing import ClassVar
 
@@ -28,6 +30,21 @@ _BITS_A_SPLAT = 90
 #: Bits that an entry of the palette has to be worth; and the most entries to begin with, as a part of the splats. An
 #: entry takes some 60 bits: but points leave a dear one all at once.
 _BITS_AN_ENTRY, _MOST_A_SPLAT = 20, 0.75
+#: What an error is worth at least, as a part of what it were if the constant coefficient could not make up for it:
+#: other views than those of the re-fit may tell them better apart.
+_LEAST_WORTH = 0.02
+#: An entry has many splats if it has so many.
+_MANY = 4
+#: What the images hold.
+_IMAGES = {
+    "means_l": "position",
+    "means_u": "position",
+    "scales": "scale",
+    "quats": "rotation",
+    "sh0": "colour: DC, opacity",
+    "shN_centroids": "colour: AC",
+    "shN_labels": "colour: AC",
+}
 #: Steps of R, G and B that are as coarse as those of Y, Co and Cg of 1.
 _STEP_OF_CHANNEL = math.sqrt(8 / 3)
 
@@ -70,6 +87,11 @@ class Sog(Output):
     ) -> tuple[SogRounded, FloatArray]:
         """A palette whose entries and labels are worth the bytes that they take."""
         assert isinstance(rounded, SogRounded)
+        made_up = None
+        if worth is not None and request.blocks is not None:
+            made_up = _made_up(request.blocks()[: sh.shape[1]])
+            worth = worth.copy()
+            worth[:, 1:] = np.maximum(worth[:, 1:] - worth[:, :1] * np.square(made_up), _LEAST_WORTH * worth[:, 1:])
         bits = _worth_in_bits(rounded, sh, worth, request)
         if sh.shape[1] == 1:
             return replace(rounded, worth=bits), sh
@@ -81,6 +103,8 @@ class Sog(Output):
         palette = _coded(device, points, weights, found.centres, found.labels)
         fixed = sh.copy()
         fixed[order, 1:] = palette.book[palette.entries][palette.labels]
+        if made_up is not None:
+            fixed[:, 0] += np.einsum("nm,nmc->nc", made_up, sh[:, 1:] - fixed[:, 1:])
         return replace(rounded, worth=bits, palette=palette), fixed
 
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
@@ -108,6 +132,27 @@ class Sog(Output):
         pieces = [bundle(images)]
         request.progress("pack", 1.0)
         return Coded(pieces, order)
+
+    def properties(self, data: bytes) -> dict[str, int]:
+        """Bytes of the images by what they hold; the description and the archive's own are "other"."""
+        sums = dict.fromkeys((*_IMAGES.values(), "other"), 0)
+        with zipfile.ZipFile(io.BytesIO(data)) as archive:
+            for entry in archive.infolist():
+                sums[_IMAGES.get(entry.filename.partition(".")[0], "other")] += entry.compress_size
+        sums["other"] += len(data) - sum(sums.values())
+        return {name: nbytes for name, nbytes in sums.items() if nbytes}
+
+
+def _made_up(first_rows: FloatArray) -> FloatArray:
+    """(N, M − 1): by how much the constant coefficient takes back an error of 1 in each of the others.
+
+    Seen from one side alone, an error of another coefficient is nearly one of the constant one.
+
+    Args:
+        first_rows: (M, N), of the splats' blocks: what the constant coefficient shares with each.
+    """
+    constant = first_rows[0]
+    return np.ascontiguousarray((first_rows[1:] / np.where(constant > 0, constant, 1)).T)
 
 
 def _worth_in_bits(rounded: SogRounded, sh: FloatArray, worth: FloatArray | None, request: Request) -> FloatArray:
@@ -138,7 +183,10 @@ def _coded(
         bits = np.minimum(-np.log2(having / len(points)), 64).astype(np.float32)
     labels = assigned(device, points, weights, levels.values, bits)
     having = np.bincount(labels, minlength=count)
-    order = np.argsort(-having, kind="stable")
+    first = np.full(count, len(labels))
+    np.minimum.at(first, labels, np.arange(len(labels)))
+    # Those of many splats first, as few bits tell them; of others, those that are used near each other stand together.
+    order = np.lexsort([first, -np.minimum(having, _MANY)])
     order = order[having[order] > 0]
     places = np.empty(count, np.int64)
     places[order] = np.arange(len(order))

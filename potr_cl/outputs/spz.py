@@ -17,11 +17,15 @@ from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes import spz, spz_values
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray, Scene
-from potr_cl.outputs.level_choice import U8, chosen_levels
+from potr_cl.outputs.feedback import rounded_in_turn
+from potr_cl.outputs.level_choice import U8, LevelTable, chosen_levels
 from potr_cl.outputs.output import Output, Request, Rounded, RoundedScene
 
-#: Bits that a splat takes, about: with what a splat may cost in error they say what a bit may.
-_BITS_A_SPLAT = 150
+#: With what a splat may cost in error this says what a bit may: about the bits that a splat takes, and some, for errors
+#: of many splats add up to more than the re-fit's blocks know.
+_BITS_A_SPLAT = 250
+#: Splats that tell how often levels occur, about.
+_SAMPLE = 1 << 15
 #: A level of AC coefficients, and of constant ones.
 _AC_STEP, _DC_STEP = 1 / 128, 1 / (255 * 0.15)
 
@@ -130,10 +134,21 @@ class Spz(Output):
     ) -> tuple[SpzRounded, FloatArray]:
         """Levels by what an error costs and by what a level takes."""
         assert isinstance(rounded, SpzRounded)
-        levels = np.clip(np.round(sh[:, 1:] * np.float32(128)) + np.float32(128), 0, 255).astype(np.uint8)
-        if worth is not None and levels.shape[1]:
-            levels = chosen_levels(levels, worth[:, 1:] * _bits_of_error(_AC_STEP, request), request.threads)
-        fixed = sh.copy()
+        fixed, levels = sh.copy(), _ac_levels(sh[:, 1:])
+        if worth is not None and levels.size:
+            cost = worth[:, 1:] * _bits_of_error(_AC_STEP, request)
+            if request.blocks is None:
+                levels = chosen_levels(levels, cost, request.threads)
+            else:
+                some = slice(None, None, max(len(sh) // _SAMPLE, 1))
+                table = LevelTable(levels[some], cost[some])
+
+                def quantise(coefficient: int, wanted: FloatArray, splats: slice) -> FloatArray:
+                    chosen = table(_ac_levels(wanted), cost[splats, coefficient - 1])
+                    return (chosen.astype(np.float32) - np.float32(128)) / np.float32(128)
+
+                fixed = rounded_in_turn(sh, request.blocks(), quantise, request.threads)
+                levels = _ac_levels(fixed[:, 1:])
         fixed[:, 1:] = (levels.astype(np.float32) - np.float32(128)) / np.float32(128)
         return replace(rounded, ac=levels, worth=worth), fixed
 
@@ -156,6 +171,11 @@ class Spz(Output):
     def properties(self, data: bytes) -> dict[str, int]:
         """Of version 4, whose streams are apart."""
         return spz.stream_sizes(data)
+
+
+def _ac_levels(sh: NDArray[np.floating]) -> U8:
+    levels: U8 = np.clip(np.round(sh * 128) + 128, 0, 255).astype(np.uint8)
+    return levels
 
 
 def _bits_of_error(step: float, request: Request) -> np.float32:

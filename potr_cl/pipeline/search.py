@@ -304,7 +304,10 @@ class _Search:
             if finer in points or options == start.options or self._target.inside(best.value):
                 break
             reduced, geometry = start.reduced, start.reduced.geometry
-            if isinstance(geometry, Geometry):
+            if self._fitted and self._options.output.fixes_ac:
+                # The re-fit has rounded to the steps.
+                reduced = self._refit(start.thinned, options)
+            elif isinstance(geometry, Geometry):
                 reduced = dataclasses.replace(reduced, geometry=geometry.with_colour_steps(options.parameters))
             found = self._evaluate("colours", start.options.q, start.thinned, reduced, options)
             points[finer] = found.value

@@ -95,27 +95,35 @@ class SceneBuffers(Owner):
         }
 
     def write_rows(
-        self, parameter: cl.Buffer, rows: NDArray[Any], what: str, pending: list[cl.Event] | None = None
+        self,
+        parameter: cl.Buffer,
+        rows: NDArray[Any],
+        what: str,
+        pending: list[cl.Event] | None = None,
+        start: int = 0,
     ) -> None:
         """Set a parameter to rows, one for each splat, which are turned to columns on the device.
 
         Args:
             parameter: one of the buffers.
-            rows: (N, columns) of any kind of float.
+            rows: (n, columns) of any kind of float.
             what: they are, for errors.
             pending: as of :meth:`potr_cl.opencl.device.Device.upload`.
+            start: number of the first of these splats.
 
         Raises:
             DeviceError: there is no room for them beside the scene.
         """
         device, width = self.device, rows.shape[1]
         turn = device.shared_kernel("raster/columns.cl", "columns")
-        for first in range(0, self.splats, _UPLOADED):
+        if start + len(rows) > self.splats:
+            raise ValueError(f"{len(rows)} rows from splat {start} on do not fit {self.splats} splats")
+        for first in range(0, len(rows), _UPLOADED):
             some = np.ascontiguousarray(rows[first : first + _UPLOADED], np.float32)
             with Memory(device) as memory:
                 turn.bind(
                     rows=memory.upload(some, what, pending),
-                    first=first,
+                    first=start + first,
                     width=width,
                     stride=self.stride,
                     result=parameter,
@@ -123,23 +131,35 @@ class SceneBuffers(Owner):
                 turn.launch((len(some),))
 
     def write_columns(
-        self, parameter: cl.Buffer, first: int, columns: FloatArray, pending: list[cl.Event] | None = None
+        self,
+        parameter: cl.Buffer,
+        first: int,
+        columns: FloatArray,
+        pending: list[cl.Event] | None = None,
+        own: slice | None = None,
     ) -> None:
-        """Set some columns of a parameter, from number ``first`` on, to (columns, N) float32, C order.
+        """Set some columns of a parameter, from number ``first`` on.
 
-        ``pending`` as of :meth:`potr_cl.opencl.device.Device.upload`.
+        Args:
+            parameter: one of the buffers.
+            first: number of the first column.
+            columns: (columns, N) float32, C order.
+            pending: as of :meth:`potr_cl.opencl.device.Device.upload`.
+            own: of these splats only; None: of all.
         """
-        number, splats = columns.shape
+        start, stop, _ = (own or slice(None)).indices(self.splats)
+        if columns.shape[1] != self.splats:
+            raise ValueError(f"columns of {columns.shape[1]} values are not those of {self.splats} splats")
         with self.device.errors("cannot take a scene"):
             event = cl.enqueue_copy(
                 self.device.queue,
                 parameter,
                 columns,
-                buffer_origin=(0, first, 0),
-                host_origin=(0, 0, 0),
-                region=(4 * splats, number, 1),
+                buffer_origin=(4 * start, first, 0),
+                host_origin=(4 * start, 0, 0),
+                region=(4 * (stop - start), len(columns), 1),
                 buffer_pitches=(4 * self.stride, 0),
-                host_pitches=(4 * splats, 0),
+                host_pitches=(4 * self.splats, 0),
                 is_blocking=pending is None,
             )
         if pending is not None:

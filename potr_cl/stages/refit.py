@@ -15,7 +15,7 @@ from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
-from potr_cl.stages.refitting.refit import RefitOptions, Refitted, active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, Refitted, active_coefficients, refit_colours
 from potr_cl.stages.refitting.targets import GroundTruthTargets, PartlyPhotographed, RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
@@ -131,9 +131,10 @@ class Refit(Stage):
             def progress(done: int, steps: int) -> None:
                 bench.progress("refit", (number + done / steps) / fits)
 
-            def fix_ac(sh: FloatArray, worth: FloatArray) -> FloatArray:
+            def fix_ac(sh: FloatArray, refit: ColourRefit) -> FloatArray:
                 nonlocal geometry
-                geometry, sh = bench.output.fix_ac(rounded, sh, worth, bench.request(state))
+                request = replace(bench.request(state), blocks=refit.blocks)
+                geometry, sh = bench.output.fix_ac(rounded, sh, refit.worth(), request)
                 return sh
 
             found = refit_colours(

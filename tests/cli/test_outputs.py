@@ -28,8 +28,12 @@ def folder(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.Captu
 @pytest.mark.parametrize(
     ("call", "said"),
     [
-        ("encode a.ply -o b.spz", "encode to 'b.potr', then 'potr-cl decode b.potr -o b.spz'"),
-        ("encode a.ply -o b.compressed.ply", "encode to 'b.potr'"),
+        ("encode a.ply -o b.gltf", "give it a name that ends in .glb"),
+        ("encode a.ply -o b.splat", "encode writes .potr, .spz"),
+        ("encode a.ply -o b.spz --entropy zstd", "--entropy means nothing for .spz files"),
+        ("encode a.ply -o b.ply --sf-dc 9", "--sf-dc means nothing for .ply files"),
+        ("encode a.ply -o b.potr --spz-version 3", "potr_cl has no version to choose"),
+        ("encode a.ply -o sub --to sog4", "'.sog4' is no suffix of what encode writes"),
         ("encode a.ply -o b.png", "a name that ends in .potr"),
         ("encode a.ply -o b", "a name that ends in .potr"),
         ("encode a.ply -o b.potr --report b.png", "a name that ends in .html"),
@@ -112,6 +116,6 @@ def test_versions_of_spz(folder: Path, capsys: pytest.CaptureFixture[str]) -> No
 
 
 def test_encode_from_python_writes_no_other_name(folder: Path) -> None:
-    with pytest.raises(UsageError, match=r"encode to 'b\.potr'"):
-        encode("a.ply", output="b.spz", prune=False, compact=False, refit="off")
-    assert not Path("b.spz").exists()
+    with pytest.raises(UsageError, match=r"encode writes \.potr"):
+        encode("a.ply", output="b.splat", prune=False, compact=False, refit="off")
+    assert not Path("b.splat").exists()

@@ -15,10 +15,10 @@ def device(request):
 
 
 def some(count, groups, seed=1):
-    """Vectors around some places, and weights."""
+    """Vectors of very different lengths, as SH coefficients are, and weights."""
     generator = np.random.default_rng(seed)
-    places = generator.normal(size=(20, groups, 3))
-    points = places[generator.integers(20, size=count)] + 0.1 * generator.normal(size=(count, groups, 3))
+    lengths = np.exp(generator.normal(size=(count, 1, 1)))
+    points = lengths * generator.normal(size=(count, groups, 3))
     return points.astype(np.float32), generator.uniform(0.1, 2, (count, groups)).astype(np.float32)
 
 
@@ -37,8 +37,8 @@ def test_the_best_centre_is_found(device, groups):
         labels, scores = at.nearest(centres, biases)
     expected = distances(points, weights, centres) + biases
     found = expected[np.arange(333), labels]
-    assert found == pytest.approx(expected.min(axis=1), abs=1e-4)
-    assert scores + errors_at_zero(points, weights) == pytest.approx(found, abs=1e-3)
+    assert found == pytest.approx(expected.min(axis=1), rel=1e-4, abs=1e-3)
+    assert scores + errors_at_zero(points, weights) == pytest.approx(found, rel=1e-4, abs=1e-3)
     assert device.allocated == 0
 
 
@@ -52,7 +52,7 @@ def test_points_are_compared_with_the_centres_of_their_cell(device):
         labels, _ = at.nearest(centres, None, cells, Lists(runs, np.array([0, 1, 2, 4], np.uint32)))
     expected = distances(points, weights, centres)
     for row, cell in enumerate(cells):
-        assert expected[row, labels[row]] == pytest.approx(expected[row, allowed[cell]].min(), abs=1e-4)
+        assert expected[row, labels[row]] == pytest.approx(expected[row, allowed[cell]].min(), rel=1e-4, abs=1e-3)
 
 
 def test_centres_become_weighted_means(device):
@@ -75,7 +75,7 @@ def test_clusters_are_about_as_good_as_those_of_all_comparisons(device):
     assert found.centres.shape == (700, 3, 3)
     assert len(np.unique(found.labels)) > 650
     error = distances_to_own(points, weights, found.centres, found.labels)
-    centres = points[:: len(points) // 700][:700]
+    centres = points[:: len(points) // 700][:700].copy()
     for _ in range(8):  # Lloyd's algorithm, each point with all centres
         labels = distances(points, weights, centres).argmin(axis=1)
         for number in np.unique(labels):
@@ -100,7 +100,7 @@ def test_what_labels_and_entries_take_decides_how_many_there_are(device):
     points, weights = some(2000, 3)
     counts = []
     for bits in (1.0, 100.0, 1e5):
-        found = cluster(device, points, weights * np.float32(1000), 600, Rate(bits))
+        found = cluster(device, points, weights * np.float32(30), 600, Rate(bits))
         assert not found.centres[0].any()
         counts.append(len(np.unique(found.labels)))
     assert counts[0] > counts[1] > counts[2]
@@ -134,7 +134,7 @@ def test_equal_points_are_one_cluster(device):
 
 def test_the_best_of_given_centres(device):
     points, weights = some(3000, 3)
-    centres = some(900, 3, seed=5)[0]
+    centres = points[::3] + np.float32(0.01)
     labels = assigned(device, points, weights, centres)
     expected = distances(points, weights, centres)
     found = expected[np.arange(3000), labels]

@@ -103,8 +103,9 @@ def test_within_balanced_steps(degree, entropy, q):
     options = as_it_is("best", entropy, q=q)
     encoded = encode(scene, options=options)
     data = joined(encoded)
-    context = any(s.coder == Coder.BUNDLES for s in PotrFile.from_bytes(data).header.sections)
-    assert context == (entropy.name == "context")
+    bundled = any(s.coder == Coder.BUNDLES for s in PotrFile.from_bytes(data).header.sections)
+    # Of few splats without much to tell, bundles may take more than zstd.
+    assert bundled == (entropy.name == "context") or (not bundled and degree == 0)
     check_within_balanced_steps(scene, data, encoded.order, options.parameters.beta * typical_size(scene))
 
 

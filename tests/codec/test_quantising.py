@@ -12,6 +12,7 @@ from potr_cl.codec.geometry import quantise_geometry
 from potr_cl.codec.native.library import VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError
+from potr_cl.raster.activation import unit_quaternions
 from potr_cl.reference.scenes import random_scene, tilted_camera
 from potr_cl.stages.refitting.refit import active_coefficients
 
@@ -62,6 +63,19 @@ def test_all_splats_are_taken_without_an_order(both):
     for imaginary, turned in both(lambda: quantize.canonical_rotations(rotations, scales)):
         assert imaginary.shape == turned.shape == (12, 3)
         assert (np.linalg.norm(imaginary, axis=1) < 0.53).all()  # the real part is 0.85 or more
+
+
+@pytest.mark.parametrize("number", [0, 1, 1000])
+def test_unit_quaternions_are_those_of_the_rasterizer(number):
+    functions = native()
+    if functions is None:
+        pytest.skip("the compiled library is not there: python -m tools.make.native, or pip install -e .")
+    rng = np.random.default_rng(number)
+    quaternions = rng.normal(0, 1, (number, 4)).astype(np.float32) * rng.lognormal(0, 9, (number, 1)).astype(np.float32)
+    quaternions[::7] = 0
+    assert_same_bits(
+        functions.quantising.unit_quaternions(quaternions), unit_quaternions(quaternions).astype(np.float32)
+    )
 
 
 @pytest.mark.parametrize("degree", [0, 1, 3])

@@ -22,6 +22,7 @@ from potr_cl import Scene, UsageError, cli, info
 from potr_cl.formats import cameras, load_cameras, load_scene, registry, save_scene, scene_writer, scenes
 from potr_cl.formats.declaration import CameraFormat, SceneFormat
 from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS, listed
+from potr_cl.formats.scenes.compressed_ply import is_compressed_ply
 from potr_cl.host.installation import install_command
 from potr_cl.reference.scenes import random_scene
 from tests.cases.cameras import nerfstudio, view, write_json
@@ -194,9 +195,7 @@ def test_a_missing_extra_is_named(entry: SceneFormat | CameraFormat, tmp_path: P
         return
     path = tmp_path / f"a{entry.suffixes[0]}"
     if entry.save is not None:
-        with pytest.raises(UsageError, match=expected):
-            entry.save(path, random_scene(3))
-        assert not path.exists()
+        entry.save(path, random_scene(3))  # only to read needs a library
     path.write_bytes(b"")
     with pytest.raises(UsageError, match=expected):
         entry.load(path)
@@ -206,9 +205,8 @@ def test_a_missing_extra_is_named(entry: SceneFormat | CameraFormat, tmp_path: P
 def test_a_missing_library_is_named(tmp_path: Path, data: Path, plush_excerpt: Scene) -> None:
     with pytest.raises(UsageError, match=re.escape(install_command("convert"))):
         load_scene(data / "foreign" / "degree_3.compressed.ply")
-    with pytest.raises(UsageError, match=re.escape(install_command("convert"))):
-        scene_writer(tmp_path / "x.compressed.ply")(plush_excerpt)
-    assert not list(tmp_path.iterdir())
+    scene_writer(tmp_path / "x.compressed.ply")(plush_excerpt)  # only to read needs it
+    assert is_compressed_ply(tmp_path / "x.compressed.ply")
 
 
 @pytest.mark.usefixtures("no_extras")

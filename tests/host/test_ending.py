@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -33,6 +34,16 @@ def test_work_that_goes_on_is_waited_for():
         "end_at_once(0)\nprint('an ordinary end')"
     )
     assert (done.returncode, done.stdout) == (0, "an ordinary end\ndone\n")
+
+
+def test_a_profiler_is_not_cheated_of_its_result(tmp_path):
+    program = tmp_path / "program.py"
+    program.write_text("from potr_cl.host.ending import end_at_once\nend_at_once(0)\nprint('an ordinary end')\n")
+    command = [sys.executable, "-m", "cProfile", "-o", str(tmp_path / "profile"), str(program)]
+    environment = {**os.environ, "PYTHONPATH": str(ROOT)}
+    done = subprocess.run(command, capture_output=True, text=True, check=True, timeout=60, env=environment)
+    assert done.stdout == "an ordinary end\n"
+    assert (tmp_path / "profile").stat().st_size > 0
 
 
 @pytest.mark.skipif(not Path("/dev/full").exists(), reason="there is no full device here")

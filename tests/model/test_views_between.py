@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from potr_cl.errors import UsageError
-from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.views_between import is_between, views_between
@@ -132,14 +131,6 @@ def test_half_of_the_given_views_get_one():
     more = views_between(BALL, ORBIT, 1.5)
     assert [camera.name for camera in more[:12]] == [camera.name for camera in whole]
     assert len(more) == 18
-
-
-def test_threads_do_not_change_them():
-    with thread_pool(4) as pool:
-        shared = views_between(BALL, ORBIT, 2, run=pool.map)
-    alone = views_between(BALL, ORBIT, 2)
-    assert [c.name for c in shared] == [c.name for c in alone]
-    assert np.array_equal(camera_centres(shared), camera_centres(alone))
 
 
 def test_parts_of_a_scene_are_shown_by_the_views_that_face_them():

@@ -194,3 +194,24 @@ def test_the_commands_say_the_same_of_a_file_and_of_its_scene(tmp_path, monkeypa
     assert len(pictures["potr"]) == 2
     assert pictures["potr"] == pictures["ply"]
     assert told["potr"] == told["ply"]
+
+
+def test_parts_that_are_uploaded_while_others_are_decoded(device, monkeypatch):
+    """Several bundles, of which two threads decode some at a time."""
+    from potr_cl.ondevice.dequantiser import DeviceDequantiser
+
+    told: list[tuple[int, int]] = []
+    filled = DeviceDequantiser.filled
+
+    def noted(self, start, stop):
+        told.append((start, stop))
+        filled(self, start, stop)
+
+    monkeypatch.setattr(DeviceDequantiser, "filled", noted)
+    splats = 9 * 8192 + 77
+    file = PotrFile.from_bytes(coded(splats, "best", degree=1))
+    with uploaded(device, file.scene()) as wanted, decode_to_device(file, device, threads=2) as got:
+        assert bits(wanted) == bits(got)
+    assert len(told) > 1
+    assert [start for start, _ in told] == [0, *(stop for _, stop in told[:-1])]
+    assert told[-1][1] == splats

@@ -147,7 +147,7 @@ def test_a_try_is_not_what_is_found_by_it(device, plush_excerpt, cameras):
     assert found.value in [step.value for step in found.tries[1:]]
     assert len(found.encoded.order) == found.encoded.pruned.kept
     coders = {section.coder for section in PotrFile.from_bytes(b"".join(found.encoded.pieces)).header.sections}
-    assert Coder.CONTEXT in coders
+    assert Coder.BUNDLES in coders
 
 
 def test_without_a_refit_only_the_steps_of_the_quantiser_may_be_of_another_q(device, plush_excerpt, cameras):

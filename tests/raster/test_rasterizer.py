@@ -144,6 +144,41 @@ def test_prepared_views_composite_as_rendered(device: Device) -> None:
     rasterizer.close()
 
 
+def test_a_prepared_view_takes_another_camera_in_its_memory(device: Device) -> None:
+    """With more intersections and with fewer, and back; not one of another size."""
+    scene = random_splats(2000, 2, seed=4)
+    cameras = [tilted_camera(1, 64, 64), tilted_camera(2, 61, 50), tilted_camera(3, 64, 64, offset=1e4)]
+    with Rasterizer(device, scene) as rasterizer, rasterizer.prepare_set([cameras[2]]) as views:
+        for camera in [cameras[0], cameras[1], cameras[2], cameras[0]]:
+            assert rasterizer.prepare_again(views, [camera])
+            image, transmittance = rasterizer.composite(views.views[0])
+            rendered = rasterizer.render(camera)
+            assert image.tobytes() == rendered[0].tobytes()
+            assert transmittance.tobytes() == rendered[1].tobytes()
+        before = rasterizer.composite(views.views[0])[0]
+        assert not rasterizer.prepare_again(views, [tilted_camera(1, 64, 65)])
+        assert np.array_equal(rasterizer.composite(views.views[0])[0], before)
+
+
+def test_a_set_takes_other_cameras_in_its_memory(device: Device) -> None:
+    if device.family == "cpu":
+        pytest.skip("CPU kernels take one view at a time")
+    scene = random_splats(2000, 2, seed=4)
+    first = [tilted_camera(seed, 64, 64, offset=1e4 * (seed == 2)) for seed in (1, 2, 3)]
+    then = [tilted_camera(seed, 64, 64, offset=1e4 * (seed == 4)) for seed in (4, 5, 6)]
+    with Rasterizer(device, scene) as rasterizer, rasterizer.prepare_set(first) as views:
+        for cameras in (then, first, then):
+            assert rasterizer.prepare_again(views, cameras)
+            intersections = device.download(views.intersections, (views.capacity,), np.uint32)
+            for view, offsets, start, camera in zip(
+                views.views, views.read_offsets(), views.intersection_starts, cameras, strict=False
+            ):
+                with rasterizer.prepare(camera) as alone:
+                    own_offsets, own_intersections = read_lists(device, alone)
+                assert np.array_equal(offsets, own_offsets)
+                assert np.array_equal(intersections[start : start + view.intersection_count], own_intersections)
+
+
 def test_views_of_a_set_are_those_prepared_alone(device: Device) -> None:
     """Different sizes, one view that sees nothing, lists one behind the other."""
     if device.family == "cpu":

@@ -46,8 +46,8 @@ def photographs(folder, device, scene, cameras, noise=0.0, factor=1.0):
     return folder
 
 
-def encoded(scene, cameras, device, folder):
-    options = EncodeOptions().changed(prune={"iterations": 2}, refit={"ground_truth": folder})
+def encoded(scene, cameras, device, folder, **changes):
+    options = EncodeOptions().changed(prune={"iterations": 2}, refit={"ground_truth": folder}, **changes)
     return encode(scene, cameras, options, device=device)
 
 
@@ -63,10 +63,11 @@ def test_photographs_that_agree_with_each_other_are_fitted_to(tmp_path, scene, c
 def test_photographs_of_noise_are_not_fitted_to(tmp_path, scene, cameras, device):
     """The file is then that of an encode that never heard of photographs."""
     folder = photographs(tmp_path, device, scene, cameras, noise=0.3)
-    made = encoded(scene, cameras, device, folder)
+    # Renders of views between them would keep the colours from following the noise, so that it does no harm.
+    made = encoded(scene, cameras, device, folder, between=False)
     assert not made.photographs.kept
     assert made.photographs.fitted < made.photographs.rendered
-    plain = encode(scene, cameras, EncodeOptions().changed(prune={"iterations": 2}), device=device)
+    plain = encode(scene, cameras, EncodeOptions().changed(prune={"iterations": 2}, between=False), device=device)
     assert plain.photographs is None
     assert b"".join(made.pieces) == b"".join(plain.pieces)
 

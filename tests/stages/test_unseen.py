@@ -8,8 +8,12 @@ import numpy as np
 import pytest
 
 from potr_cl import EncodeOptions, Scene, UsageError, decode, encode
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
 from potr_cl.reference.surfaces import together
+from potr_cl.stages.prune import Prune
+from potr_cl.stages.stage import State, Workbench
 from tests.devices import FAMILIES, open_device
 
 FEW = {"iterations": 3}
@@ -79,3 +83,19 @@ def test_colours_of_seen_splats_are_treated_as_without_the_others(
         sh = decode(b"".join(encoded.pieces)).sh[seen]
         colours.append(sh[np.argsort(encoded.order[seen])])
     np.testing.assert_array_equal(*colours)
+
+
+def test_a_splat_that_only_an_added_view_sees_is_kept(device, half_seen, plush_excerpt_cameras):
+    given = train_views(plush_excerpt_cameras)
+    # The same view, from where it sees the splats that no given one sees.
+    there = dataclasses.replace(given[0], translation=given[0].translation - given[0].rotation @ np.full(3, 30.0))
+    state = dataclasses.replace(State.of(half_seen, [*given, there]), added=1)
+    left = Prune(iterations=3).run(state, Workbench(HyperParameters.from_quality(0.2), device=device))
+    assert left.learnt["unseen"].splats == 300
+    assert set(range(1500, 1800)) <= set(left.survivors)
+    # Had somebody given it, some of them would have gone.
+    asked = Prune(iterations=3).run(
+        dataclasses.replace(state, added=0), Workbench(HyperParameters.from_quality(0.2), device=device)
+    )
+    assert asked.learnt["unseen"].splats < 300
+    assert not set(range(1500, 1800)) <= set(asked.survivors)

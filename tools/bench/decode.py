@@ -9,6 +9,7 @@ speed    decodes in this process, in turn by NumPy and by the native path, with 
          wall time and processor time
 memory   host memory that a decode takes at most, beside what it makes; a process each
 command  `decode FILE -o scene.ply` as a fresh process; the decoded scene is written as PLY too
+versions the same splats in files of version 2 and of version 3: bytes, how fast they are coded and decoded, in turn
 roads    the tokens of the context coder alone: by NumPy, by the native path, and by OpenCL kernels of both families on
          the devices given, with what a fresh process pays for a context and for loading the kernels
 device   from the file's bytes to buffers of a device, in turn by way of a scene on the host and straight, on the
@@ -27,13 +28,17 @@ import sys
 import tempfile
 import time
 from collections.abc import Callable, Iterable, Mapping
+from dataclasses import replace
 from functools import partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.library import VARIABLE
+from potr_cl.codec.quantize import HyperParameters
 from potr_cl.formats import load_cameras, load_scene
+from potr_cl.model.scene import Scene
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
@@ -44,6 +49,7 @@ from tools.make.large_scene import DEFAULT_SCENE, EXCERPT, large_scene
 from tools.results import ROOT, Column, Results
 from tools.results import threads as processors
 
+K = TypeVar("K")
 PATHS = {"NumPy": "0", "native": "1"}
 
 
@@ -58,6 +64,9 @@ def main() -> None:
     parser.add_argument("--part", action="append", choices=list(PARTS), dest="parts")
     parser.add_argument(
         "--device", action="append", dest="devices", default=[], help="for roads and device; more than one"
+    )
+    parser.add_argument(
+        "--threads", action="append", type=int, metavar="T", help="to decode with; default: 1, 2 and one a processor"
     )
     parser.add_argument("--json", type=Path, metavar="FILE", help="keep the figures")
     args = parser.parse_args()
@@ -82,9 +91,9 @@ def made_files(splats: int, folder: Path) -> list[Path]:
     return files
 
 
-def in_turn(works: Mapping[str, Callable[[], Any]], runs: int) -> dict[str, tuple[list[float], list[float]]]:
+def in_turn(works: Mapping[K, Callable[[], Any]], runs: int) -> dict[K, tuple[list[float], list[float]]]:
     """Wall and processor times, seconds, of some works that are done in turn."""
-    times: dict[str, tuple[list[float], list[float]]] = {name: ([], []) for name in works}
+    times: dict[K, tuple[list[float], list[float]]] = {name: ([], []) for name in works}
     for _ in range(runs):
         for name, work in works.items():
             wall, used = time.perf_counter(), _processor_time()
@@ -123,7 +132,7 @@ def speed(results: Results, files: Iterable[Path], args: argparse.Namespace) -> 
     )
     for path in files:
         splats = PotrFile.open(path).header.splats
-        for threads in sorted({1, processors()}):
+        for threads in args.threads or _threads():
             works = {way: partial(_decode, path, way, threads) for way in PATHS}
             in_turn(works, 1)
             times = in_turn(works, args.runs)
@@ -136,6 +145,53 @@ def speed(results: Results, files: Iterable[Path], args: argparse.Namespace) -> 
                 round(splats / wall["native"] / 1e6, 3), round(splats / min(times["native"][0]) / 1e6, 3),
                 round(splats / used["native"] / 1e6, 3),
             )  # fmt: skip
+
+
+def _threads() -> list[int]:
+    return sorted({1, min(2, processors()), processors()})
+
+
+def versions(results: Results, files: Iterable[Path], args: argparse.Namespace) -> None:
+    table = results.table(
+        "versions",
+        "The same splats in files of version 2 and of version 3, by the native path, medians",
+        Column("file"),
+        Column("splats", format=","),
+        Column("threads"),
+        Column("size, version 2", "bytes", ","),
+        Column("size, version 3", "bytes", ","),
+        Column("coding version 2, processor time", "ms", ".0f"),
+        Column("coding version 3, processor time", "ms", ".0f"),
+        Column("rate, version 2", "million splats/s", ".2f"),
+        Column("rate, version 3", "million splats/s", ".2f"),
+        Column("times as fast", format=".2f"),
+    )
+    os.environ[VARIABLE] = PATHS["native"]
+    for path in files:
+        scene = PotrFile.open(path).scene()
+        coded: dict[int, bytes] = {}
+        for threads in args.threads or _threads():
+            coding = {version: partial(_coded, scene, version, threads, coded) for version in (2, 3)}
+            used = {version: statistics.median(t[1]) for version, t in in_turn(coding, 3).items()}
+            works = {str(v): partial(_decode_bytes, coded[v], threads) for v in (2, 3)}
+            in_turn(works, 1)
+            times = in_turn(works, args.runs)
+            rates = {way: len(scene) / statistics.median(times[way][0]) / 1e6 for way in works}
+            ratio = statistics.median(a / b for a, b in zip(times["2"][0], times["3"][0], strict=True))
+            table.add(
+                path.stem, len(scene), threads, len(coded[2]), len(coded[3]),
+                *(round(1e3 * used[v], 1) for v in (2, 3)), round(rates["2"], 3), round(rates["3"], 3), round(ratio, 2),
+            )  # fmt: skip
+
+
+def _coded(scene: Scene, version: int, threads: int, coded: dict[int, bytes]) -> None:
+    """A scene as it is; with the same steps for all splats, so that only the coder differs."""
+    parameters = replace(HyperParameters.from_quality(0.5, "best"), version=version)
+    coded[version] = b"".join(code_scene(scene, parameters, threads=threads).pieces)
+
+
+def _decode_bytes(data: bytes, threads: int) -> None:
+    PotrFile.from_bytes(data).scene(threads=threads)
 
 
 def memory(results: Results, files: Iterable[Path], _: argparse.Namespace) -> None:
@@ -259,6 +315,7 @@ PARTS: dict[str, Callable[[Results, Iterable[Path], argparse.Namespace], None]] 
     "speed": speed,
     "memory": memory,
     "command": command,
+    "versions": versions,
     "roads": roads,
     "device": device,
 }

@@ -72,6 +72,12 @@ def main() -> None:
         "degree1_antialiased_balanced": encode(small.rendered(True), cameras, fast),
         "degree1_mip_splatting": encode(sharper, cameras, best),
     }
+    scenes |= {
+        "degree0_two_bundles": encode(random_scene(8500, 0, seed=17), None, best.changed(q=0.0)),
+        "degree0_wide_integers_balanced": encode(
+            random_scene(400, 0, seed=18, extent=1e3), None, best.with_parameters(sf_scale=1e8, sf_dc=1e6)
+        ),
+    }
     for name, encoded in scenes.items():
         version = PotrFile.from_bytes(b"".join(encoded.pieces)).header.version
         path = DATA / f"golden_v{version}_{name}.potr"

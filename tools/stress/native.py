@@ -34,8 +34,7 @@ import numpy as np
 
 from potr_cl.codec import decoder, encoder
 from potr_cl.codec.decoder import PotrFile
-from potr_cl.codec.encoder import code_scene
-from potr_cl.codec.native import arrays, functions
+from potr_cl.codec.native import arrays, bundles, functions
 from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError
@@ -66,13 +65,15 @@ def changed_file(seed: int, number: int) -> bytes:
 
 @cache
 def _originals() -> list[bytes]:
-    """The fuzzer's, and two of the context coder with integers of many bits and lanes that end at different steps."""
+    """The fuzzer's, and some of coders of streams with integers of many bits and lanes that end at different steps."""
     files = list(_FUZZED())
     with patch.object(encoder, "_FEW", 0):
-        for splats, degree, q in ((700, 0, 1.0), (90, 2, 1.0)):
+        for version, splats, degree in ((2, 700, 0), (2, 90, 2), (3, 700, 0), (3, 90, 2), (3, 520, 3)):
             scene = random_scene(splats, degree, seed=splats)
             scene.sh[...] *= np.float32(40)
-            files.append(b"".join(code_scene(scene, HyperParameters.from_quality(q, "best")).pieces))
+            # Most AC coefficients of real scenes are 0.
+            scene.sh[:, 1:] *= np.random.default_rng(splats).random(scene.sh[:, 1:].shape) < 0.3
+            files.append(potr_files.file_of(scene, "context", HyperParameters.from_quality(1.0, "best"), version))
     return files
 
 
@@ -82,7 +83,7 @@ _FUZZED_HOW_OFTEN = potr_files._HOW_OFTEN
 
 
 def _how_often() -> tuple[int, ...]:
-    return (*_FUZZED_HOW_OFTEN, 2, 4)
+    return (*_FUZZED_HOW_OFTEN, 2, 4, 3, 6, 2)
 
 
 # ---------------------------------------------------------------------------------------------------- worker
@@ -103,6 +104,7 @@ def work(seed: int, first: int, stop: int, compare: int) -> None:
     with (
         patch.object(arrays, "address", copied),
         patch.object(functions, "address", copied),
+        patch.object(bundles, "address", copied),
         patch.object(decoder, "thread_pool", _at_once),
     ):
         tally = dict.fromkeys(("read", "refused", "compared"), 0)

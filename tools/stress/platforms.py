@@ -4,8 +4,8 @@
 
 Each device and kernel family runs in a process of its own, so that a runtime that crashes is one row of the table. What
 is checked: the device's self-check; small random scenes of every SH degree and both rules against the float64
-definition; the same bytes twice; SSIM, the re-fit's maps and its solution against float64; and, where FOLDER holds
-scenes with reference renders, PSNR against them.
+definition; the same bytes twice; SSIM, the re-fit's maps and its solution, and the derivatives of pictures against
+float64; and, where FOLDER holds scenes with reference renders, PSNR against them.
 
 Oclgrind, where installed, simulates small scenes under its race, bounds and initialisation checks. pip's PoCL, Debian's
 PoCL (pocl-opencl-icd), Intel's (intel-opencl-rt) and Mesa's rusticl (mesa-opencl-icd) are found if they are there.
@@ -15,6 +15,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import os
 import shutil
@@ -22,6 +23,7 @@ import subprocess
 import sys
 import tempfile
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -30,15 +32,18 @@ import pyopencl as cl
 
 from potr_cl.errors import DeviceError
 from potr_cl.formats import load_cameras, load_scene
-from potr_cl.model.camera import camera_centres
+from potr_cl.model.camera import Camera, camera_centres
+from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, list_devices
+from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.quality.metrics import ssim
 from potr_cl.quality.metrics_device import Similarity
 from potr_cl.quality.pictures import Picture
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA
 from potr_cl.reference import raster as reference
+from potr_cl.reference.derivatives import gradient
 from potr_cl.reference.refit import Array, to_ycocg
 from potr_cl.reference.refit_cases import Case, Linearised, Pictures
 from potr_cl.reference.scenes import (
@@ -50,7 +55,8 @@ from potr_cl.reference.scenes import (
     visible_scene,
 )
 from potr_cl.stages.compaction.ridge import Compactor
-from potr_cl.stages.compaction.view_weights import ViewWeights
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS, ViewWeights
+from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
@@ -144,6 +150,27 @@ def _relative(value: Array, wanted: Array) -> float:
     return float(np.linalg.norm(value - wanted) / np.linalg.norm(wanted))
 
 
+def check_derivatives(device: Device) -> dict[str, float]:
+    """The derivatives of pictures in float32 against float64, relative errors by kind of parameter: the worst of SH
+    degrees 0 to 3, with and without antialiasing."""
+    worst: dict[str, float] = {}
+    cameras = ring_of_cameras(3, size=40)
+    for degree, antialiased in itertools.product(range(4), (False, True)):
+        scene = dataclasses.replace(visible_scene(60, degree, seed=degree), antialiased=antialiased)
+        values = [np.random.default_rng(degree).normal(size=(c.height, c.width, 3)) for c in cameras]
+        with PictureDerivatives(device, scene) as derivatives, Memory(device) as memory:
+            rows = np.concatenate([v.reshape(-1, 3) for v in values]).astype(np.float32)
+            derivatives.add(cameras, memory.upload(rows, "the values"), given=True)
+            columns = derivatives.read().astype(np.float64) * 40 * 40 / REFERENCE_PIXELS
+        wanted = [gradient(scene, camera, INRIA, v) for camera, v in zip(cameras, values, strict=True)]
+        parts = np.split(columns, [3, 6, 10, 11], axis=1)
+        for name, found in zip(("means", "log_scales", "quaternions", "opacity_logits", "sh"), parts, strict=True):
+            exact = sum(getattr(each, name) for each in wanted).reshape(len(scene), -1)
+            error = float(np.linalg.norm(found - exact) / np.linalg.norm(exact))
+            worst[name] = max(worst.get(name, 0.0), error)
+    return worst
+
+
 def check_scene(device: Device, folder: Path) -> dict[str, float]:
     """Lowest PSNR against the reference renders, largest difference, and seconds a frame."""
     with Rasterizer(device, load_scene(folder / "point_cloud.ply"), GSPLAT) as rasterizer:
@@ -168,6 +195,7 @@ def check_device(index: int, family: str, scenes: Path | None) -> dict[str, Any]
     device.self_check()
     check_similarity(device)
     result = {"vector_width": device.vector_width, **check_definition(device), "refit": check_refit(device)}
+    result["derivatives"] = check_derivatives(device)
     for name in ("lego", "plush"):
         if scenes and (scenes / name / "reference").exists():
             result[name] = check_scene(device, scenes / name)
@@ -190,6 +218,7 @@ def simulate(what: str) -> None:
     cl.enqueue_fill_buffer = fill
     info = next(d for d in list_devices() if "oclgrind" in d.platform.lower())
     kept: list[Rasterizer] = []
+    others: list[Owner] = []
     freed: list[cl.Buffer] = []
     for family, width in (("gpu", 1), ("cpu", 4), ("cpu", 8), ("cpu", 16)):
         if what != family:
@@ -212,6 +241,7 @@ def simulate(what: str) -> None:
         removal.remove(np.arange(0, 60, 5))
         removal.measure()
         prune_scene(RemovalSweep(kept[-1], views, SweepOptions(0, tighten=True)), PruningOptions(1e-4, 3))
+        _simulate_derivatives(device, scene, views, others)
         refit_options = RefitOptions(steps=2, gain=0, drop=1e-9)
         refit_colours(device, scene, views, RenderedTargets(kept[-1], views), refit_options)
         weights = ViewWeights.from_importances(len(scene), removal.view_importances())
@@ -220,11 +250,19 @@ def simulate(what: str) -> None:
         centres = np.random.default_rng(0).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (5000, 3))
         kept.append(Rasterizer(device, plain_splats(centres, sigma=1e-3, logit=1)))
         kept[-1].render(straight_camera(16, 16))  # a list longer than local memory
-        _simulate_several_batches(device, kept)
+        _simulate_several_batches(device, kept, others)
         check_similarity(device)
 
 
-def _simulate_several_batches(device: Device, kept: list[Rasterizer]) -> None:
+def _simulate_derivatives(device: Device, scene: Scene, views: Sequence[Camera], others: list[Owner]) -> None:
+    pixels = sum(view.width * view.height for view in views)
+    target = device.upload(np.full((pixels, 3), 0.5, np.float32), "the targets")
+    derivatives = PictureDerivatives(device, scene)
+    others.append(derivatives)
+    derivatives.add(views, target)
+
+
+def _simulate_several_batches(device: Device, kept: list[Rasterizer], others: list[Owner]) -> None:
     """Removal and re-fit of a tile whose list the GPU kernels take in three batches, whose pixels go on to the end."""
     centres = np.random.default_rng(1).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (300, 3))
     scene, views = plain_splats(centres, sigma=0.03, logit=-4), [straight_camera(16, 16)]
@@ -235,6 +273,7 @@ def _simulate_several_batches(device: Device, kept: list[Rasterizer]) -> None:
         removal.remove(np.arange(0, len(scene), 7))
         removal.measure()
     refit_colours(device, scene, views, RenderedTargets(kept[-1], views), RefitOptions(steps=1, gain=0, drop=1e-9))
+    _simulate_derivatives(device, scene, views, others)
 
 
 def run_oclgrind() -> str:
@@ -267,17 +306,19 @@ def row(info: DeviceInfo, family: str, scenes: Path | None) -> str:
     head = f"| {info.name} | {info.platform}, {info.version} | {family}"
     if run.returncode:
         message = run.stderr.strip().splitlines()[-1] if run.stderr.strip() else f"exit code {run.returncode}"
-        return f"{head} | failed: {message}" + " |" * 11
+        return f"{head} | failed: {message}" + " |" * 12
     r = json.loads(run.stdout.splitlines()[-1])
     real = [
         f"{r[n]['psnr']:.1f} dB, {r[n]['largest']:.1e}, {1e3 * r[n]['seconds']:.1f} ms" if n in r else ""
         for n in ("lego", "plush")
     ]
     same = r["same_bytes"] and r["refit"]["same_bytes"]
+    derivatives = max(r["derivatives"].values())
     refit = " | ".join(f"{r['refit'][n]:.0e}" for n in ("adjoint", "transposed", "normal", "blocks", "solution"))
     return (
         f"{head} | {r['vector_width'] if family == 'cpu' else ''} | {r['error']:.1e} | "
-        f"{r['flips']} of {r['pixels']:,} | {'yes' if same else 'NO'} | {refit} | {real[0]} | {real[1]} |"
+        f"{r['flips']} of {r['pixels']:,} | {'yes' if same else 'NO'} | {refit} | {derivatives:.0e} | "
+        f"{real[0]} | {real[1]} |"
     )
 
 
@@ -298,7 +339,7 @@ def main() -> None:
         return
     print(
         "| device | runtime | family | vector | largest error | flipped pixels | same bytes twice | re-fit: "
-        "<A d, r> − <d, Aᵀ r> | Aᵀ r | Aᵀ A d | blocks | solution | lego | plush |\n" + "|---" * 14 + "|"
+        "<A d, r> − <d, Aᵀ r> | Aᵀ r | Aᵀ A d | blocks | solution | derivatives | lego | plush |\n" + "|---" * 15 + "|"
     )
     for info in list_devices():
         for family in ("gpu", "cpu") if info.family == "cpu" else ("gpu",):

@@ -5,7 +5,8 @@
 
    Macros: none. */
 
-/* steps: for each column the length of a step, and the least and the greatest value that it may reach.
+/* steps: for each column the length of a step, which is multiplied by `part`, and the least and the greatest value that
+   it may reach.
    debias_mean, debias_square: what the moments are multiplied by because they began at 0. */
 kernel void adam(
     global float *parameters,
@@ -15,6 +16,7 @@ kernel void adam(
     uint splats,
     uint stride,
     global const float4 *steps,
+    float part,
     float decay_mean,
     float decay_square,
     float debias_mean,
@@ -33,7 +35,7 @@ kernel void adam(
     squares[i] = square;
     if (mean == 0.0f || !(square > 0.0f))
         return;
-    const float value = parameters[i] - step.x * (mean * debias_mean) / sqrt(square * debias_square);
+    const float value = parameters[i] - part * step.x * (mean * debias_mean) / sqrt(square * debias_square);
     if (fabs(value) < 1e30f)
         parameters[i] = fmin(fmax(value, step.y), step.z);
 }

@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from potr_cl.codec.bundles.description import Fitted
 from potr_cl.codec.bundles.layout import BUNDLE, LANES, Bundles, Layout
 from potr_cl.codec.bundles.levels import Items, Levels, joined
-from potr_cl.codec.bundles.ranges import Words, decode_stream
+from potr_cl.codec.bundles.ranges import Words, decode_stream, integer_type
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Key, Section
 from potr_cl.codec.bundles.streams import band, differences, step_terms, streams_of
 from potr_cl.codec.native.bundles import FINE, TOO_FEW_WORDS, BundledFile
@@ -25,7 +25,9 @@ from potr_cl.codec.sections import Property
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.errors import DataError
 
+I16 = NDArray[np.int16]
 I64 = NDArray[np.int64]
+Integers = NDArray[np.signedinteger]
 
 
 @dataclass(frozen=True)
@@ -111,8 +113,6 @@ class Reader:
         if file is not None:
             work = file.work()
             return joined([_levels_of(self, file, bundle, wanted, work) for bundle in range(first, last)])
-        for key in wanted.keys:
-            self.section(key)
         run = _Run(self, first, last)
         for key in wanted.keys:
             run.decode(key)
@@ -126,14 +126,15 @@ class Reader:
             DataError: damaged.
         """
         functions = native()
+        # By whatever path, they are looked at before anything is decoded.
+        sections = {ORDER.index(key): self.section(key) for key in wanted.keys}
+        steps = self.steps if wanted.sections > 2 else None
         if functions is None:
             return None
         if wanted not in self._files:
-            sections = {ORDER.index(key): self.section(key) for key in wanted.keys}
             there = {number: section for number, section in sections.items() if section is not None}
             fit = all(section.fits for section in there.values())
             words = {number: section.for_native() for number, section in there.items()}
-            steps = self.steps if wanted.sections > 2 else None
             self._files[wanted] = functions.bundled_file(self.bundles.splats, words, steps) if fit else None
         return self._files[wanted]
 
@@ -145,7 +146,7 @@ class _Run:
         start, stop = first * BUNDLE, min(last * BUNDLE, reader.bundles.splats)
         self._reader, self._first, self._last = reader, first, last
         self._bundles = Bundles(stop - start)
-        self._terms: dict[str, I64] = {}
+        self._terms: dict[str, I16] = {}
         self._states = {key: self._states_of(key) for key in (MAIN[0], ROTATION)}
         self.levels = Levels(start, stop)
 
@@ -186,36 +187,42 @@ class _Run:
     def _chain(self, key: Key) -> I64:
         return self._states[ROTATION if key == ROTATION else MAIN[0]]
 
-    def _dense(self, key: Key) -> list[I64]:
+    def _dense(self, key: Key) -> list[Integers]:
         """Integers of the streams of an item a splat."""
         section = self._reader.section(key)
         splats = self._bundles.splats
         if section is None:
             for stream in streams_of(*key):
-                self._terms[stream.name] = np.full(splats, stream.sizes[0], np.int64)
-            return [np.zeros(splats, np.int64) for _ in streams_of(*key)]
+                self._terms[stream.name] = np.full(splats, stream.sizes[0], np.int16)
+            return [np.zeros(splats, np.int16) for _ in streams_of(*key)]
         words = section.of(self._first, self._last)
         return [self._stream(key, words, fitted, self._bundles.dense, self._terms) for fitted in section.streams] + (
             self._finished(words, section)
         )
 
-    def _finished(self, words: Words, section: Section) -> list[I64]:
+    def _finished(self, words: Words, section: Section) -> list[Integers]:
         if not words.all_taken:
             raise DataError(f"section '{section.what}' does not end where its last token does")
         return []
 
     def _stream(
-        self, key: Key, words: Words, fitted: Fitted, layout: Layout, terms: dict[str, I64], which: I64 | None = None
+        self,
+        key: Key,
+        words: Words,
+        fitted: Fitted,
+        layout: Layout,
+        terms: dict[str, I16],
+        which: NDArray[np.integer] | None = None,
     ) -> I64:
         """Integers of a stream, mapped to unsigned; their sizes become a term."""
         base = np.full(int(layout.counts.sum()), fitted.constant, np.int64)
         for name, weight in zip(fitted.stream.terms, fitted.terms.tolist(), strict=True):
             if weight:
-                base += weight * terms[name]
+                base += np.multiply(terms[name], weight, dtype=np.int64)
         if which is not None:
             base += fitted.biases[which]
         tokens, integers = decode_stream(layout, base, fitted, self._chain(key), words)
-        terms[fitted.stream.name] = fitted.stream.sizes.take(tokens).astype(np.int64)
+        terms[fitted.stream.name] = fitted.stream.sizes.astype(np.int16).take(tokens)
         return integers
 
     def _find_steps(self) -> None:
@@ -224,14 +231,14 @@ class _Run:
         classes = np.zeros(self._bundles.splats, np.int8)
         if steps is not None and levels.scales is not None and levels.opacities is not None:
             classes, _ = steps.classes(levels.scales, levels.opacities, levels.start)
-        self._terms["step"] = step_terms(classes)
+        self._terms["step"] = step_terms(classes).astype(np.int16)
 
     def _decode_band(self, key: Key) -> None:
         """The AC coefficients of a degree."""
         terms = self._terms
         splats = self._bundles.splats
         for c in range(3):
-            terms.setdefault(f"sum {c}", np.zeros(splats, np.int64))
+            terms.setdefault(f"sum {c}", np.zeros(splats, np.int16))
         section = self._reader.section(key)
         if section is None:
             return
@@ -239,12 +246,14 @@ class _Run:
         words = section.of(self._first, self._last)
         mask, pattern, *values = section.streams
         masks = self._stream(key, words, mask, self._bundles.dense, terms)
-        splat, which = np.nonzero(masks[:, None] >> np.arange(end - first) & 1)
+        bits = np.unpackbits(masks.astype(np.uint8)[:, None], axis=1, bitorder="little")[:, : end - first]
+        splat, which = (where.astype(np.int32) for where in np.nonzero(bits))
         at_items = {name: terms[name][splat] for name in (*(f"sum {c}" for c in range(3)), "mask", "step")}
         layout = self._bundles.items(splat)
         patterns = self._stream(key, words, pattern, layout, at_items, which)
-        channels = np.zeros((3, len(splat)), np.int64)
-        sizes = [np.zeros(len(splat), np.int64) for _ in range(3)]
+        wide = np.result_type(*(integer_type(fitted.alphabet) for fitted in values))
+        channels = np.zeros((3, len(splat)), wide)
+        sizes = [np.zeros(len(splat), np.int16) for _ in range(3)]
         for c, fitted in enumerate(values):
             (there,) = np.nonzero(patterns >> c & 1)
             at_values = {name: at_items[name][there] for name in at_items}
@@ -254,8 +263,8 @@ class _Run:
             channels[c, there] = _signed(integers + 1)
         self._finished(words, section)
         for c in range(3):
-            terms[f"sum {c}"] += np.bincount(splat, weights=sizes[c], minlength=splats).astype(np.int64)
-        self.levels.ac.append(Items(splat, which + first, channels))
+            terms[f"sum {c}"] += np.bincount(splat, weights=sizes[c], minlength=splats).astype(np.int16)
+        self.levels.ac.append(Items(splat, (which + first).astype(np.uint8), channels))
 
 
 def _levels_of(reader: Reader, file: BundledFile, bundle: int, wanted: Wanted, work: NDArray[np.uint8]) -> Levels:
@@ -273,8 +282,8 @@ def _levels_of(reader: Reader, file: BundledFile, bundle: int, wanted: Wanted, w
     for k, key in enumerate(MAIN[3 : wanted.sections]):
         if reader.section(key) is not None:
             own = slice(ends[k], ends[k + 1])
-            splats = found.splats[own].astype(np.int64)
-            levels.ac.append(Items(splats, found.coefficients[own].astype(np.int64), found.channels[:, own]))
+            splats = found.splats[own].astype(np.int32)
+            levels.ac.append(Items(splats, found.coefficients[own], found.channels[:, own]))
     return levels
 
 
@@ -293,5 +302,5 @@ def check_said(reader: Reader, said: int, number: int) -> None:
     check_end(False, np.zeros(0, np.uint32), what)
 
 
-def _signed(mapped: I64) -> I64:
+def _signed(mapped: Integers) -> Integers:
     return (mapped >> 1) ^ -(mapped & 1)

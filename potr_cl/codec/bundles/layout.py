@@ -46,7 +46,7 @@ class Bundles:
         """Of the streams that have an item for each splat."""
         return self.items(np.arange(self.splats))
 
-    def items(self, splats: I64) -> Layout:
+    def items(self, splats: NDArray[np.integer]) -> Layout:
         """Of a stream with an item for each of some splats, which are named in order, and may be named repeatedly."""
         return Layout(np.bincount(splats // BUNDLE, minlength=self.number), self.lanes)
 

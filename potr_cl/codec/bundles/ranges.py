@@ -15,7 +15,7 @@ from numpy.typing import NDArray
 from potr_cl.codec.bundles.description import Fitted
 from potr_cl.codec.bundles.layout import LANES, Layout
 from potr_cl.codec.context.model import LARGEST_SIZE
-from potr_cl.codec.context.tokens import DIRECT, extra_bits
+from potr_cl.codec.context.tokens import DIRECT, extra_bits, largest_integer
 from potr_cl.codec.rans import CONTEXT_SHIFT, LOWEST, PRECISION, TOTAL, no_words_left
 
 I64 = NDArray[np.int64]
@@ -24,7 +24,9 @@ U16 = NDArray[np.uint16]
 
 #: Extra bits that a state gives at a time.
 CHUNK = 12
+#: Where an entry of a decoder's table has the place within a token, and twice the token's size.
 _FREQUENCY_BITS = PRECISION + 1
+_SIZE_AT = _FREQUENCY_BITS + PRECISION
 
 
 class Words:
@@ -37,34 +39,42 @@ class Words:
     """
 
     def __init__(self, words: U16, counts: I64, what: str) -> None:
-        self._words, self._what = words, what
+        # Behind a word that nobody takes, so that ranks from 1 on tell the next ones.
+        self._words, self._what = np.concatenate([np.zeros(1, np.int64), words]), what
         self._ends = np.cumsum(counts)
         self._next = self._ends - counts
+        shape = (len(counts), LANES)
+        self._low, self._full = np.empty(shape, bool).ravel(), np.empty(shape, np.int64).ravel()
+        self._ranks, self._taken = np.empty(shape, np.int64), np.empty(shape, np.int64)
 
     def renormalise(self, states: I64) -> None:
-        """Give a word to every state (bundles · LANES,) that needs one.
+        """Give a word to every state (bundles · LANES,) that needs one; :meth:`check` tells if there were enough."""
+        low = np.less(states, LOWEST, out=self._low)
+        # Lane after lane of a bundle: the first that needs a word has rank 1.
+        ranks = low.reshape(-1, LANES).cumsum(axis=1, out=self._ranks)
+        np.add(ranks, self._next[:, None], out=self._taken)
+        self._next += ranks[:, -1]
+        full = np.left_shift(states, 16, out=self._full)
+        full |= self._words.take(self._taken.ravel(), mode="clip")
+        np.copyto(states, full, where=low)
+
+    def check(self) -> None:
+        """Check that there was a word whenever one was asked for.
 
         Raises:
-            DataError: no words are left.
+            DataError: there was not.
         """
-        (at,) = np.nonzero(states < LOWEST)
-        if not len(at):
-            return
-        bundles = at // LANES
-        counts = np.bincount(bundles, minlength=len(self._ends))
-        firsts = np.cumsum(counts) - counts
-        taken = np.arange(len(at)) + (self._next - firsts)[bundles]
-        self._next += counts
         if (self._next > self._ends).any():
             raise no_words_left(self._what)
-        states[at] = states[at] << 16 | self._words[taken]
 
     @property
     def all_taken(self) -> bool:
         return bool((self._next == self._ends).all())
 
 
-def decode_stream(layout: Layout, base: I64, fitted: Fitted, states: I64, words: Words) -> tuple[U8, I64]:
+def decode_stream(
+    layout: Layout, base: I64, fitted: Fitted, states: I64, words: Words
+) -> tuple[U8, NDArray[np.signedinteger]]:
     """Decode a stream.
 
     Args:
@@ -81,28 +91,42 @@ def decode_stream(layout: Layout, base: I64, fitted: Fitted, states: I64, words:
         DataError: no words are left.
     """
     contexts, tokens, entries = _tables(fitted)
-    sizes = 2 * fitted.stream.sizes.astype(np.int64)
-    found = np.zeros(layout.shape, np.uint8)
+    slots = np.zeros(layout.shape, np.int64)
     extra = np.zeros(layout.shape, np.int64) if fitted.alphabet > DIRECT else None
-    recent = np.zeros(layout.shape[1], np.int64)
+    width = layout.shape[1]
+    recent, a, b, entry = (np.zeros(width, np.int64) for _ in range(4))
+    weight = fitted.recent
     idle = layout.idle
     partly = set(np.flatnonzero(idle.any(axis=1)).tolist())
-    for t, (expected, token) in enumerate(zip(layout.laid(base), found, strict=True)):
-        expected += fitted.recent * recent
-        expected >>= CONTEXT_SHIFT
-        slot = contexts.take(expected, mode="clip")
+    # Little is done in a step, so that what numpy takes to be called is most of the time: no call too many.
+    multiply, add, subtract, shift, mask = np.multiply, np.add, np.subtract, np.right_shift, np.bitwise_and
+    for t, (expected, slot) in enumerate(zip(layout.laid(base), slots, strict=True)):
+        multiply(recent, weight, a)
+        add(a, expected, a)
+        shift(a, CONTEXT_SHIFT, a)
+        contexts.take(a, None, slot, "clip")
         if t in partly:
             slot[idle[t]] = len(entries) - TOTAL
-        slot += states & (TOTAL - 1)
-        tokens.take(slot, out=token, mode="clip")
-        entry = entries.take(slot)
-        states[:] = (states >> PRECISION) * (entry & (2 * TOTAL - 1)) + (entry >> _FREQUENCY_BITS)
+        mask(states, TOTAL - 1, a)
+        add(slot, a, slot)
+        entries.take(slot, None, entry, "wrap")  # faster than the other modes, and there is nothing to wrap
+        shift(recent, 2, a)
+        subtract(recent, a, recent)
+        shift(entry, _SIZE_AT, a)
+        add(recent, a, recent)
+        shift(states, PRECISION, a)
+        mask(entry, 2 * TOTAL - 1, b)
+        multiply(a, b, a)
+        shift(entry, _FREQUENCY_BITS, entry)
+        mask(entry, TOTAL - 1, entry)
+        add(a, entry, states)
         words.renormalise(states)
-        if extra is not None and (token >= DIRECT).any():
+        if extra is not None and (token := tokens.take(slot)).max() >= DIRECT:
             _take_bits(token, states, words, extra[t])
-        recent += sizes.take(token, mode="clip") - (recent >> 2)
-    of_items = layout.taken(found)
-    return of_items, _integers(of_items, None if extra is None else layout.taken(extra))
+    words.check()
+    of_items = tokens.take(layout.taken(slots))
+    extras = None if extra is None else layout.taken(extra)
+    return of_items, _integers(of_items, extras, integer_type(fitted.alphabet))
 
 
 def _take_bits(tokens: U8, states: I64, words: Words, extra: I64) -> None:
@@ -117,8 +141,14 @@ def _take_bits(tokens: U8, states: I64, words: Words, extra: I64) -> None:
         shift += CHUNK
 
 
-def _integers(tokens: U8, extra: I64 | None) -> I64:
-    mapped = tokens.astype(np.int64)
+def integer_type(alphabet: int) -> type[np.signedinteger]:
+    """The narrowest type of the integers of so many tokens."""
+    largest = largest_integer(alphabet - 1)
+    return np.int16 if largest < 1 << 14 else np.int32 if largest < 1 << 30 else np.int64
+
+
+def _integers(tokens: U8, extra: I64 | None, dtype: type[np.signedinteger]) -> NDArray[np.signedinteger]:
+    mapped = tokens.astype(dtype)
     if extra is None:
         return mapped
     (large,) = np.nonzero(tokens >= DIRECT)
@@ -128,22 +158,23 @@ def _integers(tokens: U8, extra: I64 | None) -> I64:
 
 
 def _tables(fitted: Fitted) -> tuple[I64, U8, I64]:
-    """Where the context of each expected size begins, and of each slot: its token; frequency and place in one number.
+    """Where the context of each expected size begins, and of each slot: its token, and what it does in one number.
 
-    Behind the contexts stands one that leaves a state as it is.
+    That is its frequency, its place within the token, and twice the token's size. Behind the contexts stands one that
+    leaves a state as it is.
     """
     frequencies = fitted.frequencies
     contexts, alphabet = frequencies.shape
     flat = frequencies.ravel()
     starts = np.cumsum(flat) - flat
-    slots = np.arange(contexts * TOTAL)
-    idle = TOTAL | np.arange(TOTAL) << _FREQUENCY_BITS
-    entries = np.concatenate([np.repeat(flat, flat) | (slots - np.repeat(starts, flat)) << _FREQUENCY_BITS, idle])
+    sizes = np.tile(2 * fitted.stream.sizes[:alphabet].astype(np.int64), contexts)
+    entries = (np.arange(contexts * TOTAL) - np.repeat(starts, flat)) << _FREQUENCY_BITS
+    entries |= np.repeat(flat | sizes << _SIZE_AT, flat)
     tokens = np.repeat(np.tile(np.arange(alphabet, dtype=np.uint8), contexts), flat)
     return (
         fitted.classes.astype(np.int64) * TOTAL,
         np.concatenate([tokens, np.zeros(TOTAL, np.uint8)]),
-        entries,
+        np.concatenate([entries, TOTAL | np.arange(TOTAL) << _FREQUENCY_BITS]),
     )
 
 

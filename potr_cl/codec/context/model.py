@@ -9,6 +9,7 @@ from __future__ import annotations
 import struct
 from collections.abc import Sequence
 from dataclasses import dataclass
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -146,14 +147,16 @@ def read_models(raw: bytes, read: int, most_tokens: Sequence[int], what: str) ->
         cells = contexts * used
         if not (1 <= contexts <= MOST_CONTEXTS and 1 <= used <= most) or len(raw) < read + contexts - 1 + 2 * cells:
             raise _impossible(what)
-        thresholds = np.frombuffer(raw, np.uint8, contexts - 1, read).astype(np.int64)
+        thresholds = raw[read : read + contexts - 1]
         read += contexts - 1
         low, high = (np.frombuffer(raw, np.uint8, cells, read + k * cells).astype(np.int64) for k in (0, 1))
         read += 2 * cells
         frequencies = (low | high << 8).reshape(used, contexts).T
-        if (np.diff(thresholds, prepend=0) < 1).any() or (frequencies.sum(axis=1) != rans.TOTAL).any():
+        rising = all(a < b for a, b in pairwise(b"\0" + thresholds))
+        if not rising or (frequencies.sum(axis=1) != rans.TOTAL).any():
             raise _impossible(what)
-        classes = np.searchsorted(thresholds, np.arange(LARGEST_SIZE + 1), side="right").astype(np.uint8)
+        widths = [b - a for a, b in pairwise((0, *thresholds, LARGEST_SIZE + 1))]
+        classes = np.repeat(np.arange(contexts, dtype=np.uint8), widths)
         models.append(Model(classes, frequencies))
     if len(raw) != read:
         raise _impossible(what)

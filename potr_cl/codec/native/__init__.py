@@ -4,13 +4,17 @@ It gives the same bits as the NumPy modules around it, which are its definition 
 :func:`potr_cl.codec.native.library.native` says which of both is taken. The C sources lie beside this file; each has
 its twin in Python:
 
-==================  ===========================================================================================
-``context.c``       :mod:`potr_cl.codec.context`: tokens of lanes, and what they stand for
-``encode.c``        :mod:`potr_cl.codec.context`, :mod:`potr_cl.codec.rans`: an encoder's contexts and range coding
-``octree.c``        :mod:`potr_cl.codec.octree`: streams to centres
-``dequantize.c``    :mod:`potr_cl.codec.quantize`, :mod:`potr_cl.codec.byte_planes`: levels to values
-``module.c``        nothing: it makes a Python module of the library, so that it is built and found as one
-==================  ===========================================================================================
+====================  =========================================================================================
+``context.c``         :mod:`potr_cl.codec.context`: tokens of lanes, and what they stand for
+``encode.c``          :mod:`potr_cl.codec.context`, :mod:`potr_cl.codec.rans`: an encoder's contexts and range coding
+``bundles.c``         :mod:`potr_cl.codec.bundles`: a bundle's integers
+``bundles_values.c``  :mod:`potr_cl.codec.bundled_scene`: their values, while they are in a cache
+``bundles_encode.c``  :mod:`potr_cl.codec.bundles.encoder`: what contexts are fitted to, and range coding
+``bundles_fit.c``     :mod:`potr_cl.codec.bundles.fitting`: contexts from counts
+``octree.c``          :mod:`potr_cl.codec.octree`: streams to centres
+``dequantize.c``      :mod:`potr_cl.codec.quantize`, :mod:`potr_cl.codec.byte_planes`: levels to values
+``module.c``          nothing: it makes a Python module of the library, so that it is built and found as one
+====================  =========================================================================================
 
 :mod:`potr_cl.codec.native.functions` gives each C function NumPy arrays whose sizes it has checked.
 """

@@ -22,7 +22,8 @@ def address(array: NDArray[Any], dtype: type[np.generic], number: int, writable:
         raise TypeError(f"the native path takes {number} of {np.dtype(dtype)}, not {array.size} of {array.dtype}")
     if writable and not array.flags.writeable:
         raise TypeError("the native path cannot write to a read-only array")
-    return array.ctypes.data
+    where: int = array.__array_interface__["data"][0]  # what array.ctypes.data says, in a fraction of its time
+    return where
 
 
 def kind_of(levels: NDArray[Any]) -> str:

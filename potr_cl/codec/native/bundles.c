@@ -460,13 +460,8 @@ POTR_EXPORT size_t potr_bundles_work(void)
 /* Makes it ready, once; it holds zeros. */
 POTR_EXPORT void potr_bundles_begin(work *w)
 {
-    for (unsigned mask = 0; mask < 128; mask++) {
-        uint8_t bytes[8] = { 0 };
-        for (unsigned bit = 0, number = 0; bit < 7; bit++)
-            if (mask >> bit & 1)
-                bytes[number++] = (uint8_t)bit;
-        memcpy(&w->coefficient_bytes[mask], bytes, 8);
-    }
+    for (unsigned mask = 0; mask < 128; mask++)
+        list_bits(mask, &w->coefficient_bytes[mask]);
     for (int32_t level = 0; level < ENOUGH; level++)
         w->logarithms[level] = (int16_t)logarithm(level);
 }

@@ -3,6 +3,8 @@
 #ifndef POTR_BUNDLES_H
 #define POTR_BUNDLES_H
 
+#include <string.h>
+
 #include "potr_native.h"
 
 enum {
@@ -99,6 +101,16 @@ typedef struct {
 } work;
 
 enum { FINE, TOO_FEW_WORDS, TOO_MANY_WORDS, BAD_END, BEYOND_TABLE };
+
+/* The bits of a mask, a byte each, lowest first; 0 behind the last. */
+static INLINE void list_bits(unsigned mask, uint64_t *bits)
+{
+    uint8_t bytes[8] = { 0 };
+    for (unsigned bit = 0, number = 0; bit < BAND; bit++)
+        if (mask >> bit & 1)
+            bytes[number++] = (uint8_t)bit;
+    memcpy(bits, bytes, 8);
+}
 
 /* Bundles have as many lanes as their splats need, and lanes as many steps. */
 static INLINE size_t splats_of(const bundled_file *file, uint64_t bundle)

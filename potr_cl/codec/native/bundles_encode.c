@@ -46,12 +46,15 @@ typedef struct {
     uint8_t row_coefficients[ITEMS + LANES];
     int32_t sums[ITEMS + LANES];
     /* Items of a degree in their order. */
-    uint16_t places[ITEMS + 8];
+    uint16_t places[ITEMS + 8], splats[ITEMS + 8];
     uint8_t coefficients[ITEMS + 8], patterns[ITEMS + 8];
+    uint32_t chosen[ITEMS + 8];
+    uint8_t masks[BUNDLE], made_masks[BUNDLE];
     int32_t channels[3][ITEMS + 8];
     int16_t item_sizes[3][ITEMS + 8];
     int32_t rows[BUNDLE];
     int32_t samples[COLUMNS][SAMPLES];
+    uint64_t coefficient_bytes[128]; /* a table: the bits of each mask */
 } encoding;
 
 /* Terms of splats. */
@@ -229,33 +232,64 @@ static void dense_section(
     }
 }
 
+/* Sets bit k of the mask of each splat that has a coefficient of which a channel is not 0. */
+POTR_WIDE_INTEGERS
+static void add_to_masks(
+    uint8_t *restrict masks, const int32_t *restrict y, const int32_t *restrict co, const int32_t *restrict cg,
+    size_t splats, unsigned k)
+{
+    for (size_t i = 0; i < splats; i++)
+        masks[i] |= (uint8_t)(((y[i] | co[i] | cg[i]) != 0) << k);
+}
+
+/* The masks of splats to places and coefficients of their items. Returns their number. */
+static size_t list_items(encoding *e, const int32_t *const *values, uint64_t begin, size_t steps, size_t splats)
+{
+    size_t items = 0;
+    for (size_t splat = 0, place = 0, lane = 0, step = 0; splat < splats; splat++) {
+        /* Room for eight is always there, and what is too much is written over. */
+        const uint8_t mask = e->masks[splat];
+        memcpy(e->coefficients + items, &e->coefficient_bytes[mask], 8);
+        for (size_t k = 0; k < 8; k++) {
+            e->places[items + k] = (uint16_t)place;
+            e->splats[items + k] = (uint16_t)splat;
+        }
+        unsigned bits = mask - (mask >> 1 & 0x55u);
+        bits = (bits & 0x33u) + (bits >> 2 & 0x33u);
+        items += (bits + (bits >> 4)) & 0x0fu;
+        e->made_masks[place] = mask;
+        place += LANES;
+        if (++step == steps) {
+            step = 0;
+            place = ++lane;
+        }
+    }
+    for (size_t i = 0; i < items; i++) {
+        const int32_t *const *const channels = values + 3 * e->coefficients[i];
+        const uint64_t splat = begin + e->splats[i];
+        const int32_t y = channels[0][splat], co = channels[1][splat], cg = channels[2][splat];
+        e->channels[0][i] = y;
+        e->channels[1][i] = co;
+        e->channels[2][i] = cg;
+        e->patterns[i] = (uint8_t)((y != 0) | (co != 0) << 1 | (cg != 0) << 2);
+    }
+    return items;
+}
+
 /* The streams of a degree's AC coefficients. */
 static void make_band(
     const pass *p, size_t band, const int32_t *const *values, uint64_t begin, size_t splats)
 {
     encoding *const e = p->e;
     const size_t steps = steps_of(splats), number = 2 * band + 3, first = BAND_STREAM + BAND_STREAMS * band;
-    size_t items = 0;
-    uint32_t *const masks = e->made[first].integers;
-    memset(masks, 0, LANES * steps * sizeof *masks);
-    for (size_t splat = 0; splat < splats; splat++) {
-        const uint16_t place = (uint16_t)(splat % steps * LANES + splat / steps);
-        uint32_t mask = 0;
-        for (size_t k = 0; k < number; k++) {
-            const int32_t y = values[3 * k][begin + splat], co = values[3 * k + 1][begin + splat],
-                          cg = values[3 * k + 2][begin + splat];
-            if (!(y | co | cg))
-                continue;
-            mask |= 1u << k;
-            e->places[items] = place;
-            e->coefficients[items] = (uint8_t)k;
-            e->patterns[items] = (uint8_t)((y != 0) | (co != 0) << 1 | (cg != 0) << 2);
-            e->channels[0][items] = y;
-            e->channels[1][items] = co;
-            e->channels[2][items++] = cg;
-        }
-        masks[place] = mask;
-    }
+    memset(e->masks, 0, splats);
+    for (size_t k = 0; k < number; k++)
+        add_to_masks(e->masks, values[3 * k] + begin, values[3 * k + 1] + begin, values[3 * k + 2] + begin, splats,
+            (unsigned)k);
+    memset(e->made_masks, 0, LANES * steps);
+    const size_t items = list_items(e, values, begin, steps, splats);
+    for (size_t i = 0; i < LANES * steps; i++)
+        e->made[first].integers[i] = e->made_masks[i];
     const int16_t *terms[TERMS];
     for (size_t k = 0; k < 11; k++)
         terms[k] = e->terms[T_OPACITY + k];
@@ -265,24 +299,26 @@ static void make_band(
     for (size_t k = 0; k < 8; k++)
         terms[k] = e->item_terms[k];
     int16_t *const sizes = e->item_terms[8];
-    memset(e->item_sizes, 0, sizeof e->item_sizes);
+    for (size_t c = 0; c < 3; c++)
+        memset(e->item_sizes[c], 0, items * sizeof(int16_t));
     for (size_t stream = 0; stream < 4; stream++) { /* patterns; Y, Co, Cg */
         const size_t s = first + PATTERN_STREAM + stream;
         size_t chosen = 0;
-        for (size_t i = 0; i < items; i++)
+        for (size_t i = 0; i < items; i++) {
+            e->chosen[chosen] = (uint32_t)i;
             chosen += stream == 0 || e->patterns[i] >> (stream - 1) & 1;
+        }
         const size_t item_steps = (chosen + p->lanes - 1) / p->lanes, rows = LANES * item_steps;
         made_stream *const made = &e->made[s];
         memset(made->integers, 0, rows * sizeof *made->integers);
         memset(e->row_coefficients, 0, rows);
         for (size_t k = 0; k < 8; k++)
             memset(e->item_terms[k], 0, rows * sizeof(int16_t));
-        for (size_t i = 0, at = 0, lane = 0, step = 0; i < items; i++) {
-            if (stream && !(e->patterns[i] >> (stream - 1) & 1))
-                continue;
+        for (size_t n = 0, at = 0, lane = 0, step = 0; n < chosen; n++) {
+            const size_t i = e->chosen[n], place = e->places[i];
             for (size_t k = 0; k < 4; k++)
-                e->item_terms[k][at] = e->terms[T_SUM + k][e->places[i]];
-            e->item_terms[4][at] = e->terms[T_STEP][e->places[i]];
+                e->item_terms[k][at] = e->terms[T_SUM + k][place];
+            e->item_terms[4][at] = e->terms[T_STEP][place];
             e->row_coefficients[at] = e->coefficients[i];
             if (stream == 0) {
                 made->integers[at] = e->patterns[i];
@@ -302,10 +338,8 @@ static void make_band(
         visit(p, s, terms, sizes);
         if (stream == 0)
             continue;
-        for (size_t i = 0, at = 0, lane = 0, step = 0; i < items; i++) {
-            if (!(e->patterns[i] >> (stream - 1) & 1))
-                continue;
-            e->item_sizes[stream - 1][i] = sizes[at];
+        for (size_t n = 0, at = 0, lane = 0, step = 0; n < chosen; n++) {
+            e->item_sizes[stream - 1][e->chosen[n]] = sizes[at];
             at += LANES;
             if (++step == item_steps) {
                 step = 0;
@@ -322,6 +356,8 @@ static void make_band(
 static void make_streams(const file_integers *file, uint64_t bundle, pass *p)
 {
     encoding *const e = p->e;
+    for (unsigned mask = 1; mask < 128 && !e->coefficient_bytes[127]; mask++)
+        list_bits(mask, &e->coefficient_bytes[mask]);
     const uint64_t begin = bundle * BUNDLE, left = file->splats - begin;
     const size_t splats = left < BUNDLE ? (size_t)left : BUNDLE;
     p->lanes = lanes_of(splats);

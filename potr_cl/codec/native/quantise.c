@@ -137,3 +137,18 @@ POTR_EXPORT int potr_nonzero_levels(
     }
     return sound;
 }
+
+/* n quaternions to ones of unit length; those of length 0 to the identity. The same bits as raster/activation.py. */
+POTR_EXPORT void potr_unit_quaternions(const float *restrict quaternions, size_t n, float *restrict units)
+{
+    for (size_t i = 0; i < n; i++) {
+        const float *q = quaternions + 4 * i;
+        const double w = q[0], x = q[1], y = q[2], z = q[3];
+        const double length = sqrt(w * w + x * x + y * y + z * z);
+        const int nothing = length == 0;
+        units[4 * i] = nothing ? 1.0f : (float)(w / length);
+        units[4 * i + 1] = nothing ? 0.0f : (float)(x / length);
+        units[4 * i + 2] = nothing ? 0.0f : (float)(y / length);
+        units[4 * i + 3] = nothing ? 0.0f : (float)(z / length);
+    }
+}

@@ -81,6 +81,15 @@ class Quantising:
             address(columns, np.float32, 3 * stride * count, True),
         )
 
+    def unit_quaternions(self, quaternions: F32) -> F32:
+        """(n, 4) float32 quaternions of unit length, of (n, 4); those of length 0 become the identity."""
+        number = len(quaternions)
+        units = np.empty((number, 4), np.float32)
+        self._c["potr_unit_quaternions"](
+            address(quaternions, np.float32, 4 * number), number, address(units, np.float32, 4 * number, True)
+        )
+        return units
+
     def nonzero_levels(self, sh: F32, factor: float, most: float) -> NDArray[np.bool_] | None:
         """Which coefficients, in Y, Co, Cg, have a level other than 0.
 

@@ -39,7 +39,7 @@ _GROUP_BITS = 4
 #: Logits of opacity between the first and the last place, and of the first one above the least.
 _LOGITS, _FIRST_LOGIT = 10.0, 2.0
 #: Splats that a rule is fitted to.
-_FITTED = 1 << 15
+_FITTED = 1 << 13
 _MOST_STEPS = 30
 #: The most that a group adds, in its units.
 _MOST_OF_GROUP = 12
@@ -86,9 +86,9 @@ def fit_steps(
     found = np.rint(_minimum(terms, raised[some]) * (OCTAVE / np.log(2)) * _UNITS)
     found = np.clip(found, -32767, 32767).astype(int).tolist()
     steps = replace(steps, scales=tuple(found[:3]), opacities=tuple(found[3:]))
-    left = raised * np.exp2(-steps.weights(scales, opacities) / OCTAVE)
-    steps = replace(steps, groups=_groups(left, _GROUP_BITS))
     weights = steps.weights(scales, opacities)
+    steps = replace(steps, groups=_groups(raised * np.exp2(-weights / OCTAVE), _GROUP_BITS))
+    weights += GROUP_UNIT * np.repeat(steps.groups.astype(np.int64), 1 << _GROUP_BITS)[:n]
     return replace(steps, offsets=(_offset(weights, h, _POWERS[0]), _offset(weights, h, _POWERS[1])))
 
 

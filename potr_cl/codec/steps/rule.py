@@ -39,6 +39,8 @@ CLASS_SHIFT = 6
 CLASSES = 32
 #: Scales' levels beyond are taken for this.
 _LARGEST_SCALE = (1 << 32) - 1
+#: Levels whose logarithms are looked up.
+_TABLE = 1 << 13
 _MOST_SHIFT = 40
 
 _HEAD = struct.Struct(f"<6B2h3h{KNOTS}h")
@@ -156,15 +158,15 @@ class ColourSteps:
 
 def logarithms(levels: Levels) -> I64:
     """(n,) levels of scales, >= 0, to about 16 · log2(4 · level), linear between powers of two; 0 for level 0."""
-    if levels.dtype == np.uint8:
-        small: I64 = _small_logarithms().take(levels)
-        return small
-    return _logarithms(levels)
+    if levels.dtype != np.uint8 and int(levels.max(initial=0)) >= _TABLE:
+        return _logarithms(levels)
+    small: I64 = _small_logarithms().take(levels)
+    return small
 
 
 @lru_cache(maxsize=1)
 def _small_logarithms() -> I64:
-    return _logarithms(np.arange(256))
+    return _logarithms(np.arange(_TABLE))
 
 
 def _logarithms(levels: Levels) -> I64:

@@ -6,6 +6,7 @@ reads one, strictly, and hands on a header of its own with exactly the bytes tha
 
 from __future__ import annotations
 
+import itertools
 import os
 import re
 from typing import BinaryIO
@@ -18,14 +19,15 @@ from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.compressed_ply_values import (
     CHUNK,
     PackedGeometry,
-    elements,
+    element_bytes,
     packed_colours,
     packed_geometry,
     packed_sh,
+    unpacked,
 )
 from potr_cl.formats.scenes.gsply_arrays import EXTRA, library, to_scene
 from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
-from potr_cl.formats.scenes.scene_files import arranged, opened, tell_of_low_pass
+from potr_cl.formats.scenes.scene_files import arranged, cleaned, opened, tell_of_low_pass
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
@@ -99,7 +101,22 @@ def pieces(
         [("chunk", len(packed.means), _BOUNDS), ("vertex", splats, _VERTEX), ("sh", splats, _coefficients(rest))],
         comments,
     )
-    return [header, *elements(packed, colours, sh)]
+    return [header, *element_bytes(packed, colours, sh)]
+
+
+def scene_of(data: bytes) -> Scene:
+    """The scene of a file that :func:`pieces` has made, without any library.
+
+    Raises:
+        DataError: it is damaged.
+    """
+    lines, comments, start = _header_lines("file in memory", data[:_MAX_HEADER_BYTES])
+    chunks, splats, rest = _counts("file in memory", lines)
+    ends = np.cumsum([start, 4 * len(_BOUNDS) * chunks, 4 * len(_VERTEX) * splats, rest * splats])
+    if len(data) != ends[-1]:
+        raise DataError(f"a compressed PLY of {len(data)} bytes should have {ends[-1]}")
+    parts = (data[first:end] for first, end in itertools.pairwise(ends))
+    return marked(cleaned("file in memory", unpacked(*parts)), comments)
 
 
 def _header(elements: list[tuple[str, int, list[tuple[str, str]]]], comments: list[str]) -> bytes:

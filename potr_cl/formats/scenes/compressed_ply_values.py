@@ -7,7 +7,7 @@ without the largest.
 
 from __future__ import annotations
 
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any
 
 import numpy as np
@@ -80,8 +80,8 @@ def packed_colours(dc: FloatArray) -> tuple[FloatArray, Words]:
     return _packed_in_bounds(dc * np.float32(SH_0) + np.float32(0.5), _COLOUR)
 
 
-def packed_sh(sh: FloatArray) -> U8:
-    """AC coefficients (N, K, 3) as levels of the same shape. 0 and 255, which readers disagree about, are not used."""
+def packed_sh(sh: NDArray[np.floating]) -> U8:
+    """AC coefficients as levels of the same shape. 0 and 255, which readers disagree about, are not used."""
     levels: U8 = np.clip(np.floor(sh * np.float32(32)) + np.float32(128), 1, 254).astype(np.uint8)
     return levels
 
@@ -91,7 +91,7 @@ def unpacked_sh(levels: U8) -> FloatArray:
     return (levels.astype(np.float32) - np.float32(127.5)) / np.float32(32)
 
 
-def elements(packed: PackedGeometry, colours: tuple[FloatArray, Words], sh: U8) -> tuple[bytes, bytes, bytes]:
+def element_bytes(packed: PackedGeometry, colours: tuple[FloatArray, Words], sh: U8) -> tuple[bytes, bytes, bytes]:
     """The elements chunk, vertex and sh of a file.
 
     Args:
@@ -104,6 +104,20 @@ def elements(packed: PackedGeometry, colours: tuple[FloatArray, Words], sh: U8) 
     chunk = np.concatenate([part.reshape(len(part), 6) for part in parts], axis=1).astype("<f4")
     vertex = np.stack([packed.positions, packed.rotations, packed.scales, words | packed.opacities], axis=1)
     return chunk.tobytes(), vertex.astype("<u4").tobytes(), np.ascontiguousarray(sh.transpose(0, 2, 1)).tobytes()
+
+
+def unpacked(chunk: bytes, vertex: bytes, sh: bytes) -> Scene:
+    """The scene of what :func:`element_bytes` has returned."""
+    bounds = np.frombuffer(chunk, "<f4").reshape(-1, 3, 2, 3)
+    words = np.frombuffer(vertex, "<u4").reshape(-1, 4)
+    opacities = (words[:, 3] & np.uint32(255)).astype(np.uint8)
+    packed = PackedGeometry(bounds[:, 0], bounds[:, 1], words[:, 0], words[:, 1], words[:, 2], opacities)
+    colours = _unpacked_in_bounds(bounds[:, 2], words[:, 3], _COLOUR)
+    levels = np.frombuffer(sh, np.uint8).reshape(len(words), 3, -1).transpose(0, 2, 1)
+    coefficients = np.empty((len(words), 1 + levels.shape[1], 3), np.float32)
+    coefficients[:, 0] = (colours - np.float32(0.5)) / np.float32(SH_0)
+    coefficients[:, 1:] = unpacked_sh(levels)
+    return replace(unpacked_geometry(packed), sh=coefficients)
 
 
 def _packed_in_bounds(values: FloatArray, places: Any) -> tuple[FloatArray, Words]:

@@ -19,7 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.logarithm import natural_logarithm
-from potr_cl.errors import DataError, UsageError
+from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.gltf_file import Asset
 from potr_cl.formats.scenes.gltf_writer import EXTENSION as _EXTENSION
@@ -72,18 +72,16 @@ def files(path: Path) -> list[Path]:
 
 
 def save(path: str | os.PathLike[str], scene: Scene) -> None:
-    """Write a scene as binary glTF; the file appears under its name only when it is whole.
+    """Write a scene as glTF in one file; the file appears under its name only when it is whole.
 
     Raises:
-        UsageError: ``path`` cannot be written to, or does not end in .glb.
+        UsageError: ``path`` cannot be written to.
         PotrError: the system failed to write.
     """
-    if Path(path).suffix.lower() != ".glb":
-        raise UsageError(f"'{path}': glTF is written as one binary file: give it a name that ends in .glb")
     if scene.antialiased:
         _log.warning("'%s': glTF cannot say that the scene is antialiased: it will be drawn as the others", path)
     with replacing(path) as file:
-        for piece in pieces(scene):
+        for piece in pieces(scene, binary=Path(path).suffix.lower() != ".gltf"):
             file.write(piece)
 
 
@@ -91,7 +89,7 @@ FORMAT = SceneFormat(
     name="glTF",
     suffixes=(".glb", ".gltf"),
     note="with the Khronos Group's KHR_gaussian_splatting, uncompressed, floats or integers; nodes' transforms are "
-    "applied, axes kept; written as .glb, in float32",
+    "applied, axes kept; written in float32",
     load=load,
     save=save,
     starts=(b"glTF",),

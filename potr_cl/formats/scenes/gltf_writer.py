@@ -1,4 +1,4 @@
-"""Scenes as binary glTF with KHR_gaussian_splatting: :func:`pieces`.
+"""Scenes as glTF with KHR_gaussian_splatting: :func:`pieces`.
 
 All attributes are float32: SH coefficients, most of the bytes, may be nothing else, and not every reader takes what the
 others may be. Nothing is turned: the file has the scene's axes.
@@ -8,6 +8,7 @@ Specification: github.com/KhronosGroup/glTF, extensions/2.0/Khronos/KHR_gaussian
 
 from __future__ import annotations
 
+import base64
 import json
 import struct
 from typing import Any
@@ -45,11 +46,16 @@ def attributes(scene: Scene) -> dict[str, FloatArray]:
     return {name: np.ascontiguousarray(value, "<f4") for name, value in values.items()}
 
 
-def pieces(scene: Scene) -> list[bytes]:
-    """The bytes of a .glb file, to be written one after another."""
+def pieces(scene: Scene, binary: bool = True) -> list[bytes]:
+    """The bytes of a file, to be written one after another.
+
+    Args:
+        scene: to write.
+        binary: .glb; otherwise a .gltf, which is text with the values in Base64, a third larger.
+    """
     views: list[dict[str, Any]] = []
     accessors: list[dict[str, Any]] = []
-    binary: list[bytes] = []
+    parts: list[bytes] = []
     places: dict[str, int] = {}
     start = 0
     for name, values in attributes(scene).items():
@@ -65,7 +71,7 @@ def pieces(scene: Scene) -> list[bytes]:
         places[name] = len(accessors)
         views.append({"buffer": 0, "byteOffset": start, "byteLength": len(data)})
         accessors.append(accessor)
-        binary.append(data)
+        parts.append(data)
         start += len(data)
     kind = {
         "kernel": "ellipse",
@@ -74,7 +80,7 @@ def pieces(scene: Scene) -> list[bytes]:
         "sortingMethod": "cameraDistance",
     }
     primitive = {"attributes": places, "mode": _POINTS, "extensions": {EXTENSION: kind}}
-    description = {
+    description: dict[str, Any] = {
         "asset": {"version": "2.0", "generator": "potr_cl"},
         "extensionsUsed": [EXTENSION],
         "scene": 0,
@@ -85,7 +91,11 @@ def pieces(scene: Scene) -> list[bytes]:
         "bufferViews": views,
         "accessors": accessors,
     }
+    if not binary:
+        text = base64.b64encode(b"".join(parts)).decode("ascii")
+        description["buffers"][0]["uri"] = f"data:application/octet-stream;base64,{text}"
+        return [json.dumps(description, separators=(",", ":")).encode()]
     said = json.dumps(description, separators=(",", ":")).encode()
     said += b" " * (-len(said) % 4)
     head = struct.pack("<III", _MAGIC, 2, 12 + 8 + len(said) + 8 + start) + struct.pack("<II", len(said), _JSON)
-    return [head, said, struct.pack("<II", start, _BINARY), *binary]
+    return [head, said, struct.pack("<II", start, _BINARY), *parts]

@@ -4,11 +4,11 @@ from __future__ import annotations
 
 import dataclasses
 from collections.abc import Sequence
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.placement.colour_memory import ColourMemory
 from potr_cl.model.placement.matter import CROWDED, cell_of, frame_of, matter_of, surroundings
@@ -16,8 +16,8 @@ from potr_cl.model.scene import Scene
 
 F32 = NDArray[np.float32]
 
-#: So many splats, evenly taken, tell where a scene is and what hides what.
-_TAKEN = 50_000
+#: So many splats, evenly taken, tell where a scene is; views are judged by so many of them, and points that hide them.
+_TAKEN, _TARGETS, _OCCLUDERS = 20_000, 1_000, 8_000
 #: Part of what a new view shows that some given view must show, too.
 _KNOWN = 0.9
 #: A new view shows at least this part of what the view shows that it lies beside, by number of splats.
@@ -32,29 +32,32 @@ class GivenViews:
     Args:
         scene: that they show.
         cameras: the given views, at least one.
-        run: calls functions, perhaps in several threads.
     """
 
-    def __init__(self, scene: Scene, cameras: Sequence[Camera], run: Run = map) -> None:
+    def __init__(self, scene: Scene, cameras: Sequence[Camera]) -> None:
         every = max(len(scene) // _TAKEN, 1)
         some = scene.subset(np.arange(0, len(scene), every))
         self._frame = frame_of(some)
-        matter = matter_of(some, self._frame)
+        matter = matter_of(some, self._frame, _TARGETS, _OCCLUDERS)
         # Each point stands for the surface of the splats that were not taken, too.
         self._matter = dataclasses.replace(matter, areas=matter.areas * np.float32(every))
-        shown, blocked = zip(*run(self._look, cameras), strict=True)
+        shown, blocked = zip(*map(self._look, cameras), strict=True)
         self._shown: F32 = np.stack(shown)
         self._known: F32 = self._shown.max(axis=0)
         # Whoever photographs indoors, stands close to things.
         self._crowded = max(CROWDED, max(blocked))
-        places = (camera_centres(cameras) - self._frame.centre) / self._frame.unit
-        self._memory = ColourMemory(places, self._matter)
-        self._forgotten = 0.0
-        if self._memory.tells:
-            self._forgotten = _REMEMBERED * min(run(self._remembered, range(len(cameras))))
+        self._places = (camera_centres(cameras) - self._frame.centre) / self._frame.unit
+
+    @cached_property
+    def _memory(self) -> tuple[ColourMemory, float]:
+        """What colours remember of given places, and the least that they must remember of others."""
+        memory = ColourMemory(self._places, self._matter)
+        if not memory.tells:
+            return memory, 0.0
+        return memory, _REMEMBERED * min(memory.of_known(*given) for given in enumerate(self._shown))
 
     def views_of_parts(self) -> NDArray[np.int64]:
-        """(K,) how many given views show each of a few thousand splats, evenly taken from those that any view shows."""
+        """(K,) how many given views show each of some splats, evenly taken; those that none shows are left out."""
         counts: NDArray[np.int64] = np.count_nonzero(self._shown, axis=0)
         return counts[counts > 0]
 
@@ -77,10 +80,8 @@ class GivenViews:
         if total > 0 and float((shown * self._known).sum()) < _KNOWN * total:
             return False
         place = (camera.centre - self._frame.centre) / self._frame.unit
-        return not self._memory.tells or self._memory.of(place, shown) >= self._forgotten
-
-    def _remembered(self, number: int) -> float:
-        return self._memory.of_known(number, self._shown[number])
+        memory, least = self._memory
+        return not memory.tells or memory.of(place, shown) >= least
 
     def _look(self, camera: Camera) -> tuple[F32, float]:
         """(K,) 1 for each target that the view shows, else 0; and how much matter there is close by."""

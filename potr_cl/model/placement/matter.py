@@ -86,7 +86,8 @@ def frame_of(scene: Scene) -> Frame:
     return Frame(centre, unit, up * np.sign(up[np.argmax(np.abs(up))]), _NEAR / unit)
 
 
-def matter_of(scene: Scene, frame: Frame) -> Matter:
+def matter_of(scene: Scene, frame: Frame, targets: int = _TARGETS, occluders: int = _OCCLUDERS) -> Matter:
+    """What there is to see of a scene: so many splats to judge by, and points on all that hide them."""
     opacity = scene.opacities.astype(np.float64)
     solid = np.flatnonzero(opacity > _OPAQUE)
     if len(solid) == 0:
@@ -94,7 +95,7 @@ def matter_of(scene: Scene, frame: Frame) -> Matter:
     means = np.clip((scene.means[solid].astype(np.float64) - frame.centre) / frame.unit, -_FAR, _FAR)
     scales = np.exp(np.clip(scene.log_scales[solid].astype(np.float64) - math.log(frame.unit), -30, 3))
 
-    chosen = np.unique(np.linspace(0, len(solid) - 1, _TARGETS).astype(np.int64))
+    chosen = np.unique(np.linspace(0, len(solid) - 1, targets).astype(np.int64))
     largest = scales[chosen].max(axis=1)
     relative = np.sqrt(largest / max(float(np.median(largest)), 1e-12))
     points, areas = points_on_splats(
@@ -102,7 +103,7 @@ def matter_of(scene: Scene, frame: Frame) -> Matter:
         scales,
         scene.quaternions[solid].astype(np.float64),
         opacity[solid],
-        2 * low_discrepancy(_OCCLUDERS, 3) - 1,
+        2 * low_discrepancy(occluders, 3) - 1,
     )
     # Haze and backdrops: of so wide a splat it means nothing that one of its few points is near.
     areas[areas > _ELBOW_ROOM**2] = 0

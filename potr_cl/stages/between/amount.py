@@ -16,7 +16,7 @@ _MOST = 2.0
 #: An added view takes as much time as a training view. So that an encode takes at most 1.6 times as long, added views
 #: are a part of the training views, and some more where an encode does much besides looking at views, as on GPUs.
 _SHARE = 0.45
-_BESIDES, _BESIDES_ON_CPU = 60, 4
+_BESIDES, _BESIDES_ON_CPU = 45, 4
 
 
 def needed(shown_by: float, views: int, slow: bool) -> float:

@@ -63,14 +63,17 @@ class Adam(Owner):
         scene: where the parameters begin.
         buffers: of a rasterizer that has this scene; each step writes the new parameters there.
         columns: which parameter is in which column.
+        rates: of a step.
         limits: of the parameters.
 
     Raises:
         DeviceError: it does not fit the device, or the kernels cannot be built.
     """
 
-    def __init__(self, device: Device, scene: Scene, buffers: SceneBuffers, columns: Columns, limits: Limits) -> None:
-        self._device, self._scene, self._buffers, self._columns, self._limits = device, scene, buffers, columns, limits
+    def __init__(
+        self, device: Device, scene: Scene, buffers: SceneBuffers, columns: Columns, rates: Rates, limits: Limits
+    ) -> None:
+        self._device, self._scene, self._buffers, self._columns = device, scene, buffers, columns
         self._start = _columns_of(scene, columns, buffers.stride)
         self._taken = 0
         self._memory = Memory(device)
@@ -81,28 +84,22 @@ class Adam(Owner):
             self._moments = [self._memory.allocate(nbytes, "the gradient's moments") for _ in range(2)]
             for moment in self._moments:
                 cl.enqueue_fill_buffer(device.queue, moment, np.float32(0), 0, nbytes)
-            self._steps = self._memory.allocate(16 * columns.count, "the steps")
+            self._steps = self._memory.upload(_steps(columns, rates, limits), "the steps")
             self._step = device.shared_kernel("fit/adam.cl", "adam")
             self._activate = device.shared_kernel("fit/adam.cl", "activate")
         except BaseException:
             self.close()
             raise
 
-    def step(self, gradient: cl.Buffer, rates: Rates) -> None:
+    def step(self, gradient: cl.Buffer, part: float) -> None:
         """Take a step, and give the rasterizer its scene.
 
         Args:
             gradient: (columns, stride) float32; becomes 0.
-            rates: of this step.
+            part: of the rates that this step is long.
         """
         self._taken += 1
         buffers, columns = self._buffers, self._columns
-        steps = np.zeros((columns.count, 4), np.float32)
-        steps[:, 0] = rates.of_columns(columns)
-        steps[:, 1], steps[:, 2] = -1e30, 1e30
-        steps[columns.log_scales, 1:3] = self._limits.log_scales
-        steps[columns.opacity_logits, 1:3] = self._limits.opacity_logits
-        cl.enqueue_copy(self._device.queue, self._steps, steps, is_blocking=True)
         self._step.bind(
             parameters=self._parameters,
             gradient=gradient,
@@ -111,6 +108,7 @@ class Adam(Owner):
             splats=buffers.splats,
             stride=buffers.stride,
             steps=self._steps,
+            part=part,
             decay_mean=_DECAY_MEAN,
             decay_square=_DECAY_SQUARE,
             debias_mean=1 / (1 - _DECAY_MEAN**self._taken),
@@ -159,6 +157,16 @@ class Adam(Owner):
     def close(self) -> None:
         """Give all device memory back."""
         self._memory.close()
+
+
+def _steps(columns: Columns, rates: Rates, limits: Limits) -> FloatArray:
+    """(columns, 4) as cl/fit/adam.cl takes them."""
+    steps = np.zeros((columns.count, 4), np.float32)
+    steps[:, 0] = rates.of_columns(columns)
+    steps[:, 1], steps[:, 2] = -1e30, 1e30
+    steps[columns.log_scales, 1:3] = limits.log_scales
+    steps[columns.opacity_logits, 1:3] = limits.opacity_logits
+    return steps
 
 
 def _columns_of(scene: Scene, columns: Columns, stride: int) -> FloatArray:

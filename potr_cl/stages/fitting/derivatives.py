@@ -93,6 +93,7 @@ class PictureDerivatives(Owner):
         self._totals = Scratch(device, "the derivatives' sums")
         self._errors = Scratch(device, "the tiles' errors")
         self._factors = Scratch(device, "the views' weights")
+        self._written: list[float] | None = None
         self._views: ViewSet | None = None
         self.rasterizer = Rasterizer(device, scene, rules, background)
         try:
@@ -159,7 +160,8 @@ class PictureDerivatives(Owner):
             # They become zero again whenever they have been used.
             cl.enqueue_fill_buffer(self._device.queue, self._totals.buffer, np.uint32(0), 0, self._totals.nbytes)
         self._errors.reserve(4 * views.tiles)
-        self._factors.reserve(4 * len(views.views))
+        if self._factors.reserve(4 * len(views.views)):
+            self._written = None
 
     def _enqueue(
         self, views: ViewSet, cameras: Sequence[Camera], target: cl.Buffer, first: int, given: bool, unit: float
@@ -167,7 +169,9 @@ class PictureDerivatives(Owner):
         queue = self._device.queue
         scale = fixed_point_scale(max(c.width for c in cameras), max(c.height for c in cameras))
         factors = [REFERENCE_PIXELS / (c.width * c.height) / (scale * (1.0 if given else unit)) for c in cameras]
-        cl.enqueue_copy(queue, self._factors.buffer, np.array(factors, np.float32), is_blocking=True)
+        if factors != self._written:  # whoever writes waits for the device
+            cl.enqueue_copy(queue, self._factors.buffer, np.array(factors, np.float32), is_blocking=True)
+            self._written = factors
         self._launcher.sweep(
             views,
             self.rasterizer.background,

@@ -10,6 +10,7 @@ The targets are pictures of the uncompressed scene, so any number of views betwe
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import math
 from collections.abc import Callable, Sequence
@@ -179,9 +180,10 @@ def fit_scene(
     ):
         rasterizer = derivatives.rasterizer
         judges = _Judges(rasterizer, [cameras[number] for number in held_out], [pictures.download(n) for n in held_out])
-        with Adam(device, scene, rasterizer.parameters, derivatives.columns, _limits(scene)) as adam:
+        rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
+        with Adam(device, scene, rasterizer.parameters, derivatives.columns, rates, _limits(scene)) as adam:
             fit = _Fit(options, derivatives, adam, pictures, judges, cameras)
-            return fit.run(fit_to, _usual_size(scene), progress, tell or logger.debug)
+            return fit.run(fit_to, progress, tell or logger.debug)
 
 
 class _Judges:
@@ -223,19 +225,18 @@ class _Fit:
         self._options, self._derivatives, self._adam = options, derivatives, adam
         self._pictures, self._judges, self._cameras = pictures, judges, cameras
 
-    def run(
-        self, fit_to: Sequence[int], size: float, progress: FitProgress | None, tell: Callable[[str], None]
-    ) -> Fitted:
+    def run(self, fit_to: Sequence[int], progress: FitProgress | None, tell: Callable[[str], None]) -> Fitted:
         options = self._options
         errors = [self._judges.error()]
         pace = min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
+        slowing = options.last ** (1 / max(options.steps - 1, 1))
         kept = done = since = 0
         order = batches(fit_to, options.batch, options.seed)
         for round_number in range(1, options.rounds + 1):
             end = options.steps * round_number // options.rounds
             unit = _unit(errors[-1])
             while done < end:
-                self._step(next(order), unit, self._rates(done, pace, size))
+                self._step(next(order), unit, pace * slowing**done)
                 done += 1
                 if progress is not None:
                     progress(done, options.steps)
@@ -251,22 +252,10 @@ class _Fit:
                 break
         return Fitted(self._adam.kept(), done, kept, tuple(errors), len(self._judges))
 
-    def _step(self, numbers: Sequence[int], unit: float, rates: Rates) -> None:
+    def _step(self, numbers: Sequence[int], unit: float, part: float) -> None:
         cameras = [self._cameras[number] for number in numbers]
         self._derivatives.add(cameras, self._pictures.of(numbers), unit=unit)
-        self._adam.step(self._derivatives.gradient, rates)
-
-    def _rates(self, done: int, pace: float, size: float) -> Rates:
-        rates = self._options.rates
-        left = pace * self._options.last ** (done / max(self._options.steps - 1, 1))
-        return Rates(
-            means=left * rates.means * size,
-            log_scales=left * rates.log_scales,
-            quaternions=left * rates.quaternions,
-            opacity_logits=left * rates.opacity_logits,
-            dc=left * rates.dc,
-            ac=left * rates.ac,
-        )
+        self._adam.step(self._derivatives.gradient, part)
 
 
 def _decibels(error: float) -> float:

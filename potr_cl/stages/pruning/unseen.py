@@ -58,8 +58,11 @@ class Split:
 
 
 def find_unseen(state: State) -> tuple[NDArray[np.bool_], float]:
-    """Which splats of a state no training view sees, and their part of the opacity-weighted area."""
-    unseen = unseen_splats(state.scene, state.views)
+    """Which splats of a state no given training view sees, and their part of the opacity-weighted area.
+
+    Added views do not count: the one that happens to see a splat, perhaps from afar, cannot say what it is worth.
+    """
+    unseen = unseen_splats(state.scene, state.views[: len(state.views) - state.added])
     if not unseen.any():  # as usual
         return unseen, 0.0
     areas = opacity_weighted_areas(state.scene)

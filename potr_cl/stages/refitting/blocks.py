@@ -52,6 +52,13 @@ class SplatBlocks(Owner):
         blocks[:, rows, columns] = blocks[:, columns, rows] = packed[:, : layout.splats].T
         return blocks
 
+    def packed(self) -> FloatArray:
+        """(M (M + 1) / 2, N) float32, the upper triangles row by row."""
+        layout = self._coefficients.layout
+        return self._coefficients.device.download(self.buffer, (self._triangle, layout.stride), np.float32)[
+            :, : layout.splats
+        ]
+
     def diagonals(self) -> FloatArray:
         """(N, M) float32, what stands on the blocks' diagonals."""
         layout = self._coefficients.layout

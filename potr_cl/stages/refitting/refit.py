@@ -100,7 +100,7 @@ def refit_colours(
     active: NDArray[np.bool_] | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: Callable[[int, int], None] | None = None,
-    fix_ac: Callable[[FloatArray, FloatArray], FloatArray] | None = None,
+    fix_ac: Callable[[FloatArray, ColourRefit], FloatArray] | None = None,
 ) -> Refitted:
     """Re-fit a scene's colours to pictures of all views together.
 
@@ -114,8 +114,8 @@ def refit_colours(
         background: R, G, B behind the scene.
         progress: called with the steps done and their greatest number.
         fix_ac: chooses the AC coefficients that a file can hold, from the solution (N, M, 3) R, G, B, which it must not
-            change, and :meth:`ColourRefit.worth`. The constant ones are then solved for again. If it returns the
-            solution itself, that stays as it is.
+            change, and from what the re-fit knows of them (:meth:`ColourRefit.worth`). The constant ones are then
+            solved for again. If it returns the solution itself, that stays as it is.
 
     Raises:
         UsageError: no camera.
@@ -130,13 +130,13 @@ def refit_colours(
 
     with ColourRefit(device, scene, cameras, background=background, memory=options.memory) as refit:
         found = refit.solve(scene.sh, targets, options, active, progress=report)
-        fixed = found.sh if fix_ac is None else fix_ac(found.sh, refit.worth())
+        fixed = found.sh if fix_ac is None else fix_ac(found.sh, refit)
         if fixed is found.sh:
             return found
         constant = np.zeros(fixed.shape, bool)
         constant[:, 0] = True
         few = replace(options, drop=0.0, steps=_CONSTANT_STEPS)
-        again = refit.solve(fixed, targets, few, constant, hold=True)
+        again = refit.solve(fixed, targets, few, constant, hold=True, again=True)
         again.sh[:, 1:] = fixed[:, 1:]  # they were rounded once more on their way through Y, Co, Cg
         return Refitted(again.sh, (found.errors[0], again.errors[1]), found.steps + again.steps)
 
@@ -191,6 +191,7 @@ class ColourRefit(Owner):
         active: NDArray[np.bool_] | None = None,
         hold: bool = False,
         progress: Callable[[int, int], None] | None = None,
+        again: bool = False,
     ) -> Refitted:
         """Re-fit the active coefficients, after choosing among them if the options say so.
 
@@ -201,6 +202,7 @@ class ColourRefit(Owner):
             active: (N, M, 3) in Y, Co, Cg: the coefficients that may change; all by default.
             hold: whether the other coefficients keep their values; if not, they become 0.
             progress: called with the steps done and their greatest number.
+            again: whether the solution before was for nearly the same colours: it saves some work.
 
         Raises:
             DeviceError: the device failed.
@@ -219,7 +221,7 @@ class ColourRefit(Owner):
             if progress is not None:
                 progress(steps, total)
 
-        solved = solver.solve(self.colour_map, targets, descent, selection, after_step)
+        solved = solver.solve(self.colour_map, targets, descent, selection, after_step, again)
         return Refitted(coefficients.read_sh(solver.x), solved.errors, solved.steps)
 
     def worth(self) -> FloatArray:
@@ -227,7 +229,11 @@ class ColourRefit(Owner):
 
         As the last solution has found it at its start; errors of different coefficients are taken as independent.
         """
-        return self._solver.curvatures() / np.float32(self.colour_map.total_weight)
+        return self._solver.blocks.diagonals() / np.float32(self.colour_map.total_weight)
+
+    def blocks(self) -> FloatArray:
+        """(M (M + 1) / 2, N) float32: the same for errors of a splat's coefficients together, upper triangles."""
+        return self._solver.blocks.packed() / np.float32(self.colour_map.total_weight)
 
     def active(self) -> NDArray[np.bool_]:
         """(N, M, 3) in Y, Co, Cg: the coefficients that the last solution left active."""

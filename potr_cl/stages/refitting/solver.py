@@ -19,7 +19,6 @@ from dataclasses import dataclass, replace
 import numpy as np
 import pyopencl as cl
 
-from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Owner
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients, Ridge
@@ -115,6 +114,7 @@ class ColourSolver(Owner):
 
     Attributes:
         x: the coefficients: set them to the start before :meth:`solve`, which leaves the solution in them.
+        blocks: the splats' own blocks, as they were at the last start.
 
     Raises:
         DeviceError: the device has no room, or the kernels cannot be built.
@@ -124,7 +124,7 @@ class ColourSolver(Owner):
         self._coefficients = coefficients
         self.x, self._start, self._residual = (coefficients.vector() for _ in range(3))
         self._gradients = ConjugateGradients(coefficients)
-        self._blocks = SplatBlocks(coefficients)
+        self.blocks = SplatBlocks(coefficients)
 
     def solve(
         self,
@@ -133,6 +133,7 @@ class ColourSolver(Owner):
         descent: Descent,
         selection: Selection | None = None,
         after_step: Callable[[int], None] = lambda steps: None,
+        known: bool = False,
     ) -> Solved:
         """Solve for the active coefficients, after choosing among them if there is to be a choice.
 
@@ -142,14 +143,18 @@ class ColourSolver(Owner):
             descent: to the solution.
             selection: what comes first.
             after_step: called with the number of steps done.
+            known: whether the splats' blocks are taken from the solution before, of nearly the same colours: they are
+                only what the steps are preconditioned with.
 
         Raises:
             DeviceError: the device failed.
         """
         problem = _Problem(colour_map, targets)
-        self._blocks.zero()
+        if not known:
+            self.blocks.zero()
         self._coefficients.copy(self._start, self.x)
-        first = self._linearise(problem, (selection.descent if selection else descent).ridge, self._blocks)
+        ridge = (selection.descent if selection else descent).ridge
+        first = self._linearise(problem, ridge, None if known else self.blocks)
         state, steps = first, 0
         if selection is not None:
             state, steps = self._choose(problem, first, selection, descent.ridge, after_step)
@@ -179,7 +184,7 @@ class ColourSolver(Owner):
 
     def _descend(self, problem: _Problem, state: _State, how: Descent, after_step: Callable[[int], None]) -> int:
         """Take conjugate-gradient steps from where x was linearised; returns their number."""
-        equations = _NormalEquations(problem.colour_map, self._coefficients, self._blocks, how.ridge, at=self._start)
+        equations = _NormalEquations(problem.colour_map, self._coefficients, self.blocks, how.ridge, at=self._start)
         return self._gradients.descend(
             equations, self.x, self._residual, state.objective, how.steps, how.gain, after_step
         )
@@ -227,16 +232,12 @@ class ColourSolver(Owner):
         return state, steps
 
     def _give_up(self, least: float, ridge: Ridge) -> None:
-        self._blocks.give_up(self.x, ridge.prior, least)
+        self.blocks.give_up(self.x, ridge.prior, least)
 
     def _start_here(self, problem: _Problem, ridge: Ridge) -> _State:
         self._coefficients.copy(self._start, self.x)
         return self._linearise(problem, ridge)
 
-    def curvatures(self) -> FloatArray:
-        """(N, M) float32: squared error by W for an error of 1 in a coefficient of one channel, at the last start."""
-        return self._blocks.diagonals()
-
     def close(self) -> None:
         """Give the blocks' memory back."""
-        self._blocks.close()
+        self.blocks.close()

@@ -6,6 +6,7 @@ The layout is that of docs/format.md and is written out here anew, so that a mis
 from __future__ import annotations
 
 import dataclasses
+import itertools
 import struct
 import zlib
 from functools import cache
@@ -16,35 +17,55 @@ import numpy as np
 import zstandard
 
 from potr_cl.codec import encoder
-from potr_cl.codec.quantize import Preset
-from potr_cl.pipeline.encode import encode
-from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.codec.container import EntropyCoder
+from potr_cl.codec.encoder import code_scene
+from potr_cl.codec.geometry import quantise_geometry
+from potr_cl.codec.quantize import HyperParameters, Preset
+from potr_cl.codec.steps.fitting import fit_steps
+from potr_cl.codec.steps.rule import ColourSteps
+from potr_cl.model.scene import Scene
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from tools.stress.hostile.changes import damaged, damaged_json, interesting, interesting_double
 
 _HEADER = struct.Struct("<8sHHIQQBBHI8d8s8s")
 _ENTRY = struct.Struct("<BBBBIQQ")
 _CRC = struct.Struct("<I")
-_RAW, _ZSTD, _DEFLATE, _CONTEXT = range(4)
-_METADATA, _OCCUPANCY, _SEVERAL, _MULTIPLICITY, _TAIL_LENGTH, _TAIL = range(6)
+_RAW, _ZSTD, _DEFLATE, _CONTEXT, _BUNDLES = range(5)
+_METADATA, _OCCUPANCY, _SEVERAL, _MULTIPLICITY, _TAIL_LENGTH, _TAIL, _STEPS = range(7)
+_SCALE, _ROTATION, _OPACITY, _SH = range(16, 20)
 _FIRST_PER_SPLAT = 16
 _HEAD = struct.Struct("<II")
-#: Entropy, splats, SH degree and preset of the files that are changed: all coders, both versions, and few splats, for a
-#: file should take no more than a millisecond.
-_ORIGINALS: list[tuple[str, int, int, Preset]] = [
-    ("zstd", 7, 3, "paper"),
-    ("npz", 24, 1, "paper"),
-    ("zstd", 30, 0, "paper"),
-    ("npz", 1, 0, "paper"),
-    ("npz", 5, 1, "best"),
-    ("zstd", 9, 0, "best"),
-    ("context", 1, 0, "best"),
-    ("context", 12, 1, "best"),
-    ("context", 5, 3, "best"),
-    ("context", 300, 0, "best"),
+#: Entropy, splats, SH degree, preset and version of the files that are changed: all coders and versions; few splats, as
+#: a file should take no more than a millisecond.
+_ORIGINALS: list[tuple[str, int, int, Preset, int]] = [
+    ("zstd", 7, 3, "paper", 1),
+    ("npz", 24, 1, "paper", 1),
+    ("zstd", 30, 0, "paper", 1),
+    ("npz", 1, 0, "paper", 1),
+    ("npz", 5, 1, "best", 2),
+    ("zstd", 9, 0, "best", 2),
+    ("context", 1, 0, "best", 2),
+    ("context", 12, 1, "best", 2),
+    ("context", 5, 3, "best", 2),
+    ("context", 300, 0, "best", 2),
+    ("zstd", 9, 1, "best", 3),
+    ("context", 1, 0, "best", 3),
+    ("context", 12, 1, "best", 3),
+    ("context", 20, 3, "best", 3),
+    ("context", 300, 0, "best", 3),
 ]
 #: Of these: the one of most work least.
-_HOW_OFTEN = (2, 4, 4, 2, 4, 4, 4, 8, 4, 1)
+_HOW_OFTEN = (2, 4, 4, 2, 4, 4, 4, 8, 4, 1, 4, 4, 12, 8, 2)
+#: Numbers that tell contexts before the models in a description of coder 4.
+_NUMBERS = {
+    (_OPACITY, 0): 2,
+    (_SCALE, 0): 9,
+    (_ROTATION, 0): 27,
+    (_SH, 0): 24,
+    (_SH, 3): 13 + 7 + 8 + 9 + 10 + 4 * 3,
+    (_SH, 12): 13 + 7 + 8 + 9 + 10 + 4 * 5,
+    (_SH, 27): 13 + 7 + 8 + 9 + 10 + 4 * 7,
+}
 
 
 @dataclasses.dataclass
@@ -108,21 +129,33 @@ class File:
 def originals() -> list[bytes]:
     """Good files, some hundred bytes each, with and without splats in one place."""
     files = []
-    # The encoder takes the context coder where it pays, which is not in files as small as these.
+    # The encoder takes coders of streams where they pay, which is not in files as small as these.
     with patch.object(encoder, "_FEW", 0):
-        for number, (entropy, splats, degree, preset) in enumerate(_ORIGINALS):
+        for number, (entropy, splats, degree, preset, version) in enumerate(_ORIGINALS):
             scene = random_scene(splats, degree, seed=number)
-            if number in (1, 4, 7):  # splats in the same place
+            if number in (1, 4, 7, 12):  # splats in the same place
                 scene = scene.subset(np.r_[np.arange(splats), np.arange(splats // 3), [3, 3]])
-            options = EncodeOptions(preset=preset).changed(
-                prune=False, compact=False, refit=False, code={"entropy": entropy}
-            )
-            cameras = ring_of_cameras(2) if number == 0 else None
-            files.append(b"".join(encode(scene, cameras, options).pieces))
+            files.append(file_of(scene, entropy, HyperParameters.from_quality(0.5, preset), version))
             coders = {section.coder for section in File.of(files[-1]).sections if section.prop >= _FIRST_PER_SPLAT}
-            if (entropy == "context") != (coders == {_CONTEXT}):
+            if (entropy == "context") != (coders == {_CONTEXT if version == 2 else _BUNDLES}):
                 raise RuntimeError(f"the encoder takes other coders than {entropy} for what is to be changed")
     return files
+
+
+def file_of(scene: Scene, entropy: str, parameters: HyperParameters, version: int) -> bytes:
+    """A scene as it is in a file of a version, if that has them with steps of colours."""
+    parameters = dataclasses.replace(parameters, version=version)
+    views = ring_of_cameras(2)
+    geometry = quantise_geometry(scene, parameters, views)
+    if version == 3:
+        effects = np.exp(np.random.default_rng(1).normal(size=len(scene)))
+        steps = fit_steps(geometry.scales, geometry.opacities, geometry.parameters.sf_opacity, effects)
+        groups = np.arange(-(-len(scene) >> 2)).astype(np.int8) % 7 - 3
+        few = ColourSteps(2, 3, 1, (8, 5), (20, -900), (188, -86, 55), tuple(range(-160, 180, 20)), groups)
+        geometry = dataclasses.replace(geometry, steps=steps or few)
+    metadata = b'{"encoder": "potr_cl", "preset": "best", "quality": 0.5}'
+    coder = EntropyCoder(entropy, 3)
+    return b"".join(code_scene(scene, parameters, views, metadata, coder, 1, geometry=geometry).pieces)
 
 
 def sealed(data: bytes) -> bytes:
@@ -157,7 +190,7 @@ def changed(rng: Random) -> bytes:
 def _header(file: File, rng: Random) -> None:
     kind = rng.randrange(9)
     if kind == 0:
-        file.version = rng.choice((0, 1, 2, 3, interesting(rng, 2)))
+        file.version = rng.choice((0, 1, 2, 3, 4, interesting(rng, 2)))
     elif kind == 1:
         file.splats = rng.choice((interesting(rng, 8), interesting(rng, 2), file.splats + 1, file.splats - 1))
     elif kind == 2:
@@ -179,11 +212,11 @@ def _table(file: File, rng: Random) -> None:
     section = rng.choice(file.sections)
     kind = rng.randrange(7)
     if kind == 0:
-        section.prop = rng.choice((*range(6), *range(16, 20), interesting(rng, 1)))
+        section.prop = rng.choice((*range(7), *range(16, 20), interesting(rng, 1)))
     elif kind == 1:
         section.index = rng.choice((0, 1, 2, 3, 12, 27, 47, 48, interesting(rng, 1)))
     elif kind == 2:
-        section.coder = rng.choice((0, 1, 2, 3, 4, 255))
+        section.coder = rng.choice((0, 1, 2, 3, 4, 5, 255))
     elif kind == 3:
         section.number = rng.choice((0, 1, 2, 3, 8, 9, 15, 21, interesting(rng, 1)))
     elif kind == 4:
@@ -222,9 +255,9 @@ def _claim(file: File, rng: Random) -> None:
 
 def _behind_the_coder(file: File, rng: Random) -> None:
     """Other integers in a stream, coded anew."""
-    plain = [section for section in file.sections if section.coder != _CONTEXT]
+    plain = [section for section in file.sections if section.coder < _CONTEXT]
     if not plain:
-        _in_the_context_coder(file, rng)
+        _in_a_coder_of_streams(file, rng)
         return
     section = rng.choice(plain)
     raw = _decoded(section)
@@ -238,7 +271,7 @@ def _behind_the_coder(file: File, rng: Random) -> None:
     elif section.prop == _MULTIPLICITY and rng.random() < 0.5:
         section.number = rng.randrange(1, 9)
         raw = b"".join(rng.choice((b"\0", b"\1", b"\2", b"\3", b"\xff")) for _ in range(section.number * 2))
-    elif section.prop in (_OCCUPANCY, _SEVERAL, _TAIL_LENGTH, _TAIL) and raw and rng.random() < 0.5:
+    elif section.prop in (_OCCUPANCY, _SEVERAL, _TAIL_LENGTH, _TAIL, _STEPS) and raw and rng.random() < 0.5:
         values = bytearray(raw)
         for _ in range(1 + rng.randrange(3)):
             values[rng.randrange(len(values))] = rng.choice((0, 1, 2, 3, 52, 53, 128, 255, rng.randrange(256)))
@@ -282,6 +315,49 @@ def _coded(raw: bytes, coder: int, rng: Random) -> bytes:
     return stored if rng.random() < 0.9 else damaged(stored, rng)
 
 
+def _in_a_coder_of_streams(file: File, rng: Random) -> None:
+    if any(section.coder == _BUNDLES for section in file.sections):
+        _in_bundles(file, rng)
+    else:
+        _in_the_context_coder(file, rng)
+
+
+def _in_bundles(file: File, rng: Random) -> None:
+    """Description, states, counts or words of a section of coder 4."""
+    section = rng.choice([section for section in file.sections if section.coder == _BUNDLES])
+    if len(section.stored) <= 4:
+        return
+    (described,) = struct.unpack_from("<I", section.stored)
+    start, bundles = 4 + described, min(-(-file.splats // 8192), 100)
+    lanes = min(-(-file.splats // 256), 8192) if section.prop in (_OPACITY, _ROTATION) else 0
+    ends = [4, start, start + 4 * lanes, start + 4 * (lanes + bundles), len(section.stored)]
+    parts = [section.stored[a:b] for a, b in itertools.pairwise(ends)]
+    kind = rng.randrange(7)
+    if kind <= 1:
+        parts[0] = _changed_description(parts[0], 2 * _NUMBERS.get((section.prop, section.index), 2), rng)
+    elif kind == 2 and lanes:
+        which = 4 * rng.randrange(lanes)
+        state = rng.choice((0, 1, 65535, 65536, 65537, 2**32 - 1, rng.randrange(2**32)))
+        parts[1] = parts[1][:which] + struct.pack("<I", state) + parts[1][which + 4 :]
+    elif kind == 3:  # words that are one more or one less, and are counted
+        parts[3] = parts[3][:-2] if rng.random() < 0.5 else parts[3] + rng.randbytes(2)
+        parts[2] = struct.pack("<I", len(parts[3]) // 2) + parts[2][4:]
+    elif kind == 4:
+        parts[2] = damaged(parts[2], rng)
+    elif parts[3]:
+        parts[3] = damaged(parts[3], rng) if rng.random() < 0.3 else _flipped(parts[3], rng)
+    head = struct.pack("<I", len(parts[0]) if rng.random() < 0.95 else interesting(rng, 4))
+    section.stored = head + b"".join(parts)
+
+
+def _flipped(data: bytes, rng: Random) -> bytes:
+    """Of the same length."""
+    changed_bytes = bytearray(data)
+    for _ in range(1 + rng.randrange(3)):
+        changed_bytes[rng.randrange(len(data))] = rng.randrange(256)
+    return bytes(changed_bytes)
+
+
 def _in_the_context_coder(file: File, rng: Random) -> None:
     """Description, extra bits, states or words of a section of the context coder."""
     coded = [section for section in file.sections if section.coder == _CONTEXT and len(section.stored) > _HEAD.size]
@@ -300,7 +376,7 @@ def _in_the_context_coder(file: File, rng: Random) -> None:
     ]
     kind = rng.randrange(6)
     if kind <= 1:
-        parts[0] = _changed_description(parts[0], section.number, rng)
+        parts[0] = _changed_description(parts[0], 14 * section.number, rng)
     elif kind <= 4:
         part = parts[kind - 1]
         if kind == 3 and rng.random() < 0.5 and lanes < 100:
@@ -316,16 +392,15 @@ def _in_the_context_coder(file: File, rng: Random) -> None:
 
 
 def _behind_the_coder_again(file: File, rng: Random) -> None:
-    if any(section.coder != _CONTEXT for section in file.sections):
+    if any(section.coder < _CONTEXT for section in file.sections):
         _behind_the_coder(file, rng)
 
 
-def _changed_description(stored: bytes, streams: int, rng: Random) -> bytes:
+def _changed_description(stored: bytes, weights: int, rng: Random) -> bytes:
     try:
         raw = bytearray(zstandard.ZstdDecompressor().decompress(stored, max_output_size=1 << 20))
     except zstandard.ZstdError:
         return damaged(stored, rng)
-    weights = 14 * streams
     kind = rng.randrange(5)
     if kind == 0 and len(raw) >= weights > 0:
         at = 2 * rng.randrange(weights // 2)
@@ -355,5 +430,5 @@ def _changed_description(stored: bytes, streams: int, rng: Random) -> bytes:
 _CHANGES = (
     _header, _header, _table, _table, _order, _claim,
     _behind_the_coder, _behind_the_coder, _behind_the_coder,
-    _in_the_context_coder, _in_the_context_coder, _in_the_context_coder,
+    _in_a_coder_of_streams, _in_a_coder_of_streams, _in_a_coder_of_streams, _in_a_coder_of_streams,
 )  # fmt: skip

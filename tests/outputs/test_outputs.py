@@ -1,0 +1,263 @@
+"""What an encode ends in: every kind of file is what its reader sees, and the colours are fitted on that."""
+
+from __future__ import annotations
+
+import dataclasses
+import logging
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import potr_cl
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.errors import UsageError
+from potr_cl.formats import load_scene
+from potr_cl.model.camera import test_views as held_out
+from potr_cl.model.camera import train_views
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.outputs.output import Output, Request, RoundedScene
+from potr_cl.outputs.registry import OUTPUTS, output_of, output_of_suffix
+from potr_cl.outputs.spz import Spz
+from potr_cl.pipeline.encode import Encoded
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.quality.compare import compare, mean_view
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.reference.scenes import random_scene
+from tests.cases.scenes import antialiased
+
+EVERY = [*(kind() for kind in OUTPUTS), Spz(version=3), Spz(version=4)]
+OTHERS = EVERY[1:]
+
+
+def name(output: Output) -> str:
+    return output.suffix + str(getattr(output, "version", ""))
+
+
+@pytest.fixture(scope="module")
+def device():
+    device = Device()
+    yield device
+    assert device.allocated == 0, "an encode did not give all its memory back"
+
+
+def encoded_to(output: Output, scene: Scene, cameras, device: Device, **changes) -> Encoded:
+    return potr_cl.encode(scene, cameras, EncodeOptions(output=output).changed(**changes), device=device)
+
+
+def psnr(device: Device, scene: Scene, other: Scene, cameras) -> float:
+    with Rasterizer(device, scene) as a, Rasterizer(device, other) as b:
+        return mean_view(compare(a, b, held_out(cameras)).views).figures["b_against_a"].psnr
+
+
+def seen_in_file(encoded: Encoded, folder: Path) -> Scene:
+    """What the format's own reader makes of the file, which need not be what the output says that it holds."""
+    path = folder / f"file{encoded.options.output.suffix}"
+    encoded.save(path)
+    if path.suffixes[-2:] == [".compressed", ".ply"]:
+        pytest.importorskip("gsply", reason="the extra convert is not installed")
+    return load_scene(path)
+
+
+@pytest.mark.parametrize("output", EVERY, ids=name)
+def test_the_file_is_what_its_reader_sees(output, plush_excerpt, plush_excerpt_cameras, device, tmp_path):
+    encoded = encoded_to(output, plush_excerpt, plush_excerpt_cameras, device)
+    seen = seen_in_file(encoded, tmp_path)
+    assert len(seen) == len(encoded.order) < len(plush_excerpt)
+    # Splat by splat those of the source that are said to be there.
+    near = plush_excerpt.subset(encoded.order)
+    size = np.exp(np.median(near.log_scales.max(axis=1)))
+    assert np.abs(seen.means - near.means).max() < size
+    assert np.corrcoef(seen.opacities, near.opacities)[0, 1] > 0.99
+    for field in ("means", "log_scales", "opacities", "sh"):
+        assert np.allclose(getattr(encoded.scene, field), getattr(seen, field), rtol=1e-5, atol=2e-5), field
+    assert psnr(device, plush_excerpt, seen, plush_excerpt_cameras) > 49
+
+
+@pytest.mark.parametrize("output", OTHERS, ids=name)
+@pytest.mark.parametrize("degree", [0, 3])
+def test_geometry_is_rounded_as_the_file_holds_it(output, degree):
+    scene = random_scene(700, degree)
+    request = Request(HyperParameters.from_quality(0.5, "best"))
+    rounded = output.geometry(scene, request)
+    coded = output.file(scene, None, request)
+    assert np.array_equal(coded.order, rounded.order)
+    assert sorted(coded.order) == list(range(700))
+    seen, told = output.read(b"".join(coded.pieces)), rounded.decoded(scene.sh).subset(rounded.order)
+    for field in ("means", "log_scales", "opacities"):
+        assert np.allclose(getattr(seen, field), getattr(told, field), rtol=1e-5, atol=2e-5), field
+    same_turn = np.abs((seen.quaternions * told.quaternions).sum(axis=1))
+    lengths = np.linalg.norm(seen.quaternions, axis=1) * np.linalg.norm(told.quaternions, axis=1)
+    assert (same_turn / lengths).min() > 1 - 1e-5
+    assert seen.sh.shape == scene.sh.shape
+
+
+@pytest.mark.parametrize("output", OTHERS, ids=name)
+def test_fixed_coefficients_are_those_of_the_file(output):
+    scene = random_scene(700, 3)
+    request = Request(HyperParameters.from_quality(0.3, "best"))
+    rounded = output.geometry(scene, request)
+    worth = np.random.default_rng(1).lognormal(-20, 2, scene.sh.shape[:2]).astype(np.float32)
+    before = scene.sh.copy()
+    fixed, sh = output.fix_ac(rounded, scene.sh, worth, request)
+    assert np.array_equal(scene.sh, before), "the re-fit still needs what it has handed out"
+    coded = output.file(dataclasses.replace(scene, sh=sh), fixed, request)
+    seen = output.read(b"".join(coded.pieces)).sh
+    assert np.abs(seen[:, 1:] - sh[coded.order, 1 : seen.shape[1]]).max() < 1e-6
+    assert not sh[:, seen.shape[1] :].any()
+
+
+@pytest.mark.parametrize("output", OTHERS, ids=name)
+def test_bytes_do_not_depend_on_threads(output):
+    scene = random_scene(40_000, 2)
+    files = []
+    for threads in (1, 3):
+        request = Request(HyperParameters.from_quality(0.5, "best"), threads=threads)
+        worth = np.random.default_rng(1).lognormal(-20, 2, scene.sh.shape[:2]).astype(np.float32)
+        fixed, sh = output.fix_ac(output.geometry(scene, request), scene.sh, worth, request)
+        files.append(b"".join(output.file(dataclasses.replace(scene, sh=sh), fixed, request).pieces))
+    assert files[0] == files[1]
+
+
+def test_levels_of_spz_follow_what_errors_cost(plush_excerpt, plush_excerpt_cameras, device):
+    """With a re-fit, which knows what errors cost, files are smaller than with the nearest levels, and hardly worse."""
+    fitted, plain = (
+        encoded_to(Spz(), plush_excerpt, plush_excerpt_cameras, device, q=0.2, refit={"steps": steps})
+        for steps in (8, 0)
+    )
+    assert fitted.nbytes < 0.85 * plain.nbytes
+    figures = [psnr(device, plush_excerpt, each.scene, plush_excerpt_cameras) for each in (plain, fitted)]
+    assert figures[1] > figures[0] - 1
+
+
+def test_constant_colours_make_up_for_coarse_coefficients(plush_excerpt, plush_excerpt_cameras, device):
+    """Compressed PLY rounds AC coefficients to 1/32: without splats lost, that is nearly all that it loses."""
+    output = output_of(Path("a.compressed.ply"))
+    fitted = encoded_to(output, plush_excerpt, plush_excerpt_cameras, device, prune=False)
+    plain = encoded_to(output, plush_excerpt, plush_excerpt_cameras, device, prune=False, refit={"steps": 0})
+    assert plain.nbytes == fitted.nbytes
+    figures = [psnr(device, plush_excerpt, each.scene, plush_excerpt_cameras) for each in (plain, fitted)]
+    assert figures[1] > figures[0] + 1
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".compressed.ply"])
+def test_a_size_is_met(suffix, plush_excerpt, plush_excerpt_cameras, device):
+    goal = {".spz": 40_000, ".compressed.ply": 84_000}[suffix]
+    encoded = potr_cl.encode(plush_excerpt, plush_excerpt_cameras, to=suffix, max_size=goal, device=device)
+    assert 0.9 * goal < encoded.nbytes <= goal
+
+
+@pytest.mark.parametrize(("suffix", "least"), [(".spz", 48), (".compressed.ply", 62)])
+def test_a_psnr_is_met(suffix, least, plush_excerpt, plush_excerpt_cameras, device):
+    encoded = potr_cl.encode(plush_excerpt, plush_excerpt_cameras, to=suffix, min_psnr=least, device=device)
+    assert least <= psnr(device, plush_excerpt, encoded.scene, plush_excerpt_cameras) < least + 1.5
+
+
+def test_quality_decides_of_size(plush_excerpt, plush_excerpt_cameras, device):
+    for output in OTHERS:
+        sizes = [encoded_to(output, plush_excerpt, plush_excerpt_cameras, device, q=q).nbytes for q in (0.1, 0.5, 0.9)]
+        assert sizes[0] < sizes[1] < sizes[2], output
+
+
+def test_degrees_go_where_splats_are_worth_more(plush_excerpt, plush_excerpt_cameras, device):
+    output = output_of_suffix("glb")
+    low, high = (encoded_to(output, plush_excerpt, plush_excerpt_cameras, device, q=q).scene for q in (0.0, 0.6))
+    assert high.sh_degree == 3
+    rounded = RoundedScene(HyperParameters.from_quality(0.5, "best"), np.arange(len(high)), high)
+    request = Request(rounded.asked)
+    for each, degree in ((1e-30, 0), (1.0, 3)):
+        worth = np.full(high.sh.shape[:2], each, np.float32)
+        _, sh = output.fix_ac(rounded, high.sh, worth, request)
+        assert bool(sh[:, 1:].any()) == (degree > 0)
+    assert low.sh_degree <= 3
+
+
+def test_what_a_format_cannot_hold_is_said_once(plush_excerpt, plush_excerpt_cameras, device, caplog):
+    scene = antialiased(plush_excerpt)
+    with caplog.at_level(logging.WARNING, "potr_cl"):
+        potr_cl.encode(scene, plush_excerpt_cameras, to="glb", max_size=280_000, device=device)
+    said = [record.getMessage() for record in caplog.records if "cannot hold" in record.getMessage()]
+    assert len(said) == 1
+    assert "antialiased" in said[0]
+    assert "\n" not in said[0]
+
+
+@pytest.mark.parametrize("suffix", [".spz", ".compressed.ply", ".ply"])
+def test_antialiased_scenes_stay_so(suffix, plush_excerpt, plush_excerpt_cameras, device, tmp_path):
+    encoded = encoded_to(output_of_suffix(suffix), antialiased(plush_excerpt), plush_excerpt_cameras, device)
+    assert seen_in_file(encoded, tmp_path).antialiased
+
+
+def test_results_are_saved_in_their_own_format_and_others(plush_excerpt, tmp_path):
+    nothing = {"prune": False, "refit": False}
+    encoded = potr_cl.encode(plush_excerpt, output=tmp_path / "a.spz", **nothing)
+    assert (tmp_path / "a.spz").read_bytes() == encoded.data
+    potr_cl.save(encoded, tmp_path / "b.spz")
+    assert (tmp_path / "b.spz").read_bytes() == encoded.data
+    potr_cl.save(encoded, tmp_path / "c.ply")
+    assert len(load_scene(tmp_path / "c.ply")) == len(plush_excerpt)
+    again = potr_cl.encode(encoded, to="ply", **nothing)
+    potr_cl.save(again, tmp_path / "d.compressed.ply")
+    assert (tmp_path / "d.compressed.ply").read_bytes().find(b"packed_position") > 0
+
+
+def test_a_name_picks_the_longest_suffix():
+    assert output_of(Path("a.compressed.ply")).format.name == "compressed PLY"
+    assert output_of(Path("a.ply")).format.name == "3DGS PLY"
+    assert output_of(Path("A.SPZ"), version=4) == Spz(version=4)
+    for wrong, choices in (("a.xyz", {}), ("a", {}), ("a.ply", {"version": 2}), ("a.spz", {"version": 7})):
+        with pytest.raises(UsageError):
+            output_of(Path(wrong), **choices)
+
+
+def test_without_views_files_are_made_too(plush_excerpt, tmp_path):
+    for output in OTHERS:
+        encoded = potr_cl.encode(plush_excerpt, None, EncodeOptions(output=output), prune=False, refit=False)
+        assert len(encoded.scene) == len(plush_excerpt)
+
+
+def test_training_views_are_what_worth_is_about(plush_excerpt, plush_excerpt_cameras, device):
+    """An error in a coefficient that is worth much is worth that in pictures: the sum over one channel's error."""
+    from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions
+    from potr_cl.stages.refitting.targets import RenderedTargets
+
+    views = train_views(plush_excerpt_cameras)
+    with (
+        Rasterizer(device, plush_excerpt) as rasterizer,
+        ColourRefit(device, plush_excerpt, views) as refit,
+    ):
+        refit.solve(plush_excerpt.sh, RenderedTargets(rasterizer, views), RefitOptions(steps=1))
+        worth = refit.worth()
+        sh = plush_excerpt.sh.copy()
+        splat = int(worth[:, 0].argmax())
+        sh[splat, 2, 1] += 0.05
+        changed = dataclasses.replace(plush_excerpt, sh=sh)
+        with Rasterizer(device, changed) as other:
+            errors = [np.mean((rasterizer.render(v)[0] - other.render(v)[0]) ** 2) for v in views]
+    # The mean over three channels of which one has changed; colours that are cut at 0 change nothing.
+    assert np.mean(errors) == pytest.approx(worth[splat, 2] * 0.05**2, rel=0.1)
+
+
+def test_coefficients_make_up_for_each_other(plush_excerpt, plush_excerpt_cameras, device):
+    """Rounded in turn, the coefficients of a splat lose less than each for itself, and the file is no larger."""
+    from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions
+    from potr_cl.stages.refitting.targets import RenderedTargets
+
+    views, output = train_views(plush_excerpt_cameras), output_of(Path("a.compressed.ply"))
+    request = Request(HyperParameters.from_quality(0.5, "best"))
+    with (
+        Rasterizer(device, plush_excerpt) as rasterizer,
+        ColourRefit(device, plush_excerpt, views) as refit,
+    ):
+        refit.solve(plush_excerpt.sh, RenderedTargets(rasterizer, views), RefitOptions(steps=1))
+        worth, in_turn = refit.worth(), dataclasses.replace(request, blocks=refit.blocks)
+        alone, together = (
+            output.fix_ac(output.geometry(plush_excerpt, each), plush_excerpt.sh, worth, each)[1]
+            for each in (request, in_turn)
+        )
+    figures = [
+        psnr(device, plush_excerpt, dataclasses.replace(plush_excerpt, sh=sh), plush_excerpt_cameras)
+        for sh in (alone, together)
+    ]
+    assert figures[1] > figures[0] + 3

@@ -1,0 +1,236 @@
+"""Encodes straight to the formats that viewers open: bytes and loss, judged through our readers and through others'.
+
+    python -m tools.study.output_formats measure SCENE … --json OUT.json --keep DIR [--seconds S] [options]
+    python -m tools.study.output_formats judge SCENE … --json OUT.json --keep DIR [--transform COMMAND]
+    python -m tools.study.output_formats report OUT.json FORMATS.json [--json RESULTS.json]
+
+``measure`` prunes each scene once for each quality, and from there makes every output of :data:`PLAN`; a file of each
+is kept in DIR. It also writes the whole scene with convert's writers. It stops before a step that would begin after S
+seconds. ``judge`` has splat-transform (npm's @playcanvas/splat-transform) decode the kept files to PLY and judges
+those, on any machine. ``report`` prints Markdown: how many times smaller a file of the same PSNR is than the other
+writers' files of FORMATS.json, which tools.study.compare_formats has made; --json keeps the tables for docs/benchmarks.
+"""
+
+from __future__ import annotations
+
+import argparse
+import json
+import shlex
+import subprocess
+import sys
+import tempfile
+import time
+from pathlib import Path
+from typing import Any
+
+from potr_cl.formats import load_scene, save_scene
+from potr_cl.model.camera import train_views
+from potr_cl.opencl.device import Device
+from potr_cl.outputs.registry import output_of_suffix
+from potr_cl.pipeline.encode import Run, Stopwatch
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.stages.code import Code
+from potr_cl.stages.refit import Refit
+from potr_cl.stages.stage import State
+from tools.results import Column, Results, circumstances, write_json
+from tools.study.evaluation import EvaluatedScene
+from tools.study.rate_distortion import size_at
+
+#: The outputs of each quality, the most interesting first: a suffix, and a version behind a colon. Those of float32 are
+#: large, and of one quality only.
+PLAN: dict[float, tuple[str, ...]] = {
+    0.5: (".spz:2", ".sog", ".compressed.ply", ".spz:4", ".glb"),
+    0.3: (".spz:2", ".sog", ".compressed.ply"),
+    0.8: (".compressed.ply", ".spz:2", ".sog"),
+    0.1: (".spz:2", ".sog"),
+}
+#: Written whole, as convert does.
+CONVERTED = (".spz", ".compressed.ply", ".sog")
+#: What splat-transform reads.
+_READ_BY_OTHERS = (".spz", ".compressed.ply", ".sog")
+
+
+# ------------------------------------------------------------------------------------------- measurement
+
+
+def _measure(args: argparse.Namespace) -> None:
+    began = time.perf_counter()
+    device = Device(args.device)
+    results: dict[str, Any] = {"scenes": {}, **circumstances(device.info), "device": device.info.name}
+
+    def in_time() -> bool:
+        return bool(time.perf_counter() - began < args.seconds)
+
+    for q in PLAN:
+        for folder in args.scenes:
+            if not in_time():
+                break
+            with EvaluatedScene(folder, device) as evaluator:
+                entry = results["scenes"].setdefault(
+                    evaluator.name, {**evaluator.facts(), "encodes": [], "converts": []}
+                )
+                options = EncodeOptions(q=q)
+                watch = Stopwatch()
+                first = [type(stage) for stage in options.stages]
+                state = Run(options, watch, device).stages(
+                    State.of(evaluator.source, train_views(evaluator.cameras)), first[: first.index(Refit)]
+                )
+                for name in PLAN[q]:
+                    if in_time():
+                        entry["encodes"].append(_encoded(args, evaluator, state, q, name, dict(watch.seconds), device))
+                        write_json(args.json, results)
+    for folder in args.scenes:
+        with EvaluatedScene(folder, device) as evaluator:
+            for suffix in CONVERTED:
+                if in_time():
+                    results["scenes"][evaluator.name]["converts"].append(_converted(args, evaluator, suffix))
+                    write_json(args.json, results)
+
+
+def _encoded(
+    args: argparse.Namespace,
+    evaluator: EvaluatedScene,
+    state: State,
+    q: float,
+    name: str,
+    seconds: dict[str, float],
+    device: Device,
+) -> dict[str, Any]:
+    """One output of a pruned scene, judged through our own reader."""
+    suffix, _, version = name.partition(":")
+    output = output_of_suffix(suffix, version=int(version) if version else None)
+    watch = Stopwatch()
+    run = Run(EncodeOptions(q=q, output=output), watch, device)
+    encoded = run.finished(run.stages(state, [Refit, Code]))
+    kept = None
+    if suffix in _READ_BY_OTHERS:
+        path = args.keep / evaluator.name / f"{q:g}{'v' + version if version else ''}{suffix}"
+        path.parent.mkdir(parents=True, exist_ok=True)
+        encoded.save(path)
+        kept = str(path.relative_to(args.keep))
+    point = {
+        "format": name,
+        "q": q,
+        "bytes": encoded.nbytes,
+        "splats": len(encoded.order),
+        "properties": output.properties(encoded.data),
+        "seconds": {**seconds, **watch.seconds},
+        "file": kept,
+        **evaluator(encoded.scene),
+    }
+    print(f"{evaluator.name} {name} q {q:g}: {point['bytes']} bytes, {point['psnr']:.2f} dB", flush=True)
+    return point
+
+
+def _converted(args: argparse.Namespace, evaluator: EvaluatedScene, suffix: str) -> dict[str, Any]:
+    """The whole scene in a format, as convert writes it."""
+    path = args.keep / evaluator.name / f"whole{suffix}"
+    path.parent.mkdir(parents=True, exist_ok=True)
+    began = time.perf_counter()
+    save_scene(path, evaluator.source)
+    seconds = time.perf_counter() - began
+    point = {"format": suffix, "bytes": path.stat().st_size, "seconds": seconds, **evaluator(load_scene(path))}
+    path.unlink()  # nobody judges it again, and it is large
+    print(f"{evaluator.name} {suffix} whole: {point['bytes']} bytes, {point['psnr']:.2f} dB", flush=True)
+    return point
+
+
+def _judge(args: argparse.Namespace) -> None:
+    """Add to each kept file's point what it loses as splat-transform decodes it."""
+    results = json.loads(args.json.read_text())
+    device = Device(args.device)
+    command = shlex.split(args.transform)
+    for folder in args.scenes:
+        with EvaluatedScene(folder, device) as evaluator, tempfile.TemporaryDirectory() as temporary:
+            for point in results["scenes"][evaluator.name]["encodes"]:
+                if point["file"] is None or "other_reader" in point:
+                    continue
+                decoded = Path(temporary) / "decoded.ply"
+                made = subprocess.run(
+                    [*command, "-w", str(args.keep / point["file"]), str(decoded)], capture_output=True, text=True
+                )
+                if made.returncode:
+                    print(f"{point['file']}: refused: {made.stderr.strip()[-300:]}", file=sys.stderr)
+                    continue
+                point["other_reader"] = evaluator(load_scene(decoded))
+                write_json(args.json, results)
+                other = point["other_reader"]["psnr"]
+                print(f"{point['file']}: {point['psnr']:.3f} dB, {other:.3f} dB by splat-transform", flush=True)
+
+
+# ------------------------------------------------------------------------------------------------ report
+
+
+def _report(args: argparse.Namespace) -> None:
+    results, others = json.loads(args.results.read_text()), json.loads(args.formats.read_text())
+    tables = Results(None, args.json)
+    for name, entry in results["scenes"].items():
+        table = tables.table(
+            f"outputs_{name}",
+            f"Encodes straight to other formats: {name}, all test views",
+            Column("format"),
+            Column("q", format="g"),
+            Column("splats", format=","),
+            Column("size", "MB", ".2f"),
+            Column("PSNR", "dB", ".2f"),
+            Column("lost", "dB", ".2f"),
+            Column("PSNR by splat-transform", "dB", ".2f"),
+            Column("time after pruning", "s", ".1f"),
+        )
+        for point in sorted(entry["encodes"], key=lambda p: (p["format"], p["q"])):
+            after = sum(value for stage, value in point["seconds"].items() if stage in ("refit", "pack"))
+            other = point.get("other_reader", {}).get("psnr")
+            table.add(
+                point["format"], point["q"], point["splats"], point["bytes"] / 1e6, point["psnr"],
+                point.get("psnr_loss"), other, after,
+            )  # fmt: skip
+        for point in entry["converts"]:
+            table.add(
+                f"{point['format']}, all splats", None, entry["source_splats"], point["bytes"] / 1e6, point["psnr"],
+                point.get("psnr_loss"), None, point["seconds"],
+            )  # fmt: skip
+        times = tables.table(
+            f"outputs_gain_{name}",
+            f"How many times smaller than other writers' files of the same PSNR, by interpolation: {name}",
+            Column("format"),
+            Column("other writer's size", "MB", ".2f"),
+            Column("PSNR", "dB", ".2f"),
+            Column("encode at that PSNR", "MB", ".2f"),
+            Column("times smaller", format=".2f"),
+        )
+        for other in others["scenes"].get(name, {}).get("formats", []):
+            for kind in sorted({point["format"] for point in entry["encodes"]}):
+                if kind.partition(":")[0].lstrip(".") != other["format"].lstrip("."):
+                    continue
+                points = [point for point in entry["encodes"] if point["format"] == kind]
+                size = size_at(points, "psnr", other["psnr"]) if len(points) > 1 else None
+                times.add(
+                    kind, other["bytes"] / 1e6, other["psnr"], size and size / 1e6, size and other["bytes"] / size
+                )
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    commands = parser.add_subparsers(required=True)
+    for name, run in (("measure", _measure), ("judge", _judge)):
+        sub = commands.add_parser(name)
+        sub.add_argument("scenes", type=Path, nargs="+", metavar="SCENE")
+        sub.add_argument("--json", type=Path, required=True)
+        sub.add_argument("--keep", type=Path, required=True, help="folder of the files")
+        sub.add_argument("--device", help="OpenCL device")
+        sub.set_defaults(run=run)
+        if name == "measure":
+            sub.add_argument("--seconds", type=float, default=1e9, help="begin nothing after so long")
+        else:
+            sub.add_argument("--transform", default="splat-transform", help="the command; default %(default)s")
+    sub = commands.add_parser("report")
+    sub.add_argument("results", type=Path)
+    sub.add_argument("formats", type=Path, help="of tools.study.compare_formats")
+    sub.add_argument("--json", type=Path)
+    sub.set_defaults(run=_report)
+    args = parser.parse_args()
+    args.run(args)
+
+
+if __name__ == "__main__":
+    main()
