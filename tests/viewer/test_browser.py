@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import io
 import time
 from collections.abc import Callable, Iterator
@@ -25,7 +26,9 @@ HOSTILE = '<img src=x onerror="document.title=1">\u202e.ply'
 
 @pytest.fixture(scope="module")
 def viewer(ladder, data) -> Iterator[Any]:
-    with potr_cl.view(data / "plush_excerpt.ply", ladder, data / "plush_excerpt_cameras.json") as viewer:
+    cameras = potr_cl.read_cameras(data / "plush_excerpt_cameras.json")
+    cameras[3] = dataclasses.replace(cameras[3], name=HOSTILE)
+    with potr_cl.view(data / "plush_excerpt.ply", ladder, cameras) as viewer:
         yield viewer
 
 
@@ -63,7 +66,7 @@ def opened(browser: Any, viewer: Any) -> Iterator[Any]:
     assert errors == []
 
 
-def until(condition: Callable[[], bool], seconds: float = 60) -> None:
+def until(condition: Callable[[], bool], seconds: float = 120) -> None:
     end = time.monotonic() + seconds
     while not condition():
         assert time.monotonic() < end, "it has not come"
@@ -256,6 +259,7 @@ def test_a_dropped_file_is_shown_and_hostile_names_are_text(viewer, page, data):
     drop(page, HOSTILE, content, "B")
     until(lambda: len(viewer.session.exhibit("B").scene) == len(scene))
     page.locator("[data-potr=scenes]", has_text="<img src=x").wait_for()
+    page.locator("[data-potr=views]", has_text="<img src=x").wait_for()
     assert page.locator("img[src=x]").count() == 0
     assert page.title() != "1"
     viewer.put("B", exhibit)

@@ -257,3 +257,36 @@ def test_the_thread_ends(device, scenes):
     painter.stop()
     assert threading.active_count() == before - 1
     assert painter.ask(lambda: 1) is None
+
+
+@pytest.mark.one_runtime
+def test_the_photograph_of_a_view_fades_over_it(device, scenes, plush_excerpt_cameras, tmp_path):
+    from PIL import Image
+
+    from potr_cl.quality.ground_truth import GroundTruth
+
+    camera = dataclasses.replace(plush_excerpt_cameras[0], cx=120.0, cy=90.0)
+    photograph = np.full((camera.height, camera.width, 3), 200, np.uint8)
+    Image.fromarray(photograph).save(tmp_path / f"{camera.name}.png")
+    session = Session(lambda: device, INRIA, (0.0, 0.0, 0.0))
+    session.show("A", scenes[0])
+    painter = Painter(session, Losses([camera], GroundTruth(tmp_path, [camera])), lambda: None)
+    painter.start()
+    try:
+        browser = Browser()
+        browser.visitor.width, browser.visitor.height = camera.width, camera.height
+        painter.enter(browser.visitor)
+        browser.look(painter, gaze_on(camera, camera.width / camera.height))
+        bare = browser.still().picture
+        browser.visitor.view = 0
+        for part in (1.0, 0.5, 0.0):
+            browser.visitor.fade = part
+            painter.wake(browser.visitor)
+            painter.ask(lambda: None)
+            end = time.monotonic() + 30
+            expected = bare * (1 - part) + 200 * part
+            while abs(browser.shown[-1].picture - expected).max() > 1:
+                assert time.monotonic() < end
+                time.sleep(0.01)
+    finally:
+        painter.stop()
