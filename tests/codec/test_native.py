@@ -158,7 +158,8 @@ def test_the_encoder_writes_the_same_bytes(splats, q, choose):
 
 def resealed(data: bytearray) -> bytes:
     """A file whose checksums are right again."""
-    count = struct.unpack_from("<H", data, 34)[0]
+    # The number of sections may be among what was changed.
+    count = min(struct.unpack_from("<H", data, 34)[0], (len(data) - 124) // 24)
     at = 124 + 24 * count
     for entry in range(120, 120 + 24 * count, 24):
         (size,) = struct.unpack_from("<Q", data, entry + 16)
