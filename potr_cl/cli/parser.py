@@ -159,7 +159,8 @@ def _described(action: argparse.Action) -> str:
 
 
 def _help(action: argparse.Action) -> str:
-    return f" ({action.help})" if action.help else ""
+    """What a value is, in brackets: the help up to its first semicolon, for what follows is advice."""
+    return f" ({action.help.partition(';')[0]})" if action.help else ""
 
 
 def _one_of(names: Sequence[str]) -> str:

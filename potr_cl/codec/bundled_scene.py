@@ -85,7 +85,8 @@ class BundledScene:
             DataError: damaged.
         """
         number, splats = self.reader.bundles.number, self.header.splats
-        parts = max(number // (_ROUNDS * threads), 1)
+        native = self.reader.bundled_file(self._wanted(arrays)) is not None
+        parts = max(number // (_ROUNDS * threads), 1) if native else -(-number // _SIDE_BY_SIDE)
         ends = [number * (part + 1) // parts for part in range(parts)]
         ready = 0
         with thread_pool(threads) as pool:

@@ -24,7 +24,7 @@ def test_convert_there_and_back(tmp_path, data, plush_excerpt, capsys):
 
 @pytest.mark.parametrize(
     ("output", "said"),
-    [("a.potr", "command encode"), ("a.sog", "written as"), ("a", "written as"), ("no/a.spz", "does not exist")],
+    [("a.potr", "command encode"), ("a.ksplat", "written as"), ("a", "written as"), ("no/a.spz", "does not exist")],
 )
 def test_convert_tells_what_it_cannot_do(tmp_path, data, capsys, output, said):
     assert main(["convert", str(data / "plush_excerpt.ply"), str(tmp_path / output)]) == 2

@@ -131,7 +131,8 @@ def test_a_forgotten_option_is_one_line(capsys: pytest.CaptureFixture[str]) -> N
     assert outcome(capsys, ["encode", "i.ply"]) == (
         2,
         "",
-        'potr-cl encode: -o OUT.potr (.potr, a folder, or "-" for standard output) is missing '
+        "potr-cl encode: -o OUT.potr (.potr, .spz, .sog, .compressed.ply, .glb or .ply, a folder, "
+        'or "-" for standard output) is missing '
         "(see potr-cl encode --help)\n",
     )
 
@@ -277,10 +278,12 @@ def test_a_library_that_does_not_start(
             if name == "gsply":
                 raise error or ImportError("no gsply")
 
+    packed = scene_path.with_suffix(".compressed.ply")
+    assert outcome(capsys, ["convert", scene_path, packed])[0] == 0  # written without it
     monkeypatch.setattr(sys, "meta_path", [Finder(), *sys.meta_path])
     for name in [name for name in sys.modules if name.partition(".")[0] == "gsply"]:
         monkeypatch.delitem(sys.modules, name)
-    code, _, err = outcome(capsys, ["convert", scene_path, scene_path.with_suffix(".compressed.ply")])
+    code, _, err = outcome(capsys, ["convert", packed, scene_path.with_suffix(".spz")])
     assert code == (2 if error is None else 1)
     assert "needs the library gsply" in err
 
@@ -397,7 +400,7 @@ def test_trust_reaches_the_readers(
         asked.append(keywords)
         raise PotrError("enough")
 
-    for reader in ("cli.scenes.load_scene", "cli.files.decode", "api.describing.load_scene"):
+    for reader in ("cli.scenes.load_scene", "cli.files.decode", "api.describing.load_scene", "formats.load_scene"):
         monkeypatch.setattr(f"potr_cl.{reader}", ask)
     monkeypatch.setattr("potr_cl.codec.decoder.PotrFile.open", ask)
     cameras = str(ROOT / "tests" / "data" / "plush_excerpt_cameras.json")

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from functools import cache
 
 import pytest
@@ -27,22 +28,25 @@ STREAMS = {
 
 
 @cache
-def report_of(preset, entropy):
+def report_of(preset, entropy, version=None):
     parameters = HyperParameters.from_quality(0.5, preset)
+    if version is not None:
+        parameters = replace(parameters, version=version)
     pieces = code_scene(random_scene(SPLATS, 1), parameters, metadata=b'{"q": 0.5}', entropy=entropy).pieces
     return file_report(PotrFile.from_bytes(b"".join(pieces)))
 
 
 @pytest.mark.parametrize(
-    ("preset", "entropy", "coder"),
+    ("preset", "version", "entropy", "coder"),
     [
-        ("best", EntropyCoder("context", 1), "context"),
-        ("best", EntropyCoder("zstd", 1), "zstd"),
-        ("paper", EntropyCoder("npz"), "deflate"),
+        ("best", 2, EntropyCoder("context", 1), "context"),
+        ("best", 3, EntropyCoder("context", 1), "bundles"),
+        ("best", 3, EntropyCoder("zstd", 1), "zstd"),
+        ("paper", 1, EntropyCoder("npz"), "deflate"),
     ],
 )
-def test_streams_and_integers(preset, entropy, coder):
-    sections = report_of(preset, entropy)["sections"]
+def test_streams_and_integers(preset, version, entropy, coder):
+    sections = report_of(preset, entropy, version)["sections"]
     assert {name: sections[name]["streams"] for name in STREAMS} == STREAMS
     for name, streams in STREAMS.items():
         assert sections[name]["integers"] == SPLATS * streams
@@ -51,10 +55,11 @@ def test_streams_and_integers(preset, entropy, coder):
     assert sections["header"]["streams"] == sections["header"]["integers"] == 0
 
 
-def test_what_the_context_coder_holds_was_never_serialised():
-    report = report_of("best", EntropyCoder("context", 1))
+@pytest.mark.parametrize(("version", "coder"), [(2, "context"), (3, "bundles")])
+def test_what_the_context_coders_hold_was_never_serialised(version, coder):
+    report = report_of("best", EntropyCoder("context", 1), version)
     for name in STREAMS:
-        assert report["sections"][name]["coders"] == ["context"]
+        assert report["sections"][name]["coders"] == [coder]
         assert report["sections"][name]["serialised_bytes"] is None
     octree = report["sections"]["position: octree"]
     assert octree["serialised_bytes"] >= octree["bytes"]
@@ -90,9 +95,9 @@ def test_the_table_for_people():
     context, zstd = (report_of("best", EntropyCoder(name, 1)) for name in ("context", "zstd"))
     titles = row(context, "section")
     assert titles[:5] == ["coder", "streams", "integers", "serialised", "bytes"]
-    for report, coder in ((context, "context"), (zstd, "zstd")):
+    for report, coder in ((context, "bundles"), (zstd, "zstd")):
         entry = report["sections"]["rotation"]
         cells = row(report, "rotation")
         assert cells[:3] == [coder, "3", str(3 * SPLATS)]
-        assert cells[3] == ("-" if coder == "context" else str(entry["serialised_bytes"]))
+        assert cells[3] == ("-" if coder == "bundles" else str(entry["serialised_bytes"]))
         assert cells[4] == str(entry["bytes"])

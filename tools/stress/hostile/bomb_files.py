@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import gzip
 import json
 import struct
@@ -28,7 +29,7 @@ from tools.stress.hostile import (
 from tools.stress.hostile.formats import Files
 from tools.stress.hostile.potr_files import File, Section
 
-_RAW, _ZSTD, _DEFLATE, _CONTEXT = range(4)
+_RAW, _ZSTD, _DEFLATE, _CONTEXT, _BUNDLES = range(5)
 _METADATA, _OCCUPANCY, _SEVERAL, _MULTIPLICITY, _TAIL_LENGTH, _TAIL = range(6)
 _SCALE, _ROTATION, _OPACITY, _SH = range(16, 20)
 _LONG = 1 << 26
@@ -72,18 +73,25 @@ def _leaf(splats: int) -> Files:
     return _potr(splats, 0, _one_leaf(splats))
 
 
-def _constant_context() -> Files:
+def _equal_splats(version: int) -> Files:
     alike = random_scene(1, 0).subset(np.zeros(400_000, np.int64))
-    return {"a.potr": b"".join(code_scene(alike, HyperParameters.from_quality(0.5, "best")).pieces)}
+    parameters = dataclasses.replace(HyperParameters.from_quality(0.5, "best"), version=version)
+    return {"a.potr": b"".join(code_scene(alike, parameters).pieces)}
 
 
-def _long_description() -> Files:
-    file = File.of(potr_files.originals()[-1])
-    section = next(each for each in file.sections if each.coder == _CONTEXT)
-    described, beside = struct.unpack_from("<II", section.stored)
-    packed = zstandard.ZstdCompressor(level=3).compress(bytes(_LONG))
-    section.stored = struct.pack("<II", len(packed), beside) + packed + section.stored[8 + described :]
-    return {"a.potr": file.bytes()}
+def _long_description(coder: int) -> Files:
+    """A description, whose stored size opens the section, followed in coder CONTEXT by a second size."""
+    for data in reversed(potr_files.originals()):
+        file = File.of(data)
+        for section in file.sections:
+            if section.coder == coder:
+                head = 8 if coder == _CONTEXT else 4
+                (described,) = struct.unpack_from("<I", section.stored)
+                packed = zstandard.ZstdCompressor(level=3).compress(bytes(_LONG))
+                rest = section.stored[4:head] + packed + section.stored[head + described :]
+                section.stored = struct.pack("<I", len(packed)) + rest
+                return {"a.potr": file.bytes()}
+    raise RuntimeError(f"no original has a section of coder {coder}")
 
 
 def _all_cells() -> Files:
@@ -282,8 +290,10 @@ BOMBS: dict[str, dict[str, Callable[[], Files]]] = {
         "one splat, long metadata": _one_splat(_METADATA, 32),
         "a leaf of 10 million splats": lambda: _leaf(10_000_000),
         "a leaf of 65,536 splats": lambda: _leaf(65_536),
-        "400,000 equal splats, context coder": _constant_context,
-        "a long description, context coder": _long_description,
+        "400,000 equal splats, context coder": lambda: _equal_splats(2),
+        "400,000 equal splats, bundles": lambda: _equal_splats(3),
+        "a long description, context coder": lambda: _long_description(_CONTEXT),
+        "a long description, bundles": lambda: _long_description(_BUNDLES),
         "1.3 million cells above 32,768 splats": _all_cells,
         "the most splats that are let through": _as_much_as_is_let_through(1),
         "the most splats, 8 planes each": _as_much_as_is_let_through(8),
