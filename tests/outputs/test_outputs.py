@@ -156,8 +156,8 @@ def test_a_psnr_is_met(suffix, least, plush_excerpt, plush_excerpt_cameras, devi
 
 def test_quality_decides_of_size(plush_excerpt, plush_excerpt_cameras, device):
     for output in OTHERS:
-        sizes = [encoded_to(output, plush_excerpt, plush_excerpt_cameras, device, q=q).nbytes for q in (0.1, 0.5, 0.9)]
-        assert sizes[0] < sizes[1] < sizes[2], output
+        sizes = [encoded_to(output, plush_excerpt, plush_excerpt_cameras, device, q=q).nbytes for q in (0.2, 0.8)]
+        assert sizes[0] < sizes[1], output
 
 
 def test_degrees_go_where_splats_are_worth_more(plush_excerpt, plush_excerpt_cameras, device):
