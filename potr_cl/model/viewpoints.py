@@ -66,8 +66,9 @@ def look_around(scene: Scene, count: int = VIEWS, size: int = SIZE, up: Sequence
         UsageError: ``count``, ``size`` or ``up`` is out of range.
     """
     _check(count, size)
+    wanted = None if up is None else _direction(up)
     standpoints = place_cameras(scene, max(count, _STANDPOINTS), size)
-    top = _direction(up) if up is not None else guess_up(scene, standpoints)
+    top = guess_up(scene, standpoints) if wanted is None else wanted
     return [dataclasses.replace(levelled(camera, top), split="test") for camera in standpoints[:count]]
 
 
@@ -89,8 +90,9 @@ def turntable(scene: Scene, count: int, size: int = SIZE, up: Sequence[float] | 
         UsageError: ``count``, ``size`` or ``up`` is out of range.
     """
     _check(count, size)
+    wanted = None if up is None else _direction(up)
     standpoints = place_cameras(scene, _STANDPOINTS, size)
-    top = _direction(up) if up is not None else guess_up(scene, standpoints)
+    top = guess_up(scene, standpoints) if wanted is None else wanted
     middle = focus(standpoints)
     away = camera_centres(standpoints) - middle
     distance = np.linalg.norm(away, axis=1)

@@ -264,11 +264,12 @@ def removal_effects(alpha: F64, colours: F64, wanted: F64, splats: NDArray[np.in
     weights[1:] *= before[:-1]
     effects, magnitudes = np.zeros(len(splats)), np.zeros(len(splats))
     for i, k in enumerate(splats):
-        without = alpha.copy()
+        touched = np.flatnonzero(alpha[k])  # no other pixel changes, and most splats are in few of them
+        without = alpha[:, touched]
         without[k] = 0
-        change = held_image(without, colours) - now
-        effects[i] = np.sum(change**2 + 2 * change * (now - wanted))
-        magnitudes[i] = np.sum(change**2 + 2 * np.abs(change) * np.abs(now - wanted))
+        change, error = held_image(without, colours) - now[touched], (now - wanted)[touched]
+        effects[i] = np.sum(change**2 + 2 * change * error)
+        magnitudes[i] = np.sum(change**2 + 2 * np.abs(change) * np.abs(error))
     pixels = alpha.shape[1]
     return effects / (3 * pixels), magnitudes / (3 * pixels), weights[splats].sum(axis=1) / pixels
 
