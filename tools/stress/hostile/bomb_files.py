@@ -198,12 +198,13 @@ def _sog_member(name: str, content: bytes) -> Files:
 
 def _sog_overlapping() -> Files:
     """Thousands of names for the same packed bytes."""
-    packed = zlib.compress(bytes(1 << 24), 9)[2:-4]
+    content = bytes(1 << 24)
+    packed, checksum = zlib.compress(content, 9)[2:-4], zlib.crc32(content)
     name = b"a.webp"
-    local = struct.pack("<4sHHHHHIIIHH", b"PK\3\4", 20, 0, 8, 0, 0, zlib.crc32(bytes(1 << 24)), len(packed), 1 << 24,
+    local = struct.pack("<4sHHHHHIIIHH", b"PK\3\4", 20, 0, 8, 0, 0, checksum, len(packed), 1 << 24,
                         len(name), 0) + name + packed  # fmt: skip
     entries = b"".join(
-        struct.pack("<4sHHHHHHIIIHHHHHII", b"PK\1\2", 20, 20, 0, 8, 0, 0, zlib.crc32(bytes(1 << 24)), len(packed),
+        struct.pack("<4sHHHHHHIIIHHHHHII", b"PK\1\2", 20, 20, 0, 8, 0, 0, checksum, len(packed),
                     1 << 24, 6, 0, 0, 0, 0, 0, 0) + (b"%06d" % i)
         for i in range(3000)
     )  # fmt: skip
