@@ -280,6 +280,8 @@ def usual(command: str, flag: str) -> list[str]:
         given.append("--turntable")
     elif flag in WITHOUT_CAMERAS and command in ("render", "compare"):
         given.append("--size")
+    if (command, flag) == ("fit", "--virtual-views"):  # large ones: all 1500 steps on them take minutes
+        given.append("--steps")
     return [*given, *(name for name in WITH.get(flag, []) if name in available)]
 
 
