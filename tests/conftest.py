@@ -70,9 +70,13 @@ def _whole_scene(name: str) -> Path:
     return folder
 
 
-@pytest.fixture(scope="session")
+@pytest.fixture(scope="module")
 def browser() -> Iterator[Any]:
-    """Chromium of the system, driven by Playwright; WebGL is computed on the CPU."""
+    """Chromium of the system, driven by Playwright; WebGL is computed on the CPU.
+
+    One for each module: for as long as Playwright runs, its event loop occupies the thread, and tests of other modules
+    could not run one of their own.
+    """
     library = pytest.importorskip("playwright.sync_api", reason="the extra browser is not installed")
     names = ("chromium", "chromium-browser", "google-chrome")
     path = os.environ.get(CHROMIUM_VARIABLE) or next(filter(None, map(shutil.which, names)), None)
