@@ -113,7 +113,7 @@ class Reader:
         if file is not None:
             work = file.work()
             return joined([_levels_of(self, file, bundle, wanted, work) for bundle in range(first, last)])
-        run = _Run(self, first, last)
+        run = _Run(self, first, last, wanted)
         for key in wanted.keys:
             run.decode(key)
         run.check_end(wanted)
@@ -142,12 +142,13 @@ class Reader:
 class _Run:
     """Some bundles that are decoded side by side."""
 
-    def __init__(self, reader: Reader, first: int, last: int) -> None:
+    def __init__(self, reader: Reader, first: int, last: int, wanted: Wanted) -> None:
         start, stop = first * BUNDLE, min(last * BUNDLE, reader.bundles.splats)
         self._reader, self._first, self._last = reader, first, last
         self._bundles = Bundles(stop - start)
         self._terms: dict[str, I16] = {}
-        self._states = {key: self._states_of(key) for key in (MAIN[0], ROTATION)}
+        chains = (MAIN[0], ROTATION) if wanted.rotations else (MAIN[0],)
+        self._states = {key: self._states_of(key) for key in chains}
         self.levels = Levels(start, stop)
 
     def _states_of(self, key: Key) -> I64:
