@@ -31,6 +31,7 @@ from potr_cl.raster.view_set import ViewSet
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.fixed_point import fixed_point_scale
 from potr_cl.stages.fitting.launcher import launcher_for
+from potr_cl.stages.fitting.pixel_sums import PixelSums
 
 #: Bytes of a splat's sums in a view: nine 64-bit integers.
 _SUMS = 72
@@ -173,15 +174,17 @@ class PictureDerivatives(Owner):
             cl.enqueue_copy(queue, self._factors.buffer, np.array(factors, np.float32), is_blocking=True)
             self._written = factors
         self._launcher.sweep(
-            views,
-            self.rasterizer.background,
-            target,
-            first,
-            given,
-            unit,
-            scale,
-            self._errors.buffer,
-            self._totals.buffer,
+            PixelSums(
+                views=views,
+                background=self.rasterizer.background,
+                target=target,
+                first_pixel=first,
+                given=given,
+                unit=unit,
+                scale=scale,
+                errors=self._errors.buffer,
+                totals=self._totals.buffer,
+            )
         )
         parameters = self.rasterizer.parameters
         self._chain.bind(

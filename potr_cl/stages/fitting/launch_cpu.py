@@ -2,13 +2,11 @@
 
 from __future__ import annotations
 
-import pyopencl as cl
-
 from potr_cl.opencl.device import Device
 from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.rules import RasterRules
-from potr_cl.raster.view_set import ViewSet, camera_struct
-from potr_cl.stages.fitting.fixed_point import LARGEST_GAP, LARGEST_VALUE
+from potr_cl.raster.view_set import camera_struct
+from potr_cl.stages.fitting.pixel_sums import PixelSums, macros
 
 
 class CpuLauncher:
@@ -27,43 +25,11 @@ class CpuLauncher:
             "fit/derivatives_cpu.cl",
             "derivatives",
             LANES=max(device.vector_width, 8),
-            ALPHA_CAP=float(rules.alpha_cap),
-            TRANSMITTANCE_THRESHOLD=rules.transmittance_threshold,
-            LARGEST_VALUE=LARGEST_VALUE,
-            LARGEST_GAP=LARGEST_GAP,
+            **macros(rules),
             **totals_limits(device),
         )
 
-    def sweep(
-        self,
-        views: ViewSet,
-        background: tuple[float, float, float],
-        target: cl.Buffer,
-        first_pixel: int,
-        given: bool,
-        unit: float,
-        scale: float,
-        errors: cl.Buffer,
-        totals: cl.Buffer,
-    ) -> None:
+    def sweep(self, sums: PixelSums) -> None:
         """See :meth:`potr_cl.stages.fitting.launcher.Launcher.sweep`."""
-        (view,) = views.views
-        red, green, blue = background
-        self._sweep.bind(
-            shapes=views.shapes,
-            colours=views.colours,
-            offsets=views.offsets,
-            intersections=views.intersections,
-            subtiles=views.subtiles,
-            view=camera_struct(view.camera),
-            red=red,
-            green=green,
-            blue=blue,
-            target=target,
-            first_pixel=first_pixel,
-            given=given,
-            unit=unit,
-            scale=scale,
-            errors=errors,
-            totals=totals,
-        ).launch((views.tiles,), (1,))
+        (view,) = sums.views.views
+        self._sweep.bind(view=camera_struct(view.camera), **sums.arguments).launch((sums.views.tiles,), (1,))

@@ -4,13 +4,11 @@ from __future__ import annotations
 
 from typing import Protocol
 
-import pyopencl as cl
-
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rules import RasterRules
-from potr_cl.raster.view_set import ViewSet
 from potr_cl.stages.fitting.launch_cpu import CpuLauncher
 from potr_cl.stages.fitting.launch_gpu import GpuLauncher
+from potr_cl.stages.fitting.pixel_sums import PixelSums
 
 
 class Launcher(Protocol):
@@ -26,30 +24,8 @@ class Launcher(Protocol):
         """Views that a launch can do."""
         ...
 
-    def sweep(
-        self,
-        views: ViewSet,
-        background: tuple[float, float, float],
-        target: cl.Buffer,
-        first_pixel: int,
-        given: bool,
-        unit: float,
-        scale: float,
-        errors: cl.Buffer,
-        totals: cl.Buffer,
-    ) -> None:
-        """Enqueue the sums of cl/fit/sums.clh over the pixels of some views.
-
-        Args:
-            views: prepared, with their geometry.
-            background: R, G, B behind the splats.
-            target: (pixels, 3) float32, view after view, and first_pixel: where these views' begin.
-            given: whether these are the numbers v that pixels are multiplied by; if not, v is the picture's difference
-                to the target, times ``unit``.
-            unit: see there.
-            scale: the views' fixed point.
-            errors: (tiles,) float32, becomes each tile's sum of v².
-            totals: (views, stride, 9) int64, the sums are added to them.
+    def sweep(self, sums: PixelSums) -> None:
+        """Enqueue the sums over the pixels of some views.
 
         Raises:
             DeviceError: the device refused it.

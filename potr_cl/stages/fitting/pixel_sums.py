@@ -1,0 +1,73 @@
+"""What both kernel families are told of the sums over pixels: :class:`PixelSums`, and macros of the kernels."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Any
+
+import pyopencl as cl
+
+from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.view_set import ViewSet
+from potr_cl.stages.fitting.fixed_point import LARGEST_GAP, LARGEST_VALUE
+
+
+@dataclass(frozen=True)
+class PixelSums:
+    """The sums of cl/fit/sums.clh over the pixels of some views.
+
+    Attributes:
+        views: prepared, with their geometry.
+        background: R, G, B behind the splats.
+        target: (pixels, 3) float32, view after view.
+        first_pixel: where these views' begin.
+        given: whether these are the numbers v that pixels are multiplied by; if not, v is the picture's difference to
+            the target, times ``unit``.
+        unit: see there.
+        scale: the views' fixed point.
+        errors: (tiles,) float32, becomes each tile's sum of v².
+        totals: (views, stride, 9) int64, the sums are added to them.
+    """
+
+    views: ViewSet
+    background: tuple[float, float, float]
+    target: cl.Buffer
+    first_pixel: int
+    given: bool
+    unit: float
+    scale: float
+    errors: cl.Buffer
+    totals: cl.Buffer
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The arguments that the kernels of both families have, by name."""
+        views = self.views
+        red, green, blue = self.background
+        return {
+            "shapes": views.shapes,
+            "colours": views.colours,
+            "offsets": views.offsets,
+            "intersections": views.intersections,
+            "subtiles": views.subtiles,
+            "red": red,
+            "green": green,
+            "blue": blue,
+            "target": self.target,
+            "first_pixel": self.first_pixel,
+            "given": self.given,
+            "unit": self.unit,
+            "scale": self.scale,
+            "errors": self.errors,
+            "totals": self.totals,
+        }
+
+
+def macros(rules: RasterRules) -> dict[str, Any]:
+    """Macros that the kernels of both families need."""
+    return {
+        "ALPHA_CAP": float(rules.alpha_cap),
+        "TRANSMITTANCE_THRESHOLD": rules.transmittance_threshold,
+        "LARGEST_VALUE": LARGEST_VALUE,
+        "LARGEST_GAP": LARGEST_GAP,
+    }
