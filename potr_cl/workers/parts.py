@@ -13,8 +13,6 @@ from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
 from typing import Any
 
-import numpy as np
-
 from potr_cl.errors import DeviceError, PotrError
 from potr_cl.opencl.memory import Owner
 from potr_cl.workers.pool import Held, Part, Pool, Worker, WorkerLost
@@ -68,17 +66,19 @@ class Parts(Owner):
 
     # ------------------------------------------------------------------------------------------------ commands
 
-    def begin(self, command: str, *args: Any, each: Sequence[Sequence[Any]] | None = None) -> Pending:
-        """Give all parts a command that changes them, and do something else until :meth:`Pending.results`.
+    def begin(self, command: str, *args: Any, logged: bool = True, anew: bool = False) -> Pending:
+        """Give all parts a command, and do something else until :meth:`Pending.results`.
 
         Args:
             command: the parts' method.
-            args: the same for all parts.
-            each: further arguments of each part, after those.
+            args: of the method, the same for all parts.
+            logged: whether it changes the parts.
+            anew: whether nothing that they were told before matters after it.
         """
         self._settle()
-        arguments = [(*args, *(each[k] if each else ())) for k in range(len(self))]
-        self._pending = Pending(self, command, arguments)
+        if anew:
+            self._log.clear()
+        self._pending = Pending(self, command, args, logged)
         return self._pending
 
     def tell(self, command: str, *args: Any) -> list[Any]:
@@ -102,10 +102,6 @@ class Parts(Owner):
         self.ready()
         if self._pending is not None:
             self._pending.results()
-
-    def forget_log(self) -> None:
-        """Have parts that are made again begin with the next command: what came before changes nothing any more."""
-        self._log.clear()
 
     def close(self) -> None:
         """Have the workers forget the parts."""
@@ -153,8 +149,8 @@ class Parts(Owner):
                     take(place, future.result())
                 except DeviceError as error:
                     failed.append((place, error))
-        for place, error in failed:
-            take(place, self._elsewhere(place, error, again))
+        for place, fault in failed:
+            take(place, self._elsewhere(place, fault, again))
 
     def _elsewhere(self, place: int, error: DeviceError, again: Callable[[int], Any]) -> Any:
         """Have another worker do what one could not.
@@ -192,24 +188,24 @@ class Parts(Owner):
         assert worker is not None
         held = worker.make(self._kind, self._memory, self._given[place]).result()
         self._held[place] = held
-        for command, arguments in self._log:
-            self._begin(place, command, arguments[place]).result()
+        for command, args in self._log:
+            self._begin(place, command, args).result()
         return held
 
     def _again(self, place: int, command: str, args: Sequence[Any]) -> Any:
         self._remake(place)
         return self._begin(place, command, args).result()
 
-    def _note(self, command: str, arguments: Sequence[tuple[Any, ...]]) -> None:
-        self._log.append((command, tuple(arguments)))
+    def _note(self, command: str, args: tuple[Any, ...]) -> None:
+        self._log.append((command, args))
 
 
 class Pending:
     """A command that all parts have been given."""
 
-    def __init__(self, parts: Parts, command: str, arguments: Sequence[tuple[Any, ...]]) -> None:
-        self._parts, self._command, self._arguments = parts, command, arguments
-        self._futures = [parts._begin(place, command, args) for place, args in enumerate(arguments)]
+    def __init__(self, parts: Parts, command: str, args: tuple[Any, ...], logged: bool) -> None:
+        self._parts, self._command, self._args, self._logged = parts, command, args, logged
+        self._futures = [parts._begin(place, command, args) for place in range(len(parts))]
         self._found: list[Any] | None = None
 
     def results(self) -> list[Any]:
@@ -226,16 +222,17 @@ class Pending:
             parts._pool.traffic.received += nbytes(result)
             found[place] = result
 
-        parts._collect(self._futures, take, lambda place: parts._again(place, self._command, self._arguments[place]))
-        parts._note(self._command, self._arguments)
+        parts._collect(self._futures, take, lambda place: parts._again(place, self._command, self._args))
+        if self._logged:
+            parts._note(self._command, self._args)
         self._found = found
         return found
 
 
 def nbytes(thing: Any) -> int:
     """Bytes of the arrays in a thing made of arrays, bytes, lists and tuples."""
-    if isinstance(thing, np.ndarray):
-        return thing.nbytes
+    if isinstance(getattr(thing, "nbytes", None), int):
+        return int(thing.nbytes)
     if isinstance(thing, (bytes, bytearray, memoryview)):
         return len(thing)
     if isinstance(thing, (list, tuple)):
