@@ -98,12 +98,15 @@ class Pool(ABC):
         takes_part: whether the master does a share of the work on it.
         sparse: whether workers send what has changed, and not all of it: worth its time where bytes travel slowly.
         traffic: so far.
+        patience: seconds, or ten times as long as the others took if that is longer, after which a worker that alone
+            has not answered counts as lost; None: workers are waited for.
     """
 
     first: Device
     takes_part: bool
     sparse: bool
     traffic: Traffic
+    patience: float | None = None
 
     @abstractmethod
     def workers(self) -> list[Worker]:
