@@ -1,17 +1,20 @@
 """A Dask cluster: :class:`ClusterPool`. Every worker of it is a worker here, with a device of its own.
 
-Dask brings scheduling, the network, and who is alive. A part lives in an actor (:class:`_Seat`) on one worker; what is
-shared is scattered to all workers once. The master only adds up what they find.
+Dask brings the network, placing things on workers, and who is alive. A worker's parts, and what they share, live in an
+actor there (:class:`_Seat`). Dask's own way to share things (``scatter``) keeps only one copy of them in the long run,
+and that goes with its worker. The master only adds up what the workers find.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
 from potr_cl.errors import DeviceError, PotrError, UsageError
@@ -29,8 +32,8 @@ _CONNECT, _HELLO = 10.0, 120.0
 _ALIVE, _POLL = 3.0, 0.1
 #: Seconds in which the handle of a part arrives once it is made.
 _FETCH = 30.0
-#: Seconds to wait for a worker to give a part's memory back.
-_CLOSE = 60.0
+#: Threads that wait for workers.
+_MOST_WAITING = 256
 
 
 class ClusterPool(Pool):
@@ -51,9 +54,9 @@ class ClusterPool(Pool):
     def __init__(self, cluster: str | Client, first: Device, patience: float = 60.0) -> None:
         self.first, self.traffic, self.patience = first, Traffic(), patience
         self._closing = threading.Event()
+        self._waiting = ThreadPoolExecutor(_MOST_WAITING, thread_name_prefix="potr_cl cluster")
+        self._workers: list[_ClusterWorker] = []
         self.client, self._is_own = _client_of(cluster)
-        self._scattered: list[tuple[Any, Any]] = []
-        self._waiting = ThreadPoolExecutor(256, thread_name_prefix="potr_cl cluster")
         try:
             self._workers = self._met()
         except BaseException:
@@ -69,21 +72,14 @@ class ClusterPool(Pool):
 
     @contextmanager
     def shared(self, thing: Any) -> Iterator[Shared]:
-        """Scattered to all workers; what is shared again later is still there."""
-        future = next((future for known, future in self._scattered if known is thing), None)
-        if future is None:
-            with _lost_as_worker_lost("the cluster"):
-                future = self.client.scatter(thing, broadcast=True, hash=False)
-            self.traffic.sent += getattr(thing, "nbytes", 0) * len(self._workers)
-        # Two scenes: the uncompressed one, and what is worked on now.
-        others = [each for each in self._scattered if each[0] is not thing]
-        self._scattered = [*others[-1:], (thing, future)]
-        yield Shared(future)
+        """A worker is sent it when it first makes a part of it, and keeps it for the parts that follow."""
+        yield Shared(thing)
 
     def close(self) -> None:
         self._closing.set()
-        self._scattered.clear()
         self._waiting.shutdown(wait=False, cancel_futures=True)
+        for worker in self._workers:
+            worker.leave()
         if self._is_own:
             with suppress(Exception):
                 self.client.close(timeout=2)
@@ -92,17 +88,24 @@ class ClusterPool(Pool):
 
     def _alive(self) -> set[str]:
         """Addresses of the workers that the scheduler knows."""
-        with _lost_as_worker_lost("the scheduler"):
+        with _as_worker_lost("the scheduler"):
             return set(self.client.nthreads())
 
-    def wait_for(self, answer: Any, address: str) -> Any:
+    def wait_for(self, answer: Any, address: str, most: float = math.inf) -> Any:
         """What a worker answers.
+
+        Args:
+            answer: a future of Dask's.
+            address: of the worker.
+            most: seconds to wait.
 
         Raises:
             WorkerLost: it is gone. Whatever the worker raises.
         """
-        looked = time.monotonic()
+        began = looked = time.monotonic()
         while not self._answered(answer):
+            if time.monotonic() - began > most:
+                raise WorkerLost(f"{address} does not answer")
             if self._closing.is_set():
                 raise WorkerLost(f"{address} is not waited for any more")
             if time.monotonic() - looked > _ALIVE:
@@ -149,117 +152,154 @@ class ClusterPool(Pool):
         # Several workers of one computer take its devices in turn.
         hosts = [address.rsplit(":", 1)[0] for address in addresses]
         places = [hosts[:number].count(host) for number, host in enumerate(hosts)]
-        asked = [
-            self.client.submit(_hello, place, workers=[address], allow_other_workers=False, pure=False)
-            for address, place in zip(addresses, places, strict=True)
-        ]
-        workers = []
-        for address, place, answer in zip(addresses, places, asked, strict=True):
-            try:
-                version, name, family = answer.result(timeout=_HELLO)
-            except PotrError as error:
-                raise UsageError(f"worker {address} of the cluster: {error}") from None
-            except Exception as error:
-                raise UsageError(
-                    f"worker {address} of the cluster cannot do the work ({_first_line(error)}): install potr_cl there "
-                    "as it is here"
-                ) from None
-            _check(address, version, name, family, self.first)
-            workers.append(_ClusterWorker(self, address, place))
+        workers = [_ClusterWorker(self, address, place) for address, place in zip(addresses, places, strict=True)]
+        for worker in workers:
+            worker.meet()
         return workers
 
 
 class _ClusterWorker(Worker):
-    """One of Dask's workers."""
+    """One of Dask's workers, with a seat for this pool.
 
-    def __init__(self, pool: ClusterPool, address: str, place: int) -> None:
-        self.name = address
-        self._pool, self._place = pool, place
+    Args:
+        pool: that it is of.
+        name: its address.
+        place: its number among the workers of its computer.
+    """
+
+    def __init__(self, pool: ClusterPool, name: str, place: int) -> None:
+        self.name = name
+        self._pool = pool
+        self._known: list[tuple[int, Any]] = []  # what the seat has been sent
+        self._next = 0
+        self._sending = threading.Lock()
+        options = {"actor": True, "workers": [name], "allow_other_workers": False, "pure": False}
+        with _as_worker_lost(name):
+            self._future = pool.client.submit(_Seat, place, **options)
+        self._seat: Any = None
+
+    def meet(self) -> None:
+        """Wait until it says which device it has.
+
+        Raises:
+            UsageError: it cannot do the work.
+        """
+        try:
+            self._seat = self._pool.wait_for(self._future, self.name, _HELLO)
+            version, name, family = self.ask("hello")
+        except DeviceError as error:
+            raise UsageError(
+                f"worker {self.name} of the cluster cannot do the work ({error}): install potr_cl there as it is here, "
+                "and an OpenCL driver"
+            ) from None
+        _check(self.name, version, name, family, self._pool.first)
+
+    def ask(self, method: str, *args: Any) -> Any:
+        """What a method of the seat returns."""
+        with _as_worker_lost(self.name), self._pool.client.as_current():  # actors look for the client
+            answer = getattr(self._seat, method)(*args)
+        return self._pool.wait_for(answer, self.name)
 
     def make(self, kind: type[Part], memory: int | None, given: Sequence[Any]) -> Future[Held]:
-        # Dask hands an actor what was scattered when it makes it, so these come first.
-        shared = [each.handle for each in given if isinstance(each, Shared)]
-        rest = [_Place() if isinstance(each, Shared) else each for each in given]
-
         def made() -> Held:
-            with _lost_as_worker_lost(self.name):
-                seat = self._pool.client.submit(
-                    _Seat, *shared, actor=True, workers=[self.name], allow_other_workers=False, pure=False
-                )
-            held = _HeldThere(self._pool, self.name, seat, self._pool.wait_for(seat, self.name))
-            held.wait("make", self._place, kind, memory, rest)
-            return held
+            with self._sending:
+                things = [_Known(self._sent(each.handle)) if isinstance(each, Shared) else each for each in given]
+                self._next += 1
+                number = self._next
+            self.ask("make", number, kind, memory, things)
+            return _HeldThere(self._pool, self, number)
 
         return self._pool.begin(made)
+
+    def _sent(self, thing: Any) -> int:
+        """The number by which the seat knows a thing, after sending it if need be."""
+        number = next((number for number, known in self._known if known is thing), None)
+        if number is None:
+            self._next += 1
+            number = self._next
+            # Two: the uncompressed scene, and what is worked on now.
+            kept = self._known[-1:]
+            self.ask("keep", number, thing, [each for each, _ in kept])
+            self._pool.traffic.sent += getattr(thing, "nbytes", 0)
+        else:
+            kept = [each for each in self._known if each[1] is not thing]
+        self._known = [*kept, (number, thing)]
+        return number
+
+    def leave(self) -> None:
+        """Have Dask forget the seat, and with it all that it holds, as soon as it is idle."""
+        with suppress(Exception):
+            self._future.release()
 
 
 class _HeldThere(Held):
     """A part on one of Dask's workers."""
 
-    def __init__(self, pool: ClusterPool, address: str, future: Any, seat: Any) -> None:
-        self._pool, self._address, self._future, self._seat = pool, address, future, seat
-
-    def wait(self, method: str, *args: Any) -> Any:
-        """What a method of the seat returns."""
-        try:
-            with self._pool.client.as_current():  # actors look for it
-                answer = getattr(self._seat, method)(*args)
-        except Exception as error:
-            raise WorkerLost(f"{self._address} is gone ({_first_line(error)})") from None
-        return self._pool.wait_for(answer, self._address)
+    def __init__(self, pool: ClusterPool, worker: _ClusterWorker, number: int) -> None:
+        self._pool, self._worker, self._number = pool, worker, number
 
     def begin(self, command: str, args: Sequence[Any]) -> Future[Any]:
-        return self._pool.begin(lambda: self.wait("run", command, tuple(args)))
+        return self._pool.begin(lambda: self._worker.ask("run", self._number, command, tuple(args)))
 
     def close(self) -> None:
-        with suppress(Exception):
-            if not self._pool._closing.is_set():
-                with self._pool.client.as_current():
-                    self._seat.close().result(timeout=_CLOSE)
-        with suppress(Exception):
-            self._future.release()  # the worker then forgets the seat, as soon as it is idle
+        with suppress(PotrError):
+            self._pool.begin(lambda: self._worker.ask("drop", self._number)).result()
 
 
-class _Place:
-    """Stands for a shared thing among what a part is made with."""
+@dataclass(frozen=True)
+class _Known:
+    """Stands for something that the seat has been sent."""
+
+    number: int
 
 
 class _Seat:
-    """Lives on a worker and holds a part.
+    """Lives on a worker, and holds its parts and what they share.
 
     Args:
-        shared: things that were scattered, for the part.
+        place: the worker's number among those of its computer.
     """
 
-    def __init__(self, *shared: Any) -> None:
-        self._shared = shared
-        self._part: Part | None = None
+    def __init__(self, place: int) -> None:
+        self._place = place
+        self._known: dict[int, Any] = {}
+        self._parts: dict[int, Part] = {}
 
-    def make(self, place: int, kind: type[Part], memory: int | None, given: Sequence[Any]) -> None:
-        """Make the part."""
-        shared = iter(self._shared)
-        things = [next(shared) if isinstance(each, _Place) else each for each in given]
-        self._device = _device(place)
+    def hello(self) -> tuple[str, str, str]:
+        """The version here, the device, and the family of its kernels."""
+        from potr_cl import __version__
+
+        device = _device(self._place)
+        return __version__, str(device.info), device.family
+
+    def keep(self, number: int, thing: Any, others: Sequence[int]) -> None:
+        """Keep a thing for parts, and of those that are known only the ones of these numbers."""
+        self._known = {each: self._known[each] for each in others} | {number: thing}
+
+    def make(self, number: int, kind: type[Part], memory: int | None, given: Sequence[Any]) -> None:
+        """Make a part."""
+        device = _device(self._place)
+        things = [self._known[each.number] if isinstance(each, _Known) else each for each in given]
         # A failure may leave buffers behind that nobody owns any more.
-        with self._device.all_or_nothing(), self._device.errors("failed while encoding"):
-            self._part = kind(self._device, memory, *things)
-        self._shared = ()
+        with device.all_or_nothing(), device.errors("failed while encoding"):
+            self._parts[number] = kind(device, memory, *things)
 
-    def run(self, command: str, args: Sequence[Any]) -> Any:
-        """Give the part a command."""
-        with self._device.errors("failed while encoding"):
-            return getattr(self._part, command)(*args)
+    def run(self, number: int, command: str, args: Sequence[Any]) -> Any:
+        """Give a part a command."""
+        with _device(self._place).errors("failed while encoding"):
+            return getattr(self._parts[number], command)(*args)
 
-    def close(self) -> None:
-        """Give the part's memory back."""
-        part, self._part = self._part, None
+    def drop(self, number: int) -> None:
+        """Give a part's memory back."""
+        part = self._parts.pop(number, None)
         if part is not None:
             part.close()
 
     def __del__(self) -> None:
-        # The master has gone without a word, or does not wait.
-        with suppress(Exception):
-            self.close()
+        # The master has left, perhaps without a word.
+        for number in list(self.__dict__.get("_parts", ())):
+            with suppress(Exception):
+                self.drop(number)
 
 
 _opened: dict[int, Device] = {}
@@ -276,14 +316,6 @@ def _device(place: int) -> Device:
 
 def _kind(info: DeviceInfo) -> tuple[str, str]:
     return info.kind, info.platform
-
-
-def _hello(place: int) -> tuple[str, str, str]:
-    """On a worker: which version it has, and which device and kernels it takes."""
-    from potr_cl import __version__
-
-    device = _device(place)
-    return __version__, str(device.info), device.family
 
 
 def _check(address: str, version: str, name: str, family: str, first: Device) -> None:
@@ -329,7 +361,7 @@ def _is_of_transport(error: Exception) -> bool:
 
 
 @contextmanager
-def _lost_as_worker_lost(who: str) -> Iterator[None]:
+def _as_worker_lost(who: str) -> Iterator[None]:
     try:
         yield
     except PotrError:
