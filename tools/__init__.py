@@ -22,6 +22,7 @@ bench.forecast         how far off is what an encode says beforehand of its time
 bench.install          what does an installation take, and where are there wheels?
 bench.views_between    what do views between the training views bring, and what do they take?
 bench.palettes         how long does a palette of SH coefficients take, and how near does it come?
+bench.outputs          what does a file of another format take beyond the encode itself?
 bench.needs            what is a scene charged for splats, views and tiles that nobody needs?
 bench.busy             how busy is the device during an encode, stage by stage?
 bench.kernels          processor time of each kernel, on machines that do other work too
