@@ -2,9 +2,9 @@
 
     python -m tools.bench.decode_parts FILE.potr … [--runs R] [--json FILE]
 
-Decodes in this process with one thread, by the native path, with a clock around each part that Python calls; the time of
-a part is without those of the parts that it calls. Of files of coder BUNDLES the sections are told apart by decoding a
-bundle to the end of one section and of the next, and their values by decoding with and without them. Memory is told
+Decodes in this process with one thread, by the native path, with a clock around each part that Python calls; the time
+of a part is without those of the parts that it calls. Of files of coder BUNDLES the sections are told apart by decoding
+bundles to the end of one section and of the next, and their values by decoding with and without them. Memory is told
 apart by decoding to arrays that were written to before. Each figure is the least of R runs.
 """
 
