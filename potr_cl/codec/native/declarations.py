@@ -21,14 +21,17 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
         _NUMBER,
         [_POINTER, _SIZE, _POINTER, _SIZE, _NUMBER, _NUMBER, _POINTER, _POINTER, _POINTER],
     ),
-    "potr_octree_tails": (
-        _NUMBER,
-        [_POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _POINTER, _WORD, _WORD, _NUMBER, _POINTER],
+    "potr_octree_cut": (_SIZE, []),
+    "potr_octree_cuts": (
+        _SIZE,
+        [_POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _WORD, _WORD, _POINTER, _WORD, _SIZE, _POINTER],
     ),
-    "potr_octree_centres": (
+    "potr_octree_leaves": (
         _NUMBER,
-        [_POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _POINTER, _WORD, _WORD, _NUMBER, *[_POINTER] * 6, _WORD],
+        [_POINTER, _POINTER, _NUMBER, *[_POINTER] * 3, _NUMBER, *[_POINTER] * 3],
     ),
+    "potr_octree_padding": (_NUMBER, [_POINTER, _POINTER]),
+    "potr_octree_centres": (None, [_POINTER] * 9),
     "potr_encode_recent": (None, [_POINTER, _SIZE, _SIZE, _POINTER]),
     "potr_encode_cells": (None, [_POINTER, _SIZE, _POINTER, _POINTER, _SIZE, ctypes.c_int32, _POINTER]),
     "potr_encode_count": (None, [_POINTER, _SIZE, _POINTER]),
