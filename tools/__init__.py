@@ -13,6 +13,7 @@ bench.refit            what does the re-fit of the colours bring, and what does 
 bench.compaction       speed of the compaction, and its error against float64
 bench.compact_at       when within the pruning schedule to compact?
 bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
+bench.decode_parts     what is the time of a decode made of, part by part?
 bench.whole_command    what is the time of a fresh command `encode` made of?
 bench.codec            speed, memory and size of the codec alone
 bench.search           what does encoding to a size or a PSNR cost, against one plain encode?
