@@ -63,6 +63,11 @@ class Parameters(Owner):
         """Remember the parameters as they are, in place of what was remembered before."""
         cl.enqueue_copy(self._device.queue, self._kept, self.values)
 
+    def back(self) -> None:
+        """Go back to the parameters as they were when :meth:`keep` was called last, or at first."""
+        cl.enqueue_copy(self._device.queue, self.values, self._kept)
+        self.give()
+
     def kept(self) -> Scene:
         """The scene as it was when :meth:`keep` was called last. Splats that have not moved are the same bit by bit."""
         columns = self.columns
