@@ -12,7 +12,8 @@ fitted to the whole scene's renders of training views, by Adam as the stage "fit
 - D is a part of the blocks' diagonal, which grows where a step has gained less than it promised and falls where it has
   gained what it promised (the trust region). A step that makes the batch worse is taken back.
 
-It tells PSNR on training and on test views against the seconds that a fit has computed; judging is not counted.
+It tells PSNR on training and on test views against the seconds that a fit has computed (of processors together, where
+the device is a CPU); judging is not counted.
 """
 
 from __future__ import annotations
@@ -342,10 +343,10 @@ class Race:
             solver = begin(derivatives, pictures)
             next(solver)  # builds kernels
             while spent < seconds and waiting:
-                began = time.perf_counter()
+                began = _now(device)
                 told = next(solver)
                 device.queue.finish()
-                spent += time.perf_counter() - began
+                spent += _now(device) - began
                 steps += 1
                 if spent >= waiting[0]:
                     while waiting and spent >= waiting[0]:
@@ -354,6 +355,11 @@ class Race:
                     print(" ".join(map(str, rows[-1])), flush=True)
             solver.close()
         return rows
+
+
+def _now(device: Device) -> float:
+    """Seconds: of the clock on GPUs; on CPUs, which other work may share, of all processors together."""
+    return time.process_time() if device.info.kind == "cpu" else time.perf_counter()
 
 
 def usual_size(scene: Scene) -> float:
@@ -387,12 +393,12 @@ def adam(
             yield ""
             spent = 0.0
             while True:
-                began = time.perf_counter()
+                began = _now(race.device)
                 numbers = next(order)
                 derivatives.add([race.train[n] for n in numbers], pictures.of(numbers), unit=8.0)
                 it.step(derivatives.gradient, 0.1 ** min(spent / seconds, 1.0))
                 race.device.queue.finish()
-                spent += time.perf_counter() - began
+                spent += _now(race.device) - began
                 yield ""
 
     return run

@@ -116,13 +116,11 @@ kernel void chain(
         const vfloat a = p.a, b = p.b, c = p.c, inverse_z = p.inverse_z;
 
         /* The centre on screen, and the covariance: L^T M L, where M has the sums of e U^2, e U V and e V^2, and
-           L = (a b; 0 c). */
+           L = (a b; 0 c), which takes (mx, my) to (u, v). */
         const vfloat by_x = 2.0f * LN2 * a * sums[4];
         const vfloat by_y = 2.0f * LN2 * (b * sums[4] + c * sums[5]);
-        const float factor = 2.0f * LN2 * LN2;
-        const vfloat by_xx = factor * a * a * sums[6];
-        const vfloat by_xy = factor * a * (b * sums[6] + c * sums[7]);
-        const vfloat by_yy = factor * (b * b * sums[6] + 2.0f * b * c * sums[7] + c * c * sums[8]);
+        const float factor = 4.0f * LN2 * LN2;
+        const vfloat uu = factor * sums[6], uv = factor * sums[7], vv = factor * sums[8];
 #if ANTIALIASED
         const vint loses = p.sharp / p.determinant > LEAST_COMPENSATION_SQUARED;
         const vfloat by_sharp = loses ? sums[3] * (1.0f / p.sharp - 1.0f / p.determinant) : (vfloat)(0.0f);
@@ -130,17 +128,21 @@ kernel void chain(
 #endif
         vfloat by_ratio_x = (vfloat)(0.0f), by_ratio_y = (vfloat)(0.0f), by_size = (vfloat)(0.0f);
         for (int k = 0; k < 3; ++k) {
-            vfloat by_mx = 2.0f * (by_xx * p.mx[k] + by_xy * p.my[k]);
-            vfloat by_my = 2.0f * (by_xy * p.mx[k] + by_yy * p.my[k]);
+            const vfloat by_u = uu * p.u[k] + uv * p.v[k], by_v = uv * p.u[k] + vv * p.v[k];
+            vfloat by_mx = a * by_u, by_my = b * by_u + c * by_v;
+            vfloat by_scale = by_u * p.u[k] + by_v * p.v[k];
 #if ANTIALIASED
             const int i = (k + 1) % 3, j = (k + 2) % 3;
-            by_mx += by_sharp * (p.my[i] * p.n[j] - p.my[j] * p.n[i]) + by_trace * p.mx[k];
-            by_my += by_sharp * (p.n[i] * p.mx[j] - p.n[j] * p.mx[i]) + by_trace * p.my[k];
+            const vfloat more_x = by_sharp * (p.my[i] * p.n[j] - p.my[j] * p.n[i]) + by_trace * p.mx[k];
+            const vfloat more_y = by_sharp * (p.n[i] * p.mx[j] - p.n[j] * p.mx[i]) + by_trace * p.my[k];
+            by_mx += more_x;
+            by_my += more_y;
+            by_scale += more_x * p.mx[k] + more_y * p.my[k];
 #endif
             const vint kept = axis_changes(&p, k);
             by_mx = kept ? by_mx : (vfloat)(0.0f);
             by_my = kept ? by_my : (vfloat)(0.0f);
-            const vfloat by_scale = by_mx * p.mx[k] + by_my * p.my[k];
+            by_scale = kept ? by_scale : (vfloat)(0.0f);
             by_size += by_scale;
             add_to(gradient + (3 + k) * column, index, seen, by_scale);
             const vfloat of_x = by_mx * p.along_x[k], of_y = by_my * p.along_y[k];

@@ -87,7 +87,8 @@ kernel void splat_tangents(
     const vfloat d_x = view->fx * d_across, d_y = view->fy * d_down;
 
     /* The ellipse. */
-    vfloat d_xx = (vfloat)(0.0f), d_xy = (vfloat)(0.0f), d_yy = (vfloat)(0.0f);
+    const vfloat a = p.a, b = p.b, c = p.c;
+    vfloat uu = (vfloat)(0.0f), uv = (vfloat)(0.0f), vv = (vfloat)(0.0f);
 #if ANTIALIASED
     vfloat half_sharp = (vfloat)(0.0f), half_trace = (vfloat)(0.0f);
 #endif
@@ -97,22 +98,24 @@ kernel void splat_tangents(
             d_turned[i] = w[3 * i] * d_axes[3 * k] + w[3 * i + 1] * d_axes[3 * k + 1] + w[3 * i + 2] * d_axes[3 * k + 2];
         const vfloat growth = VLOAD(index, direction + (3 + k) * column) - d_depth;
         const vfloat nearing = p.turned[3 * k + 2];
-        vfloat d_mx = p.mx[k] * growth + p.along_x[k] * (d_turned[0] - p.ratio_x * d_turned[2] - d_ratio_x * nearing);
-        vfloat d_my = p.my[k] * growth + p.along_y[k] * (d_turned[1] - p.ratio_y * d_turned[2] - d_ratio_y * nearing);
+        const vfloat turned_x = p.along_x[k] * (d_turned[0] - p.ratio_x * d_turned[2] - d_ratio_x * nearing);
+        const vfloat turned_y = p.along_y[k] * (d_turned[1] - p.ratio_y * d_turned[2] - d_ratio_y * nearing);
         const vint changes = axis_changes(&p, k);
-        d_mx = changes ? d_mx : (vfloat)(0.0f);
-        d_my = changes ? d_my : (vfloat)(0.0f);
-        d_xx += 2.0f * p.mx[k] * d_mx;
-        d_xy += p.mx[k] * d_my + p.my[k] * d_mx;
-        d_yy += 2.0f * p.my[k] * d_my;
+        vfloat d_u = p.u[k] * growth + a * turned_x + b * turned_y, d_v = p.v[k] * growth + c * turned_y;
+        d_u = changes ? d_u : (vfloat)(0.0f);
+        d_v = changes ? d_v : (vfloat)(0.0f);
+        uu += p.u[k] * d_u;
+        uv += p.v[k] * d_u + p.u[k] * d_v;
+        vv += p.v[k] * d_v;
 #if ANTIALIASED
         const int i = (k + 1) % 3, j = (k + 2) % 3;
+        const vfloat d_mx = changes ? p.mx[k] * growth + turned_x : (vfloat)(0.0f);
+        const vfloat d_my = changes ? p.my[k] * growth + turned_y : (vfloat)(0.0f);
         half_sharp += (p.my[i] * p.n[j] - p.my[j] * p.n[i]) * d_mx + (p.n[i] * p.mx[j] - p.n[j] * p.mx[i]) * d_my;
         half_trace += p.mx[k] * d_mx + p.my[k] * d_my;
 #endif
     }
-    const vfloat a = p.a, b = p.b, c = p.c;
-    const float factor = 2.0f * LN2 * LN2;
+    const float factor = 4.0f * LN2 * LN2;
     vfloat numbers[NUMBERS];
     /* log2 of the opacity changes with its logit by (1 - opacity) / ln 2. */
     numbers[3] = VLOAD(index, direction + 10 * column) * -expm1(LN2 * VLOAD(index, log2_opacities));
@@ -124,9 +127,9 @@ kernel void splat_tangents(
 #endif
     numbers[4] = 2.0f * LN2 * (a * d_x + b * d_y);
     numbers[5] = 2.0f * LN2 * c * d_y;
-    numbers[6] = factor * (a * (a * d_xx + 2.0f * b * d_xy) + b * b * d_yy);
-    numbers[7] = 2.0f * factor * c * (a * d_xy + b * d_yy);
-    numbers[8] = factor * c * c * d_yy;
+    numbers[6] = factor * uu;
+    numbers[7] = factor * uv;
+    numbers[8] = factor * vv;
 
     /* The colour. Channels that are cut are 0, and stay so. */
     const vfloat nearness = 1.0f / sqrt(p.away[0] * p.away[0] + p.away[1] * p.away[1] + p.away[2] * p.away[2]);
