@@ -309,8 +309,8 @@ class Counted:
 @pytest.mark.one_runtime
 @pytest.mark.parametrize("rounds", [True, False])
 def test_no_picture_is_looked_at_only_to_measure_what_the_next_solution_measures(case, rounds):
-    """At the start, after the choice of coefficients, after rounding, and at the end; where nothing is rounded, the last
-    two are one."""
+    """At the start, after the choice of coefficients, after rounding, and at the end; where nothing is rounded, the
+    last two are one."""
     targets = Counted(case.targets)
     refitted = refit_colours(
         case.device, case.scene, case.cameras, targets, RefitOptions(steps=4, gain=0, drop=1e-7, memory=0),

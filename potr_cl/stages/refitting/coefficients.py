@@ -53,7 +53,7 @@ class Layout:
         return {"LANES": self.lanes, "SH_COUNT": self.sh_count}
 
     def some(self, constant: bool) -> dict[str, int]:
-        """The same for kernels that look at all coefficients, or at the constant ones alone: their columns come first."""
+        """The same for kernels that look at all coefficients, or at the constant ones, whose columns come first."""
         return {**self.macros, "SH_COUNT": 1} if constant else self.macros
 
     def over_splats(self, kernel: Kernel, *others: int) -> None:

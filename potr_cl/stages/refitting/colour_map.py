@@ -188,7 +188,7 @@ class ColourMap(Owner):
     def _enqueue_colours(
         self, views: ViewSet, x: cl.Buffer, result: cl.Buffer, unit: float | None, constant: bool = False
     ) -> None:
-        """Enqueue the views' colours, or with a unit those that so many times a direction adds where none is cut at 0."""
+        """Enqueue the views' colours, or what ``unit`` times a direction adds to them where none is cut at 0."""
         kernel = self._view_colours[constant]
         kernel.bind(
             coefficients=x,

@@ -133,6 +133,7 @@ def refit_colours(
             progress(done, steps + more)
 
     with ColourRefit(device, scene, cameras, background=background, memory=options.memory) as refit:
+
         def solve(check: bool) -> Refitted:
             return refit.solve(scene.sh, targets, options, active, progress=report, check=check)
 
