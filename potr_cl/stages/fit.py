@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 from potr_cl.errors import UsageError
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.fit import FitOptions, LeftOut, fit_scene
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
@@ -28,7 +29,7 @@ class Fit(Stage):
 
     Attributes:
         steps: the most steps of the fit; with 0 it is left out.
-        batch, rounds, patience, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
+        batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
         UsageError: a value is out of range.
@@ -51,6 +52,7 @@ class Fit(Stage):
     batch: int = option(FitOptions.batch)
     rounds: int = option(FitOptions.rounds)
     patience: int = option(FitOptions.patience)
+    rates: Rates = option(FitOptions.rates)
     last: float = option(FitOptions.last)
     seed: int = option(FitOptions.seed)
 
@@ -67,6 +69,7 @@ class Fit(Stage):
             batch=self.batch,
             rounds=self.rounds,
             patience=self.patience,
+            rates=self.rates,
             last=self.last,
             seed=self.seed,
             memory=memory,
