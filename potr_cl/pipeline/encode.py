@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
@@ -26,7 +26,8 @@ from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.stages.fitting.fit import Fitted, LeftOut
+from potr_cl.stages.fit import LeftOut
+from potr_cl.stages.fitting.fit import Fitted
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.pruning.unseen import Unseen
@@ -148,6 +149,7 @@ def encode(
     antialiased: bool | None = None,
     kept: KeptScene | None = None,
     in_frame: bool = False,
+    tell: Callable[[str], None] | None = None,
 ) -> Encoded:
     """Encode a scene.
 
@@ -162,6 +164,7 @@ def encode(
         antialiased: whether to take it as an antialiased scene; None: as what it says that it is.
         kept: the scene on the device, if it will be needed there afterwards.
         in_frame: whether :func:`check_frame` has found the cameras to be in the scene's frame.
+        tell: told a line for every round of a fit.
 
     Raises:
         UsageError: options out of range, cameras without a training view, or cameras that are probably not in the
@@ -172,7 +175,7 @@ def encode(
     options = options or EncodeOptions()
     scene = scene.rendered(antialiased)
     tell_losses(scene, options)
-    watch = Stopwatch(progress)
+    watch = Stopwatch(progress, tell)
     cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame)
     with ExitStack() as stack:
         if kept is None and cameras and options.look_at_views(scene):
@@ -263,6 +266,7 @@ class Run:
             interludes=self._interludes(stage, state),
             metadata=lambda last: _metadata(last, options),
             progress=self._watch,
+            tell=self._watch.tell,
             output=options.output,
             kept=self._kept,
         )
@@ -314,10 +318,12 @@ class Stopwatch:
 
     Attributes:
         seconds: wall time by stage, in the order in which they began.
+        tell: takes lines about the work.
     """
 
-    def __init__(self, progress: Progress | None = None) -> None:
+    def __init__(self, progress: Progress | None = None, tell: Callable[[str], None] | None = None) -> None:
         self._progress = progress
+        self.tell: Callable[[str], None] = tell or _log.debug
         self._running: str | None = None
         self._last = time.perf_counter()
         self.seconds: dict[str, float] = {}

@@ -94,7 +94,7 @@ def encode_to_target(
     options = options or EncodeOptions()
     scene = scene.rendered(antialiased)
     tell_losses(scene, options)
-    watch = Stopwatch(progress)
+    watch = Stopwatch(progress, tell)
     cameras = cameras_or_virtual(scene, cameras, options, watch)
     if target.min_psnr is not None and not cameras:
         raise UsageError("a PSNR can be reached with cameras only: without them there is no view to judge by")

@@ -110,6 +110,7 @@ class Workbench:
         metadata: makes the file's metadata from the last state.
         output: the kind of file that is made in the end.
         progress: called to say how far the work is.
+        tell: called with a line about the work that progress has no place for.
         kept: the uncompressed scene, where it stays on the device from one stage to the next.
     """
 
@@ -121,6 +122,7 @@ class Workbench:
     interludes: tuple[Interlude, ...] = ()
     metadata: Callable[[State], bytes] = lambda state: b""
     progress: Progress = lambda what, done: None
+    tell: Callable[[str], None] = lambda line: None
     output: Output = field(default_factory=Potr)
     kept: KeptScene | None = None
 

@@ -12,8 +12,8 @@ from potr_cl.errors import UsageError
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.refit_cases import Pictures
 from potr_cl.reference.scenes import ring_of_cameras, visible_scene
-from potr_cl.stages.fit import Fit
-from potr_cl.stages.fitting.fit import FitOptions, Fitted, LeftOut, fit_scene
+from potr_cl.stages.fit import Fit, LeftOut
+from potr_cl.stages.fitting.fit import FitOptions, Fitted, fit_scene
 from potr_cl.stages.fitting.views import batches, share_out
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import State, Workbench

@@ -7,9 +7,10 @@ coder: "q0.1/1000" prunes it as q = 0.1 would, and fits it in 1000 steps; "q0.3/
 what is left and fits again. What follows, "@0.3@0.5", are the qualities of the re-fit and the coder: the work before
 them is done once for all. After a "+", options of the fit: "q0.1/1000+last=0.2@0.3", "+groups=means:dc" moves these
 parameters only, "+between=3" has it look at three views between for each training view, and at none that an encode
-adds. PSNR is the mean over the test views against the uncompressed scene's renders; bytes at equal PSNR are against the
-scene without a fit at the --plain qualities, interpolated in the logarithm of the bytes. PSNR before and after the fit
-are of what is not yet coded.
+adds; "+further=7" has it remove splats itself and decide whether to be left out, as an encode does. PSNR is the mean
+over the test views against the uncompressed scene's renders; bytes at equal PSNR are against the scene without a fit at
+the --plain qualities, interpolated in the logarithm of the bytes. PSNR before and after the fit are of what is not yet
+coded.
 
 --fraction F takes all pictures smaller, --every N takes every N-th training view, and --iterations N prunes in fewer
 iterations: for a CPU, not for publication. --limit S begins nothing new after so many seconds.
@@ -104,7 +105,7 @@ class Course:
             if name == "groups":
                 options["rates"] = only(value.split(":"))
             else:
-                options[name] = float(value) if name == "last" else int(value)
+                options[name] = float(value) if name in ("last", "further") else int(value)
         turns = tuple((float(q.removeprefix("q")), int(n)) for q, n in parts)
         return Course(text, turns, options, options.pop("between", None), tuple(map(float, qualities)))
 
@@ -168,6 +169,9 @@ class Bench(Owner):
             options = self._options.changed(prune={"delta_mse_max": limit}, fit={"steps": steps, **course.fit})
             state, seconds = self._run(state, options, [Prune])
             prune += seconds
+            if "further" not in course.fit:  # the fit takes what it is given, and keeps what comes of it
+                learnt = {name: each for name, each in state.learnt.items() if name != "price"}
+                state = dataclasses.replace(state, learnt=learnt)
             if steps:
                 before = self._judge.psnr(state.scene)
                 views, added = self._seen(state, course.between)
