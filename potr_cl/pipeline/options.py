@@ -118,12 +118,18 @@ class EncodeOptions:
     def parameters(self) -> HyperParameters:
         """The hyper-parameters that q gives, but for those that a stage replaces.
 
+        A stage that is done may have them taken from another q (:meth:`potr_cl.stages.stage.Stage.quality`).
+
         Raises:
             UsageError: q or a replaced value is out of range.
         """
         given = {name: getattr(stage, name) for stage in self.stages for name in parameters(type(stage))}
         given |= {name: value for name, value in self.output.replaces.items() if given.get(name) is None}
-        return HyperParameters.from_quality(self.q, self.preset, **given)
+        q = self.q
+        if 0 <= q <= 1:
+            for stage in self.stages:
+                q = stage.quality(q) if stage.asked_for else q
+        return HyperParameters.from_quality(q, self.preset, **given)
 
     def with_parameters(self, **values: float) -> EncodeOptions:
         """The same with some hyper-parameters replaced, each in the stage that has it.

@@ -190,6 +190,10 @@ class Stage(ABC):
         """Whether there is anything in this scene for which the stage has to look at views."""
         return self.asked_for and self.needs_views
 
+    def quality(self, q: float) -> float:
+        """The q whose hyper-parameters all stages take where a user asks for this q, if this stage is done."""
+        return q
+
     @property
     def removes_in(self) -> int | None:
         """In how many iterations the stage removes splats; None: there are none for other stages to come between."""

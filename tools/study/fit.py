@@ -7,10 +7,10 @@ coder: "q0.1/1000" prunes it as q = 0.1 would, and fits it in 1000 steps; "q0.3/
 what is left and fits again. What follows, "@0.3@0.5", are the qualities of the re-fit and the coder: the work before
 them is done once for all. After a "+", options of the fit: "q0.1/1000+last=0.2@0.3", "+groups=means:dc" moves these
 parameters only, "+between=3" has it look at three views between for each training view, and at none that an encode
-adds; "+further=7" has it remove splats itself and decide whether to be left out, as an encode does. PSNR is the mean
-over the test views against the uncompressed scene's renders; bytes at equal PSNR are against the scene without a fit at
-the --plain qualities, interpolated in the logarithm of the bytes. PSNR before and after the fit are of what is not yet
-coded.
+adds. "encode/1000@0.3" is an encode as users have it, with --fit 1000: it removes more splats by itself and decides
+whether the fit pays; "encode/1000+cycles=2@0.3" has other options of the stage. PSNR is the mean over the test views
+against the uncompressed scene's renders; bytes at equal PSNR are against the scene without a fit at the --plain
+qualities, interpolated in the logarithm of the bytes. PSNR before and after the fit are of what is not yet coded.
 
 --fraction F takes all pictures smaller, --every N takes every N-th training view, and --iterations N prunes in fewer
 iterations: for a CPU, not for publication. --limit S begins nothing new after so many seconds.
@@ -77,14 +77,14 @@ class Course:
 
     Attributes:
         text: as it was given, without the qualities.
-        parts: by turns, the q whose threshold pruning takes, and the steps of the fit.
+        parts: by turns, the q whose threshold pruning takes, or None for that of the encode, and the steps of the fit.
         fit: further options of the fit.
         between: for each training view, views between that only the fit looks at; None: those that all look at.
         qualities: of the re-fit and the coder.
     """
 
     text: str
-    parts: tuple[tuple[float, int], ...]
+    parts: tuple[tuple[float | None, int], ...]
     fit: dict[str, Any]
     between: int | None
     qualities: tuple[float, ...]
@@ -105,8 +105,8 @@ class Course:
             if name == "groups":
                 options["rates"] = only(value.split(":"))
             else:
-                options[name] = float(value) if name in ("last", "further") else int(value)
-        turns = tuple((float(q.removeprefix("q")), int(n)) for q, n in parts)
+                options[name] = float(value) if name in ("last", "further", "finer") else int(value)
+        turns = tuple((None if q == "encode" else float(q.removeprefix("q")), int(n)) for q, n in parts)
         return Course(text, turns, options, options.pop("between", None), tuple(map(float, qualities)))
 
 
@@ -131,6 +131,16 @@ def threshold(q: float, preset: Any) -> float:
     """ΔMSE_MAX as a quality has it, also beyond 0 and 1, where it goes on in the same way."""
     low, high = (HyperParameters.from_quality(end, preset).delta_mse_max for end in (0.0, 1.0))
     return float(low * (high / low) ** q)
+
+
+@dataclass(frozen=True)
+class _Fitted:
+    """What a course has made of a scene: seconds, and PSNR before and after the last fit."""
+
+    state: State
+    prune: float
+    fit: float
+    psnrs: list[float] | None
 
 
 class Bench(Owner):
@@ -163,13 +173,34 @@ class Bench(Owner):
 
     def measure(self, course: Course, table: Table) -> None:
         """Encode, and put a row for each quality into the table."""
+        known: _Fitted | None = None
+        for q in course.qualities:
+            if known is None or course.parts[0][0] is None:
+                known = self._fitted(course, q)
+            options = self._options.changed(q=q)
+            if course.parts[0][0] is None:
+                options = options.changed(fit={"steps": course.parts[0][1], **course.fit})
+            coded, seconds = self._run(known.state, options, [Refit, Code])
+            data = b"".join(coded.learnt["code"].pieces)
+            found = {"bytes": len(data), "psnr": self._judge.psnr(decode(data, trust=True))}
+            if known.psnrs is None:
+                self._plain.append(found)
+            same = size_at(self._plain, "psnr", found["psnr"])
+            saved = 100 * (len(data) / same - 1) if same else None
+            table.add(
+                self.name, course.text, q, len(coded.scene), len(data), found["psnr"], known.psnrs, saved,
+                known.prune, known.fit, seconds,
+            )  # fmt: skip
+
+    def _fitted(self, course: Course, q: float) -> _Fitted:
         state, prune, fit, psnrs = self._start, 0.0, 0.0, None
         for pruned_as, steps in course.parts:
-            limit = threshold(pruned_as, self._options.preset)
-            options = self._options.changed(prune={"delta_mse_max": limit}, fit={"steps": steps, **course.fit})
+            options = self._options.changed(q=q, fit={"steps": steps, **course.fit})
+            if pruned_as is not None:
+                options = options.changed(prune={"delta_mse_max": threshold(pruned_as, options.preset)})
             state, seconds = self._run(state, options, [Prune])
             prune += seconds
-            if "further" not in course.fit:  # the fit takes what it is given, and keeps what comes of it
+            if pruned_as is not None:  # the fit takes what it is given, and keeps what comes of it
                 learnt = {name: each for name, each in state.learnt.items() if name != "price"}
                 state = dataclasses.replace(state, learnt=learnt)
             if steps:
@@ -180,19 +211,7 @@ class Bench(Owner):
                 state = dataclasses.replace(fitted, views=state.views, added=state.added)
                 fit += seconds
                 psnrs = [before, self._judge.psnr(state.scene)]
-        for q in course.qualities:
-            options = self._options.changed(q=q)
-            coded, seconds = self._run(state, options, [Refit, Code])
-            data = b"".join(coded.learnt["code"].pieces)
-            found = {"bytes": len(data), "psnr": self._judge.psnr(decode(data, trust=True))}
-            if psnrs is None:
-                self._plain.append(found)
-            same = size_at(self._plain, "psnr", found["psnr"])
-            saved = 100 * (len(data) / same - 1) if same else None
-            splats = len(coded.scene)
-            table.add(
-                self.name, course.text, q, splats, len(data), found["psnr"], psnrs, saved, prune, fit, seconds
-            )  # fmt: skip
+        return _Fitted(state, prune, fit, psnrs)
 
     def _seen(self, state: State, between: int | None) -> tuple[tuple[Camera, ...], int]:
         """What a fit looks at, and how many of these views lie between those that were given."""
