@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.encoder import Coded
+from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, PotrError
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.agreement import require_agreement
@@ -26,7 +27,7 @@ from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.stages.fit import LeftOut
+from potr_cl.stages.fit import Fit, LeftOut
 from potr_cl.stages.fitting.fit import Fitted
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
@@ -58,6 +59,7 @@ class Encoded:
         seconds: wall time by stage.
         options: that it was encoded with: those that were given, or that a search for a size or a PSNR has found.
         source_splats: how many splats the source scene has.
+        parameters: the hyper-parameters that the stages took.
     """
 
     pieces: list[bytes]
@@ -73,6 +75,7 @@ class Encoded:
     seconds: dict[str, float]
     options: EncodeOptions
     source_splats: int
+    parameters: HyperParameters
 
     def __repr__(self) -> str:
         q = f"q {self.options.q:.4g} of preset {self.options.preset}"
@@ -257,14 +260,14 @@ class Run:
         return state
 
     def _one(self, stage: Stage, state: State) -> State:
-        options = self._options
+        options = as_done(self._options, state)
         bench = Workbench(
             options.parameters,
             memory=options.memory,
             background=options.background,
             threads=options.threads,
             interludes=self._interludes(stage, state),
-            metadata=lambda last: _metadata(last, options),
+            metadata=lambda last: _metadata(last, as_done(options, last)),
             progress=self._watch,
             tell=self._watch.tell,
             output=options.output,
@@ -310,7 +313,15 @@ class Run:
             seconds=self._watch.seconds,
             options=self._options,
             source_splats=len(state.source),
+            parameters=as_done(self._options, state).parameters,
         )
+
+
+def as_done(options: EncodeOptions, state: State) -> EncodeOptions:
+    """The options as a state has followed them: without a fit that was left out, for which others would be finer."""
+    if isinstance(state.learnt.get(Fit.name), LeftOut):
+        return options.changed(fit=False)
+    return options
 
 
 class Stopwatch:

@@ -27,7 +27,7 @@ from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, cameras_or_virtual, tell_losses
+from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, as_done, cameras_or_virtual, tell_losses
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.growth import FASTEST, SLOWEST, FinenessAxis, Typical, meet, with_colour_steps, with_steps
 from potr_cl.pipeline.options import EncodeOptions
@@ -225,6 +225,7 @@ class _Search:
             return q
         thinned = self._thin(options)
         self._mind_interrupts(thinned)
+        options = as_done(options, thinned)
         value = self._evaluate("scout", rough, thinned, self._refit(thinned, options), options).value
         if shorter_refit:
             size, psnr = _SCOUT_MISSES
@@ -237,6 +238,7 @@ class _Search:
         options = self._options.changed(q=q)
         thinned = self._thin(options)
         self._mind_interrupts(thinned)
+        options = as_done(options, thinned)
         found = self._evaluate("encode", q, thinned, self._refit(thinned, options), options)
         self._encoded[q] = found.value
         return found
@@ -299,7 +301,7 @@ class _Search:
         chosen = start.options.parameters
         once = [kind for kind in self._once if kind is Prune or self._options.stage(kind).on]
         kept = {name: getattr(chosen, name) for kind in once for name in parameters(kind)}
-        options = self._options.changed(q=q).with_parameters(**kept)
+        options = as_done(self._options.changed(q=q), start.thinned).with_parameters(**kept)
         return self._evaluate("refit", q, start.thinned, self._refit(start.thinned, options), options)
 
     def _with_other_steps(self, start: _Candidate, q: float) -> _Candidate:

@@ -22,9 +22,9 @@ from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
 #: By so much a fit lessens the harm of a splat that is gone, about (docs/benchmarks/fit.md).
-FURTHER = 7.0
-#: By how much the others take a higher q for the fit to reach the PSNR that q has without it: at q = 0; less and less
-#: up to q = 1, because a fit brings the more, the fewer splats are left.
+FURTHER = 5.0
+#: By how much finer than q the re-fit and the coder round, so that the PSNR is about that of q without a fit: at q = 0;
+#: less and less up to q = 1, because a fit brings the more, the fewer splats are left.
 FINER = 0.115
 #: Steps that "auto" stands for.
 STEPS: dict[Family, int] = {"cpu": 500, "gpu": 1500}
@@ -77,7 +77,7 @@ class Fit(Stage):
         steps: the most steps of the fit; with 0 it is left out. "auto": as many as pay on the device.
         further: times the ΔMSE_MAX of the pruning before it up to which splats are removed for the fit to make up for;
             1: none are.
-        finer: by how much of its way to 1 the q is higher whose hyper-parameters all stages take.
+        finer: by how much of its way to 1 the q is higher whose hyper-parameters the re-fit and the coder take.
         cycles: how often at most splats are removed and a fit follows: as long as that pays.
         iterations: of the pruning in each of them.
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.

@@ -191,7 +191,10 @@ class Stage(ABC):
         return self.asked_for and self.needs_views
 
     def quality(self, q: float) -> float:
-        """The q whose hyper-parameters all stages take where a user asks for this q, if this stage is done."""
+        """The q whose hyper-parameters stages take where a user asks for this q, if this stage is done.
+
+        But the threshold of the pruning is that of the q that is asked for.
+        """
         return q
 
     @property
