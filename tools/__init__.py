@@ -67,6 +67,7 @@ What tests and pages are made of (``make``):
 
 ====================  ==================================================================================================
 make.large_scene      a scene of any size with the statistics of a real one
+make.city             copies of trained scenes side by side, any number of splats and views
 make.test_data        the excerpts in tests/data
 make.release          a wheel and an sdist that are ready for a package index
 make.viewer_pictures  the pictures of the viewer in README and docs

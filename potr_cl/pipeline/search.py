@@ -22,6 +22,7 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from potr_cl.codec.blocks.geometry import GeometryOfBlocks
 from potr_cl.codec.geometry import Geometry
 from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.model.camera import Camera, train_views
@@ -328,7 +329,7 @@ class _Search:
             if self._fitted and self._options.output.fixes_ac:
                 # The re-fit has rounded to the steps.
                 reduced = self._refit(start.thinned, options)
-            elif isinstance(geometry, Geometry):
+            elif isinstance(geometry, (Geometry, GeometryOfBlocks)):
                 reduced = dataclasses.replace(reduced, geometry=geometry.with_colour_steps(options.parameters))
             found = self._evaluate("colours", start.options.q, start.thinned, reduced, options)
             points[finer] = found.value
