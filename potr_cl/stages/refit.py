@@ -15,7 +15,14 @@ from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
-from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, Refitted, active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit import (
+    ColourRefit,
+    HelpFrom,
+    RefitOptions,
+    Refitted,
+    active_coefficients,
+    refit_colours,
+)
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
@@ -140,6 +147,8 @@ class Refit(Stage):
             found = refit_colours(
                 bench.opened, decoded, views, targets, options, active, bench.background, progress,
                 fix_ac if bench.output.fixes_ac else None,
+                # Photographs lie where the master reads them.
+                HelpFrom(bench.pool, state.source) if bench.pool and isinstance(targets, RenderedTargets) else None,
             )  # fmt: skip
             return found, geometry
 
@@ -189,6 +198,7 @@ class RefitOnTheWay(Stage):
                 RefitOptions(steps=self.steps, memory=bench.memory),
                 background=bench.background,
                 progress=lambda done, steps: bench.progress("refit", 0.99 * done / steps),
+                help_from=None if bench.pool is None else HelpFrom(bench.pool, state.source),
             )
         bench.progress("refit", 1.0)
         return state.recoloured(refitted.sh)

@@ -27,6 +27,7 @@ from potr_cl.outputs.output import Output, Request, Rounded
 from potr_cl.outputs.potr import Potr
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
+from potr_cl.workers.pool import Pool
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -111,6 +112,7 @@ class Workbench:
         output: the kind of file that is made in the end.
         progress: called to say how far the work is.
         kept: the uncompressed scene, where it stays on the device from one stage to the next.
+        pool: workers that views are shared out to; None: the device does all of them.
     """
 
     parameters: HyperParameters
@@ -123,6 +125,7 @@ class Workbench:
     progress: Progress = lambda what, done: None
     output: Output = field(default_factory=Potr)
     kept: KeptScene | None = None
+    pool: Pool | None = None
 
     def drawable(self, scene: Scene) -> Drawable:
         """What to give to a rasterizer for a scene: it may lie on the device already."""

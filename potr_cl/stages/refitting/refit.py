@@ -28,8 +28,11 @@ from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients, Layout, Ridge
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
+from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection
 from potr_cl.stages.refitting.targets import Targets
+from potr_cl.workers.dealing import shares
+from potr_cl.workers.pool import Pool
 
 #: Steps in which the constant coefficients are solved for once more, after the others have been rounded.
 _CONSTANT_STEPS = 3
@@ -101,6 +104,7 @@ def refit_colours(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: Callable[[int, int], None] | None = None,
     fix_ac: Callable[[FloatArray, ColourRefit], FloatArray] | None = None,
+    help_from: HelpFrom | None = None,
 ) -> Refitted:
     """Re-fit a scene's colours to pictures of all views together.
 
@@ -116,6 +120,7 @@ def refit_colours(
         fix_ac: chooses the AC coefficients that a file can hold, from the solution (N, M, 3) R, G, B, which it must not
             change, and from what the re-fit knows of them (:meth:`ColourRefit.worth`). The constant ones are then
             solved for again. If it returns the solution itself, that stays as it is.
+        help_from: workers that do some of the views; the targets are then pictures of a scene.
 
     Raises:
         UsageError: no camera.
@@ -128,7 +133,9 @@ def refit_colours(
         if progress is not None:
             progress(done, steps + more)
 
-    with ColourRefit(device, scene, cameras, background=background, memory=options.memory) as refit:
+    with ColourRefit(
+        device, scene, cameras, background=background, memory=options.memory, help_from=help_from
+    ) as refit:
         found = refit.solve(scene.sh, targets, options, active, progress=report)
         fixed = found.sh if fix_ac is None else fix_ac(found.sh, refit)
         if fixed is found.sh:
@@ -141,6 +148,19 @@ def refit_colours(
         return Refitted(again.sh, (found.errors[0], again.errors[1]), found.steps + again.steps)
 
 
+@dataclass(frozen=True)
+class HelpFrom:
+    """Workers that do some of the views of a re-fit.
+
+    Attributes:
+        pool: the workers.
+        source: the scene whose pictures are the targets.
+    """
+
+    pool: Pool
+    source: Scene
+
+
 class ColourRefit(Owner):
     """The map and the solver of one scene, for any number of solutions.
 
@@ -150,6 +170,7 @@ class ColourRefit(Owner):
         cameras: the views that count, all the same whatever their size.
         rules, background: of the rasterizer.
         memory: bytes of device memory that prepared views and targets may take; None: a quarter of what is free.
+        help_from: workers that do some of the views.
 
     Attributes:
         coefficients, colour_map: the vectors and the map, for callers that want products rather than solutions.
@@ -167,10 +188,21 @@ class ColourRefit(Owner):
         rules: RasterRules = INRIA,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         memory: int | None = None,
+        help_from: HelpFrom | None = None,
     ) -> None:
         if not cameras:
             raise UsageError("a re-fit needs at least one view")
         with ExitStack() as owned:
+            own, others = None, None
+            if help_from is not None:
+                share = shares(help_from.pool, len(cameras))
+                if share.others:
+                    own = share.own
+                    others = owned.enter_context(
+                        colour_parts(
+                            help_from.pool, share, scene, rules, background, help_from.source, cameras, memory
+                        )
+                    )  # fmt: skip
             # The rasterizer's own colours are never looked at.
             rasterizer = owned.enter_context(Rasterizer(device, replace(scene, sh=scene.sh[:, :1]), rules))
             launcher = launcher_for(device, rules)
@@ -178,8 +210,11 @@ class ColourRefit(Owner):
             self.coefficients = owned.enter_context(Coefficients(device, layout))
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             self._solver = owned.enter_context(ColourSolver(self.coefficients))
+            helpers = None if others is None else owned.enter_context(SharedViews(self.coefficients, others))
             self.colour_map = owned.enter_context(
-                ColourMap(launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory)
+                ColourMap(
+                    launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory, own, helpers
+                )
             )
             self._owned = owned.pop_all()
 
