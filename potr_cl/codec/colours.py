@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
-from potr_cl.codec.geometry import Geometry
+from potr_cl.codec.blocks.geometry import AnyGeometry
 from potr_cl.codec.steps.rule import factors
 from potr_cl.host.threads import Run
 from potr_cl.model.scene import FloatArray
@@ -74,7 +74,7 @@ def colour_levels(
     return levels
 
 
-def rounded_ac(sh: FloatArray, geometry: Geometry, run: Run = map) -> FloatArray:
+def rounded_ac(sh: FloatArray, geometry: AnyGeometry, run: Run = map) -> FloatArray:
     """The same colours with AC coefficients rounded to the steps of their splats.
 
     Args:
