@@ -15,6 +15,7 @@ Times are the clock's on GPUs, and of processors together on CPUs, which other w
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Sequence
 
@@ -89,12 +90,13 @@ def main() -> None:
         products.add(name, len(left), train[0].width * train[0].height, *_products(plain, left, train))
     errors = results.table(
         "errors", "Error of derivatives against float64, and their time",
-        Column("kernels"), Column("differences", "", "g"), Column("unit", "", "g"), Column("relative error of Jᵀ r", "", ".1e"),
+        Column("kernels"), Column("differences", "", "g"), Column("unit", "", "g"),
+        Column("relative error of Jᵀ r", "", ".1e"),
         Column("time of a view", "ms", ".3f"),
     )  # fmt: skip
     for family in ("cpu", "gpu") if device.info.family == "cpu" else ("gpu",):
         for size, unit in itertools.product(_DIFFERENCES, _UNITS):
-            errors.add(family, size, unit, *_error(Device(args.device, family=family), size, unit))  
+            errors.add(family, size, unit, *_error(Device(args.device, family=family), size, unit))
 
 
 Load = tuple[str, Scene, Scene, list[Camera]]
