@@ -36,11 +36,11 @@ FOLDERS: dict[str, set[str]] = {
     "reference": {"errors", "model", "opencl", "raster", "stages"},
     "api": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages",
-        "quality", "pipeline", "report", "outputs", "viewer",
+        "quality", "pipeline", "report", "outputs", "viewer", "workers",
     },
     "cli": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages",
-        "quality", "pipeline", "report", "viewer", "api", "outputs",
+        "quality", "pipeline", "report", "viewer", "api", "outputs", "workers",
     },
 }  # fmt: skip
 #: They offer the whole package under short names, and start it.
