@@ -74,6 +74,13 @@ def colour_levels(
     return levels
 
 
+def ac_factors(geometry: AnyGeometry) -> NDArray[np.float32]:
+    """(N,) scale factors of each splat's AC coefficients, in the order of the scene."""
+    classes = np.empty(len(geometry.order), np.int8)
+    classes[geometry.order] = geometry.colour_classes()[1]
+    return factors(geometry.parameters.sf_sh, classes)
+
+
 def rounded_ac(sh: FloatArray, geometry: AnyGeometry, run: Run = map) -> FloatArray:
     """The same colours with AC coefficients rounded to the steps of their splats.
 
@@ -85,14 +92,13 @@ def rounded_ac(sh: FloatArray, geometry: AnyGeometry, run: Run = map) -> FloatAr
     Raises:
         DataError: a coefficient is too large to quantise.
     """
-    classes = np.empty(len(sh), np.int8)
-    classes[geometry.order] = geometry.colour_classes()[1]
+    of_splats = ac_factors(geometry)
     rounded = np.empty((sh.shape[1], 3, len(sh)), np.float32).transpose(2, 0, 1)
     rounded[:, :1] = sh[:, :1]
 
     def take(start: int) -> None:
         rows = slice(start, start + _BLOCK)
-        divisors = factors(geometry.parameters.sf_sh, classes[rows])
+        divisors = of_splats[rows]
         for m in range(1, sh.shape[1]):
             channels = quantize.to_ycocg(sh[rows, m].astype(np.float64))
             y, co, cg = (quantize.quantize_sh(channel, divisors) / divisors for channel in channels)
