@@ -89,8 +89,8 @@ class Refit(Stage):
         None,
         Flag(
             "--photos",
-            "photographs, named after the views: re-fit to them instead, for truth rather than fidelity, if some that "
-            "are held out are matched better so",
+            "photographs, named after the views: re-fit (and with --fit, fit) to them instead, for truth rather than "
+            "fidelity, if some that are held out are matched better so",
             "DIR",
             Path,
             default="the uncompressed scene's pictures",
