@@ -754,13 +754,14 @@ def print_report(results: list[dict[str, Any]]) -> None:
             f"| {by_ratio['ratio']:.2g} | {shortened(by_ratio['ratio_at'])} | {sum(w['checked'] for w in rows)} |"
         )
     print("\nWorst error (worst ratio) by device:\n")
-    print("| device | kernels | " + " | ".join(WHAT) + " |")
-    print("|---" * (len(WHAT) + 2) + "|")
+    measured = [measure for measure in WHAT if any(measure in r["worst"] for r in sound)]
+    print("| device | kernels | " + " | ".join(measured) + " |")
+    print("|---" * (len(measured) + 2) + "|")
     for r in results:
         if "failed" in r:
-            print(f"| {r['device']} | {r['family']} | failed: {r['failed']}" + " |" * len(WHAT))
+            print(f"| {r['device']} | {r['family']} | failed: {r['failed']}" + " |" * len(measured))
             continue
-        found = [r["worst"].get(measure) for measure in WHAT]
+        found = [r["worst"].get(measure) for measure in measured]
         cells = (f"{w['error']:.0e} ({w['ratio']:.1g})" if w else "" for w in found)
         print(f"| {r['device']} | {r['family']} | " + " | ".join(cells) + " |")
     failures = [(r, *failure) for r in sound for failure in r["failures"].items()]
