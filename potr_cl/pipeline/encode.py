@@ -36,7 +36,7 @@ from potr_cl.stages.refitting.photographs import PhotographChoice
 from potr_cl.stages.refitting.refit import Refitted
 from potr_cl.stages.stage import Interlude, Progress, Stage, State, Workbench
 from potr_cl.stages.views_between import Added
-from potr_cl.workers.pool import Pool
+from potr_cl.workers.pool import Pool, Traffic
 
 _log = logging.getLogger("potr_cl")
 
@@ -61,6 +61,7 @@ class Encoded:
         options: that it was encoded with: those that were given, or that a search for a size or a PSNR has found.
         source_splats: how many splats the source scene has.
         parameters: the hyper-parameters that the stages took.
+        shared: who did the work, where views were shared out.
     """
 
     pieces: list[bytes]
@@ -77,6 +78,7 @@ class Encoded:
     options: EncodeOptions
     source_splats: int
     parameters: HyperParameters
+    shared: SharedOut | None = None
 
     def __repr__(self) -> str:
         q = f"q {self.options.q:.4g} of preset {self.options.preset}"
@@ -103,6 +105,30 @@ class Encoded:
         with replacing(path) as file:
             for piece in self.pieces:
                 file.write(piece)
+
+
+@dataclass(frozen=True)
+class SharedOut:
+    """How views were shared out.
+
+    Attributes:
+        workers: their names.
+        sent, received: bytes that went to them and came from them.
+    """
+
+    workers: tuple[str, ...]
+    sent: int
+    received: int
+
+    @staticmethod
+    def by(pool: Pool, before: Traffic) -> SharedOut:
+        """What a pool has done since its traffic was ``before``."""
+        now = pool.traffic
+        return SharedOut(pool.names, now.sent - before.sent, now.received - before.received)
+
+    def __str__(self) -> str:
+        megabytes = f"{self.sent / 1e6:,.0f} MB sent, {self.received / 1e6:,.0f} MB received"
+        return f"views shared out to {len(self.workers)} workers: {megabytes}"
 
 
 @dataclass(frozen=True)
@@ -256,6 +282,7 @@ class Run:
     ) -> None:
         self.device: Device | None = None
         self._pool = pool
+        self._before = Traffic() if pool is None else dataclasses.replace(pool.traffic)
         self._options, self._watch, self._given, self._kept = options, watch, device, kept
 
     def stages(self, state: State, only: Sequence[type[Stage]] | None = None) -> State:
@@ -324,6 +351,7 @@ class Run:
             seconds=self._watch.seconds,
             options=self._options,
             source_splats=len(state.source),
+            shared=None if self._pool is None else SharedOut.by(self._pool, self._before),
             parameters=as_done(self._options, state).parameters,
         )
 

@@ -70,6 +70,10 @@ class ClusterPool(Pool):
             raise WorkerLost("all workers of the cluster are gone: start some, and encode again")
         return left
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(worker.name for worker in self._workers)
+
     @contextmanager
     def shared(self, thing: Any) -> Iterator[Shared]:
         """A worker is sent it when it first makes a part of it, and keeps it for the parts that follow."""

@@ -130,6 +130,7 @@ class Pool(ABC):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def __str__(self) -> str:
-        names = [str(self.first.info)] if self.takes_part else []
-        return ", ".join(names + [worker.name for worker in self.workers()])
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """What all that compute views are called, those that have been lost too."""
