@@ -108,6 +108,23 @@ class _Values(ctypes.Structure):
     )
 
 
+def native_steps(steps: ColourSteps, splats: int) -> _Steps:
+    """What C takes of the steps of colours of N splats; the array of their groups must be kept."""
+    # Both are checked where steps are read, and once more: C shifts by them.
+    if not 0 <= steps.group_bits <= 40 or not 0 <= steps.knot_shift <= 40:
+        raise TypeError("the native path was given impossible steps")
+    return _Steps(
+        address(steps.groups, np.int8, -(-splats >> steps.group_bits)),
+        steps.group_bits,
+        steps.knot_shift,
+        steps.first_knot,
+        steps.powers,
+        steps.offsets,
+        steps.scales,
+        steps.opacities,
+    )
+
+
 @dataclass(frozen=True)
 class StreamModel:
     """What C takes of a stream.
@@ -269,17 +286,8 @@ class BundledFile:
             self._file.rotation_states = self._keep(sections[SECTIONS - 1].states.astype(np.uint32), np.uint32, lanes)
 
         if steps is not None:
-            self._take_steps(steps)
-
-    def _take_steps(self, steps: ColourSteps) -> None:
-        to = self._file.steps
-        # Both are checked where steps are read, and once more: C shifts by them.
-        if not 0 <= steps.group_bits <= 40 or not 0 <= steps.knot_shift <= 40:
-            raise TypeError("the native path was given impossible steps")
-        to.groups = self._keep(np.ascontiguousarray(steps.groups), np.int8, -(-self._splats >> steps.group_bits))
-        to.group_bits, to.knot_shift, to.first_knot = steps.group_bits, steps.knot_shift, steps.first_knot
-        to.powers[:], to.offsets[:] = list(steps.powers), list(steps.offsets)
-        to.scales[:], to.knots[:] = list(steps.scales), list(steps.opacities)
+            self._kept.append(steps.groups)
+            self._file.steps = native_steps(steps, splats)
 
     def _keep(self, array: NDArray[Any], dtype: type[np.generic], number: int) -> int:
         self._kept.append(array)
