@@ -73,7 +73,7 @@ class Words:
 
 
 def decode_stream(
-    layout: Layout, base: I64, fitted: Fitted, states: I64, words: Words
+    layout: Layout, base: NDArray[np.integer], fitted: Fitted, states: I64, words: Words
 ) -> tuple[U8, NDArray[np.signedinteger]]:
     """Decode a stream.
 
@@ -100,7 +100,7 @@ def decode_stream(
     partly = set(np.flatnonzero(idle.any(axis=1)).tolist())
     # Little is done in a step, so that what numpy takes to be called is most of the time: no call too many.
     multiply, add, subtract, shift, mask = np.multiply, np.add, np.subtract, np.right_shift, np.bitwise_and
-    for t, (expected, slot) in enumerate(zip(layout.laid(base), slots, strict=True)):
+    for t, (expected, slot) in enumerate(zip(layout.laid(base, np.int64), slots, strict=True)):
         multiply(recent, weight, a)
         add(a, expected, a)
         shift(a, CONTEXT_SHIFT, a)
