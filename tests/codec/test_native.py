@@ -25,7 +25,7 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import Scene
 from potr_cl.reference.scenes import random_scene
 
-GOLDEN = sorted((Path(__file__).parents[1] / "data").glob("golden_v*.potr"))
+GOLDEN = sorted((Path(__file__).parents[1] / "data").glob("golden_v[123]*.potr"))
 ATTRIBUTES = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 TREE = ("occupancy", "several", "multiplicities", "tail_lengths", "tails")
 PATHS = {"numpy": "0", "native": "1"}
