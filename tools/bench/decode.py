@@ -8,8 +8,8 @@ pruning by the presets best and fast. Parts (default: all but roads and device):
 speed    decodes in this process, in turn by NumPy and by the native path, with one thread and with one a processor;
          wall time and processor time
 memory   host memory that a decode takes at most, beside what it makes; a process each
-command  `decode FILE -o scene.ply` as a fresh process that finds its modules compiled, as `pip install` leaves them; the
-         decoded scene is written as PLY too
+command  `decode FILE -o scene.ply` as a fresh process; the decoded scene is written as PLY too. Python finds its
+         modules compiled, as `pip install` leaves them
 versions the same splats in files of version 2 and of version 3: bytes, how fast they are coded and decoded, in turn
 roads    the tokens of the context coder alone: by NumPy, by the native path, and by OpenCL kernels of both families on
          the devices given, with what a fresh process pays for a context and for loading the kernels
