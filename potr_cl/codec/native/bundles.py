@@ -289,9 +289,9 @@ class BundledFile:
             self._kept.append(steps.groups)
             self._file.steps = native_steps(steps, splats)
 
-    def _keep(self, array: NDArray[Any], dtype: type[np.generic], number: int) -> int:
+    def _keep(self, array: NDArray[Any], dtype: type[np.generic], number: int, writable: bool = False) -> int:
         self._kept.append(array)
-        return address(array, dtype, number)
+        return address(array, dtype, number, writable)
 
     def _describe(self, to: _Stream, model: StreamModel) -> None:
         contexts, alphabet = model.frequencies.shape
@@ -304,19 +304,13 @@ class BundledFile:
         frequencies = np.ascontiguousarray(model.frequencies, np.uint16)
         sizes = np.zeros(_TOKENS, np.int16)
         sizes[: len(model.sizes)] = model.sizes
-        if self._c["potr_bundles_table"](
-            address(frequencies, np.uint16, frequencies.size),
-            contexts,
-            alphabet,
-            address(sizes, np.int16, _TOKENS),
-            address(slots, np.uint8, len(slots), True),
-            address(intervals, np.uint32, len(intervals), True),
-        ):
+        to.slots = self._keep(slots, np.uint8, len(slots), True)
+        to.intervals = self._keep(intervals, np.uint32, len(intervals), True)
+        to.sizes = self._keep(sizes, np.int16, _TOKENS)
+        rows = address(frequencies, np.uint16, frequencies.size)
+        if self._c["potr_bundles_table"](rows, contexts, alphabet, to.sizes, to.slots, to.intervals):
             raise TypeError("the native path was given frequencies that do not add up")
         to.classes = self._keep(model.classes, np.uint8, 256)
-        to.slots = self._keep(slots, np.uint8, len(slots))
-        to.intervals = self._keep(intervals, np.uint32, len(intervals))
-        to.sizes = self._keep(sizes, np.int16, _TOKENS)
         to.weights[: len(model.terms)] = list(model.terms)
         to.biases[: len(model.biases)] = list(model.biases)
         to.recent, to.constant, to.alphabet = model.recent, model.constant, alphabet
