@@ -6,9 +6,8 @@ Threads share the bundles out. Integers of a bundle become values while they are
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
-from threading import Lock
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -26,7 +25,7 @@ from potr_cl.codec.native.bundles import BEYOND_TABLE, BundledFile, Tables, Valu
 from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
 from potr_cl.codec.versions import VERSIONS
-from potr_cl.host.threads import thread_pool
+from potr_cl.host.threads import Run, SharedWork, thread_pool
 
 if TYPE_CHECKING:
     from potr_cl.codec.destination import Activation, Destination
@@ -35,8 +34,8 @@ if TYPE_CHECKING:
 _SIDE_BY_SIDE = 32
 #: Bundles whose integers a thread joins at a time.
 _HANDED = 4
-#: Bundles that each thread decodes before it is told which values are there.
-_ROUNDS = 2
+#: Parts of the positions for each thread, so that none waits long for another.
+_PARTS = 2
 #: Levels whose values are looked up.
 _TABLE = 1 << 16
 
@@ -70,7 +69,7 @@ class BundledScene:
         self,
         arrays: ValueArrays,
         threads: int = 1,
-        centres: Callable[[], None] | None = None,
+        centres: Callable[[Run, int], None] | None = None,
         filled: Callable[[int, int], None] = lambda start, stop: None,
     ) -> None:
         """Fill some arrays; sections of others are not looked at.
@@ -78,29 +77,36 @@ class BundledScene:
         Args:
             arrays: what to decode.
             threads: to work with.
-            centres: what else to do meanwhile.
+            centres: what else to do meanwhile; it is told how to share out work, and into how many parts.
             filled: told from one splat to another which values are there; others are decoded meanwhile.
 
         Raises:
             DataError: damaged.
         """
-        number, splats = self.reader.bundles.number, self.header.splats
-        native = self.reader.bundled_file(self._wanted(arrays)) is not None
-        parts = max(number // (_ROUNDS * threads), 1) if native else -(-number // _SIDE_BY_SIDE)
-        ends = [number * (part + 1) // parts for part in range(parts)]
-        ready = 0
+        work, first = SharedWork(), []
         with thread_pool(threads) as pool:
-            first = [] if centres is None else [pool.submit(centres)]
-            for start, end in zip([0, *ends], ends, strict=False):
-                futures = [pool.submit(work) for work in self._jobs(arrays, threads, range(start, end))]
-                if ready < start * BUNDLE:
-                    filled(ready, start * BUNDLE)
-                    ready = start * BUNDLE
-                for future in futures:
+            try:
+                if centres is not None:
+                    first.append(work.add(partial(centres, work.run, 1 if threads == 1 else _PARTS * threads)))
+                    if threads > 1:  # while this thread opens the sections
+                        pool.submit(work.do)
+                job = self._job(arrays)
+                bundles = job.shares(self.reader.bundles.number)
+                futures = [work.add(partial(job, some)) for some in bundles]
+                for _ in range(min(threads, len(futures) + len(first)) if job.file is not None else 1):
+                    pool.submit(work.do)
+                ready = done = 0
+                while done < len(futures):
+                    futures[done].result()
+                    while done < len(futures) and futures[done].done() and futures[done].exception() is None:
+                        done += 1
+                    stop = min(bundles[done - 1].stop * BUNDLE, self.header.splats)
+                    filled(ready, stop)
+                    ready = stop
+                for future in first:
                     future.result()
-            filled(ready, splats)
-            for future in first:
-                future.result()
+            finally:
+                work.forget()
 
     def hand_to(self, destination: Destination, sh_count: int, threads: int) -> None:
         """Hand all integers but those of the centres to a destination, with so many SH coefficients of a channel.
@@ -146,13 +152,12 @@ class BundledScene:
             header.sf_rotation,
         )
 
-    def _jobs(self, arrays: ValueArrays, threads: int, bundles: range) -> list[Job]:
+    def _job(self, arrays: ValueArrays) -> Job:
         wanted = self._wanted(arrays)
         file = self.reader.bundled_file(wanted)
         if file is not None:
             _ = self.tables  # made once, before threads ask for them
-        share = _Share(bundles, 1 if file is not None else _SIDE_BY_SIDE)
-        return [Job(self, arrays, wanted, file, share) for _ in range(threads if file is not None else 1)]
+        return Job(self, arrays, wanted, file)
 
     def _wanted(self, arrays: ValueArrays) -> Wanted:
         rotations = arrays.quaternions is not None
@@ -198,44 +203,40 @@ def _wide(largest: int) -> type[np.generic]:
     return np.int32 if largest < 1 << 29 else np.int64
 
 
-class _Share:
-    """Gives every thread the next bundles."""
-
-    def __init__(self, bundles: range, at_once: int) -> None:
-        self._stop, self._at_once = bundles.stop, at_once
-        self._next, self._lock = bundles.start, Lock()
-
-    def take(self) -> range:
-        with self._lock:
-            first = self._next
-            self._next = min(first + self._at_once, self._stop)
-            return range(first, self._next)
-
-
 @dataclass(frozen=True)
 class Job:
-    """A thread's part of a decode: calling it takes bundles until none are left."""
+    """What decodes bundles, by any thread."""
 
     scene: BundledScene
     arrays: ValueArrays
     wanted: Wanted
     file: BundledFile | None
-    share: _Share
+    _works: list[NDArray[np.uint8]] = field(default_factory=list)
 
-    def __call__(self) -> None:
-        """Raises DataError if damaged."""
-        work = None if self.file is None else self.file.work()
-        while len(bundles := self.share.take()):
-            if self.file is None or work is None:
-                self._by_numpy(bundles)
-                continue
-            said, section = self.file.values(
-                bundles.start, self.wanted.sections, self.wanted.rotations, work, self.arrays, self.scene.tables
-            )
-            if said == BEYOND_TABLE:
-                self._by_numpy(bundles)
-            else:
-                check_said(self.scene.reader, said, section)
+    def shares(self, number: int) -> list[range]:
+        """The bundles of a file, as they are decoded at a time."""
+        at_once = 1 if self.file is not None else _SIDE_BY_SIDE
+        return [range(first, min(first + at_once, number)) for first in range(0, number, at_once)]
+
+    def __call__(self, bundles: range) -> None:
+        """Decode one of the shares.
+
+        Raises:
+            DataError: damaged.
+        """
+        if self.file is None:
+            self._by_numpy(bundles)
+            return
+        # What a thread has worked with the next one takes.
+        work = self._works.pop() if self._works else self.file.work()
+        said, section = self.file.values(
+            bundles.start, self.wanted.sections, self.wanted.rotations, work, self.arrays, self.scene.tables
+        )
+        self._works.append(work)
+        if said == BEYOND_TABLE:
+            self._by_numpy(bundles)
+        else:
+            check_said(self.scene.reader, said, section)
 
     def _by_numpy(self, bundles: range) -> None:
         header = self.scene.header

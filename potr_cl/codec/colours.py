@@ -6,7 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
-from potr_cl.codec.geometry import Geometry
+from potr_cl.codec.blocks.geometry import AnyGeometry
 from potr_cl.codec.steps.rule import factors
 from potr_cl.host.threads import Run
 from potr_cl.model.scene import FloatArray
@@ -74,7 +74,14 @@ def colour_levels(
     return levels
 
 
-def rounded_ac(sh: FloatArray, geometry: Geometry, run: Run = map) -> FloatArray:
+def ac_factors(geometry: AnyGeometry) -> NDArray[np.float32]:
+    """(N,) scale factors of each splat's AC coefficients, in the order of the scene."""
+    classes = np.empty(len(geometry.order), np.int8)
+    classes[geometry.order] = geometry.colour_classes()[1]
+    return factors(geometry.parameters.sf_sh, classes)
+
+
+def rounded_ac(sh: FloatArray, geometry: AnyGeometry, run: Run = map) -> FloatArray:
     """The same colours with AC coefficients rounded to the steps of their splats.
 
     Args:
@@ -85,14 +92,13 @@ def rounded_ac(sh: FloatArray, geometry: Geometry, run: Run = map) -> FloatArray
     Raises:
         DataError: a coefficient is too large to quantise.
     """
-    classes = np.empty(len(sh), np.int8)
-    classes[geometry.order] = geometry.colour_classes()[1]
+    of_splats = ac_factors(geometry)
     rounded = np.empty((sh.shape[1], 3, len(sh)), np.float32).transpose(2, 0, 1)
     rounded[:, :1] = sh[:, :1]
 
     def take(start: int) -> None:
         rows = slice(start, start + _BLOCK)
-        divisors = factors(geometry.parameters.sf_sh, classes[rows])
+        divisors = of_splats[rows]
         for m in range(1, sh.shape[1]):
             channels = quantize.to_ycocg(sh[rows, m].astype(np.float64))
             y, co, cg = (quantize.quantize_sh(channel, divisors) / divisors for channel in channels)

@@ -8,16 +8,18 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, wait
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import container, metadata, octree, sections
+from potr_cl.codec.blocks.file import BlockedFile
+from potr_cl.codec.blocks.table import FIXED_BYTES, header_bytes_of, is_of_blocks, read_table
 from potr_cl.codec.bundled_scene import BundledScene
 from potr_cl.codec.byte_planes import IntegerStream, PlaneStream, unpack_integers
 from potr_cl.codec.colour_factors import ColourFactors, Once
@@ -33,8 +35,9 @@ from potr_cl.codec.sections import Coder, Property, Section
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
-from potr_cl.host.threads import thread_pool
-from potr_cl.model.scene import SH_COEFFICIENTS, Scene
+from potr_cl.host.threads import Run, SharedWork, first_error, thread_pool
+from potr_cl.model.box import Box
+from potr_cl.model.scene import Scene, most_coefficients
 
 #: More threads would find nothing to do.
 _MOST_THREADS = 16
@@ -83,21 +86,10 @@ class PotrFile:
             UsageError: the path cannot be read.
             DataError: not a .potr file, or a damaged one, or too many splats for its size.
         """
-        path = Path(path)
-        try:
-            with path.open("rb") as file:
-                status = os.fstat(file.fileno())
-                if not (stat.S_ISREG(status.st_mode) or stat.S_ISFIFO(status.st_mode)):
-                    raise UsageError(f"'{path}' is not a regular file")
-                # The header must be sound before the rest is worth its memory.
-                start = file.read(len(container.MAGIC))
-                if start == container.MAGIC:
-                    start += file.read()
-            return PotrFile(container.read_header(start, max(len(start), status.st_size), trust), start)
-        except (OSError, ValueError) as error:
-            raise UsageError(f"cannot read '{path}': {getattr(error, 'strerror', None) or error}") from None
-        except DataError as error:
-            raise DataError(f"'{path}': {error}") from None
+        opened = open_file(path, trust)
+        if isinstance(opened, BlockedFile):
+            raise DataError(f"'{os.fspath(path)}': a file of blocks, which is no single one")
+        return opened
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -114,6 +106,9 @@ class PotrFile:
         Raises:
             DataError: damaged.
         """
+        return self._means(map, 1)
+
+    def _means(self, run: Run, parts: int) -> NDArray[np.float32]:
         header = self.header
         planes = self._planes(Property.MULTIPLICITY)
         raw = self._raw(Property.MULTIPLICITY)
@@ -131,7 +126,7 @@ class PotrFile:
             tails=self._raw(Property.TAIL),
             absolute=self.rules.absolute_leaf_levels,
         )
-        return octree.parse(tree, header.splats)
+        return octree.parse(tree, header.splats, run, parts)
 
     def log_scales(self) -> NDArray[np.float32]:
         """(N, 3) float32 natural logarithms of standard deviations. Raises DataError if damaged."""
@@ -236,7 +231,7 @@ class PotrFile:
             (self._contextual(Property.OPACITY), opacities),
         ]
         threads = min(threads or min(os.cpu_count() or 1, _MOST_THREADS), self._threads_in_memory())
-        self._run(jobs, lambda: destination.take_means(self.means()), threads)
+        self._run(jobs, lambda run, parts: destination.take_means(self._means(run, parts)), threads)
 
     def sh_count(self, degree: int | None = None) -> int:
         """How many SH coefficients of a channel there are up to a degree, which need not be in the file; None: all.
@@ -244,16 +239,14 @@ class PotrFile:
         Raises:
             UsageError: there is no such degree.
         """
-        if degree is not None and not 0 <= degree < len(SH_COEFFICIENTS):
-            raise UsageError(f"SH degree {degree} is unknown: choose 0 to {len(SH_COEFFICIENTS) - 1}")
-        return SH_COEFFICIENTS[self.header.sh_degree if degree is None else min(degree, self.header.sh_degree)]
+        return most_coefficients(self.header.sh_degree, degree)
 
     @property
     def rules(self) -> FormatVersion:
         """Those of the file's version."""
         return VERSIONS[self.header.version]
 
-    def _run(self, jobs: list[tuple[bool, _Job]], centres: Callable[[], None], threads: int) -> None:
+    def _run(self, jobs: list[tuple[bool, _Job]], centres: Callable[[Run, int], None], threads: int) -> None:
         """Do some jobs, each with whether it takes the context coder, and decode the centres.
 
         By NumPy the context coder makes many short calls, in which threads would only wait for each other: one makes
@@ -261,13 +254,15 @@ class PotrFile:
         """
         alone = native() is None
         left: list[Future[None]] = []
+        work = SharedWork()
 
-        def leave(work: Callable[[], None]) -> None:
+        def leave(what: Callable[[], None]) -> None:
             # What waits holds memory; where much does, threads are not what is missing.
             if sum(not future.done() for future in left) < _MOST_WAITING:
-                left.append(pool.submit(work))
+                left.append(work.add(what))
+                pool.submit(work.do)
             else:
-                work()
+                what()
 
         submit: _Submit = _now if threads == 1 else leave
 
@@ -277,21 +272,23 @@ class PotrFile:
 
         contextual = [job for takes_coder, job in jobs if takes_coder]
         with thread_pool(threads) as pool:
-            coded = [pool.submit(in_turn, some) for some in ([contextual] if alone else [[job] for job in contextual])]
-            means = pool.submit(centres)
-            others = [pool.submit(job, _now) for takes_coder, job in jobs if not takes_coder]
-            first: list[Future[Any]] = [*coded, means, *others]
-            for futures in (first, left):
-                wait(futures, return_when=FIRST_EXCEPTION)
-                for future in futures:
-                    if future.done() and (error := future.exception()) is not None:
+            try:
+                coded = [partial(in_turn, some) for some in ([contextual] if alone else [[job] for job in contextual])]
+                others = [partial(job, _now) for takes_coder, job in jobs if not takes_coder]
+                first = [work.add(what) for what in (*coded, partial(centres, work.run, threads), *others)]
+                for _ in range(min(threads, len(first))):
+                    pool.submit(work.do)
+                for futures in (first, left):
+                    if (error := first_error(futures)) is not None:
                         raise error
+            finally:
+                work.forget()
 
     def _decode_bundles(
         self, scene: BundledScene, destination: Destination, threads: int, sh_degree: int | None
     ) -> None:
-        def centres() -> None:
-            destination.take_means(self.means())
+        def centres(run: Run, parts: int) -> None:
+            destination.take_means(self._means(run, parts))
 
         if isinstance(destination, Fillable):
             replace(scene, activation=destination.activation).fill(
@@ -299,7 +296,7 @@ class PotrFile:
             )
             return
         scene.hand_to(destination, self.sh_count(sh_degree), threads)
-        centres()
+        centres(map, 1)
 
     # ------------------------------------------------------------------------------------------ inside
 
@@ -429,7 +426,69 @@ def _now(work: Callable[[], None]) -> None:
     work()
 
 
-def decode(source: bytes | str | os.PathLike[str], trust: bool = False, sh_degree: int | None = None) -> Scene:
+#: A .potr file, opened: of a scene in one piece, or in blocks.
+AnyFile: TypeAlias = "PotrFile | BlockedFile[PotrFile]"
+
+
+def open_file(source: bytes | str | os.PathLike[str], trust: bool = False) -> AnyFile:
+    """Open a .potr file of any version, given as bytes or as a path, and verify its header.
+
+    Of a file of blocks only the header is read; the blocks are when they are asked for.
+
+    Args:
+        source: the file; a path may be that of a pipe that brings one.
+        trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
+
+    Raises:
+        UsageError: the path cannot be read.
+        DataError: not a .potr file, or a damaged one, or too many splats for its size.
+    """
+    if isinstance(source, bytes):
+        return _opened(source, len(source), trust, lambda offset, nbytes: source[offset : offset + nbytes])
+    path = Path(source)
+    try:
+        with path.open("rb") as file:
+            status = os.fstat(file.fileno())
+            if not (stat.S_ISREG(status.st_mode) or stat.S_ISFIFO(status.st_mode)):
+                raise UsageError(f"'{path}' is not a regular file")
+            # The header must be sound before the rest is worth its memory.
+            start = file.read(FIXED_BYTES)
+            if stat.S_ISREG(status.st_mode) and is_of_blocks(start):
+                start += file.read(max(min(header_bytes_of(start), status.st_size) - len(start), 0))
+                return _opened(start, status.st_size, trust, partial(_read, path))
+            if start.startswith(container.MAGIC):
+                start += file.read()
+        return _opened(
+            start, max(len(start), status.st_size), trust, lambda offset, nbytes: start[offset : offset + nbytes]
+        )
+    except (OSError, ValueError) as error:
+        raise UsageError(f"cannot read '{path}': {getattr(error, 'strerror', None) or error}") from None
+    except DataError as error:
+        raise DataError(f"'{path}': {error}") from None
+
+
+def _opened(start: bytes, file_bytes: int, trust: bool, read: Callable[[int, int], bytes]) -> AnyFile:
+    if not is_of_blocks(start):
+        return PotrFile(container.read_header(start, file_bytes, trust), start)
+    return BlockedFile(read_table(start, file_bytes, trust), read, partial(PotrFile.from_bytes, trust=trust), trust)
+
+
+def _read(path: Path, offset: int, nbytes: int) -> bytes:
+    """Some bytes of a file, fewer where it has got shorter."""
+    try:
+        with path.open("rb") as file:
+            file.seek(offset)
+            return file.read(nbytes)
+    except OSError as error:
+        raise UsageError(f"cannot read '{path}': {error.strerror or error}") from None
+
+
+def decode(
+    source: bytes | str | os.PathLike[str],
+    trust: bool = False,
+    sh_degree: int | None = None,
+    box: Box | None = None,
+) -> Scene:
     """Decode a .potr file, given as bytes or as a path.
 
     Args:
@@ -437,15 +496,28 @@ def decode(source: bytes | str | os.PathLike[str], trust: bool = False, sh_degre
         trust: whether it may hold more splats a byte than a real scene has. Without, the memory taken is in proportion
             to the size of the file.
         sh_degree: leave out SH coefficients of higher degrees; None: none.
+        box: leave out splats whose centres lie outside. Of a file of blocks only those that meet the box are read.
 
     Raises:
-        UsageError: the path cannot be read, or there is no such degree.
+        UsageError: the path cannot be read, there is no such degree, or no splat lies in the box.
         DataError: damaged, or too many splats for its size.
     """
-    if isinstance(source, bytes):
-        return PotrFile.from_bytes(source, trust).scene(sh_degree=sh_degree)
     try:
-        return PotrFile.open(source, trust).scene(sh_degree=sh_degree)
+        return scene_of_file(open_file(source, trust), sh_degree, box)
     except DataError as error:
-        where = os.fspath(source)
+        where = "" if isinstance(source, bytes) else os.fspath(source)
         raise error if where in str(error) else DataError(f"'{where}': {error}") from None
+
+
+def scene_of_file(file: AnyFile, sh_degree: int | None = None, box: Box | None = None, threads: int = 0) -> Scene:
+    """Decode an opened file; arguments and errors as of :func:`decode`."""
+    if isinstance(file, BlockedFile):
+        return file.scene(threads, sh_degree, box)
+    scene = file.scene(threads, sh_degree)
+    if box is None:
+        return scene
+    inside = np.flatnonzero(box.holds(scene.means))
+    if not len(inside):
+        low, high = scene.means.min(axis=0), scene.means.max(axis=0)
+        raise UsageError(f"no splat lies in the box {box}: the scene lies in {Box.of([*low, *high])}")
+    return scene.subset(inside)

@@ -108,6 +108,29 @@ def quantise_geometry(
     version = VERSIONS[parameters.version]
     nearest = distances_to_views(scene.means, views, run)
     world = version.in_world_units(parameters, scene, nearest)
+    return quantise_in_world_units(scene, parameters, world, nearest, run)
+
+
+def quantise_in_world_units(
+    scene: Scene,
+    parameters: quantize.HyperParameters,
+    world: quantize.HyperParameters,
+    nearest: NDArray[np.float64],
+    run: Run = map,
+) -> Geometry:
+    """Quantise a scene's geometry, or that of a part of a scene.
+
+    Args:
+        scene: as of :func:`quantise_geometry`; its colours are not looked at.
+        parameters: as asked for.
+        world: the same in world units.
+        nearest: (N,) distance to the nearest view; 0 where there is none.
+        run: in place of :func:`map`, to work with several threads.
+
+    Raises:
+        As :func:`quantise_geometry`.
+    """
+    version = VERSIONS[parameters.version]
     tolerance = np.maximum(world.gamma, world.beta * nearest)
     tree, order = octree.build(scene.means, tolerance, absolute=version.absolute_leaf_levels)
     check_positions(scene, tolerance, tree, order)

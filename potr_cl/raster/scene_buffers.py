@@ -165,6 +165,33 @@ class SceneBuffers(Owner):
         if pending is not None:
             pending.append(event)
 
+    def write_part(self, part: SceneBuffers, first: int) -> None:
+        """Set the parameters of some splats to those of another scene on the same device.
+
+        Args:
+            part: of the same SH degree.
+            first: the number here of its first splat.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        if first + part.splats > self.splats or part.sh_count != self.sh_count:
+            raise ValueError(f"{part.splats} splats from number {first} on do not fit {self.splats} splats")
+        names = {"means": 3, "scales": 3, "quaternions": 4, "log2_opacities": 1, "sh": 3 * self.sh_count}
+        with self.device.errors("cannot take a part of a scene"):
+            for name, columns in names.items():
+                cl.enqueue_copy(
+                    self.device.queue,
+                    getattr(self, name),
+                    getattr(part, name),
+                    src_origin=(0, 0, 0),
+                    dst_origin=(4 * first, 0, 0),
+                    region=(4 * part.splats, columns, 1),
+                    src_pitches=(4 * part.stride, 0),
+                    dst_pitches=(4 * self.stride, 0),
+                )
+            self.device.queue.finish()
+
     def write_sh(self, parameter: cl.Buffer, sh: FloatArray) -> None:
         """Set SH coefficients, (N, M, 3) float32 of any strides.
 
@@ -204,6 +231,41 @@ class SceneBuffers(Owner):
 
 #: What can be rendered: a scene of the host, or one that is on the device already.
 Drawable: TypeAlias = "Scene | SceneBuffers"
+
+
+def gathered(scene: SceneBuffers, splats: NDArray[np.int64]) -> SceneBuffers:
+    """Some splats of a scene on a device, there.
+
+    Args:
+        scene: that has them.
+        splats: (n,) their numbers.
+
+    Raises:
+        DeviceError: they do not fit the device beside the scene.
+    """
+    device = scene.device
+    part = SceneBuffers(device, len(splats), scene.sh_count, scene.antialiased, scene.low_pass)
+    try:
+        gather = device.shared_kernel("raster/gather_columns.cl", "gather_columns")
+        columns = {"means": 3, "scales": 3, "quaternions": 4, "log2_opacities": 1, "sh": 3 * scene.sh_count}
+        with Memory(device) as memory:
+            numbers = memory.upload(splats.astype(np.uint32), "the numbers of some splats")
+            for name, count in columns.items():
+                gather.bind(
+                    columns=getattr(scene, name),
+                    stride=scene.stride,
+                    numbers=numbers,
+                    count=len(splats),
+                    result_stride=part.stride,
+                    result=getattr(part, name),
+                )
+                gather.launch((part.stride, count), (SPLAT_GROUP, 1))
+            with device.errors("cannot take a part of a scene"):
+                device.queue.finish()
+    except BaseException:
+        part.close()
+        raise
+    return part
 
 
 def uploaded(device: Device, scene: Scene) -> SceneBuffers:

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
-from potr_cl.stages.pruning.measured import Measured, measurement
+from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Pruned, PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.unseen import CHOICES, Unseen, as_of_whole, find_unseen, put_back, set_aside
@@ -127,12 +126,15 @@ class Prune(Stage):
     def run(self, state: State, bench: Workbench) -> State:
         """Remove splats, and leave a :class:`potr_cl.stages.pruning.schedule.Pruned` in ``learnt``.
 
-        And as "unseen" a :class:`potr_cl.stages.pruning.unseen.Unseen`.
+        And as "unseen" a :class:`potr_cl.stages.pruning.unseen.Unseen`; and as "price", where the number of splats is
+        not given, the ΔMSE below which a splat has gone.
         """
         hidden, area = find_unseen(state)
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
         told = state.having_learnt("unseen", Unseen(splats, len(state.scene), area, kept))
+        if self.keep is None and self.count is None:
+            told = told.having_learnt("price", bench.parameters.delta_mse_max)
         if not (kept and splats):
             return self._pruned(told, bench)
         split = set_aside(told, hidden)
@@ -179,7 +181,7 @@ class _Course:
         sh: (N, M, 3) the colours that all splats of the state's scene have by now.
     """
 
-    def __init__(self, state: State, removal: RemovalSweep) -> None:
+    def __init__(self, state: State, removal: Removal) -> None:
         self._state, self._removal = state, removal
         self.sh = state.scene.sh
 

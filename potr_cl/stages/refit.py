@@ -15,7 +15,14 @@ from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
-from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, Refitted, active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit import (
+    ColourRefit,
+    HelpFrom,
+    RefitOptions,
+    Refitted,
+    active_coefficients,
+    refit_colours,
+)
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
@@ -137,9 +144,20 @@ class Refit(Stage):
                 geometry, sh = bench.output.fix_ac(rounded, sh, refit.worth(), request)
                 return sh
 
+            def ac_factors(effects: FloatArray) -> FloatArray:
+                nonlocal geometry
+                geometry, steps = bench.output.ac_factors(rounded, effects, bench.request(state))
+                return steps
+
+            in_steps = bench.output.steps_of_ac(bench.request(state))
             found = refit_colours(
                 bench.opened, decoded, views, targets, options, active, bench.background, progress,
-                fix_ac if bench.output.fixes_ac else None,
+                fix_ac=None if in_steps or not bench.output.fixes_ac else fix_ac,
+                # Photographs lie where the master reads them.
+                help_from=HelpFrom(bench.pool, state.source)
+                if bench.pool and isinstance(targets, RenderedTargets)
+                else None,
+                ac_factors=ac_factors if in_steps else None,
             )  # fmt: skip
             return found, geometry
 
@@ -189,6 +207,7 @@ class RefitOnTheWay(Stage):
                 RefitOptions(steps=self.steps, memory=bench.memory),
                 background=bench.background,
                 progress=lambda done, steps: bench.progress("refit", 0.99 * done / steps),
+                help_from=None if bench.pool is None else HelpFrom(bench.pool, state.source),
             )
         bench.progress("refit", 1.0)
         return state.recoloured(refitted.sh)

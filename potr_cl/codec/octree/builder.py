@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, U64, OctreeStreams
+from potr_cl.model.morton import spread
 
 #: Splats worked on at a time where each stands for itself: the temporaries of a block stay in the cache.
 _BLOCK = 1 << 15
@@ -132,22 +133,9 @@ def _morton_words(grid: list[U64], depth: int) -> list[U64]:
             bits = np.zeros(len(word[block]), np.uint64)
             for axis, g in enumerate(grid):
                 part = g[block] >> np.uint64(shift) if shift >= 0 else g[block] << np.uint64(-shift)
-                bits |= _spread(part & np.uint64(0x1FFFFF)) << np.uint64(axis)
+                bits |= spread(part & np.uint64(0x1FFFFF)) << np.uint64(axis)
             word[block] = bits
     return words
-
-
-def _spread(x: U64) -> U64:
-    """Move bit i to bit 3 i, for 21 bits."""
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        x = (x | (x << np.uint64(shift))) & np.uint64(mask)
-    return x
 
 
 def _common_levels(words: list[U64], depth: int) -> NDArray[np.int8]:
