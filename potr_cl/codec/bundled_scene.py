@@ -6,6 +6,7 @@ Threads share the bundles out. Integers of a bundle become values while they are
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future
 from dataclasses import dataclass, field
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
@@ -20,6 +21,7 @@ from potr_cl.codec.bundles.levels import joined
 from potr_cl.codec.bundles.sections import MAIN, Key
 from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
+from potr_cl.codec.context.tokens import largest_integer
 from potr_cl.codec.dequantizer import Dequantizer
 from potr_cl.codec.native.bundles import BEYOND_TABLE, BundledFile, Tables, ValueArrays
 from potr_cl.codec.steps import prediction
@@ -70,43 +72,60 @@ class BundledScene:
         arrays: ValueArrays,
         threads: int = 1,
         centres: Callable[[Run, int], None] | None = None,
-        filled: Callable[[int, int], None] = lambda start, stop: None,
+        filled: Callable[[int, int], None] | None = None,
     ) -> None:
         """Fill some arrays; sections of others are not looked at.
 
         Args:
             arrays: what to decode.
-            threads: to work with.
+            threads: to work with, this one included.
             centres: what else to do meanwhile; it is told how to share out work, and into how many parts.
-            filled: told from one splat to another which values are there; others are decoded meanwhile.
+            filled: told from one splat to another which values are there, by this thread; others decode meanwhile.
 
         Raises:
             DataError: damaged.
         """
-        work, first = SharedWork(), []
-        with thread_pool(threads) as pool:
+        work, number = SharedWork(), self.reader.bundles.number
+        # More threads than half the bundles would share memory and caches for nothing.
+        helpers = min(threads, max(number // 2, 2)) - (filled is None)
+        first = []
+        if centres is not None:
+            first.append(work.add(partial(centres, work.run, _PARTS * threads if helpers else 1)))
+        with thread_pool(max(helpers, 1)) as pool:
             try:
-                if centres is not None:
-                    first.append(work.add(partial(centres, work.run, 1 if threads == 1 else _PARTS * threads)))
-                    if threads > 1:  # while this thread opens the sections
-                        pool.submit(work.do)
-                job = self._job(arrays)
-                bundles = job.shares(self.reader.bundles.number)
-                futures = [work.add(partial(job, some)) for some in bundles]
-                for _ in range(min(threads, len(futures) + len(first)) if job.file is not None else 1):
+                if helpers and first:  # while this thread opens the sections
                     pool.submit(work.do)
-                ready = done = 0
-                while done < len(futures):
-                    futures[done].result()
-                    while done < len(futures) and futures[done].done() and futures[done].exception() is None:
-                        done += 1
-                    stop = min(bundles[done - 1].stop * BUNDLE, self.header.splats)
-                    filled(ready, stop)
-                    ready = stop
+                job = self._job(arrays)
+                shares = job.shares(number)
+                if job.file is None:  # by NumPy, in one thread: others would wait for the interpreter
+                    self._one_by_one(job, shares, filled or _nobody)
+                    shares = []
+                futures = [work.add(partial(job, some)) for some in shares]
+                for _ in range(helpers if shares else 0):
+                    pool.submit(work.do)
+                if filled is None:
+                    work.do()
+                self._tell(shares, futures, filled or _nobody)
                 for future in first:
                     future.result()
             finally:
                 work.forget()
+
+    def _one_by_one(self, job: Job, shares: list[range], filled: Callable[[int, int], None]) -> None:
+        for bundles in shares:
+            job(bundles)
+            filled(bundles.start * BUNDLE, min(bundles.stop * BUNDLE, self.header.splats))
+
+    def _tell(self, shares: list[range], futures: list[Future[None]], filled: Callable[[int, int], None]) -> None:
+        """Wait for shares of the bundles, and tell of all that are done at a time."""
+        ready = done = 0
+        while done < len(futures):
+            futures[done].result()
+            while done < len(futures) and futures[done].done() and futures[done].exception() is None:
+                done += 1
+            stop = min(shares[done - 1].stop * BUNDLE, self.header.splats)
+            filled(ready, stop)
+            ready = stop
 
     def hand_to(self, destination: Destination, sh_count: int, threads: int) -> None:
         """Hand all integers but those of the centres to a destination, with so many SH coefficients of a channel.
@@ -139,10 +158,10 @@ class BundledScene:
         """What makes values of levels."""
         header, activation = self.header, self.activation
         version = VERSIONS[header.version]
-        levels = np.arange(_TABLE)
+        levels = np.arange(self._largest_level(MAIN[1]) + 1)
         classes = np.arange(-CLASSES, CLASSES).astype(np.int8)
         scales = version.dequantize_scales(levels, header.sf_scale)
-        opacities = version.dequantize_opacities(levels, header.sf_opacity)
+        opacities = version.dequantize_opacities(np.arange(self._largest_level(MAIN[0]) + 1), header.sf_opacity)
         return Tables(
             scales if activation is None else activation.scales(scales),
             opacities if activation is None else activation.opacities(opacities),
@@ -150,7 +169,14 @@ class BundledScene:
             factors(header.sf_ac, classes),
             *prediction.tables(),
             header.sf_rotation,
+            activation is not None,
         )
+
+    def _largest_level(self, key: Key) -> int:
+        """Of a section, or the largest that is looked up."""
+        section = self.reader.section(key)
+        alphabets = [fitted.alphabet for fitted in section.streams] if section is not None else [1]
+        return min(largest_integer(max(alphabets) - 1), _TABLE - 1)
 
     def _job(self, arrays: ValueArrays) -> Job:
         wanted = self._wanted(arrays)
@@ -169,6 +195,10 @@ class BundledScene:
         degree = round(sh_count**0.5) - 1
         # To the end of the chain where all is asked for: so its end is checked.
         return Wanted(len(MAIN) if degree == self.header.sh_degree else 3 + degree, rotations)
+
+
+def _nobody(start: int, stop: int) -> None:
+    """Is told which values are there."""
 
 
 @dataclass(frozen=True)
@@ -242,8 +272,12 @@ class Job:
         header = self.scene.header
         levels = self.scene.reader.levels(bundles.start, bundles.stop, self.wanted)
         Dequantizer(header, VERSIONS[header.version]).of_levels(levels, self.scene.reader.steps, self.arrays)
-        activation, own = self.scene.activation, slice(levels.start, levels.stop)
-        if activation is not None and self.arrays.log_scales is not None:
-            self.arrays.log_scales[own] = activation.scales(self.arrays.log_scales[own])
-        if activation is not None and self.arrays.logits is not None:
-            self.arrays.logits[own] = activation.opacities(self.arrays.logits[own])
+        activation, own = self.scene.activation, self.arrays.part(levels.start, levels.stop)
+        if activation is None:
+            return
+        if own.log_scales is not None:
+            own.log_scales[...] = activation.scales(own.log_scales)
+        if own.logits is not None:
+            own.logits[...] = activation.opacities(own.logits)
+        if own.quaternions is not None:
+            own.quaternions[...] = activation.rotations(own.quaternions)

@@ -167,7 +167,7 @@ class PotrFile:
             DataError: damaged.
         """
         count = self.sh_count(degree)
-        arrays = SceneArrays(self.header, self.rules, count, zeros=self._bundled is not None)
+        arrays = SceneArrays(self.header, self.rules, count)
         if self._bundled:
             self._bundled.fill(ValueArrays(sh=arrays.values.sh))
             return arrays.sh
@@ -197,8 +197,7 @@ class PotrFile:
             DataError: damaged.
         """
         try:
-            zeros = self._bundled is not None
-            arrays = SceneArrays(self.header, self.rules, self.sh_count(sh_degree), zeros)
+            arrays = SceneArrays(self.header, self.rules, self.sh_count(sh_degree))
             self.decode_into(arrays, threads, sh_degree)
         except MemoryError:
             needed = self.header.splats * (11 + 3 * self.sh_count(sh_degree)) * 4
@@ -292,7 +291,7 @@ class PotrFile:
 
         if isinstance(destination, Fillable):
             replace(scene, activation=destination.activation).fill(
-                destination.values, threads, centres, destination.filled
+                destination.values, threads, centres, destination.filled if destination.is_told else None
             )
             return
         scene.hand_to(destination, self.sh_count(sh_degree), threads)

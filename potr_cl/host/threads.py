@@ -92,8 +92,11 @@ class _Task:
             return
         try:
             self.future.set_result(self._work())
-        except BaseException as error:  # the one who asks for the result is told
+        except Exception as error:  # the one who asks for the result is told
             self.future.set_exception(error)
+        except BaseException as error:  # Ctrl-C
+            self.future.set_exception(error)
+            raise
 
 
 def first_error(futures: Iterable[Future[Any]]) -> BaseException | None:

@@ -137,7 +137,7 @@ def _of_bundles(data: bytes, runs: int) -> dict[str, float]:
     if file.header.version < 3 or not any(section.coder.name == "BUNDLES" for section in file.header.sections):
         return {}
     count = file.sh_count()
-    destination = SceneArrays(file.header, file.rules, count, zeros=True)
+    destination = SceneArrays(file.header, file.rules, count)
     tables, bundles = scene.tables, range(scene.reader.bundles.number)
 
     def decoded(sections: int, rotations: bool, arrays: ValueArrays) -> Callable[[], None]:
@@ -167,7 +167,7 @@ def _of_bundles(data: bytes, runs: int) -> dict[str, float]:
     of["values, to memory that was written to before"] = written - before - of["integers: rotations"]
 
     def fresh() -> None:
-        arrays = SceneArrays(file.header, file.rules, count, zeros=True)
+        arrays = SceneArrays(file.header, file.rules, count)
         decoded(last, True, arrays.values)()
 
     of["memory that was not"] = _least(fresh, runs) - written
