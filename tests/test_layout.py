@@ -23,7 +23,7 @@ FOLDERS: dict[str, set[str]] = {
     "workers": {"errors", "host", "opencl"},
     "codec": {"errors", "host", "model"},
     "ondevice": {"errors", "host", "model", "opencl", "raster", "codec"},
-    "clustering": {"errors", "model", "opencl"},
+    "clustering": {"errors", "host", "model", "opencl"},
     "formats": {"plain_text", "errors", "host", "model", "opencl", "codec", "clustering"},
     "quality": {"errors", "host", "model", "opencl", "raster", "formats"},
     "outputs": {"errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "clustering"},

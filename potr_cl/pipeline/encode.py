@@ -357,9 +357,12 @@ class Run:
 
 
 def as_done(options: EncodeOptions, state: State) -> EncodeOptions:
-    """The options as a state has followed them: without a fit that was left out, for which others would be finer."""
-    if isinstance(state.learnt.get(Fit.name), LeftOut):
+    """The options as a state has followed them: only a fit that made up for splats has the others round finer."""
+    fitted = state.learnt.get(Fit.name)
+    if isinstance(fitted, LeftOut):
         return options.changed(fit=False)
+    if isinstance(fitted, Fitted) and not fitted.spared:
+        return options.changed(fit={"finer": 0.0})
     return options
 
 

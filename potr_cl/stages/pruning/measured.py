@@ -14,12 +14,13 @@ from potr_cl.stages.pruning.part import RemovalPart
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.shared_removal import SharedRemoval
 from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.visible_parts import PartedRemoval, parts_worth_it
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.workers.dealing import shares
 from potr_cl.workers.parts import Parts
 
-#: What measures: one device, or several together.
-Removal: TypeAlias = RemovalSweep | SharedRemoval
+#: What measures: one device, perhaps part by part, or several together.
+Removal: TypeAlias = RemovalSweep | SharedRemoval | PartedRemoval
 
 
 @contextmanager
@@ -38,6 +39,13 @@ def measurement(state: State, bench: Workbench, options: SweepOptions) -> Iterat
     share = None if pool is None or options.sample < 1 else shares(pool, len(views))
     with ExitStack() as stack:
         if pool is None or share is None or not share.others:
+            parts = parts_worth_it(state.scene, views, options)
+            if parts is not None:
+                whole = bench.drawable(state.scene)
+                yield stack.enter_context(
+                    PartedRemoval(device, state.scene, whole, views, parts, options, bench.background, progress)
+                )
+                return
             rasterizer = stack.enter_context(
                 Rasterizer(device, bench.drawable(state.scene), background=bench.background)
             )
