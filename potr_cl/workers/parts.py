@@ -96,6 +96,7 @@ class Parts(Owner):
         found: list[Any] = [None]
 
         def take(_place: int, result: Any) -> None:
+            self._pool.traffic.received += nbytes(result)
             found[0] = result
 
         future = self._begin(place, command, args)

@@ -19,7 +19,12 @@ from tests.devices import FAMILIES, open_device
 
 #: Splats go, colours are made sparse and re-fitted on the way, coefficients are given up, and AC is rounded.
 OPTIONS = EncodeOptions.for_preset(
-    "best", q=0.3, prune={"keep": 0.4, "iterations": 8}, refit={"at": (0.4,), "steps": 3, "drop": 1e-7}, compact=True
+    "best",
+    q=0.3,
+    prune={"keep": 0.4, "iterations": 8},
+    refit={"at": (0.4,), "steps": 3, "drop": 1e-7},
+    compact=True,
+    between={"views": 0},
 )
 
 
