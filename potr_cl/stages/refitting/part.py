@@ -113,12 +113,11 @@ class ColourPart(Part):
         """Some rows of the sums of the splats' own blocks after a gradient; valid until the next call.
 
         Returns:
-            (rows, N) int64, of packed upper triangles.
+            (rows, stride) int64, of packed upper triangles.
         """
         assert self._block_sums is not None, "the gradient was without blocks"
-        layout = self._coefficients.layout
-        found = self._staging.download(self._block_sums, (rows, layout.stride), np.int64, 8 * first * layout.stride)
-        return found[:, : layout.splats]
+        stride = self._coefficients.layout.stride
+        return self._staging.download(self._block_sums, (rows, stride), np.int64, 8 * first * stride)
 
     def _forget_blocks(self) -> None:
         self._blocks.close()

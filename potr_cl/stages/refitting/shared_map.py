@@ -39,7 +39,6 @@ class SharedViews(Owner):
         self._coefficients, self._others = coefficients, others
         self._packing = Packing(coefficients)
         self._columns = Staging(coefficients.device)
-        self._rows = Staging(coefficients.device)
         self._pending: Pending | None = None
 
     def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
@@ -76,17 +75,17 @@ class SharedViews(Owner):
         rows = max(_AT_ONCE // (8 * layout.stride), 1)
         for first in range(0, all_rows, rows):
             count = min(rows, all_rows - first)
-            found = self._others.ask(place, "block_rows", first, count)
-            more = self._rows.array((count, layout.stride), np.int64)
-            more[:, : layout.splats] = found
-            more[:, layout.splats :] = 0
+            more = self._others.ask(place, "block_rows", first, count)
+            if more.shape[1] != layout.stride:  # another device pads otherwise
+                padded = np.zeros((count, layout.stride), np.int64)
+                padded[:, : layout.splats] = more[:, : layout.splats]
+                more = padded
             self._packing.add_rows(blocks, first, more)
 
     def close(self) -> None:
         """Give the master's device memory back; the parts are the caller's."""
         self._packing.close()
         self._columns.close()
-        self._rows.close()
 
 
 @contextmanager
