@@ -23,7 +23,7 @@ FOLDERS: dict[str, set[str]] = {
     "workers": {"errors", "host", "opencl"},
     "codec": {"errors", "host", "model"},
     "ondevice": {"errors", "host", "model", "opencl", "raster", "codec"},
-    "clustering": {"errors", "model", "opencl"},
+    "clustering": {"errors", "host", "model", "opencl"},
     "formats": {"plain_text", "errors", "host", "model", "opencl", "codec", "clustering"},
     "quality": {"errors", "host", "model", "opencl", "raster", "formats"},
     "outputs": {"errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "clustering"},
@@ -36,11 +36,11 @@ FOLDERS: dict[str, set[str]] = {
     "reference": {"errors", "model", "opencl", "raster", "stages"},
     "api": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages",
-        "quality", "pipeline", "report", "outputs", "viewer",
+        "quality", "pipeline", "report", "outputs", "viewer", "workers",
     },
     "cli": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages",
-        "quality", "pipeline", "report", "viewer", "api", "outputs",
+        "quality", "pipeline", "report", "viewer", "api", "outputs", "workers",
     },
 }  # fmt: skip
 #: They offer the whole package under short names, and start it.

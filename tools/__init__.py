@@ -10,9 +10,11 @@ bench.encode           run time against error of every stage and variant on ever
 bench.rasterizer       frames a second, and time against splats, pixels and overlap
 bench.pruning          what does pruning keep, against other pruners, and what may its sweeps skip?
 bench.refit            what does the re-fit of the colours bring, and what does it take?
+bench.fit              how fast are the fit's steps, and how exact its derivatives?
 bench.compaction       speed of the compaction, and its error against float64
 bench.compact_at       when within the pruning schedule to compact?
 bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
+bench.decode_parts     what is the time of a decode made of, part by part?
 bench.whole_command    what is the time of a fresh command `encode` made of?
 bench.codec            speed, memory and size of the codec alone
 bench.search           what does encoding to a size or a PSNR cost, against one plain encode?
@@ -22,6 +24,7 @@ bench.forecast         how far off is what an encode says beforehand of its time
 bench.install          what does an installation take, and where are there wheels?
 bench.views_between    what do views between the training views bring, and what do they take?
 bench.palettes         how long does a palette of SH coefficients take, and how near does it come?
+bench.outputs          what does a file of another format take beyond the encode itself?
 bench.needs            what is a scene charged for splats, views and tiles that nobody needs?
 bench.busy             how busy is the device during an encode, stage by stage?
 bench.kernels          processor time of each kernel, on machines that do other work too
@@ -35,11 +38,13 @@ What a choice costs or brings, against the alternatives (``study``):
 =========================  =============================================================================================
 study.rate_distortion      size against quality: the curves that other studies compare with
 study.ablation             what does each part of the codec contribute?
+study.fit                  how far should a scene be pruned before a fit, and what does each part of the fit bring?
 study.colour_steps         what does version 3 of the format bring over version 2, part by part?
 study.compare_formats      what would people use instead?
 study.output_formats       how small are encodes to the formats that viewers open, and what do others read of them?
 study.virtual_views        how many virtual views, how large, how wide, at what time and memory?
 study.rates                where do the bits go, and what do they buy?
+study.gauss_newton         does Gauss-Newton fit a pruned scene in less time than Adam?
 study.antialiasing         what is lost if an antialiased scene is encoded as a classic one?
 study.compaction_curves    what does the compaction do to sparsity and pictures?
 study.removal_exactness    how far are predicted removal effects from removals in float64?

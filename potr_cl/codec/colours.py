@@ -7,6 +7,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
 from potr_cl.codec.blocks.geometry import AnyGeometry
+from potr_cl.codec.native.library import native
 from potr_cl.codec.steps.rule import factors
 from potr_cl.host.threads import Run
 from potr_cl.model.scene import FloatArray
@@ -44,9 +45,19 @@ def colour_levels(
     levels: NDArray[np.signedinteger] = np.empty((count, 3, len(sh)), np.int16)
     wide: list[tuple[tuple[int, int, slice], quantize.Integers]] = []
 
+    functions = native()
+    whole = columns if columns.flags.c_contiguous else sh if sh.flags.c_contiguous else None
+
     def take(start: int) -> None:
         rows = order[start : start + _BLOCK]
         block = slice(start, start + len(rows))
+        if functions is not None and whole is not None and whole.dtype == np.float32:
+            dc, ac = (
+                np.full(len(rows), scale_factor) if not part.any() else factors(scale_factor, part[block]).astype(float)
+                for scale_factor, part in zip((parameters.sf_dc, parameters.sf_sh), classes, strict=True)
+            )
+            if functions.quantising.colour_levels(whole, whole is columns, rows, dc, ac, start, levels):
+                return
         planar = (
             np.array([[column.take(rows) for column in rgb] for rgb in columns])
             if contiguous
@@ -74,6 +85,13 @@ def colour_levels(
     return levels
 
 
+def ac_factors(geometry: AnyGeometry) -> NDArray[np.float32]:
+    """(N,) scale factors of each splat's AC coefficients, in the order of the scene."""
+    classes = np.empty(len(geometry.order), np.int8)
+    classes[geometry.order] = geometry.colour_classes()[1]
+    return factors(geometry.parameters.sf_sh, classes)
+
+
 def rounded_ac(sh: FloatArray, geometry: AnyGeometry, run: Run = map) -> FloatArray:
     """The same colours with AC coefficients rounded to the steps of their splats.
 
@@ -85,14 +103,13 @@ def rounded_ac(sh: FloatArray, geometry: AnyGeometry, run: Run = map) -> FloatAr
     Raises:
         DataError: a coefficient is too large to quantise.
     """
-    classes = np.empty(len(sh), np.int8)
-    classes[geometry.order] = geometry.colour_classes()[1]
+    of_splats = ac_factors(geometry)
     rounded = np.empty((sh.shape[1], 3, len(sh)), np.float32).transpose(2, 0, 1)
     rounded[:, :1] = sh[:, :1]
 
     def take(start: int) -> None:
         rows = slice(start, start + _BLOCK)
-        divisors = factors(geometry.parameters.sf_sh, classes[rows])
+        divisors = of_splats[rows]
         for m in range(1, sh.shape[1]):
             channels = quantize.to_ycocg(sh[rows, m].astype(np.float64))
             y, co, cg = (quantize.quantize_sh(channel, divisors) / divisors for channel in channels)

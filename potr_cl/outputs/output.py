@@ -164,6 +164,25 @@ class Output(ABC):
         """
         return rounded, sh
 
+    def steps_of_ac(self, request: Request) -> bool:
+        """Whether :meth:`fix_ac` rounds each coefficient by itself, to steps that :meth:`ac_factors` tells."""
+        return False
+
+    def ac_factors(self, rounded: Rounded, effects: FloatArray, request: Request) -> tuple[Rounded, FloatArray]:
+        """To what :meth:`fix_ac` rounds, where that follows from the geometry and ``effects`` alone.
+
+        So the re-fit can ask while it solves, and round where the coefficients are. Only for outputs with
+        :meth:`steps_of_ac`.
+
+        Args:
+            rounded, request: as of :meth:`fix_ac`.
+            effects: (N,) float32, ``worth`` of the constant coefficients.
+
+        Returns:
+            What :meth:`file` is given, and (N,) float32, steps a unit of each splat's AC coefficients in Y, Co, Cg.
+        """
+        raise NotImplementedError
+
     @abstractmethod
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
         """Make the bytes of the file.

@@ -10,7 +10,7 @@ from typing import ClassVar
 from potr_cl.codec.blocks.encoder import code_blocks
 from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.blocks.geometry import AnyGeometry, GeometryOfBlocks, in_blocks, quantise
-from potr_cl.codec.colours import rounded_ac
+from potr_cl.codec.colours import ac_factors, rounded_ac
 from potr_cl.codec.decoder import decode, open_file, scene_of_file
 from potr_cl.codec.encoder import Coded, code_scene
 from potr_cl.codec.geometry import Geometry
@@ -69,6 +69,16 @@ class Potr(Output):
         geometry = rounded.with_steps(worth[:, 0])
         with thread_pool(request.threads) as pool:
             return geometry, rounded_ac(sh, geometry, pool.map)
+
+    def steps_of_ac(self, request: Request) -> bool:
+        """In the versions of the format that have steps of each splat."""
+        return VERSIONS[request.parameters.version].colour_steps
+
+    def ac_factors(self, rounded: Rounded, effects: FloatArray, request: Request) -> tuple[Rounded, FloatArray]:
+        """See :meth:`Output.ac_factors`."""
+        assert isinstance(rounded, (Geometry, GeometryOfBlocks))
+        geometry = rounded.with_steps(effects)
+        return geometry, ac_factors(geometry)
 
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
         """See :func:`potr_cl.codec.encoder.code_scene`, and :func:`potr_cl.codec.blocks.encoder.code_blocks`."""

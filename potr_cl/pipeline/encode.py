@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.encoder import Coded
+from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, PotrError
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.agreement import require_agreement
@@ -26,7 +27,8 @@ from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.stages.fitting.fit import Fitted, LeftOut
+from potr_cl.stages.fit import Fit, LeftOut
+from potr_cl.stages.fitting.fit import Fitted
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.pruning.unseen import Unseen
@@ -34,7 +36,7 @@ from potr_cl.stages.refitting.photographs import PhotographChoice
 from potr_cl.stages.refitting.refit import Refitted
 from potr_cl.stages.stage import Interlude, Progress, Stage, State, Workbench
 from potr_cl.stages.views_between import Added
-from potr_cl.workers.pool import Pool
+from potr_cl.workers.pool import Pool, Traffic
 
 _log = logging.getLogger("potr_cl")
 
@@ -58,6 +60,8 @@ class Encoded:
         seconds: wall time by stage.
         options: that it was encoded with: those that were given, or that a search for a size or a PSNR has found.
         source_splats: how many splats the source scene has.
+        parameters: the hyper-parameters that the stages took.
+        shared: who did the work, where views were shared out.
     """
 
     pieces: list[bytes]
@@ -73,6 +77,8 @@ class Encoded:
     seconds: dict[str, float]
     options: EncodeOptions
     source_splats: int
+    parameters: HyperParameters
+    shared: SharedOut | None = None
 
     def __repr__(self) -> str:
         q = f"q {self.options.q:.4g} of preset {self.options.preset}"
@@ -99,6 +105,30 @@ class Encoded:
         with replacing(path) as file:
             for piece in self.pieces:
                 file.write(piece)
+
+
+@dataclass(frozen=True)
+class SharedOut:
+    """How views were shared out.
+
+    Attributes:
+        workers: their names.
+        sent, received: bytes that went to them and came from them.
+    """
+
+    workers: tuple[str, ...]
+    sent: int
+    received: int
+
+    @staticmethod
+    def by(pool: Pool, before: Traffic) -> SharedOut:
+        """What a pool has done since its traffic was ``before``."""
+        now = pool.traffic
+        return SharedOut(pool.names, now.sent - before.sent, now.received - before.received)
+
+    def __str__(self) -> str:
+        megabytes = f"{self.sent / 1e6:,.0f} MB sent, {self.received / 1e6:,.0f} MB received"
+        return f"views shared out to {len(self.workers)} workers: {megabytes}"
 
 
 @dataclass(frozen=True)
@@ -150,6 +180,7 @@ def encode(
     kept: KeptScene | None = None,
     in_frame: bool = False,
     pool: Pool | None = None,
+    tell: Callable[[str], None] | None = None,
 ) -> Encoded:
     """Encode a scene.
 
@@ -165,6 +196,7 @@ def encode(
         kept: the scene on the device, if it will be needed there afterwards.
         in_frame: whether :func:`check_frame` has found the cameras to be in the scene's frame.
         pool: workers that views are shared out to, of which ``device`` is the first; None: the device does all.
+        tell: told a line for every round of a fit.
 
     Raises:
         UsageError: options out of range, cameras without a training view, or cameras that are probably not in the
@@ -175,7 +207,7 @@ def encode(
     options = options or EncodeOptions()
     scene = scene.rendered(antialiased)
     tell_losses(scene, options)
-    watch = Stopwatch(progress)
+    watch = Stopwatch(progress, tell)
     cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame)
     with ExitStack() as stack:
         if kept is None and cameras and options.look_at_views(scene):
@@ -250,6 +282,7 @@ class Run:
     ) -> None:
         self.device: Device | None = None
         self._pool = pool
+        self._before = Traffic() if pool is None else dataclasses.replace(pool.traffic)
         self._options, self._watch, self._given, self._kept = options, watch, device, kept
 
     def stages(self, state: State, only: Sequence[type[Stage]] | None = None) -> State:
@@ -264,15 +297,16 @@ class Run:
         return state
 
     def _one(self, stage: Stage, state: State) -> State:
-        options = self._options
+        options = as_done(self._options, state)
         bench = Workbench(
             options.parameters,
             memory=options.memory,
             background=options.background,
             threads=options.threads,
             interludes=self._interludes(stage, state),
-            metadata=lambda last: _metadata(last, options),
+            metadata=lambda last: _metadata(last, as_done(options, last)),
             progress=self._watch,
+            tell=self._watch.tell,
             output=options.output,
             kept=self._kept,
         )
@@ -317,7 +351,19 @@ class Run:
             seconds=self._watch.seconds,
             options=self._options,
             source_splats=len(state.source),
+            shared=None if self._pool is None else SharedOut.by(self._pool, self._before),
+            parameters=as_done(self._options, state).parameters,
         )
+
+
+def as_done(options: EncodeOptions, state: State) -> EncodeOptions:
+    """The options as a state has followed them: only a fit that made up for splats has the others round finer."""
+    fitted = state.learnt.get(Fit.name)
+    if isinstance(fitted, LeftOut):
+        return options.changed(fit=False)
+    if isinstance(fitted, Fitted) and not fitted.spared:
+        return options.changed(fit={"finer": 0.0})
+    return options
 
 
 class Stopwatch:
@@ -325,10 +371,12 @@ class Stopwatch:
 
     Attributes:
         seconds: wall time by stage, in the order in which they began.
+        tell: takes lines about the work.
     """
 
-    def __init__(self, progress: Progress | None = None) -> None:
+    def __init__(self, progress: Progress | None = None, tell: Callable[[str], None] | None = None) -> None:
         self._progress = progress
+        self.tell: Callable[[str], None] = tell or _log.debug
         self._running: str | None = None
         self._last = time.perf_counter()
         self.seconds: dict[str, float] = {}

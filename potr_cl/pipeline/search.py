@@ -28,20 +28,22 @@ from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, cameras_or_virtual, tell_losses
+from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, as_done, cameras_or_virtual, tell_losses
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.growth import FASTEST, SLOWEST, FinenessAxis, Typical, meet, with_colour_steps, with_steps
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.target import KINDS, Found, Target, Try
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.code import Code
+from potr_cl.stages.fit import Fit
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Progress, Stage, State, parameters
+from potr_cl.workers.pool import Pool
 
-#: A scout's pruning iterations and steps of the re-fit, and by how much what it finds is smaller than a full encode's:
-#: the logarithm of bytes, and decibels; about, and where there is a re-fit.
-_SCOUT_ITERATIONS, _SCOUT_STEPS = 12, 2
+#: A scout's pruning iterations, its steps of the re-fit and of the fit; and by how much what it finds is smaller than a
+#: full encode's: the logarithm of bytes, and decibels; about, and where there is a re-fit.
+_SCOUT_ITERATIONS, _SCOUT_STEPS, _SCOUT_FIT = 12, 2, 200
 _SCOUT_MISSES = (-0.02, -0.55)
 #: The highest q of a scout, and 1 less the lowest: the scene may be far from typical.
 _SCOUT_END = 0.9
@@ -77,6 +79,7 @@ def encode_to_target(
     device: Device | None = None,
     tell: Callable[[str], None] | None = None,
     antialiased: bool | None = None,
+    pool: Pool | None = None,
 ) -> Found:
     """Encode a scene so that it meets a target, as well (or as small) as that allows.
 
@@ -85,6 +88,7 @@ def encode_to_target(
         target: what to reach.
         options: its q is not looked at; single parameters that are given stay as they are.
         tell: told a line for every step.
+        pool: as :func:`potr_cl.pipeline.encode.encode` takes it.
 
     Raises:
         UnreachableError: no q meets the target.
@@ -95,21 +99,22 @@ def encode_to_target(
     options = options or EncodeOptions()
     scene = scene.rendered(antialiased)
     tell_losses(scene, options)
-    watch = Stopwatch(progress)
+    watch = Stopwatch(progress, tell)
     cameras = cameras_or_virtual(scene, cameras, options, watch)
     if target.min_psnr is not None and not cameras:
         raise UsageError("a PSNR can be reached with cameras only: without them there is no view to judge by")
 
     def work(device: Device, memory: int | None) -> Found:
         search = _Search(
-            scene, cameras or [], target, options.changed(memory=memory), watch, device, tell or (lambda _line: None)
-        )
+            scene, cameras or [], target, options.changed(memory=memory), watch, device, tell or (lambda _line: None),
+            pool,
+        )  # fmt: skip
         try:
             return search.run()
         finally:
             search.close()
 
-    found, _ = on_device(device or Device(), options.memory, work)
+    found, _ = on_device(device or (Device() if pool is None else pool.first), options.memory, work)
     return found
 
 
@@ -132,6 +137,15 @@ class _Candidate:
     encoded: Encoded | None
 
 
+def _with_short_fit(options: EncodeOptions) -> EncodeOptions:
+    """Options whose fit, where they have one, is as rough as all of a scout."""
+    for stage in options.stages:
+        if isinstance(stage, Fit) and stage.asked_for:
+            short = _SCOUT_FIT if stage.steps == "auto" else min(stage.steps, _SCOUT_FIT)
+            return options.changed(fit={"steps": short, "cycles": 1})
+    return options
+
+
 class _Search:
     def __init__(
         self,
@@ -142,7 +156,9 @@ class _Search:
         watch: Stopwatch,
         device: Device,
         tell: Callable[[str], None],
+        pool: Pool | None = None,
     ) -> None:
+        self._pool = pool
         self._scene = scene
         self._cameras = cameras
         self._views = train_views(cameras) if cameras else []
@@ -209,11 +225,14 @@ class _Search:
             prune={"iterations": min(prune.iterations, _SCOUT_ITERATIONS)},
             refit={"steps": min(refit.steps, _SCOUT_STEPS), "at": ()},
         )
+        options = _with_short_fit(options)
         fewer_looks = prune.on and options.prune.iterations < prune.iterations
         shorter_refit = self._fitted and options.refit.steps < refit.steps
         if not self._views or not (fewer_looks or shorter_refit):
             return q
         thinned = self._thin(options)
+        self._mind_interrupts(thinned)
+        options = as_done(options, thinned)
         value = self._evaluate("scout", rough, thinned, self._refit(thinned, options), options).value
         if shorter_refit:
             size, psnr = _SCOUT_MISSES
@@ -225,9 +244,17 @@ class _Search:
         """A full encode."""
         options = self._options.changed(q=q)
         thinned = self._thin(options)
+        self._mind_interrupts(thinned)
+        options = as_done(options, thinned)
         found = self._evaluate("encode", q, thinned, self._refit(thinned, options), options)
         self._encoded[q] = found.value
         return found
+
+    def _mind_interrupts(self, thinned: State) -> None:
+        """Fit no more where someone has interrupted a fit."""
+        fitted = thinned.learnt.get(Fit.name)
+        if fitted is not None and fitted.ended_early:
+            self._options = self._options.changed(fit=False)
 
     def _next(self) -> float:
         """The q to encode in full next, by what is known of others."""
@@ -281,7 +308,7 @@ class _Search:
         chosen = start.options.parameters
         once = [kind for kind in self._once if kind is Prune or self._options.stage(kind).on]
         kept = {name: getattr(chosen, name) for kind in once for name in parameters(kind)}
-        options = self._options.changed(q=q).with_parameters(**kept)
+        options = as_done(self._options.changed(q=q), start.thinned).with_parameters(**kept)
         return self._evaluate("refit", q, start.thinned, self._refit(start.thinned, options), options)
 
     def _with_other_steps(self, start: _Candidate, q: float) -> _Candidate:
@@ -347,14 +374,14 @@ class _Search:
         return self._run(thinned, options, self._repeated)
 
     def _run(self, state: State, options: EncodeOptions, only: list[type[Stage]]) -> State:
-        run = Run(options, self._watch, self._device)
+        run = Run(options, self._watch, self._device, pool=self._pool)
         state = run.stages(state, only)
         self._used = run.device or self._used
         self._device = run.device or self._device
         return state
 
     def _code(self, state: State, options: EncodeOptions) -> Encoded:
-        run = Run(options, self._watch, self._device)
+        run = Run(options, self._watch, self._device, pool=self._pool)
         return dataclasses.replace(run.finished(run.stages(state, [Code])), device=self._used)
 
     def _evaluate(self, kind: str, q: float, thinned: State, reduced: State, options: EncodeOptions) -> _Candidate:

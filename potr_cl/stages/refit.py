@@ -144,11 +144,20 @@ class Refit(Stage):
                 geometry, sh = bench.output.fix_ac(rounded, sh, refit.worth(), request)
                 return sh
 
+            def ac_factors(effects: FloatArray) -> FloatArray:
+                nonlocal geometry
+                geometry, steps = bench.output.ac_factors(rounded, effects, bench.request(state))
+                return steps
+
+            in_steps = bench.output.steps_of_ac(bench.request(state))
             found = refit_colours(
                 bench.opened, decoded, views, targets, options, active, bench.background, progress,
-                fix_ac if bench.output.fixes_ac else None,
+                fix_ac=None if in_steps or not bench.output.fixes_ac else fix_ac,
                 # Photographs lie where the master reads them.
-                HelpFrom(bench.pool, state.source) if bench.pool and isinstance(targets, RenderedTargets) else None,
+                help_from=HelpFrom(bench.pool, state.source)
+                if bench.pool and isinstance(targets, RenderedTargets)
+                else None,
+                ac_factors=ac_factors if in_steps else None,
             )  # fmt: skip
             return found, geometry
 

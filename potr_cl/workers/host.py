@@ -47,6 +47,10 @@ class HostPool(Pool):
     def shared(self, thing: Any) -> AbstractContextManager[Shared]:
         return nullcontext(Shared(thing))  # threads see what the master sees
 
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (f"0: {self.first.info}", *(worker.name for worker in self._workers))
+
     def close(self) -> None:
         for worker in self._workers:
             assert isinstance(worker, _Thread)

@@ -8,6 +8,7 @@ notices.
 from __future__ import annotations
 
 import logging
+import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
@@ -16,6 +17,9 @@ from typing import Any
 from potr_cl.errors import DeviceError, PotrError
 from potr_cl.opencl.memory import Owner
 from potr_cl.workers.pool import Held, Part, Pool, Worker, WorkerLost
+
+#: A worker may take so many times as long as the slowest of the others.
+_SLOWER = 10
 
 _log = logging.getLogger("potr_cl")
 
@@ -141,8 +145,15 @@ class Parts(Owner):
         """Wait for all; where a worker fails, have ``again`` do it on another one."""
         waiting = dict(zip(futures, places if places is not None else range(len(futures)), strict=True))
         failed: list[tuple[int, DeviceError]] = []
+        patience, began, last = self._pool.patience, time.monotonic(), 0.0
         while waiting:
-            done, _ = wait(waiting, return_when=FIRST_COMPLETED)
+            # Nobody can tell how long something takes before one has done it.
+            limit = None if patience is None or not last else began + max(patience, _SLOWER * last) - time.monotonic()
+            done, _ = wait(waiting, None if limit is None else max(limit, 0.0), return_when=FIRST_COMPLETED)
+            if not done:
+                failed += [(place, WorkerLost("it does not answer")) for place in waiting.values()]
+                break
+            last = time.monotonic() - began
             for future in done:
                 place = waiting.pop(future)
                 try:

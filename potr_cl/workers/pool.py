@@ -98,12 +98,15 @@ class Pool(ABC):
         takes_part: whether the master does a share of the work on it.
         sparse: whether workers send what has changed, and not all of it: worth its time where bytes travel slowly.
         traffic: so far.
+        patience: seconds, or ten times as long as the others took if that is longer, after which a worker that alone
+            has not answered counts as lost; None: workers are waited for.
     """
 
     first: Device
     takes_part: bool
     sparse: bool
     traffic: Traffic
+    patience: float | None = None
 
     @abstractmethod
     def workers(self) -> list[Worker]:
@@ -127,6 +130,7 @@ class Pool(ABC):
     def __exit__(self, *_: object) -> None:
         self.close()
 
-    def __str__(self) -> str:
-        names = [str(self.first.info)] if self.takes_part else []
-        return ", ".join(names + [worker.name for worker in self.workers()])
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """What all that compute views are called, those that have been lost too."""

@@ -44,7 +44,7 @@ class _Stream(ctypes.Structure):
         ("recent", _NUMBER),
         ("constant", _NUMBER),
         ("alphabet", _NUMBER),
-        ("unused", _NUMBER),
+        ("by_vectors", _NUMBER),
     )
 
 
@@ -102,7 +102,9 @@ class _Values(ctypes.Structure):
         ("step", _POINTER),
         ("inverse", _POINTER),
         ("sf_rotation", ctypes.c_float),
-        ("unused", ctypes.c_float),
+        ("coefficients", _NUMBER),
+        ("columns", _NUMBER),
+        ("units", _NUMBER),
     )
 
 
@@ -153,13 +155,26 @@ class ValueArrays:
         log_scales: (N, 3).
         quaternions: (N, 4).
         logits: (N,).
-        sh: (M, 3, N), which holds zeros.
+        sh: (M, 3, N).
+        columns: whether log_scales is (3, N) instead, and quaternions (4, N).
     """
 
     log_scales: F32 | None = None
     quaternions: F32 | None = None
     logits: F32 | None = None
     sh: F32 | None = None
+    columns: bool = False
+
+    def part(self, start: int, stop: int) -> ValueArrays:
+        """Those from one splat to another, as views in which a splat is a row."""
+        scales, turned = (self._rows(array, start, stop) for array in (self.log_scales, self.quaternions))
+        logits = None if self.logits is None else self.logits[start:stop]
+        return ValueArrays(scales, turned, logits, None if self.sh is None else self.sh[:, :, start:stop])
+
+    def _rows(self, array: F32 | None, start: int, stop: int) -> F32 | None:
+        if array is None:
+            return None
+        return array[:, start:stop].T if self.columns else array[start:stop]
 
 
 @dataclass(frozen=True)
@@ -171,6 +186,7 @@ class Tables:
         sf_dc, sf_ac: (64,) scale factors of each class of steps.
         steps, inverses: (64,) int64 of each class of steps, of the prediction of DC.
         sf_rotation: scale factor.
+        units: whether quaternions are made as long as 1 in double precision.
     """
 
     scales: F32
@@ -180,6 +196,7 @@ class Tables:
     steps: NDArray[np.int64]
     inverses: NDArray[np.int64]
     sf_rotation: float
+    units: bool = False
 
 
 @dataclass(frozen=True)
@@ -217,6 +234,7 @@ class BundledFile:
         sections: by their place in the order of decoding (opacity, scale, DC, degrees 1 to 3, rotation); opacity's at
             least.
         steps: of colours, for files that have them.
+        vectors: whether to look tokens up by vectors, where the processor can.
     """
 
     def __init__(
@@ -225,8 +243,10 @@ class BundledFile:
         splats: int,
         sections: Mapping[int, SectionWords],
         steps: ColourSteps | None = None,
+        vectors: bool = True,
     ) -> None:
         self._c = functions
+        self._vectors = bool(vectors and functions["potr_bundles_vectors"]())
         self._splats = splats
         self._kept: list[NDArray[Any]] = []
         self._file = _File()
@@ -271,7 +291,8 @@ class BundledFile:
             raise TypeError("the native path was given contexts without frequencies, or tokens without sizes")
         if len(model.terms) > _WEIGHTS or len(model.biases) > _BIASES:
             raise TypeError("the native path was given too many weights")
-        slots, intervals = np.empty(contexts * _TOTAL, np.uint8), np.empty(contexts * _TOKENS, np.uint32)
+        # Vectors of slots are looked up with some bytes too many.
+        slots, intervals = np.empty(contexts * _TOTAL + 3, np.uint8), np.empty(contexts * _TOKENS, np.uint32)
         frequencies = np.ascontiguousarray(model.frequencies, np.uint16)
         sizes = np.zeros(_TOKENS, np.int16)
         sizes[: len(model.sizes)] = model.sizes
@@ -279,6 +300,7 @@ class BundledFile:
             address(frequencies, np.uint16, frequencies.size),
             contexts,
             alphabet,
+            address(sizes, np.int16, _TOKENS),
             address(slots, np.uint8, len(slots), True),
             address(intervals, np.uint32, len(intervals), True),
         ):
@@ -290,6 +312,7 @@ class BundledFile:
         to.weights[: len(model.terms)] = list(model.terms)
         to.biases[: len(model.biases)] = list(model.biases)
         to.recent, to.constant, to.alphabet = model.recent, model.constant, alphabet
+        to.by_vectors = self._vectors and int(sizes[:alphabet].max()) < _TOKENS
 
     def work(self) -> U8:
         """What a thread needs to decode bundles, one at a time."""
@@ -369,6 +392,9 @@ class BundledFile:
             address(tables.steps, np.int64, 2 * CLASSES),
             address(tables.inverses, np.int64, 2 * CLASSES),
             tables.sf_rotation,
+            max(planes - 1, 0),
+            arrays.columns,
+            tables.units,
         )
         section = ctypes.c_int()
         said = self._c["potr_bundles_values"](

@@ -1,4 +1,4 @@
-"""Centres to an octree's streams: :func:`build`."""
+"""Centres to an octree's streams: :func:`build`; or to the order of its leaves alone: :func:`leaf_order`."""
 
 from __future__ import annotations
 
@@ -32,24 +32,9 @@ def build(
         The streams, and ``order`` (N,): the splats' indices in the order of the leaves.
     """
     n = len(means)
-    axes = [means[:, a].astype(np.float64) for a in range(3)]
-    low = [float(a.min()) for a in axes]
-    side = max(float(a.max()) - lo for a, lo in zip(axes, low, strict=True))
-
-    resolution = np.maximum(np.maximum(np.abs(axes[0]), np.abs(axes[1])), np.abs(axes[2])) * 2.0**-23
-    limit: F64 = np.maximum(tolerance, resolution)
-    depth = _depth_for(side, float(limit.min()))
-
-    # Coordinates in units of the deepest cells; the centre test below works with real distances, so that a rounding
-    # into the neighbouring cell cannot break the criterion.
-    cells = 2.0**depth
-    grid = [
-        np.minimum((axis - lo) * (cells / side if side > 0 else 0.0), cells - 1).astype(np.uint64)
-        for axis, lo in zip(axes, low, strict=True)
-    ]
-
+    axes, low, side, limit, depth, grid = _gridded(means, tolerance)
     words = _morton_words(grid, depth)
-    order = np.argsort(words[0], kind="stable") if len(words) == 1 else np.lexsort(words[::-1])
+    order = _depth_first(words)
     grid = [g[order] for g in grid]
     common = _common_levels([w[order] for w in words], depth)
     del words
@@ -86,6 +71,37 @@ def build(
         absolute=absolute,
     )
     return streams, order
+
+
+def leaf_order(means: NDArray[np.float32], tolerance: F64 | float) -> NDArray[np.int64]:
+    """The order that :func:`build` returns, without the streams."""
+    *_, depth, grid = _gridded(means, tolerance)
+    return _depth_first(_morton_words(grid, depth))
+
+
+def _gridded(
+    means: NDArray[np.float32], tolerance: F64 | float
+) -> tuple[list[F64], list[float], float, F64, int, list[U64]]:
+    """Coordinates by axis; the cube's corner and side; tolerances; the deepest level, and coordinates in its cells.
+
+    The test of centres works with real distances, so that a rounding into the neighbouring cell cannot break it.
+    """
+    axes = [means[:, a].astype(np.float64) for a in range(3)]
+    low = [float(a.min()) for a in axes]
+    side = max(float(a.max()) - lo for a, lo in zip(axes, low, strict=True))
+    resolution = np.maximum(np.maximum(np.abs(axes[0]), np.abs(axes[1])), np.abs(axes[2])) * 2.0**-23
+    limit: F64 = np.maximum(tolerance, resolution)
+    depth = _depth_for(side, float(limit.min()))
+    cells = 2.0**depth
+    grid = [
+        np.minimum((axis - lo) * (cells / side if side > 0 else 0.0), cells - 1).astype(np.uint64)
+        for axis, lo in zip(axes, low, strict=True)
+    ]
+    return axes, low, side, limit, depth, grid
+
+
+def _depth_first(words: list[U64]) -> NDArray[np.int64]:
+    return np.argsort(words[0], kind="stable") if len(words) == 1 else np.lexsort(words[::-1])
 
 
 def _depth_for(side: float, tolerance: float) -> int:

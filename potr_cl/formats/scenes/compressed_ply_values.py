@@ -7,7 +7,8 @@ without the largest.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -26,6 +27,8 @@ _LARGEST_LOGIT = np.float32(10)
 #: Shifts and bits of three values in a word.
 _POSITION = ((21, 11), (11, 10), (0, 11))
 _COLOUR = ((24, 8), (16, 8), (8, 8))
+#: Of the centres' coordinates.
+POSITION_BITS = tuple(bits for _, bits in _POSITION)
 
 Words = NDArray[np.uint32]
 U8 = NDArray[np.uint8]
@@ -47,6 +50,13 @@ class PackedGeometry:
     rotations: Words
     scales: Words
     opacities: U8
+
+    @staticmethod
+    def joined(parts: Sequence[PackedGeometry]) -> PackedGeometry:
+        """One of several, each of which but the last has whole chunks."""
+        return PackedGeometry(
+            *(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(PackedGeometry))
+        )
 
 
 def packed_geometry(scene: Scene) -> PackedGeometry:

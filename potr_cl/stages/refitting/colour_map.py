@@ -44,10 +44,10 @@ _COLOURED = 8
 class Helpers(Protocol):
     """Do some of the views of a :class:`ColourMap`."""
 
-    def begin_gradient(self, x: cl.Buffer, blocks: bool) -> None:
+    def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
         """Have them begin with :meth:`ColourMap.sum_gradient` of their views."""
 
-    def begin_normal(self, direction: cl.Buffer, unit: float) -> None:
+    def begin_normal(self, direction: cl.Buffer, unit: float, constant: bool) -> None:
         """Have them begin with :meth:`ColourMap.sum_normal` of their views."""
 
     def add(self, sums: cl.Buffer, blocks: cl.Buffer | None) -> dict[int, float]:
@@ -102,10 +102,16 @@ class ColourMap(Owner):
         self._coefficients = coefficients
         self._background = background
         self._launcher = launcher
-        self._view_colours = device.shared_kernel("refit/view_colours.cl", "view_colours", **layout.macros)
-        self._gathers = [
-            device.shared_kernel("refit/gather.cl", "gather", WEIGHTS=weights, **layout.macros) for weights in (0, 1)
-        ]
+        self._view_colours = {
+            constant: device.shared_kernel("refit/view_colours.cl", "view_colours", **layout.some(constant))
+            for constant in (False, True)
+        }
+        self._gathers = {
+            (constant, weights): device.shared_kernel(
+                "refit/gather.cl", "gather", WEIGHTS=int(weights), **layout.some(constant)
+            )
+            for constant, weights in ((False, False), (False, True), (True, False))
+        }
         self._from_fixed = device.shared_kernel("refit/gather.cl", "from_fixed", WEIGHTS=0, **layout.macros)
         self.total_weight = 3 * REFERENCE_PIXELS * len(cameras)
         self._one = gathered_scale(cameras, [_weight(camera) for camera in cameras])
@@ -149,7 +155,14 @@ class ColourMap(Owner):
 
     # ------------------------------------------------------------------------------------------ products
 
-    def gradient(self, x: cl.Buffer, targets: Targets, result: cl.Buffer, blocks: SplatBlocks | None = None) -> float:
+    def gradient(
+        self,
+        x: cl.Buffer,
+        targets: Targets,
+        result: cl.Buffer,
+        blocks: SplatBlocks | None = None,
+        constant: bool = False,
+    ) -> float:
         """result += Aᵀ W (pictures(x) - targets), half the gradient of the squared error at x.
 
         Colours that are cut at 0 at x are settled: they have no part in it.
@@ -159,6 +172,7 @@ class ColourMap(Owner):
             targets: what the pictures should show.
             result: a vector.
             blocks: the splats' own blocks of Aᵀ W A are added to them; cuts are left out of account there.
+            constant: leave the result's AC coefficients alone. Not together with blocks.
 
         Returns:
             The squared error |pictures(x) - targets|² by W.
@@ -169,21 +183,23 @@ class ColourMap(Owner):
         with Memory(self._device) as memory:
             sums = None if blocks is None else self._block_sums(memory, blocks.nbytes)
             if self._helpers is not None:
-                self._helpers.begin_gradient(x, blocks is not None)
-            errors = self.sum_gradient(x, targets, sums)
+                self._helpers.begin_gradient(x, blocks is not None, constant)
+            errors = self.sum_gradient(x, targets, sums, constant)
             if self._helpers is not None:
                 errors |= self._helpers.add(self.sums, sums)
-            self._finish(self.sums, 1.0, result)
+            self._finish(self.sums, 1.0, result, constant)
             if blocks is not None:
                 self._finish(sums, 1.0, blocks.buffer)
                 self._device.queue.finish()  # before their memory is given back
         return math.fsum(errors[number] for number in sorted(errors))
 
-    def sum_gradient(self, x: cl.Buffer, targets: Targets, blocks: cl.Buffer | None) -> dict[int, float]:
+    def sum_gradient(
+        self, x: cl.Buffer, targets: Targets, blocks: cl.Buffer | None, constant: bool = False
+    ) -> dict[int, float]:
         """The part of :meth:`gradient` that is a sum over this device's views: it is added to :attr:`sums`.
 
         Args:
-            x, targets: as of :meth:`gradient`.
+            x, targets, constant: as of :meth:`gradient`.
             blocks: (M (M + 1) / 2, stride) int64, the same of the splats' own blocks; None: they are not wanted.
 
         Returns:
@@ -192,20 +208,21 @@ class ColourMap(Owner):
         errors: dict[int, float] = {}
         for numbers in self._views.launches:
             with self._views.ready(numbers) as (views, _):
-                self._enqueue_colours(views, x, views.colours, direction=False, unit=1.0)
+                self._enqueue_colours(views, x, views.colours, None)
                 pictures = self._targets.pictures(targets, numbers)
                 self._enqueue_sweep(numbers, views, views.colours, pictures, blocks is not None)
-                self._enqueue_gather(numbers, views, blocks)
+                self._enqueue_gather(numbers, views, blocks, constant)
                 errors |= self._found_errors(numbers, views)
         return errors
 
-    def normal(self, direction: cl.Buffer, at: cl.Buffer, result: cl.Buffer) -> None:
+    def normal(self, direction: cl.Buffer, at: cl.Buffer, result: cl.Buffer, constant: bool = False) -> None:
         """result += Aᵀ W A direction, nothing if the direction is 0 or not finite.
 
         Args:
             direction: a vector. It may be of any length: it is scaled so that the fixed point of the sums fits.
             at: the vector that :meth:`gradient` was given last, with the same content.
             result: another vector.
+            constant: the direction's AC coefficients are all 0, and those of the result are left alone.
 
         Raises:
             DeviceError: the device failed.
@@ -215,26 +232,26 @@ class ColourMap(Owner):
             return
         unit = 1 / largest
         if self._helpers is not None:
-            self._helpers.begin_normal(direction, unit)
-        self.sum_normal(direction, at, unit)
+            self._helpers.begin_normal(direction, unit, constant)
+        self.sum_normal(direction, at, unit, constant)
         if self._helpers is not None:
             self._helpers.add(self.sums, None)
-        self._finish(self.sums, unit, result)
+        self._finish(self.sums, unit, result, constant)
 
-    def sum_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float) -> None:
+    def sum_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool = False) -> None:
         """The part of :meth:`normal` that is a sum over this device's views: it is added to :attr:`sums`.
 
         Args:
-            direction, at: as of :meth:`normal`.
+            direction, at, constant: as of :meth:`normal`.
             unit: the direction is multiplied by this.
         """
         for numbers in self._views.launches:
             with self._views.ready(numbers) as (views, anew):
                 if anew:  # which colours are cut is not known any more
-                    self._enqueue_colours(views, at, views.colours, direction=False, unit=1.0)
-                self._enqueue_colours(views, direction, self._change, direction=True, unit=unit)
+                    self._enqueue_colours(views, at, views.colours, None)
+                self._enqueue_colours(views, direction, self._change, unit, constant)
                 self._enqueue_sweep(numbers, views, self._change, None, False)
-                self._enqueue_gather(numbers, views, None)
+                self._enqueue_gather(numbers, views, None, constant)
 
     # ------------------------------------------------------------------------------------------ their parts
 
@@ -244,25 +261,30 @@ class ColourMap(Owner):
         self._coefficients.zero(sums)
         return sums
 
-    def _finish(self, sums: cl.Buffer, unit: float, result: cl.Buffer) -> None:
+    def _finish(self, sums: cl.Buffer, unit: float, result: cl.Buffer, constant: bool = False) -> None:
         """Enqueue: result += the sums in the unit of what was summed; the sums become 0."""
+        # The constant coefficients' columns come first, and the others' sums are 0 then.
+        count = 3 * self._layout.stride if constant else sums.size // 8
         self._from_fixed.bind(sums=sums, unit=np.float32(1 / (self._one * unit)), result=result)
-        self._from_fixed.launch((sums.size // 8,))
+        self._from_fixed.launch((count,))
 
-    def _enqueue_colours(self, views: ViewSet, x: cl.Buffer, result: cl.Buffer, direction: bool, unit: float) -> None:
-        """Enqueue the views' colours, or ``unit`` times those that a direction adds where none is cut at 0."""
-        self._view_colours.bind(
+    def _enqueue_colours(
+        self, views: ViewSet, x: cl.Buffer, result: cl.Buffer, unit: float | None, constant: bool = False
+    ) -> None:
+        """Enqueue the views' colours, or what ``unit`` times a direction adds to them where none is cut at 0."""
+        kernel = self._view_colours[constant]
+        kernel.bind(
             coefficients=x,
             means=self._means,
             stride=self._layout.stride,
             views=views.table,
             view_count=len(views.views),
-            direction=direction,
-            unit=np.float32(unit),
+            direction=unit is not None,
+            unit=np.float32(1.0 if unit is None else unit),
             free=views.colours,
             colours=result,
         )
-        self._layout.over_splats(self._view_colours, -(-len(views.views) // _COLOURED))
+        self._layout.over_splats(kernel, -(-len(views.views) // _COLOURED))
 
     def _enqueue_sweep(
         self, numbers: range, views: ViewSet, colours: cl.Buffer, target: cl.Buffer | None, weights: bool
@@ -280,9 +302,9 @@ class ColourMap(Owner):
             weights,
         )
 
-    def _enqueue_gather(self, numbers: range, views: ViewSet, blocks: cl.Buffer | None) -> None:
+    def _enqueue_gather(self, numbers: range, views: ViewSet, blocks: cl.Buffer | None, constant: bool) -> None:
         """Enqueue the way from the views' sums to the coefficients, and to the blocks if the sums have their part."""
-        gather = self._gathers[blocks is not None]
+        gather = self._gathers[constant, blocks is not None]
         gather.bind(
             totals=self._totals,
             means=self._means,

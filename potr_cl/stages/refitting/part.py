@@ -88,13 +88,14 @@ class ColourPart(Part):
             self._targets = RenderedTargets(of_source, cameras)
             self._owned = owned.pop_all()
 
-    def gradient(self, x: FloatArray, flags: NDArray[np.uint32], blocks: bool) -> Gradient:
+    def gradient(self, x: FloatArray, flags: NDArray[np.uint32], blocks: bool, constant: bool) -> Gradient:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.gradient`.
 
         Args:
             x: (3 M, N) float32, the columns of the coefficients.
             flags: (2, N) uint32, which of them are active.
             blocks: whether the splats' own blocks are wanted.
+            constant: whether only the constant coefficients are active.
         """
         layout = self._coefficients.layout
         self._packing.give_flags(flags)
@@ -105,24 +106,25 @@ class ColourPart(Part):
             if blocks:
                 sums = memory.allocate(8 * triangle * layout.stride, "the splats' normal equations")
                 self._coefficients.zero(sums)
-            errors = self._map.sum_gradient(self._x, self._targets, sums)
+            errors = self._map.sum_gradient(self._x, self._targets, sums, constant)
             found = None
             if sums is not None:
                 found = self._device.download(sums, (triangle, layout.stride), np.int64)[:, : layout.splats]
         return Gradient(errors, self._packing.sums(self._map.sums), found)
 
-    def normal(self, direction: FloatArray, unit: float) -> NDArray[np.int64]:
+    def normal(self, direction: FloatArray, unit: float, constant: bool) -> NDArray[np.int64]:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.normal`.
 
         Args:
             direction: (active coefficients,) float32.
             unit: it is multiplied by this.
+            constant: whether only the constant coefficients are active.
 
         Returns:
             (active coefficients,) int64.
         """
         self._packing.set_floats(self._direction, direction)
-        self._map.sum_normal(self._direction, self._x, unit)
+        self._map.sum_normal(self._direction, self._x, unit, constant)
         return self._packing.sums(self._map.sums)
 
     def close(self) -> None:

@@ -10,15 +10,20 @@ This is not in the paper, which solves for each splat alone.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
+import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.codec.quantize import nonzero_levels
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
@@ -29,7 +34,7 @@ from potr_cl.stages.refitting.coefficients import Coefficients, Layout, Ridge
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts
-from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection
+from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
 from potr_cl.stages.refitting.targets import Targets
 from potr_cl.workers.dealing import shares
 from potr_cl.workers.pool import Pool
@@ -105,6 +110,7 @@ def refit_colours(
     progress: Callable[[int, int], None] | None = None,
     fix_ac: Callable[[FloatArray, ColourRefit], FloatArray] | None = None,
     help_from: HelpFrom | None = None,
+    ac_factors: Callable[[FloatArray], FloatArray] | None = None,
 ) -> Refitted:
     """Re-fit a scene's colours to pictures of all views together.
 
@@ -121,13 +127,15 @@ def refit_colours(
             change, and from what the re-fit knows of them (:meth:`ColourRefit.worth`). The constant ones are then
             solved for again. If it returns the solution itself, that stays as it is.
         help_from: workers that do some of the views; the targets are then pictures of a scene.
+        ac_factors: in place of ``fix_ac``, where AC coefficients are rounded to multiples of a step of their splat: it
+            gets :meth:`ColourRefit.worth_of_constants`, in a thread of its own, and returns (N,) steps a unit.
 
     Raises:
         UsageError: no camera.
         DeviceError: the scene does not fit the device.
     """
     options = options or RefitOptions()
-    more = 0 if fix_ac is None else _CONSTANT_STEPS
+    more = 0 if fix_ac is None and ac_factors is None else _CONSTANT_STEPS
 
     def report(done: int, steps: int) -> None:
         if progress is not None:
@@ -136,16 +144,92 @@ def refit_colours(
     with ColourRefit(
         device, scene, cameras, background=background, memory=options.memory, help_from=help_from
     ) as refit:
-        found = refit.solve(scene.sh, targets, options, active, progress=report)
-        fixed = found.sh if fix_ac is None else fix_ac(found.sh, refit)
-        if fixed is found.sh:
-            return found
-        constant = np.zeros(fixed.shape, bool)
-        constant[:, 0] = True
-        few = replace(options, drop=0.0, steps=_CONSTANT_STEPS)
-        again = refit.solve(fixed, targets, few, constant, hold=True, again=True)
-        again.sh[:, 1:] = fixed[:, 1:]  # they were rounded once more on their way through Y, Co, Cg
-        return Refitted(again.sh, (found.errors[0], again.errors[1]), found.steps + again.steps)
+        way: _Rounding
+        if ac_factors is not None:
+            way = _InSteps(refit, targets, options, ac_factors)
+        elif fix_ac is not None:
+            way = _AsTheFileDoes(refit, targets, options, fix_ac)
+        else:
+            return refit.solve(scene.sh, targets, options, active, progress=report)
+        solved = refit.solve_on_device(
+            scene.sh, targets, options, active, progress=report, check=False, after_start=way.begin
+        )
+        result, at_start = way.finish(solved)
+        # How good the solution was, the next one has measured at its start: that saves a sweep. Only if it looks bad is
+        # it measured by itself, because the rounding may be what was bad. Where many colours were cut at 0 on the way,
+        # it is the solution.
+        if not at_start <= solved.worst and not way.error() <= solved.worst:
+            solved = refit.solve_on_device(scene.sh, targets, options, active, progress=report, after_start=way.begin)
+            result, _ = way.finish(solved)
+        return result
+
+
+class _Rounding(Protocol):
+    """What becomes of a solution's AC coefficients, and of the constant ones then."""
+
+    def begin(self) -> None:
+        """Called when the splats' blocks are known."""
+        ...
+
+    def finish(self, solved: Solved) -> tuple[Refitted, float]:
+        """Round, and solve for the constant coefficients; also the error between the two."""
+        ...
+
+    def error(self) -> float:
+        """Of the solution, before it was rounded."""
+        ...
+
+
+@dataclass
+class _InSteps:
+    """Rounded on the device, to steps that are found while it solves."""
+
+    refit: ColourRefit
+    targets: Targets
+    options: RefitOptions
+    ac_factors: Callable[[FloatArray], FloatArray]
+    _factors: Future[FloatArray] | None = None
+
+    def begin(self) -> None:
+        self._factors = in_background(self.ac_factors, self.refit.worth_of_constants())
+
+    def finish(self, solved: Solved) -> tuple[Refitted, float]:
+        assert self._factors is not None
+        self.refit.round_ac(self._factors.result())
+        again = self.refit.solve_constant(self.targets, replace(self.options, steps=_CONSTANT_STEPS))
+        result = Refitted(self.refit.colours(), (solved.errors[0], again.errors[1]), solved.steps + again.steps)
+        return result, again.errors[0]
+
+    def error(self) -> float:
+        return self.refit.error(self.targets)
+
+
+@dataclass
+class _AsTheFileDoes:
+    """Rounded on the host, in whatever way a kind of file has."""
+
+    refit: ColourRefit
+    targets: Targets
+    options: RefitOptions
+    fix_ac: Callable[[FloatArray, ColourRefit], FloatArray]
+    _found: FloatArray | None = None
+
+    def begin(self) -> None:
+        pass
+
+    def finish(self, solved: Solved) -> tuple[Refitted, float]:
+        self._found = self.refit.colours()
+        fixed = self.fix_ac(self._found, self.refit)
+        if fixed is self._found:
+            error = self.error() if math.isnan(solved.errors[1]) else solved.errors[1]
+            return Refitted(fixed, (solved.errors[0], error), solved.steps), error
+        again = self.refit.solve_constant(self.targets, replace(self.options, steps=_CONSTANT_STEPS), fixed)
+        sh = self.refit.colours()
+        sh[:, 1:] = fixed[:, 1:]  # they were rounded once more on their way through Y, Co, Cg
+        return Refitted(sh, (solved.errors[0], again.errors[1]), solved.steps + again.steps), again.errors[0]
+
+    def error(self) -> float:
+        return self.refit.error(self.targets, self._found)
 
 
 @dataclass(frozen=True)
@@ -216,6 +300,7 @@ class ColourRefit(Owner):
                     launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory, own, helpers
                 )
             )
+            self._unrounded: cl.Buffer | None = None
             self._owned = owned.pop_all()
 
     def solve(
@@ -226,7 +311,6 @@ class ColourRefit(Owner):
         active: NDArray[np.bool_] | None = None,
         hold: bool = False,
         progress: Callable[[int, int], None] | None = None,
-        again: bool = False,
     ) -> Refitted:
         """Re-fit the active coefficients, after choosing among them if the options say so.
 
@@ -237,14 +321,40 @@ class ColourRefit(Owner):
             active: (N, M, 3) in Y, Co, Cg: the coefficients that may change; all by default.
             hold: whether the other coefficients keep their values; if not, they become 0.
             progress: called with the steps done and their greatest number.
-            again: whether the solution before was for nearly the same colours: it saves some work.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        solved = self.solve_on_device(sh, targets, options, active, hold, progress)
+        return Refitted(self.colours(), solved.errors, solved.steps)
+
+    def solve_on_device(
+        self,
+        sh: FloatArray,
+        targets: Targets,
+        options: RefitOptions,
+        active: NDArray[np.bool_] | None = None,
+        hold: bool = False,
+        progress: Callable[[int, int], None] | None = None,
+        check: bool = True,
+        after_start: Callable[[], None] = lambda: None,
+    ) -> Solved:
+        """The same, with the solution left where :meth:`colours`, :meth:`round_ac` and :meth:`solve_constant` find it.
+
+        Args:
+            sh, targets, options, active, hold, progress: as :meth:`solve` takes them.
+            check: measure the error of the solution, and keep the start if that was better; if not, that error is not a
+                number.
+            after_start: called when :meth:`worth` and its likes are known.
 
         Raises:
             DeviceError: the device failed.
         """
         coefficients, solver = self.coefficients, self._solver
-        coefficients.write_sh(solver.x, sh, None if hold else active)
+        coefficients.write_sh(solver.x, sh)
         coefficients.activate(active)
+        if active is not None and not hold:
+            coefficients.keep_active(solver.x)
         descent = Descent(options.steps, options.gain, Ridge(options.lam, options.chroma_factor, options.prior))
         selection, total = None, options.steps
         if options.drop:
@@ -256,8 +366,62 @@ class ColourRefit(Owner):
             if progress is not None:
                 progress(steps, total)
 
-        solved = solver.solve(self.colour_map, targets, descent, selection, after_step, again)
-        return Refitted(coefficients.read_sh(solver.x), solved.errors, solved.steps)
+        return solver.solve(
+            self.colour_map, targets, descent, selection, after_step, check=check, after_start=after_start
+        )
+
+    def solve_constant(self, targets: Targets, options: RefitOptions, sh: FloatArray | None = None) -> Solved:
+        """Re-fit the constant coefficients alone, after a solution for nearly the same colours.
+
+        Args:
+            targets, options: as :meth:`solve` takes them; none are given up.
+            sh: (N, M, 3) R, G, B, the start; None: the solution before, perhaps rounded. AC coefficients stay.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        coefficients, solver = self.coefficients, self._solver
+        if sh is not None:
+            coefficients.write_sh(solver.x, sh)
+        coefficients.activate_constant()
+        descent = Descent(options.steps, options.gain, Ridge(options.lam, options.chroma_factor, options.prior))
+        return solver.solve(self.colour_map, targets, descent, constant=True)
+
+    def colours(self) -> FloatArray:
+        """(N, M, 3) float32 R, G, B, the solution."""
+        return self.coefficients.read_sh(self._solver.x)
+
+    def round_ac(self, factors: FloatArray) -> None:
+        """Round the solution's AC coefficients; :meth:`error` still knows what they were.
+
+        Args:
+            factors: (N,) float32, steps a unit of each splat.
+        """
+        if self._unrounded is None:
+            self._unrounded = self.coefficients.vector()
+        self.coefficients.copy(self._unrounded, self._solver.x)
+        self.coefficients.round_ac(self._solver.x, factors)
+
+    def error(self, targets: Targets, sh: FloatArray | None = None) -> float:
+        """Mean squared error of the pictures. The solution is lost.
+
+        Args:
+            targets: the pictures.
+            sh: (N, M, 3) R, G, B, the colours; None: the solution as it was before :meth:`round_ac`.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        if sh is not None:
+            self.coefficients.write_sh(self._solver.x, sh)
+        else:
+            assert self._unrounded is not None
+            self.coefficients.copy(self._solver.x, self._unrounded)
+        return self._solver.error(self.colour_map, targets)
+
+    def worth_of_constants(self) -> FloatArray:
+        """(N,) float32: :meth:`worth` of the constant coefficients."""
+        return self._solver.blocks.constants() / np.float32(self.colour_map.total_weight)
 
     def worth(self) -> FloatArray:
         """(N, M) float32: by how much the mean squared error grows for an error of 1 in a coefficient of one channel.

@@ -37,15 +37,16 @@ class SharedViews(Owner):
         self._packing = Packing(coefficients)
         self._pending: Pending | None = None
 
-    def begin_gradient(self, x: cl.Buffer, blocks: bool) -> None:
+    def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
         """Have them begin with a gradient at x."""
         self._packing.take_flags()
         columns = self._coefficients.read_columns(x)
-        self._pending = self._others.begin("gradient", columns, self._packing.flags, blocks, anew=True)
+        flags = self._packing.flags
+        self._pending = self._others.begin("gradient", columns, flags, blocks, constant, anew=True)
 
-    def begin_normal(self, direction: cl.Buffer, unit: float) -> None:
+    def begin_normal(self, direction: cl.Buffer, unit: float, constant: bool) -> None:
         """Have them begin with a product of the normal matrix."""
-        self._pending = self._others.begin("normal", self._packing.floats(direction), unit, logged=False)
+        self._pending = self._others.begin("normal", self._packing.floats(direction), unit, constant, logged=False)
 
     def add(self, sums: cl.Buffer, blocks: cl.Buffer | None) -> dict[int, float]:
         """Add what they found to sums on the master's device."""
