@@ -16,7 +16,14 @@ from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
-from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, Refitted, active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit import (
+    ColourRefit,
+    HelpFrom,
+    RefitOptions,
+    Refitted,
+    active_coefficients,
+    refit_colours,
+)
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
@@ -148,6 +155,10 @@ class Refit(Stage):
             found = refit_colours(
                 bench.opened, decoded, views, targets, options, active, bench.background, progress,
                 fix_ac=None if in_steps or not bench.output.fixes_ac else fix_ac,
+                # Photographs lie where the master reads them.
+                help_from=HelpFrom(bench.pool, state.source)
+                if bench.pool and isinstance(targets, RenderedTargets)
+                else None,
                 ac_factors=ac_factors if in_steps else None,
             )  # fmt: skip
             return found, geometry
@@ -160,7 +171,8 @@ class Refit(Stage):
             if in_steps:
                 # The host rounds the geometry by itself, so the device may begin with the pictures.
                 waiting = in_background(on_geometry)
-                renders.render_ahead()
+                if not bench.pool:
+                    renders.render_ahead()
                 rounded, decoded = waiting.result()
             else:
                 rounded, decoded = on_geometry()
@@ -206,6 +218,7 @@ class RefitOnTheWay(Stage):
                 RefitOptions(steps=self.steps, memory=bench.memory),
                 background=bench.background,
                 progress=lambda done, steps: bench.progress("refit", 0.99 * done / steps),
+                help_from=None if bench.pool is None else HelpFrom(bench.pool, state.source),
             )
         bench.progress("refit", 1.0)
         return state.recoloured(refitted.sh)

@@ -183,7 +183,9 @@ class Walk:
             raise TypeError("the native path was given tails of another size than their lengths ask for")
         self._all_counts = counts
         # Leaves with a tail of each length come after all that have longer ones, and after those of the parts before.
-        self._ranks = (reach - counts.astype(np.int64)).astype(np.uint64) + np.cumsum(self._counts, axis=0, dtype=np.uint64)
+        self._ranks = (reach - counts.astype(np.int64)).astype(np.uint64) + np.cumsum(
+            self._counts, axis=0, dtype=np.uint64
+        )
         self._ranks -= self._counts
         self._tails_at = address(tails, np.uint8, len(tails))
         self._tails = tails

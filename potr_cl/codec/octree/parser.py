@@ -112,7 +112,12 @@ def _parse_natively(
     if streams.absolute:
         _check_leaf_levels(streams)
     walk = functions.octree.walk(
-        tree, streams.tail_lengths, streams.absolute, streams.multiplicities, splats, max(1, min(parts, splats // _PART))
+        tree,
+        streams.tail_lengths,
+        streams.absolute,
+        streams.multiplicities,
+        splats,
+        max(1, min(parts, splats // _PART)),
     )
     list(run(walk.leaves, range(walk.parts)))
     counts = walk.counts

@@ -39,6 +39,11 @@ class SplatBlocks(Owner):
         self._memory = Memory(device)
         self.buffer = self._memory.allocate(4 * self._triangle * layout.stride, "the splats' normal equations")
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of :attr:`buffer`."""
+        return 4 * self._triangle * self._coefficients.layout.stride
+
     def zero(self) -> None:
         """Have all blocks 0."""
         self._coefficients.zero(self.buffer)

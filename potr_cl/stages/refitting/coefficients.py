@@ -174,6 +174,17 @@ class Coefficients(Owner):
         """(N, M, 3) float32, a vector in Y, Co, Cg."""
         return np.ascontiguousarray(self._columns_of(x)[:, :, : self.layout.splats].transpose(2, 0, 1))
 
+    def write_columns(self, x: cl.Buffer, values: FloatArray) -> None:
+        """Set a vector from its columns, (3 M, N) float32, as :meth:`read_columns` gives them."""
+        columns = np.zeros((self.layout.columns, self.layout.stride), np.float32)
+        columns[:, : self.layout.splats] = values
+        cl.enqueue_copy(self.device.queue, x, columns, is_blocking=True)
+
+    def read_columns(self, x: cl.Buffer) -> FloatArray:
+        """(3 M, N) float32, the columns of a vector as they lie on the device."""
+        columns = self._columns_of(x).reshape(self.layout.columns, self.layout.stride)
+        return np.ascontiguousarray(columns[:, : self.layout.splats])
+
     def write_sh(self, x: cl.Buffer, sh: FloatArray) -> None:
         """Set a vector.
 

@@ -33,8 +33,11 @@ from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients, Layout, Ridge
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
+from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
 from potr_cl.stages.refitting.targets import Targets
+from potr_cl.workers.dealing import shares
+from potr_cl.workers.pool import Pool
 
 #: Steps in which the constant coefficients are solved for once more, after the others have been rounded.
 _CONSTANT_STEPS = 3
@@ -106,6 +109,7 @@ def refit_colours(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: Callable[[int, int], None] | None = None,
     fix_ac: Callable[[FloatArray, ColourRefit], FloatArray] | None = None,
+    help_from: HelpFrom | None = None,
     ac_factors: Callable[[FloatArray], FloatArray] | None = None,
 ) -> Refitted:
     """Re-fit a scene's colours to pictures of all views together.
@@ -122,6 +126,7 @@ def refit_colours(
         fix_ac: chooses the AC coefficients that a file can hold, from the solution (N, M, 3) R, G, B, which it must not
             change, and from what the re-fit knows of them (:meth:`ColourRefit.worth`). The constant ones are then
             solved for again. If it returns the solution itself, that stays as it is.
+        help_from: workers that do some of the views; the targets are then pictures of a scene.
         ac_factors: in place of ``fix_ac``, where AC coefficients are rounded to multiples of a step of their splat: it
             gets :meth:`ColourRefit.worth_of_constants`, in a thread of its own, and returns (N,) steps a unit.
 
@@ -136,7 +141,9 @@ def refit_colours(
         if progress is not None:
             progress(done, steps + more)
 
-    with ColourRefit(device, scene, cameras, background=background, memory=options.memory) as refit:
+    with ColourRefit(
+        device, scene, cameras, background=background, memory=options.memory, help_from=help_from
+    ) as refit:
         way: _Rounding
         if ac_factors is not None:
             way = _InSteps(refit, targets, options, ac_factors)
@@ -225,6 +232,19 @@ class _AsTheFileDoes:
         return self.refit.error(self.targets, self._found)
 
 
+@dataclass(frozen=True)
+class HelpFrom:
+    """Workers that do some of the views of a re-fit.
+
+    Attributes:
+        pool: the workers.
+        source: the scene whose pictures are the targets.
+    """
+
+    pool: Pool
+    source: Scene
+
+
 class ColourRefit(Owner):
     """The map and the solver of one scene, for any number of solutions.
 
@@ -234,6 +254,7 @@ class ColourRefit(Owner):
         cameras: the views that count, all the same whatever their size.
         rules, background: of the rasterizer.
         memory: bytes of device memory that prepared views and targets may take; None: a quarter of what is free.
+        help_from: workers that do some of the views.
 
     Attributes:
         coefficients, colour_map: the vectors and the map, for callers that want products rather than solutions.
@@ -251,10 +272,21 @@ class ColourRefit(Owner):
         rules: RasterRules = INRIA,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         memory: int | None = None,
+        help_from: HelpFrom | None = None,
     ) -> None:
         if not cameras:
             raise UsageError("a re-fit needs at least one view")
         with ExitStack() as owned:
+            own, others = None, None
+            if help_from is not None:
+                share = shares(help_from.pool, len(cameras))
+                if share.others:
+                    own = share.own
+                    others = owned.enter_context(
+                        colour_parts(
+                            help_from.pool, share, scene, rules, background, help_from.source, cameras, memory
+                        )
+                    )  # fmt: skip
             # The rasterizer's own colours are never looked at.
             rasterizer = owned.enter_context(Rasterizer(device, replace(scene, sh=scene.sh[:, :1]), rules))
             launcher = launcher_for(device, rules)
@@ -262,8 +294,11 @@ class ColourRefit(Owner):
             self.coefficients = owned.enter_context(Coefficients(device, layout))
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             self._solver = owned.enter_context(ColourSolver(self.coefficients))
+            helpers = None if others is None else owned.enter_context(SharedViews(self.coefficients, others))
             self.colour_map = owned.enter_context(
-                ColourMap(launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory)
+                ColourMap(
+                    launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory, own, helpers
+                )
             )
             self._unrounded: cl.Buffer | None = None
             self._owned = owned.pop_all()
