@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray
+from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
@@ -122,15 +123,17 @@ class Refit(Stage):
         """
         bench.progress("refit", 0.0)
         parameters = bench.parameters
-        geometry = state.geometry
-        if geometry is None or geometry.asked != parameters:
-            geometry = bench.output.geometry(state.scene, bench.request(state))
-        rounded = geometry
-        decoded = geometry.decoded(state.scene.sh)
         compacted = "compact" in state.learnt
         active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
         options = RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory)
+        in_steps = bench.output.steps_of_ac(bench.request(state))
         fits = 1 if self.ground_truth is None else 2
+
+        def on_geometry() -> tuple[Rounded, Scene]:
+            geometry = state.geometry
+            if geometry is None or geometry.asked != parameters:
+                geometry = bench.output.geometry(state.scene, bench.request(state))
+            return geometry, geometry.decoded(state.scene.sh)
 
         def fitted(views: Sequence[Camera], targets: Targets, number: int) -> tuple[Refitted, Rounded]:
             geometry = rounded
@@ -149,7 +152,6 @@ class Refit(Stage):
                 geometry, steps = bench.output.ac_factors(rounded, effects, bench.request(state))
                 return steps
 
-            in_steps = bench.output.steps_of_ac(bench.request(state))
             found = refit_colours(
                 bench.opened, decoded, views, targets, options, active, bench.background, progress,
                 fix_ac=None if in_steps or not bench.output.fixes_ac else fix_ac,
@@ -165,7 +167,16 @@ class Refit(Stage):
             stack.callback(bench.progress, "refit", 1.0)
             source = bench.drawable(state.source)
             rasterizer = stack.enter_context(Rasterizer(bench.opened, source, background=bench.background))
-            refitted, geometry = fitted(state.views, RenderedTargets(rasterizer, state.views), 0)
+            renders = stack.enter_context(RenderedTargets(rasterizer, state.views))
+            if in_steps:
+                # The host rounds the geometry by itself, so the device may begin with the pictures.
+                waiting = in_background(on_geometry)
+                if not bench.pool:
+                    renders.render_ahead()
+                rounded, decoded = waiting.result()
+            else:
+                rounded, decoded = on_geometry()
+            refitted, geometry = fitted(state.views, renders, 0)
             choice = None
             if self.ground_truth is not None:
                 given = state.views[: len(state.views) - state.added]
