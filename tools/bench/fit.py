@@ -85,7 +85,8 @@ def main() -> None:
     products = results.table(
         "products", "Products with the derivatives J of prepared views, and a picture beside them",
         Column("scene"), Column("splats", "", ",d"), Column("pixels of a view", "", ",d"),
-        Column("picture, with preparing its view", "ms a view", ".3f"), Column("Jᵀ v", "ms a view", ".3f"), Column("J x", "ms a view", ".3f"),
+        Column("picture, with preparing its view", "ms a view", ".3f"), Column("Jᵀ v", "ms a view", ".3f"),
+        Column("J x", "ms a view", ".3f"),
     )  # fmt: skip
     for name, _, left, train in loads:
         products.add(name, len(left), train[0].width * train[0].height, *_products(plain, left, train))
