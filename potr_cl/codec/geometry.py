@@ -16,7 +16,7 @@ from potr_cl.codec import octree, quantize
 from potr_cl.codec.native.library import native
 from potr_cl.codec.outliers import check_positions
 from potr_cl.codec.steps.fitting import fit_steps
-from potr_cl.codec.steps.rule import ColourSteps
+from potr_cl.codec.steps.rule import ColourSteps, factors
 from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
@@ -75,6 +75,14 @@ class Geometry:
             none = np.zeros(len(self.order), np.int8)
             return none, none
         return self.steps.classes(self.scales, self.opacities)
+
+    def colour_steps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
+        """(N,) steps of DC and of AC coefficients in the order of the scene."""
+        dc, ac = np.empty((2, len(self.order)), np.float32)
+        of_dc, of_ac = self.colour_classes()
+        dc[self.order] = 1 / factors(self.parameters.sf_dc, of_dc)
+        ac[self.order] = 1 / factors(self.parameters.sf_sh, of_ac)
+        return dc, ac
 
     def with_steps(self, effects: NDArray[np.floating]) -> Geometry:
         """The same with steps of colours by what each splat shows.

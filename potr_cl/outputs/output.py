@@ -26,6 +26,7 @@ from potr_cl.formats.declaration import SceneFormat
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.raster.scene_buffers import Drawable
 
 
@@ -145,7 +146,7 @@ class Output(ABC):
 
     def fix_ac(
         self, rounded: Rounded, sh: FloatArray, worth: FloatArray | None, request: Request
-    ) -> tuple[Rounded, FloatArray]:
+    ) -> tuple[Rounded, FloatArray | ColourGrid]:
         """Choose the AC coefficients that the file will hold: levels, bits or a palette.
 
         It is called once, after the re-fit, or by :meth:`file` where there was none. The re-fit then solves for the
@@ -160,7 +161,8 @@ class Output(ABC):
 
         Returns:
             What :meth:`file` is given, and the coefficients as readers will see them. ``sh`` itself where nothing is
-            rounded that anybody could see.
+            rounded that anybody could see. A :class:`ColourGrid` where each coefficient is rounded to steps of its
+            splat: the re-fit then does it.
         """
         return rounded, sh
 
@@ -182,7 +184,8 @@ class Output(ABC):
         """Rounded geometry and fixed AC coefficients, where :meth:`file` gets none from a re-fit."""
         if rounded is not None:
             return rounded, scene.sh
-        return self.fix_ac(self.geometry(scene, request), scene.sh, None, request)
+        rounded, sh = self.fix_ac(self.geometry(scene, request), scene.sh, None, request)
+        return rounded, scene.sh if isinstance(sh, ColourGrid) else sh
 
     def read(self, data: bytes, trust: bool = False) -> Scene:
         """The scene that a file's readers will see.

@@ -7,7 +7,6 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
-from potr_cl.codec.colours import rounded_ac
 from potr_cl.codec.decoder import PotrFile, decode
 from potr_cl.codec.encoder import Coded, code_scene
 from potr_cl.codec.geometry import Geometry, quantise_geometry
@@ -21,6 +20,7 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.outputs.output import Output, Request, Rounded
 from potr_cl.raster.scene_buffers import Drawable
 
@@ -39,7 +39,7 @@ _NAMES = {
 
 @dataclass(frozen=True)
 class Potr(Output):
-    """A .potr file: :mod:`potr_cl.codec`. AC coefficients are rounded to steps finer than one sees."""
+    """A .potr file: :mod:`potr_cl.codec`. Colours are rounded to steps finer than one sees."""
 
     format: ClassVar[SceneFormat] = FORMAT
     choices: ClassVar[frozenset[str]] = frozenset(
@@ -55,17 +55,14 @@ class Potr(Output):
 
     def fix_ac(
         self, rounded: Rounded, sh: FloatArray, worth: FloatArray | None, request: Request
-    ) -> tuple[Rounded, FloatArray]:
-        """Fit the steps of colours to each splat, and round to them, in the versions of the format that have such.
-
-        DC is solved for once more afterwards: it makes up for what the rounding of the others has changed.
-        """
+    ) -> tuple[Rounded, FloatArray | ColourGrid]:
+        """Fit the steps of colours to each splat, in the versions of the format that have such."""
         assert isinstance(rounded, Geometry)
         if worth is None or not VERSIONS[request.parameters.version].colour_steps:
             return rounded, sh
         geometry = rounded.with_steps(worth[:, 0])
-        with thread_pool(request.threads) as pool:
-            return geometry, rounded_ac(sh, geometry, pool.map)
+        constant, others = geometry.colour_steps()
+        return geometry, ColourGrid(constant, others, geometry.order)
 
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
         """See :func:`potr_cl.codec.encoder.code_scene`."""

@@ -11,6 +11,7 @@ from typing import Any
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
+from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
@@ -131,11 +132,11 @@ class Refit(Stage):
             def progress(done: int, steps: int) -> None:
                 bench.progress("refit", (number + done / steps) / fits)
 
-            def fix_ac(sh: FloatArray, refit: ColourRefit) -> FloatArray:
+            def fix_ac(sh: FloatArray, refit: ColourRefit) -> FloatArray | ColourGrid:
                 nonlocal geometry
                 request = replace(bench.request(state), blocks=refit.blocks)
-                geometry, sh = bench.output.fix_ac(rounded, sh, refit.worth(), request)
-                return sh
+                geometry, fixed = bench.output.fix_ac(rounded, sh, refit.worth(), request)
+                return fixed
 
             found = refit_colours(
                 bench.opened, decoded, views, targets, options, active, bench.background, progress,

@@ -23,16 +23,22 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
+from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients, Layout, Ridge
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
+from potr_cl.stages.refitting.rounding import ROUNDS, Rounding
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection
 from potr_cl.stages.refitting.targets import Targets
 
 #: Steps in which the constant coefficients are solved for once more, after the others have been rounded.
 _CONSTANT_STEPS = 3
+#: Steps of what is still free after each round of rounding.
+_STEPS_BETWEEN = 1
+#: What a coefficient that becomes 0 as it is rounded is worth, as a part of what one is worth that is given up before.
+_WORTH = 1.0
 
 
 @dataclass(frozen=True)
@@ -100,7 +106,7 @@ def refit_colours(
     active: NDArray[np.bool_] | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: Callable[[int, int], None] | None = None,
-    fix_ac: Callable[[FloatArray, ColourRefit], FloatArray] | None = None,
+    fix_ac: Callable[[FloatArray, ColourRefit], FloatArray | ColourGrid] | None = None,
 ) -> Refitted:
     """Re-fit a scene's colours to pictures of all views together.
 
@@ -115,7 +121,8 @@ def refit_colours(
         progress: called with the steps done and their greatest number.
         fix_ac: chooses the AC coefficients that a file can hold, from the solution (N, M, 3) R, G, B, which it must not
             change, and from what the re-fit knows of them (:meth:`ColourRefit.worth`). The constant ones are then
-            solved for again. If it returns the solution itself, that stays as it is.
+            solved for again. If it returns the solution itself, that stays as it is. If it returns a grid, all
+            coefficients but the last constant ones are rounded to it (:mod:`potr_cl.stages.refitting.rounding`).
 
     Raises:
         UsageError: no camera.
@@ -131,6 +138,8 @@ def refit_colours(
     with ColourRefit(device, scene, cameras, background=background, memory=options.memory) as refit:
         found = refit.solve(scene.sh, targets, options, active, progress=report)
         fixed = found.sh if fix_ac is None else fix_ac(found.sh, refit)
+        if isinstance(fixed, ColourGrid):
+            return refit.rounded(fixed, found, targets, options)
         if fixed is found.sh:
             return found
         constant = np.zeros(fixed.shape, bool)
@@ -223,6 +232,29 @@ class ColourRefit(Owner):
 
         solved = solver.solve(self.colour_map, targets, descent, selection, after_step, again)
         return Refitted(coefficients.read_sh(solver.x), solved.errors, solved.steps)
+
+    def rounded(self, grid: ColourGrid, found: Refitted, targets: Targets, options: RefitOptions) -> Refitted:
+        """The last solution as a file can hold it, but for the last constant coefficients.
+
+        Args:
+            grid: what the file can hold.
+            found: the last solution, nothing having been solved since.
+            targets, options: that it was solved with.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        solver, steps = self._solver, found.steps
+        descent = Descent(_STEPS_BETWEEN, 0.0, Ridge(options.lam, options.chroma_factor, options.prior))
+        with Rounding(self.coefficients, grid) as rounding:
+            for number, each in enumerate(ROUNDS):
+                worth = _WORTH * options.drop * self.colour_map.total_weight
+                rounding.round(solver.x, solver.blocks, each, worth)
+                if number < len(ROUNDS) - 1:
+                    steps += solver.step_on(self.colour_map, targets, descent)
+                else:
+                    last = solver.solve(self.colour_map, targets, descent, known=True)
+        return Refitted(self.coefficients.read_sh(solver.x), (found.errors[0], last.errors[1]), steps + last.steps)
 
     def worth(self) -> FloatArray:
         """(N, M) float32: by how much the mean squared error grows for an error of 1 in a coefficient of one channel.

@@ -165,6 +165,19 @@ class ColourSolver(Owner):
         whole = colour_map.total_weight
         return Solved((first.error / whole, last.error / whole), steps + more)
 
+    def step_on(self, colour_map: ColourMap, targets: Targets, descent: Descent) -> int:
+        """Go on from where x is, a few steps that nobody checks, with the blocks of the solution before.
+
+        Returns:
+            Conjugate-gradient steps that were taken.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        problem = _Problem(colour_map, targets)
+        state = self._start_here(problem, descent.ridge)
+        return self._descend(problem, state, descent, lambda done: None)
+
     def _linearise(self, problem: _Problem, ridge: Ridge, blocks: SplatBlocks | None = None) -> _State:
         """Settle which colours are cut, and make the residual: minus half the objective's gradient at x."""
         vectors, residual = self._coefficients, self._residual
