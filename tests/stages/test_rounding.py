@@ -66,7 +66,7 @@ def test_levels_are_those_of_the_definition(device, degree, worth):
     active = np.random.default_rng(0).random(scene.sh.shape) < 0.8
     active[:, 0] = True
     with Case(device, scene, visible_scene(60, 2, 7), cameras) as case:
-        got = Rounded(case, grid, Round(False, 0), worth, active)
+        got = Rounded(case, grid, Round(0, constant=False, steps=0), worth, active)
     due = in_turn(grid, 0)
     assert due.sum() == 25
     assert np.array_equal(got.after[~due], got.before[~due])
@@ -93,22 +93,20 @@ def test_levels_are_those_of_the_definition(device, degree, worth):
 def test_constant_coefficients_are_rounded_where_they_are_due(device):
     scene, grid = visible_scene(50, 1), grid_of(50)
     with Case(device, scene, scene, ring_of_cameras(3, size=40)) as case:
-        got = Rounded(case, grid, Round(True, 0), 0.0)
+        got = Rounded(case, grid, Round(0, constant=True, steps=0), 0.0)
     due = in_turn(grid, 0)
     levels = got.after[due, 0] / grid.constant[due, None]
     assert np.abs(levels - np.round(levels)).max() < 1e-4
-    assert np.abs(got.after[due, 0] - got.before[due, 0]).max() <= grid.constant.max() * 0.501
-    assert np.array_equal(got.after[:, 1:], got.before[:, 1:])
     assert np.array_equal(got.after[~due], got.before[~due])
-    assert np.array_equal(got.active[:, 0], np.repeat(~due[:, None], 3, axis=1))
-    assert got.active[:, 1:].all()
+    assert not got.active[due].any()
+    assert got.active[~due].all()
 
 
 def test_what_no_view_sees_goes_to_its_nearest_level(device):
     scene, grid = visible_scene(40, 2), grid_of(40, 0.02)
     scene.means[20:] += np.float32(1000)
     with Case(device, scene, visible_scene(30, 2, 7), ring_of_cameras(3, size=40)) as case:
-        got = Rounded(case, grid, Round(False, 1), 1e9)
+        got = Rounded(case, grid, Round(1, constant=False, steps=0), 1e9)
     assert np.abs(got.after[20:, 1:] - got.before[20:, 1:]).max() <= grid.others.max() * 0.501
     assert np.count_nonzero(got.after[20:, 1:]) > 300
 
@@ -134,7 +132,7 @@ def case(device):
         yield case
 
 
-def test_rounds_leave_less_error_in_fewer_coefficients_than_the_nearest_levels(device):
+def test_rounds_leave_less_error_than_the_nearest_levels(device):
     """Where nothing but the rounding spoils the pictures."""
     grid, scene = grid_of(60, 0.1), visible_scene(60, 3)
     case = Case(device, scene, scene, [tilted_camera(seed, 48, 48) for seed in range(12)])
@@ -152,7 +150,6 @@ def test_rounds_leave_less_error_in_fewer_coefficients_than_the_nearest_levels(d
     plain, rounds = (nearest(fitted(case, how), grid) for how in (round_ac, lambda sh, refit: grid))
     case.rasterizer.close()
     assert error(rounds) < 0.8 * error(plain)
-    assert np.count_nonzero(rounds[:, 1:]) < np.count_nonzero(plain[:, 1:])
 
 
 def test_all_but_half_of_the_constant_coefficients_are_on_the_grid(case):

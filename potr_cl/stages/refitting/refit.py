@@ -35,10 +35,8 @@ from potr_cl.stages.refitting.targets import Targets
 
 #: Steps in which the constant coefficients are solved for once more, after the others have been rounded.
 _CONSTANT_STEPS = 3
-#: Steps of what is still free after each round of rounding.
-_STEPS_BETWEEN = 1
 #: What a coefficient that becomes 0 as it is rounded is worth, as a part of what one is worth that is given up before.
-_WORTH = 1.0
+_WORTH = 0.0
 
 
 @dataclass(frozen=True)
@@ -245,16 +243,17 @@ class ColourRefit(Owner):
             DeviceError: the device failed.
         """
         solver, steps = self._solver, found.steps
-        descent = Descent(_STEPS_BETWEEN, 0.0, Ridge(options.lam, options.chroma_factor, options.prior))
+        ridge = Ridge(options.lam, options.chroma_factor, options.prior)
+        worth = _WORTH * options.drop * self.colour_map.total_weight
         with Rounding(self.coefficients, grid) as rounding:
-            for number, each in enumerate(ROUNDS):
-                worth = _WORTH * options.drop * self.colour_map.total_weight
+            *first, last = ROUNDS
+            for each in first:
                 rounding.round(solver.x, solver.blocks, each, worth)
-                if number < len(ROUNDS) - 1:
-                    steps += solver.step_on(self.colour_map, targets, descent)
-                else:
-                    last = solver.solve(self.colour_map, targets, descent, known=True)
-        return Refitted(self.coefficients.read_sh(solver.x), (found.errors[0], last.errors[1]), steps + last.steps)
+                steps += solver.step_on(self.colour_map, targets, Descent(each.steps, 0.0, ridge))
+            rounding.round(solver.x, solver.blocks, last, worth)
+            solved = solver.solve(self.colour_map, targets, Descent(last.steps, 0.0, ridge), known=True)
+        sh = self.coefficients.read_sh(solver.x)
+        return Refitted(sh, (found.errors[0], solved.errors[1]), steps + solved.steps)
 
     def worth(self) -> FloatArray:
         """(N, M) float32: by how much the mean squared error grows for an error of 1 in a coefficient of one channel.

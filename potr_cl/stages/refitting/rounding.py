@@ -1,10 +1,11 @@
 """Colours rounded to the steps of a file in rounds, between which the others are solved for again: :class:`Rounding`.
 
 A coefficient that is rounded alone leaves an error in the pictures, and those of many splats add up. What is not
-rounded yet can take most of it back. So the AC coefficients of every second splat come first, one after another, each
+rounded yet can take most of it back. So every second splat comes first: its AC coefficients one after another, each
 making up for those before it within the splat (cl/refit/rounding.cl; Babai: "On Lovász' lattice reduction and the
-nearest lattice point problem", 1986, the nearest-plane method). Then all that is still free takes a step towards the
-pictures; then come the AC coefficients of the other splats, and the constant ones of every second splat.
+nearest lattice point problem", 1986, the nearest-plane method), and then the constant ones. All that is still free
+takes some steps towards the pictures. Then come the AC coefficients of the other splats, and at last their constant
+ones.
 
 A coefficient becomes one step smaller than the nearest level where the bits that this saves are worth more than the
 error that it adds: rate-distortion optimised quantisation (Karczewicz, Ye, Chong: "Rate distortion optimized
@@ -34,19 +35,21 @@ _NEVER = np.iinfo(np.int32).max
 
 @dataclass(frozen=True)
 class Round:
-    """What is rounded before the next step.
+    """What is rounded together.
 
     Attributes:
-        constant: the constant coefficients, or all others.
         turn: of splats that are due in this turn and before.
+        constant: whether the constant coefficients too, besides all others.
+        steps: that what is free then takes towards the pictures.
     """
 
-    constant: bool
     turn: int
+    constant: bool
+    steps: int
 
 
 #: The constant coefficients of the last turn stay as they are: they are rounded as the file is made.
-ROUNDS = (Round(False, 0), Round(False, 1), Round(True, 0))
+ROUNDS = (Round(turn=0, constant=True, steps=3), Round(turn=1, constant=False, steps=2))
 
 
 class Rounding(Owner):
@@ -92,12 +95,6 @@ class Rounding(Owner):
         """
         layout = self._coefficients.layout
         active, stride = self._coefficients.active, layout.stride
-        if this.constant:
-            self._round_constant.bind(
-                coefficients=x, active=active, turns=self._turns, steps=self._constant, stride=stride, turn=this.turn
-            )
-            layout.over_splats(self._round_constant)
-            return
         self._round_ac.bind(
             coefficients=x,
             blocks=blocks.buffer,
@@ -110,6 +107,11 @@ class Rounding(Owner):
             to_less=np.float32(worth * _LESS),
         )
         layout.over_splats(self._round_ac)
+        if this.constant:
+            self._round_constant.bind(
+                coefficients=x, active=active, turns=self._turns, steps=self._constant, stride=stride, turn=this.turn
+            )
+            layout.over_splats(self._round_constant)
 
     def close(self) -> None:
         """Give the device's memory back."""
