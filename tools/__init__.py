@@ -13,6 +13,7 @@ bench.refit            what does the re-fit of the colours bring, and what does 
 bench.compaction       speed of the compaction, and its error against float64
 bench.compact_at       when within the pruning schedule to compact?
 bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
+bench.decode_parts     what is the time of a decode made of, part by part?
 bench.whole_command    what is the time of a fresh command `encode` made of?
 bench.codec            speed, memory and size of the codec alone
 bench.search           what does encoding to a size or a PSNR cost, against one plain encode?
@@ -22,6 +23,7 @@ bench.forecast         how far off is what an encode says beforehand of its time
 bench.install          what does an installation take, and where are there wheels?
 bench.views_between    what do views between the training views bring, and what do they take?
 bench.palettes         how long does a palette of SH coefficients take, and how near does it come?
+bench.outputs          what does a file of another format take beyond the encode itself?
 bench.needs            what is a scene charged for splats, views and tiles that nobody needs?
 bench.busy             how busy is the device during an encode, stage by stage?
 bench.kernels          processor time of each kernel, on machines that do other work too
@@ -35,6 +37,7 @@ What a choice costs or brings, against the alternatives (``study``):
 =========================  =============================================================================================
 study.rate_distortion      size against quality: the curves that other studies compare with
 study.ablation             what does each part of the codec contribute?
+study.fit                  how far should a scene be pruned before a fit, and what does each part of the fit bring?
 study.colour_steps         what does version 3 of the format bring over version 2, part by part?
 study.compare_formats      what would people use instead?
 study.output_formats       how small are encodes to the formats that viewers open, and what do others read of them?
@@ -64,6 +67,7 @@ What tests and pages are made of (``make``):
 
 ====================  ==================================================================================================
 make.large_scene      a scene of any size with the statistics of a real one
+make.city             copies of trained scenes side by side, any number of splats and views
 make.test_data        the excerpts in tests/data
 make.release          a wheel and an sdist that are ready for a package index
 make.viewer_pictures  the pictures of the viewer in README and docs

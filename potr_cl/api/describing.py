@@ -8,7 +8,7 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.api.inputs import SceneSource, bytes_of_source, encoded_bytes, name_of, scene_of
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.decoder import open_file, scene_of_file
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene, registry
 from potr_cl.formats.declaration import SceneFormat
@@ -70,7 +70,7 @@ def info(file: SceneSource, trust: bool = False) -> SceneInfo:
     told = {"trust": True} if trust else {}
     data = encoded_bytes(file)
     if data is not None:
-        opened = PotrFile.from_bytes(data, **told)
+        opened = open_file(data, trust)
     elif not isinstance(file, (str, os.PathLike)):
         scene, mended = _as_it_would_be_read(scene_of(file))
         return SceneInfo({**own, **scene_report(scene, mended)})
@@ -82,9 +82,9 @@ def info(file: SceneSource, trust: bool = False) -> SceneInfo:
                 with noting_mends() as mends:
                     scene = load_scene(path, **told)
                 return SceneInfo({**own, "format": kind.name, **scene_report(scene, mends)})
-            opened = PotrFile.open(path, **told)
+            opened = open_file(path, trust)
     # Two reports of one file: what it says itself of counts and bounds is the same as what the scene says.
-    return SceneInfo({**own, "format": POTR.name, **file_report(opened), **scene_report(opened.scene())})
+    return SceneInfo({**own, "format": POTR.name, **file_report(opened), **scene_report(scene_of_file(opened))})
 
 
 def _as_it_would_be_read(scene: Scene) -> tuple[Scene, list[CleanReport]]:

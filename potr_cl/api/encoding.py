@@ -104,7 +104,7 @@ def encode(
         threads: on the host; one for each processor by default.
         trust, antialiased: as of :func:`potr_cl.load_scene`.
         cameras_anyway: take the cameras even if they do not seem to be in the scene's frame.
-        tell: told a line for every step of a search for a size or a PSNR.
+        tell: told a line for every step of a search for a size or a PSNR, and for every round of a fit.
         choices: any option of a stage by the name of its flag: ``keep=0.5`` is ``--keep 0.5``, ``prune=False`` is
             ``--no-prune``, ``refit="off"`` is ``--refit off``; ``lambda_`` stands for ``--lambda``, as lambda is a word
             of Python. A stage's name may be given all its options: ``prune={"iterations": 16}``.
@@ -143,7 +143,7 @@ def encode(
         if target is None:
             if judging is not None and opened is not None:
                 kept = stack.enter_context(KeptScene(opened, what))
-            encoded = run_stages(what, views, settings, progress, opened, kept=kept)
+            encoded = run_stages(what, views, settings, progress, opened, kept=kept, tell=tell)
         else:
             found = encode_to_target(what, views, target, settings, progress, opened, tell)
             encoded = found.encoded

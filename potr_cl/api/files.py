@@ -6,8 +6,9 @@ To decode takes less time than to import what other functions need, so little is
 from __future__ import annotations
 
 import os
+from collections.abc import Sequence
 from pathlib import Path
-from typing import TYPE_CHECKING, Any
+from typing import TYPE_CHECKING
 
 from potr_cl.api.inputs import (
     DeviceSource,
@@ -20,6 +21,7 @@ from potr_cl.api.inputs import (
 )
 from potr_cl.codec.decoder import decode as decode_file
 from potr_cl.host.atomic_write import replacing
+from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene
 
 if TYPE_CHECKING:
@@ -86,6 +88,7 @@ def decode(
     trust: bool = False,
     sh_degree: int | None = None,
     *,
+    box: Sequence[float] | None = None,
     output: str | os.PathLike[str] | None = None,
 ) -> Scene:
     """Decode a .potr file, as the command ``decode`` does.
@@ -94,10 +97,13 @@ def decode(
         file: its path, its bytes, or the result of :func:`potr_cl.encode`.
         trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
         sh_degree: leave out SH coefficients of higher degrees, without decoding them; None: none.
+        box: x0, y0, z0, x1, y1, z1 in world units: leave out splats whose centres lie outside. Of a file of blocks only
+            those that meet the box are read.
         output: a file to write the scene to as well, usually a .ply.
 
     Raises:
-        UsageError: the path cannot be read, ``output`` not be written to, or there is no such degree.
+        UsageError: the path cannot be read, ``output`` not be written to, there is no such degree, or no splat lies in
+            the box.
         DataError: not a .potr file, a damaged one, or too many splats for its size.
     """
     write = None
@@ -106,8 +112,8 @@ def decode(
 
         write = scene_writer(output)
     data = encoded_bytes(file)
-    told: dict[str, Any] = ({"trust": True} if trust else {}) | ({} if sh_degree is None else {"sh_degree": sh_degree})
-    scene = decode_file(file if data is None else data, **told)  # type: ignore[arg-type]
+    within = None if box is None else Box.of(box)
+    scene = decode_file(file if data is None else data, trust, sh_degree, within)  # type: ignore[arg-type]
     if write is not None:
         write(scene)
     return scene

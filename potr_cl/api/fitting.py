@@ -22,6 +22,7 @@ from potr_cl.api.inputs import (
 )
 from potr_cl.errors import UsageError
 from potr_cl.formats import scene_writer
+from potr_cl.host.signals import first_interrupt_asks
 from potr_cl.model.camera import test_views, train_views
 from potr_cl.model.views_between import views_between as place_between
 from potr_cl.model.virtual_cameras import is_virtual
@@ -112,7 +113,10 @@ def fit(
     tell_part: Progress = progress or (lambda _what, _done: None)
 
     def work(device: Device, memory: int | None) -> Fitted:
-        with Rasterizer(device, original, background=colour) as rasterizer:
+        with (
+            first_interrupt_asks() as asked,
+            Rasterizer(device, original, background=colour) as rasterizer,
+        ):
             return fit_scene(
                 device,
                 reduced,
@@ -123,6 +127,7 @@ def fit(
                 colour,
                 lambda done, most: tell_part("fit", 0.99 * done / most),
                 tell,
+                asked,
             )
 
     tell_part("fit", 0.0)

@@ -8,17 +8,18 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
 
+from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.container import MAGIC
-from potr_cl.codec.decoder import PotrFile, decode
-from potr_cl.codec.destination import Destination
+from potr_cl.codec.decoder import AnyFile, PotrFile, decode, open_file
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.camera import Camera, test_views, train_views
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import Scene, joined
 
 # What reads files, colours and devices is imported where it is needed: to decode takes less time than to import it.
 if TYPE_CHECKING:
     from potr_cl.api.editing import Edited
     from potr_cl.formats.images import Colour
+    from potr_cl.ondevice.decode import Beside
     from potr_cl.opencl.device import Device
     from potr_cl.opencl.discovery import DeviceInfo
     from potr_cl.pipeline.encode import Encoded
@@ -97,13 +98,18 @@ def drawable_to_judge(
 
     samples: list[Sampled] = []
 
-    def sampled(file: PotrFile) -> Sampled:
-        rows = looked_at(file.header.splats)
-        samples.append(Sampled(file.header, file.rules, file.sh_count(), rows))
-        return samples[0]
+    def sampled(whole: AnyFile) -> Beside:
+        rows = looked_at(whole.table.splats if isinstance(whole, BlockedFile) else whole.header.splats)
+
+        def take(file: PotrFile, first: int) -> Sampled:
+            own = rows[(rows >= first) & (rows < first + file.header.splats)] - first
+            samples.append(Sampled(file.header, file.rules, file.sh_count(), own))
+            return samples[-1]
+
+        return take
 
     with on_device(source, device, trust, antialiased=antialiased, beside=sampled) as buffers:  # type: ignore[arg-type]
-        yield buffers, samples[0].scene
+        yield buffers, joined([each.scene for each in samples])
 
 
 def _is_potr(source: SceneSource) -> bool:
@@ -119,12 +125,12 @@ def on_device(
     sh_degree: int | None = None,
     antialiased: bool | None = None,
     threads: int = 0,
-    beside: Callable[[PotrFile], Destination] | None = None,
+    beside: Callable[[AnyFile], Beside] | None = None,
 ) -> SceneBuffers:
     """The .potr file that a path, bytes or the result of an encode stand for, decoded into a device's memory.
 
     Args:
-        beside: makes what takes the same splats of the opened file.
+        beside: makes of the opened file what makes what takes the same splats.
         source, device, trust, sh_degree, antialiased, threads: as of :func:`potr_cl.decode_to_device`.
 
     Raises:
@@ -132,18 +138,18 @@ def on_device(
     """
     from potr_cl.ondevice.decode import decode_to_device
 
-    def decoded(file: PotrFile) -> SceneBuffers:
+    def decoded(file: AnyFile) -> SceneBuffers:
         also = None if beside is None else beside(file)
         return decode_to_device(file, device, sh_degree, antialiased, threads, also)
 
     data = encoded_bytes(source)
     if data is not None:
-        return decoded(PotrFile.from_bytes(data, trust))
+        return decoded(open_file(data, trust))
     if not isinstance(source, (str, os.PathLike)):
         raise UsageError(f"a .potr file is wanted, its bytes or an encode to one, not {type(source).__name__}")
     path = os.fspath(source)
     try:
-        return decoded(PotrFile.open(path, trust))
+        return decoded(open_file(path, trust))
     except DataError as error:
         raise error if path in str(error) else DataError(f"'{path}': {error}") from None
 

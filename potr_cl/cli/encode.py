@@ -158,7 +158,9 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
             if args.report_view is not None:
                 _ = views and views.named(args.report_view)  # an unknown name is told before the work
             if target is None:
-                encoded = encode(scene, cameras, options, progress, device, kept=kept, in_frame=True)
+                encoded = encode(
+                    scene, cameras, options, progress, device, kept=kept, in_frame=True, tell=progress.tell
+                )
             else:
                 found = encode_to_target(scene, cameras, target, options, progress, device, progress.tell)
                 encoded, options, search = found.encoded, found.options, search_report(target, found)

@@ -13,6 +13,7 @@ from potr_cl.cli.scenes import add_from_option, add_trust_option, as_file, trust
 from potr_cl.cli.terminal import say, say_document, say_done
 from potr_cl.codec.decoder import decode
 from potr_cl.formats.registry import suffixes_read, suffixes_written
+from potr_cl.model.box import Box
 from potr_cl.model.scene import SH_COEFFICIENTS
 
 if TYPE_CHECKING:
@@ -26,7 +27,7 @@ def _decode(args: argparse.Namespace) -> None:
 def _decode_one(args: argparse.Namespace) -> None:
     started = time.perf_counter()
     with as_file(args.scene) as file:
-        scene = decode(file, **trust(args), sh_degree=args.sh_degree)
+        scene = decode(file, **trust(args), sh_degree=args.sh_degree, box=args.box and Box.of(args.box))
     decoded = time.perf_counter()
     write_scene(args.output, scene, args.to)
     written = time.perf_counter()
@@ -53,6 +54,11 @@ def add_decode(commands: Commands) -> None:
     p.add_argument(
         "--sh-degree", type=int, choices=range(len(SH_COEFFICIENTS)), metavar="N",
         help="leave out SH coefficients of degrees above N, 0 to 3, without decoding them; default: none",
+    )  # fmt: skip
+    p.add_argument(
+        "--box", type=float, nargs=6, metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="leave out splats whose centres lie outside of this box, in world units; of a file of blocks only those "
+        "that meet the box are read; default: none",
     )  # fmt: skip
     add_trust_option(p)
     p.set_defaults(run=_decode)

@@ -96,7 +96,8 @@ class CommandParser(argparse.ArgumentParser):
         try:
             return super()._match_argument(action, arg_strings_pattern)
         except argparse.ArgumentError:
-            self.error(f"{_name(action)} needs a value: {_described(action)}")
+            wanted = f"{action.nargs} values" if isinstance(action.nargs, int) and action.nargs > 1 else "a value"
+            self.error(f"{_name(action)} needs {wanted}: {_described(action)}")
 
     def _print_message(self, message: str, file: Any = None) -> None:
         # The help and the version; argparse writes them as they are, and lets errors pass.

@@ -25,6 +25,8 @@ from potr_cl.model.scene import LOW_PASS, MIP_SPLATTING_LOW_PASS, SH_COEFFICIENT
 MAGIC = b"POTR\r\n\x1a\n"
 #: Longest metadata that a reader accepts, bytes.
 MAX_METADATA = 1 << 16
+#: Of files of blocks, each of which is a file of another version (:mod:`potr_cl.codec.blocks`).
+VERSION_OF_BLOCKS = 4
 
 _FIXED = struct.Struct("<8sHHIQQBBHI8d8s8s")
 _FACTOR = struct.Struct("<d")
@@ -35,12 +37,12 @@ ENTRY_BYTES = _ENTRY.size
 
 #: Bits of the header's flags. A reader that does not know one refuses the file: it would show another picture.
 _ANTIALIASED, _MIP_SPLATTING = 1, 2
-_FLAGS = {
+FLAGS = {
     (False, LOW_PASS): 0,
     (True, LOW_PASS): _ANTIALIASED,
     (True, MIP_SPLATTING_LOW_PASS): _ANTIALIASED | _MIP_SPLATTING,
 }
-_OF_FLAGS = {flags: kind for kind, flags in _FLAGS.items()}
+OF_FLAGS = {flags: kind for kind, flags in FLAGS.items()}
 
 #: A splat, and a crowded cell of the octree, takes a bit of a file at least; what packs more is no scene.
 MOST_A_BYTE = 8
@@ -195,7 +197,7 @@ def assemble(header: Header, coded: list[tuple[Section, bytes]]) -> list[bytes]:
     fixed = _FIXED.pack(
         MAGIC,
         header.version,
-        _FLAGS[header.antialiased, header.low_pass],
+        FLAGS[header.antialiased, header.low_pass],
         header_bytes,
         file_bytes,
         header.splats,
@@ -240,8 +242,11 @@ def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) 
     if len(data) < _FIXED.size:
         raise DataError(f"truncated: {file_bytes} bytes do not even hold the header")
     version = int.from_bytes(data[8:10], "little")
-    if version > max(VERSIONS):
-        raise DataError(f"format version {version}, this potr_cl reads up to {max(VERSIONS)}: update potr_cl")
+    newest = max(*VERSIONS, VERSION_OF_BLOCKS)
+    if version > newest:
+        raise DataError(f"format version {version}, this potr_cl reads up to {newest}: update potr_cl")
+    if version == VERSION_OF_BLOCKS:
+        raise DataError("a file of blocks stands where one of another version must be")
     fields = _FIXED.unpack_from(data)
     _, _, flags, header_bytes, said_bytes, splats, degree, depth, count, reserved = fields[:10]
     numbers = fields[10:18]
@@ -261,7 +266,7 @@ def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) 
     else:
         sf_ac = numbers[7]
         reserved = reserved or any(fields[18])
-    if rules is None or flags not in _OF_FLAGS or reserved or any(fields[19]):
+    if rules is None or flags not in OF_FLAGS or reserved or any(fields[19]):
         raise DataError(f"format version {version} with flags {flags} is unknown: update potr_cl")
     if degree >= len(SH_COEFFICIENTS) or splats < 1 or depth > 52:
         raise DataError(f"the header makes no sense: {splats} splats, SH degree {degree}, octree of {depth} levels")
@@ -278,7 +283,7 @@ def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) 
     sf_scale, sf_rotation, sf_opacity, sf_dc = numbers[4:8]
     return Header(
         version, splats, degree, origin, side, depth, sf_scale, sf_rotation, sf_opacity, sf_dc, sf_ac, sections,
-        *_OF_FLAGS[flags],
+        *OF_FLAGS[flags],
     )  # fmt: skip
 
 

@@ -12,12 +12,14 @@ from concurrent.futures import FIRST_EXCEPTION, Future, wait
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import container, metadata, octree, sections
+from potr_cl.codec.blocks.file import BlockedFile
+from potr_cl.codec.blocks.table import FIXED_BYTES, header_bytes_of, is_of_blocks, read_table
 from potr_cl.codec.bundled_scene import BundledScene
 from potr_cl.codec.byte_planes import IntegerStream, PlaneStream, unpack_integers
 from potr_cl.codec.colour_factors import ColourFactors, Once
@@ -34,7 +36,8 @@ from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.threads import thread_pool
-from potr_cl.model.scene import SH_COEFFICIENTS, Scene
+from potr_cl.model.box import Box
+from potr_cl.model.scene import Scene, most_coefficients
 
 #: More threads would find nothing to do.
 _MOST_THREADS = 16
@@ -83,21 +86,10 @@ class PotrFile:
             UsageError: the path cannot be read.
             DataError: not a .potr file, or a damaged one, or too many splats for its size.
         """
-        path = Path(path)
-        try:
-            with path.open("rb") as file:
-                status = os.fstat(file.fileno())
-                if not (stat.S_ISREG(status.st_mode) or stat.S_ISFIFO(status.st_mode)):
-                    raise UsageError(f"'{path}' is not a regular file")
-                # The header must be sound before the rest is worth its memory.
-                start = file.read(len(container.MAGIC))
-                if start == container.MAGIC:
-                    start += file.read()
-            return PotrFile(container.read_header(start, max(len(start), status.st_size), trust), start)
-        except (OSError, ValueError) as error:
-            raise UsageError(f"cannot read '{path}': {getattr(error, 'strerror', None) or error}") from None
-        except DataError as error:
-            raise DataError(f"'{path}': {error}") from None
+        opened = open_file(path, trust)
+        if isinstance(opened, BlockedFile):
+            raise DataError(f"'{os.fspath(path)}': a file of blocks, which is no single one")
+        return opened
 
     @property
     def metadata(self) -> dict[str, Any]:
@@ -244,9 +236,7 @@ class PotrFile:
         Raises:
             UsageError: there is no such degree.
         """
-        if degree is not None and not 0 <= degree < len(SH_COEFFICIENTS):
-            raise UsageError(f"SH degree {degree} is unknown: choose 0 to {len(SH_COEFFICIENTS) - 1}")
-        return SH_COEFFICIENTS[self.header.sh_degree if degree is None else min(degree, self.header.sh_degree)]
+        return most_coefficients(self.header.sh_degree, degree)
 
     @property
     def rules(self) -> FormatVersion:
@@ -429,7 +419,69 @@ def _now(work: Callable[[], None]) -> None:
     work()
 
 
-def decode(source: bytes | str | os.PathLike[str], trust: bool = False, sh_degree: int | None = None) -> Scene:
+#: A .potr file, opened: of a scene in one piece, or in blocks.
+AnyFile: TypeAlias = "PotrFile | BlockedFile[PotrFile]"
+
+
+def open_file(source: bytes | str | os.PathLike[str], trust: bool = False) -> AnyFile:
+    """Open a .potr file of any version, given as bytes or as a path, and verify its header.
+
+    Of a file of blocks only the header is read; the blocks are when they are asked for.
+
+    Args:
+        source: the file; a path may be that of a pipe that brings one.
+        trust: whether it may hold more splats a byte than a real scene has, and so take memory out of proportion.
+
+    Raises:
+        UsageError: the path cannot be read.
+        DataError: not a .potr file, or a damaged one, or too many splats for its size.
+    """
+    if isinstance(source, bytes):
+        return _opened(source, len(source), trust, lambda offset, nbytes: source[offset : offset + nbytes])
+    path = Path(source)
+    try:
+        with path.open("rb") as file:
+            status = os.fstat(file.fileno())
+            if not (stat.S_ISREG(status.st_mode) or stat.S_ISFIFO(status.st_mode)):
+                raise UsageError(f"'{path}' is not a regular file")
+            # The header must be sound before the rest is worth its memory.
+            start = file.read(FIXED_BYTES)
+            if stat.S_ISREG(status.st_mode) and is_of_blocks(start):
+                start += file.read(max(min(header_bytes_of(start), status.st_size) - len(start), 0))
+                return _opened(start, status.st_size, trust, partial(_read, path))
+            if start.startswith(container.MAGIC):
+                start += file.read()
+        return _opened(
+            start, max(len(start), status.st_size), trust, lambda offset, nbytes: start[offset : offset + nbytes]
+        )
+    except (OSError, ValueError) as error:
+        raise UsageError(f"cannot read '{path}': {getattr(error, 'strerror', None) or error}") from None
+    except DataError as error:
+        raise DataError(f"'{path}': {error}") from None
+
+
+def _opened(start: bytes, file_bytes: int, trust: bool, read: Callable[[int, int], bytes]) -> AnyFile:
+    if not is_of_blocks(start):
+        return PotrFile(container.read_header(start, file_bytes, trust), start)
+    return BlockedFile(read_table(start, file_bytes, trust), read, partial(PotrFile.from_bytes, trust=trust), trust)
+
+
+def _read(path: Path, offset: int, nbytes: int) -> bytes:
+    """Some bytes of a file, fewer where it has got shorter."""
+    try:
+        with path.open("rb") as file:
+            file.seek(offset)
+            return file.read(nbytes)
+    except OSError as error:
+        raise UsageError(f"cannot read '{path}': {error.strerror or error}") from None
+
+
+def decode(
+    source: bytes | str | os.PathLike[str],
+    trust: bool = False,
+    sh_degree: int | None = None,
+    box: Box | None = None,
+) -> Scene:
     """Decode a .potr file, given as bytes or as a path.
 
     Args:
@@ -437,15 +489,28 @@ def decode(source: bytes | str | os.PathLike[str], trust: bool = False, sh_degre
         trust: whether it may hold more splats a byte than a real scene has. Without, the memory taken is in proportion
             to the size of the file.
         sh_degree: leave out SH coefficients of higher degrees; None: none.
+        box: leave out splats whose centres lie outside. Of a file of blocks only those that meet the box are read.
 
     Raises:
-        UsageError: the path cannot be read, or there is no such degree.
+        UsageError: the path cannot be read, there is no such degree, or no splat lies in the box.
         DataError: damaged, or too many splats for its size.
     """
-    if isinstance(source, bytes):
-        return PotrFile.from_bytes(source, trust).scene(sh_degree=sh_degree)
     try:
-        return PotrFile.open(source, trust).scene(sh_degree=sh_degree)
+        return scene_of_file(open_file(source, trust), sh_degree, box)
     except DataError as error:
-        where = os.fspath(source)
+        where = "" if isinstance(source, bytes) else os.fspath(source)
         raise error if where in str(error) else DataError(f"'{where}': {error}") from None
+
+
+def scene_of_file(file: AnyFile, sh_degree: int | None = None, box: Box | None = None, threads: int = 0) -> Scene:
+    """Decode an opened file; arguments and errors as of :func:`decode`."""
+    if isinstance(file, BlockedFile):
+        return file.scene(threads, sh_degree, box)
+    scene = file.scene(threads, sh_degree)
+    if box is None:
+        return scene
+    inside = np.flatnonzero(box.holds(scene.means))
+    if not len(inside):
+        low, high = scene.means.min(axis=0), scene.means.max(axis=0)
+        raise UsageError(f"no splat lies in the box {box}: the scene lies in {Box.of([*low, *high])}")
+    return scene.subset(inside)

@@ -16,7 +16,7 @@ from potr_cl.codec import octree, quantize
 from potr_cl.codec.native.library import native
 from potr_cl.codec.outliers import check_positions
 from potr_cl.codec.steps.fitting import fit_steps
-from potr_cl.codec.steps.rule import ColourSteps, factors
+from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
@@ -76,14 +76,6 @@ class Geometry:
             return none, none
         return self.steps.classes(self.scales, self.opacities)
 
-    def colour_steps(self) -> tuple[NDArray[np.float32], NDArray[np.float32]]:
-        """(N,) steps of DC and of AC coefficients in the order of the scene."""
-        dc, ac = np.empty((2, len(self.order)), np.float32)
-        of_dc, of_ac = self.colour_classes()
-        dc[self.order] = 1 / factors(self.parameters.sf_dc, of_dc)
-        ac[self.order] = 1 / factors(self.parameters.sf_sh, of_ac)
-        return dc, ac
-
     def with_steps(self, effects: NDArray[np.floating]) -> Geometry:
         """The same with steps of colours by what each splat shows.
 
@@ -116,6 +108,29 @@ def quantise_geometry(
     version = VERSIONS[parameters.version]
     nearest = distances_to_views(scene.means, views, run)
     world = version.in_world_units(parameters, scene, nearest)
+    return quantise_in_world_units(scene, parameters, world, nearest, run)
+
+
+def quantise_in_world_units(
+    scene: Scene,
+    parameters: quantize.HyperParameters,
+    world: quantize.HyperParameters,
+    nearest: NDArray[np.float64],
+    run: Run = map,
+) -> Geometry:
+    """Quantise a scene's geometry, or that of a part of a scene.
+
+    Args:
+        scene: as of :func:`quantise_geometry`; its colours are not looked at.
+        parameters: as asked for.
+        world: the same in world units.
+        nearest: (N,) distance to the nearest view; 0 where there is none.
+        run: in place of :func:`map`, to work with several threads.
+
+    Raises:
+        As :func:`quantise_geometry`.
+    """
+    version = VERSIONS[parameters.version]
     tolerance = np.maximum(world.gamma, world.beta * nearest)
     tree, order = octree.build(scene.means, tolerance, absolute=version.absolute_leaf_levels)
     check_positions(scene, tolerance, tree, order)

@@ -44,6 +44,8 @@ class FormatVersion(abc.ABC):
         rotations_need_scales: whether rotations can be dequantised only with the levels of the scales at hand.
         colour_steps: whether a file may give each splat the steps of its colours (:mod:`potr_cl.codec.steps`), so that
             colours are dequantised with the levels of scales and opacities at hand, and predicted as values.
+        in_blocks: whether scenes of many splats are cut into blocks, and the blocks of a file of blocks are of it
+            (:mod:`potr_cl.codec.blocks`).
     """
 
     number: ClassVar[int]
@@ -52,6 +54,7 @@ class FormatVersion(abc.ABC):
     absolute_leaf_levels: ClassVar[bool]
     rotations_need_scales: ClassVar[bool]
     colour_steps: ClassVar[bool] = False
+    in_blocks: ClassVar[bool] = False
 
     @property
     def coder_of_streams(self) -> Coder | None:
@@ -197,6 +200,7 @@ class Version3(Version2):
     number = 3
     coders = frozenset({Coder.RAW, Coder.ZSTD, Coder.DEFLATE, Coder.BUNDLES})
     colour_steps = True
+    in_blocks = True
 
 
 #: All versions that are read, by their number.

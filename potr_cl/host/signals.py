@@ -1,7 +1,8 @@
 """A process that is told to end, by Ctrl-C, ``kill`` or a closed terminal, ends soon and leaves nothing behind.
 
 Only programs call this, never the library: a process that uses the library has its own way with signals. A program
-calls :func:`end_cleanly_on_signals` first of all, and does its work in :func:`unwinding`.
+calls :func:`end_cleanly_on_signals` first of all, and does its work in :func:`unwinding`. What can end early with a
+result that is of use asks in :func:`first_interrupt_asks` whether it should.
 """
 
 from __future__ import annotations
@@ -24,8 +25,26 @@ _SAID = {
 #: Seconds that the work is given to let go of what it holds.
 PATIENCE = 5.0
 
+#: What the first Ctrl-C is answered by work that can end early.
+_ENDS_EARLY = b"potr-cl: interrupted: what is done so far is kept, and the work goes on with it; once more to end\n"
+
 _received: int | None = None
 _unwinds = False
+_asked: Asked | None = None
+
+
+class Asked:
+    """Whether someone has asked that work ends early; false until then."""
+
+    def __init__(self) -> None:
+        self._yes = False
+
+    def __bool__(self) -> bool:
+        return self._yes
+
+    def ask(self) -> None:
+        """Ask for it."""
+        self._yes = True
 
 
 def end_cleanly_on_signals() -> None:
@@ -57,8 +76,30 @@ def unwinding() -> Iterator[None]:
             _end(_received)
 
 
+@contextmanager
+def first_interrupt_asks() -> Iterator[Asked]:
+    """Have the first Ctrl-C (SIGINT) in the block do no more than ask the work to end early, and the second one end it.
+
+    Any other signal ends the work at once. Without :func:`end_cleanly_on_signals` this does nothing: nobody asks, and
+    signals do what they did before. A block within another one is asked, and the other is not.
+
+    Yields:
+        To be looked at now and then: whether the work was asked to end.
+    """
+    global _asked
+    before, _asked = _asked, Asked()
+    try:
+        yield _asked
+    finally:
+        _asked = before
+
+
 def _handle(number: int, _frame: FrameType | None) -> None:
     global _received
+    if number == signal.SIGINT and _asked is not None and not _asked and _received is None:
+        _asked.ask()
+        _tell(_ENDS_EARLY)
+        return
     first, _received = _received is None, number
     if not (first and _unwinds):
         _end(number)
@@ -74,6 +115,10 @@ def _end_late(number: int) -> None:
 
 def _end(number: int) -> None:
     leftovers.remove_all()
-    with suppress(OSError):  # the terminal may be gone
-        os.write(2, (b"\n" if os.isatty(2) else b"") + _SAID[signal.Signals(number).name])
+    _tell(_SAID[signal.Signals(number).name])
     os._exit(128 + number)
+
+
+def _tell(line: bytes) -> None:
+    with suppress(OSError):  # the terminal may be gone
+        os.write(2, (b"\n" if os.isatty(2) else b"") + line)

@@ -4,13 +4,14 @@ from __future__ import annotations
 
 import dataclasses
 import os
+from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.errors import DataError
+from potr_cl.errors import DataError, UsageError
 
 FloatArray = NDArray[np.float32]
 
@@ -27,6 +28,17 @@ SH_COEFFICIENTS = (1, 4, 9, 16)
 #: rasterizer, of gsplat and of viewers; and that of Mip-Splatting's code and of Brush's mip mode, which only
 #: antialiased scenes can have.
 LOW_PASS, MIP_SPLATTING_LOW_PASS = 0.3, 0.1
+
+
+def most_coefficients(own_degree: int, degree: int | None) -> int:
+    """SH coefficients of a channel up to a degree, of a scene that has those up to its own; None: all of these.
+
+    Raises:
+        UsageError: there is no such degree.
+    """
+    if degree is not None and not 0 <= degree < len(SH_COEFFICIENTS):
+        raise UsageError(f"SH degree {degree} is unknown: choose 0 to {len(SH_COEFFICIENTS) - 1}")
+    return SH_COEFFICIENTS[own_degree if degree is None else min(degree, own_degree)]
 
 
 @dataclass(frozen=True)
@@ -180,6 +192,12 @@ class Scene:
             sh=self.sh.take(numbers.astype(np.intp, copy=False), axis=0) if fast else self.sh[index],
         )
 
+    def put(self, first: int, part: Scene) -> None:
+        """Replace the splats from number ``first`` on by those of another scene of the same SH degree, in place."""
+        own = slice(first, first + len(part))
+        for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+            getattr(self, name)[own] = getattr(part, name)
+
     def rendered(self, antialiased: bool | None) -> Scene:
         """The scene as it is to be rendered: antialiased, classic, or, for None, as it was trained.
 
@@ -225,3 +243,27 @@ class Scene:
             quaternions[zero] = (1, 0, 0, 0)
             scene = dataclasses.replace(scene, quaternions=quaternions)
         return scene, CleanReport(dropped, zeros, 0)
+
+
+def joined(parts: Sequence[Scene]) -> Scene:
+    """The splats of some scenes of the same kind and SH degree, one after another.
+
+    Each SH coefficient is contiguous in memory. The scene itself, if there is one alone.
+    """
+    if len(parts) == 1:
+        return parts[0]
+    splats, count = sum(map(len, parts)), parts[0].sh.shape[1]
+    whole = Scene(
+        np.empty((splats, 3), np.float32),
+        np.empty((splats, 3), np.float32),
+        np.empty((splats, 4), np.float32),
+        np.empty(splats, np.float32),
+        np.empty((count, 3, splats), np.float32).transpose(2, 0, 1),
+        parts[0].antialiased,
+        parts[0].low_pass,
+    )
+    first = 0
+    for part in parts:
+        whole.put(first, part)
+        first += len(part)
+    return whole

@@ -20,6 +20,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.placement.candidates import candidates_of
 from potr_cl.model.placement.choice import pick
@@ -69,9 +70,10 @@ def place_cameras(
         UsageError: ``count`` or ``size`` below 1, or above what can be placed and rendered.
     """
     planned = plan(len(scene), count, size)
-    frame = frame_of(scene)
-    matter = matter_of(scene, frame)
-    candidates = candidates_of(frame, matter, math.tan(math.radians(field / 2)))
+    with thread_pool() as pool:
+        frame = frame_of(scene, pool.map)
+        matter = matter_of(scene, frame)
+        candidates = candidates_of(frame, matter, math.tan(math.radians(field / 2)), pool.map)
     tests, views = planned.test, planned.training + planned.test
     picked = pick(candidates, views)
     every = views // tests if tests else 0

@@ -7,6 +7,9 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec.blocks.geometry import AnyGeometry
+from potr_cl.codec.steps.rule import factors
+
 
 @dataclass(frozen=True)
 class ColourGrid:
@@ -21,3 +24,12 @@ class ColourGrid:
     constant: NDArray[np.float32]
     others: NDArray[np.float32]
     order: NDArray[np.int64]
+
+    @staticmethod
+    def of(geometry: AnyGeometry) -> ColourGrid:
+        """That of a .potr file."""
+        dc, ac = geometry.colour_classes()
+        steps = np.empty((2, len(geometry.order)), np.float32)
+        steps[0, geometry.order] = 1 / factors(geometry.parameters.sf_dc, dc)
+        steps[1, geometry.order] = 1 / factors(geometry.parameters.sf_sh, ac)
+        return ColourGrid(steps[0], steps[1], geometry.order)

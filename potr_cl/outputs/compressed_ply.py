@@ -15,12 +15,15 @@ import numpy as np
 from potr_cl.codec.encoder import Coded
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes import compressed_ply, compressed_ply_values
-from potr_cl.formats.scenes.scene_files import arrangement, unit_quaternions
+from potr_cl.formats.scenes.scene_files import arrangement, unfilled, unit_quaternions
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
 from potr_cl.outputs.degrees import worthwhile_degree
 from potr_cl.outputs.feedback import rounded_in_turn
 from potr_cl.outputs.output import Output, Request, Rounded, RoundedScene
 
+#: Splats rounded at a time, whole chunks.
+_BLOCK = 64 * compressed_ply_values.CHUNK
 #: Bytes of a splat without AC coefficients, its part of the bounds included, and of a coefficient.
 _SPLAT, _COEFFICIENT = 16, 3
 
@@ -48,12 +51,29 @@ class CompressedPly(Output):
     def geometry(self, scene: Scene, request: Request) -> CompressedPlyRounded:
         """Round within the bounds of 256 neighbours."""
         order = arrangement(scene)
-        packed = compressed_ply_values.packed_geometry(unit_quaternions(scene.subset(order)))
-        back = np.empty_like(order)
-        back[order] = np.arange(len(order))
-        seen = compressed_ply_values.unpacked_geometry(packed).subset(back)
-        seen = replace(seen, antialiased=scene.antialiased)
-        return CompressedPlyRounded(request.parameters, order, seen, None, packed)
+        seen = unfilled(len(scene), 1)
+
+        def rounded(start: int) -> compressed_ply_values.PackedGeometry:
+            rows = order[start : start + _BLOCK]
+            some = Scene(
+                scene.means.take(rows, axis=0),
+                scene.log_scales.take(rows, axis=0),
+                scene.quaternions.take(rows, axis=0),
+                scene.opacity_logits.take(rows),
+                np.zeros((len(rows), 1, 3), np.float32),
+            )
+            packed = compressed_ply_values.packed_geometry(unit_quaternions(some))
+            there = compressed_ply_values.unpacked_geometry(packed)
+            seen.means[rows], seen.log_scales[rows] = there.means, there.log_scales
+            seen.quaternions[rows], seen.opacity_logits[rows] = there.quaternions, there.opacity_logits
+            seen.sh[rows] = 0
+            return packed
+
+        with thread_pool(request.threads) as pool:
+            parts = list(pool.map(rounded, range(0, len(scene), _BLOCK)))
+        packed = compressed_ply_values.PackedGeometry.joined(parts)
+        there = replace(seen, antialiased=scene.antialiased)
+        return CompressedPlyRounded(request.parameters, order, there, None, packed)
 
     def fix_ac(
         self, rounded: Rounded, sh: FloatArray, worth: FloatArray | None, request: Request
@@ -77,7 +97,9 @@ class CompressedPly(Output):
         assert isinstance(rounded, CompressedPlyRounded)
         assert rounded.packed is not None
         colours = compressed_ply_values.packed_colours(sh[rounded.order, 0])
-        pieces = compressed_ply.pieces(rounded.packed, colours, rounded.ac[rounded.order], scene.antialiased)
+        pieces = compressed_ply.pieces(
+            rounded.packed, colours, rounded.ac.take(rounded.order, axis=0), scene.antialiased
+        )
         request.progress("pack", 1.0)
         return Coded(pieces, rounded.order)
 

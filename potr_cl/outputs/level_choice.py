@@ -39,12 +39,12 @@ class LevelTable:
     """
 
     def __init__(self, levels: U8, bits_of_error: NDArray[np.floating]) -> None:
-        pairs = _classes(bits_of_error)[..., None] << 8 | levels
+        pairs = weight_classes(bits_of_error)[..., None] | levels
         self._table = _table(np.bincount(pairs.ravel(), minlength=_CLASSES << 8).reshape(_CLASSES, 256)).ravel()
 
-    def __call__(self, levels: NDArray[np.integer], bits_of_error: NDArray[np.floating]) -> U8:
-        """The levels to take: (n, C) for nearest levels (n, C) and weights (n,)."""
-        chosen: U8 = self._table.take(_classes(bits_of_error)[..., None] << 8 | levels)
+    def __call__(self, levels: U8, classes: NDArray[np.uint16]) -> U8:
+        """The levels to take: (C, n) for nearest levels (C, n), and :func:`weight_classes` (n,) of the weights."""
+        chosen: U8 = self._table.take(classes | levels)
         return chosen
 
 
@@ -60,11 +60,11 @@ def chosen_levels(levels: U8, bits_of_error: FloatArray, threads: int = 0) -> U8
         uint8 (N, K, C).
     """
     blocks = [slice(start, start + _BLOCK) for start in range(0, len(levels), _BLOCK)]
-    classes = np.empty(bits_of_error.shape, np.uint8)
+    classes = np.empty(bits_of_error.shape, np.uint16)
 
     def count(block: slice) -> NDArray[np.int64]:
-        classes[block] = _classes(bits_of_error[block])
-        pairs = classes[block, :, None].astype(np.int32) << 8 | levels[block]
+        classes[block] = weight_classes(bits_of_error[block])
+        pairs = classes[block, :, None] | levels[block]
         return np.bincount(pairs.ravel(), minlength=_CLASSES << 8)
 
     chosen = np.empty_like(levels)
@@ -73,16 +73,17 @@ def chosen_levels(levels: U8, bits_of_error: FloatArray, threads: int = 0) -> U8
         table = _table(counts.reshape(_CLASSES, 256)).ravel()
 
         def choose(block: slice) -> None:
-            chosen[block] = table.take(classes[block, :, None].astype(np.int32) << 8 | levels[block])
+            chosen[block] = table.take(classes[block, :, None] | levels[block])
 
         list(pool.map(choose, blocks))
     return chosen
 
 
-def _classes(bits_of_error: NDArray[np.floating]) -> NDArray[np.int32]:
-    doublings = np.log2(np.maximum(bits_of_error, _LEAST) / _LEAST)
-    classes: NDArray[np.int32] = np.minimum(doublings * _A_DOUBLING, _CLASSES - 1).astype(np.int32)
-    return classes
+def weight_classes(bits_of_error: NDArray[np.floating]) -> NDArray[np.uint16]:
+    """The classes of some weights, of their shape; in the higher byte, where a level has room in the lower one."""
+    doublings = np.log2(np.maximum(bits_of_error, _LEAST) / np.asarray(_LEAST, bits_of_error.dtype))
+    classes: NDArray[np.uint16] = np.minimum(doublings * _A_DOUBLING, _CLASSES - 1).astype(np.uint16)
+    return classes << np.uint16(8)
 
 
 def _table(counts: NDArray[np.int64]) -> U8:

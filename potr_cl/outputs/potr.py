@@ -7,9 +7,12 @@ from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, fields
 from typing import ClassVar
 
-from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.codec.blocks.encoder import code_blocks
+from potr_cl.codec.blocks.file import BlockedFile
+from potr_cl.codec.blocks.geometry import AnyGeometry, GeometryOfBlocks, in_blocks, quantise
+from potr_cl.codec.decoder import decode, open_file, scene_of_file
 from potr_cl.codec.encoder import Coded, code_scene
-from potr_cl.codec.geometry import Geometry, quantise_geometry
+from potr_cl.codec.geometry import Geometry
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import Property
 from potr_cl.codec.versions import VERSIONS
@@ -48,24 +51,27 @@ class Potr(Output):
     steps: ClassVar[bool] = True
     fixes_ac: ClassVar[bool] = True
 
-    def geometry(self, scene: Scene, request: Request) -> Geometry:
-        """See :func:`potr_cl.codec.geometry.quantise_geometry`."""
+    def geometry(self, scene: Scene, request: Request) -> AnyGeometry:
+        """See :func:`potr_cl.codec.blocks.geometry.quantise`."""
         with thread_pool(request.threads) as pool:
-            return quantise_geometry(scene, request.parameters, request.views, pool.map)
+            return quantise(scene, request.parameters, request.views, pool.map)
 
     def fix_ac(
         self, rounded: Rounded, sh: FloatArray, worth: FloatArray | None, request: Request
     ) -> tuple[Rounded, FloatArray | ColourGrid]:
         """Fit the steps of colours to each splat, in the versions of the format that have such."""
-        assert isinstance(rounded, Geometry)
+        assert isinstance(rounded, (Geometry, GeometryOfBlocks))
         if worth is None or not VERSIONS[request.parameters.version].colour_steps:
             return rounded, sh
         geometry = rounded.with_steps(worth[:, 0])
-        constant, others = geometry.colour_steps()
-        return geometry, ColourGrid(constant, others, geometry.order)
+        return geometry, ColourGrid.of(geometry)
 
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
-        """See :func:`potr_cl.codec.encoder.code_scene`."""
+        """See :func:`potr_cl.codec.encoder.code_scene`, and :func:`potr_cl.codec.blocks.encoder.code_blocks`."""
+        if rounded is None and in_blocks(len(scene), request.parameters):
+            rounded = self.geometry(scene, request)
+        if isinstance(rounded, GeometryOfBlocks):
+            return code_blocks(scene, rounded, request.metadata, request.entropy, request.threads, request.progress)
         assert rounded is None or isinstance(rounded, Geometry)
         return code_scene(
             scene,
@@ -80,24 +86,26 @@ class Potr(Output):
 
     def read(self, data: bytes, trust: bool = False) -> Scene:
         """See :func:`potr_cl.codec.decoder.decode`."""
-        return decode(data, **({"trust": True} if trust else {}))
+        return decode(data, trust)
 
     @contextmanager
     def seen(self, data: bytes, device: Device, trust: bool = False) -> Iterator[Drawable]:
         """See :func:`potr_cl.ondevice.decode.decode_to_device`; an ordinary scene where it does not fit the device."""
-        file = PotrFile.from_bytes(data, **({"trust": True} if trust else {}))
+        file = open_file(data, trust)
         with ExitStack() as stack:
             try:
                 scene: Drawable = stack.enter_context(decode_to_device(file, device))
             except DeviceError:
-                scene = file.scene()
+                scene = scene_of_file(file)
             yield scene
 
     def properties(self, data: bytes) -> dict[str, int]:
         """Bytes by attribute; the header and the metadata are "other"."""
         names = ("position", "scale", "rotation", "opacity", "colour: DC", "colour: AC", "colour: steps", "other")
         sums = dict.fromkeys(names, 0)
-        for section in PotrFile.from_bytes(data, trust=True).header.sections:
+        file = open_file(data, trust=True)
+        headers = [file.header(k) for k in file.numbers()] if isinstance(file, BlockedFile) else [file.header]
+        for section in (section for header in headers for section in header.sections):
             if section.kind == Property.SH:
                 name = "colour: DC" if section.index < 3 else "colour: AC"
             else:

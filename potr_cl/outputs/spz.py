@@ -15,10 +15,11 @@ from potr_cl.codec.versions import VERSIONS
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes import spz, spz_values
+from potr_cl.formats.scenes.scene_files import unfilled
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.outputs.feedback import rounded_in_turn
-from potr_cl.outputs.level_choice import U8, LevelTable, chosen_levels
+from potr_cl.outputs.level_choice import U8, LevelTable, chosen_levels, weight_classes
 from potr_cl.outputs.output import Output, Request, Rounded, RoundedScene
 
 #: With what a splat may cost in error this says what a bit may: about the bits that a splat takes, and some, for errors
@@ -26,6 +27,8 @@ from potr_cl.outputs.output import Output, Request, Rounded, RoundedScene
 _BITS_A_SPLAT = 250
 #: Splats that tell how often levels occur, about.
 _SAMPLE = 1 << 15
+#: Splats rounded at a time.
+_BLOCK = 1 << 14
 #: A level of AC coefficients, and of constant ones.
 _AC_STEP, _DC_STEP = 1 / 128, 1 / (255 * 0.15)
 
@@ -73,25 +76,37 @@ class Spz(Output):
         world = VERSIONS[parameters.version].in_world_units(parameters, scene, nearest)
         bits, positions = self._positions(scene, np.maximum(world.gamma, world.beta * nearest))
         order = self._order(positions)
-        scales = _scales(world)
-        imaginary, log_scales = canonical_rotations(scene.quaternions[order], scene.log_scales[order])
-        levels = scales[np.clip(np.round((log_scales + np.float32(10)) * np.float32(16)), 0, 255).astype(np.uint8)]
-        log_scales = (levels / 16 - 10).astype(np.float32)
-        quaternions = self._rotations(imaginary, log_scales, world)
-        sorted_scene = replace(
-            scene.subset(order),
-            means=(positions[order] * 2.0**-bits).astype(np.float32),
-            log_scales=log_scales,
-            quaternions=quaternions,
-            sh=np.zeros((len(scene), 1, 3), np.float32),
-        )
-        properties = spz_values.packed(sorted_scene, bits, self.version)
-        properties[1] = _opacities(world)[np.frombuffer(properties[1], np.uint8)].tobytes()
-        seen = spz_values.unpacked(properties, len(scene), 1, self.version, bits)
-        back = np.empty_like(order)
-        back[order] = np.arange(len(order))
-        seen = replace(seen.subset(back), antialiased=scene.antialiased)
-        return SpzRounded(parameters, order, seen, None, bits, tuple(properties))
+        scales, opacities = _scales(world), _opacities(world)
+        seen = unfilled(len(scene), 1)
+        properties = [np.empty((len(scene), width), np.uint8) for width in _widths(self.version)]
+
+        def fill(start: int) -> None:
+            block = slice(start, start + _BLOCK)
+            rows = order[block]
+            turned, sizes = scene.quaternions.take(rows, axis=0), scene.log_scales.take(rows, axis=0)
+            imaginary, log_scales = canonical_rotations(turned, sizes)
+            levels = scales[np.clip(np.round((log_scales + np.float32(10)) * np.float32(16)), 0, 255).astype(np.uint8)]
+            log_scales = (levels / 16 - 10).astype(np.float32)
+            some = Scene(
+                (positions.take(rows, axis=0) * 2.0**-bits).astype(np.float32),
+                log_scales,
+                self._rotations(imaginary, log_scales, world),
+                scene.opacity_logits.take(rows),
+                np.zeros((len(rows), 1, 3), np.float32),
+            )
+            stored = spz_values.packed(some, bits, self.version)
+            stored[1] = opacities[np.frombuffer(stored[1], np.uint8)].tobytes()
+            for whole, part in zip(properties, stored, strict=True):
+                whole[block] = np.frombuffer(part, np.uint8).reshape(len(rows), -1)
+            there = spz_values.unpacked(stored, len(rows), 1, self.version, bits)
+            seen.means[rows], seen.log_scales[rows] = there.means, there.log_scales
+            seen.quaternions[rows], seen.opacity_logits[rows] = there.quaternions, there.opacity_logits
+            seen.sh[rows] = 0
+
+        with thread_pool(request.threads) as pool:
+            list(pool.map(fill, range(0, len(scene), _BLOCK)))
+        as_file = tuple(part.tobytes() for part in properties)
+        return SpzRounded(parameters, order, replace(seen, antialiased=scene.antialiased), None, bits, as_file)
 
     def _positions(self, scene: Scene, tolerance: NDArray[np.float64]) -> tuple[int, NDArray[np.int64]]:
         """Fractional bits and positions in their steps; each is a multiple of a power of two that it can do with.
@@ -113,9 +128,17 @@ class Spz(Output):
 
     def _order(self, positions: NDArray[np.int64]) -> NDArray[np.int64]:
         """By one coordinate: the splats of a slab repeat its bytes, which a general compressor sees."""
-        axis = int(np.argmin([len(np.unique(column)) for column in positions.T]))
-        others = [k for k in range(3) if k != axis]
-        return np.lexsort([positions[:, others[1]], positions[:, others[0]], positions[:, axis]])
+        columns = [column - column.min() for column in positions.T]
+        axis = int(np.argmin([len(np.unique(column)) for column in columns]))
+        keys = [columns[axis], *(columns[k] for k in range(3) if k != axis)]
+        places = int(np.bitwise_or.reduce([np.bitwise_or.reduce(key) for key in keys]))
+        unused = (places & -places).bit_length() - 1 if places else 0
+        widths = [int(key.max() >> unused).bit_length() for key in keys]
+        if sum(widths) > 63:
+            return np.lexsort(keys[::-1])
+        # One number for all three: quicker to sort.
+        first, second, third = (key >> unused for key in keys)
+        return np.argsort((first << widths[1] | second) << widths[2] | third, kind="stable")
 
     def _rotations(self, imaginary: NDArray[np.float64], log_scales: FloatArray, world: HyperParameters) -> FloatArray:
         """(N, 4) unit quaternions w, x, y, z with w largest, on multiples of SPZ's steps."""
@@ -134,23 +157,30 @@ class Spz(Output):
     ) -> tuple[SpzRounded, FloatArray]:
         """Levels by what an error costs and by what a level takes."""
         assert isinstance(rounded, SpzRounded)
-        fixed, levels = sh.copy(), _ac_levels(sh[:, 1:])
-        if worth is not None and levels.size:
-            cost = worth[:, 1:] * _bits_of_error(_AC_STEP, request)
-            if request.blocks is None:
-                levels = chosen_levels(levels, cost, request.threads)
-            else:
-                some = slice(None, None, max(len(sh) // _SAMPLE, 1))
-                table = LevelTable(levels[some], cost[some])
-
-                def quantise(coefficient: int, wanted: FloatArray, splats: slice) -> FloatArray:
-                    chosen = table(_ac_levels(wanted), cost[splats, coefficient - 1])
-                    return (chosen.astype(np.float32) - np.float32(128)) / np.float32(128)
-
-                fixed = rounded_in_turn(sh, request.blocks(), quantise, request.threads)
-                levels = _ac_levels(fixed[:, 1:])
-        fixed[:, 1:] = (levels.astype(np.float32) - np.float32(128)) / np.float32(128)
+        if worth is None or sh.shape[1] == 1:
+            levels = _ac_levels(sh[:, 1:])
+        elif request.blocks is None:
+            levels = chosen_levels(
+                _ac_levels(sh[:, 1:]), worth[:, 1:] * _bits_of_error(_AC_STEP, request), request.threads
+            )
+        else:
+            fixed = self._fixed_in_turn(sh, worth, request.blocks(), request)
+            return replace(rounded, ac=_levels_of_values(fixed[:, 1:]), worth=worth), fixed
+        fixed = sh.copy()
+        fixed[:, 1:] = _values_of_levels(levels)
         return replace(rounded, ac=levels, worth=worth), fixed
+
+    def _fixed_in_turn(self, sh: FloatArray, worth: FloatArray, blocks: FloatArray, request: Request) -> FloatArray:
+        """Coefficients on levels, each chosen after the ones behind it, so that it makes up for them."""
+        a_level = _bits_of_error(_AC_STEP, request)
+        some = slice(None, None, max(len(sh) // _SAMPLE, 1))
+        table = LevelTable(_ac_levels(sh[some, 1:]), worth[some, 1:] * a_level)
+
+        def quantise(coefficient: int, wanted: FloatArray, splats: slice) -> FloatArray:
+            classes = weight_classes(worth[splats, coefficient] * a_level)
+            return _values_of_levels(table(_ac_levels(wanted), classes))
+
+        return rounded_in_turn(sh, blocks, quantise, request.threads)
 
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
         """Levels of the constant coefficients, then the bytes."""
@@ -162,8 +192,8 @@ class Spz(Output):
             levels = chosen_levels(levels, rounded.worth[:, :1] * _bits_of_error(_DC_STEP, request), request.threads)
         order = rounded.order
         properties = list(rounded.properties)
-        properties[2] = levels[order].tobytes()
-        properties[5] = rounded.ac[order].tobytes()
+        properties[2] = levels.take(order, axis=0).tobytes()
+        properties[5] = rounded.ac.take(order, axis=0).tobytes()
         pieces = spz.pieces(properties, scene, rounded.fractional_bits, self.version)
         request.progress("pack", 1.0)
         return Coded(pieces, order)
@@ -173,9 +203,26 @@ class Spz(Output):
         return spz.stream_sizes(data)
 
 
-def _ac_levels(sh: NDArray[np.floating]) -> U8:
-    levels: U8 = np.clip(np.round(sh * 128) + 128, 0, 255).astype(np.uint8)
+def _widths(version: int) -> tuple[int, ...]:
+    """Bytes of a splat in each property, without AC coefficients."""
+    return 9, 1, 3, 3, 3 if version < 3 else 4, 0
+
+
+def _ac_levels(sh: FloatArray) -> U8:
+    """The nearest levels."""
+    values = np.rint(sh * np.float32(128))
+    values += 128
+    levels: U8 = np.clip(values, 0, 255, out=values).astype(np.uint8)
     return levels
+
+
+def _values_of_levels(levels: U8) -> FloatArray:
+    return (levels.astype(np.float32) - np.float32(128)) * np.float32(1 / 128)
+
+
+def _levels_of_values(values: FloatArray) -> U8:
+    """What :func:`_values_of_levels` was given."""
+    return (values * np.float32(128) + np.float32(128)).astype(np.uint8)
 
 
 def _bits_of_error(step: float, request: Request) -> np.float32:

@@ -7,7 +7,7 @@ import json
 import logging
 import os
 import time
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
 
@@ -15,6 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.encoder import Coded
+from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, PotrError
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.agreement import require_agreement
@@ -26,7 +27,8 @@ from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.stages.fitting.fit import Fitted, LeftOut
+from potr_cl.stages.fit import Fit, LeftOut
+from potr_cl.stages.fitting.fit import Fitted
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.pruning.unseen import Unseen
@@ -57,6 +59,7 @@ class Encoded:
         seconds: wall time by stage.
         options: that it was encoded with: those that were given, or that a search for a size or a PSNR has found.
         source_splats: how many splats the source scene has.
+        parameters: the hyper-parameters that the stages took.
     """
 
     pieces: list[bytes]
@@ -72,6 +75,7 @@ class Encoded:
     seconds: dict[str, float]
     options: EncodeOptions
     source_splats: int
+    parameters: HyperParameters
 
     def __repr__(self) -> str:
         q = f"q {self.options.q:.4g} of preset {self.options.preset}"
@@ -148,6 +152,7 @@ def encode(
     antialiased: bool | None = None,
     kept: KeptScene | None = None,
     in_frame: bool = False,
+    tell: Callable[[str], None] | None = None,
 ) -> Encoded:
     """Encode a scene.
 
@@ -162,6 +167,7 @@ def encode(
         antialiased: whether to take it as an antialiased scene; None: as what it says that it is.
         kept: the scene on the device, if it will be needed there afterwards.
         in_frame: whether :func:`check_frame` has found the cameras to be in the scene's frame.
+        tell: told a line for every round of a fit.
 
     Raises:
         UsageError: options out of range, cameras without a training view, or cameras that are probably not in the
@@ -172,7 +178,7 @@ def encode(
     options = options or EncodeOptions()
     scene = scene.rendered(antialiased)
     tell_losses(scene, options)
-    watch = Stopwatch(progress)
+    watch = Stopwatch(progress, tell)
     cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame)
     with ExitStack() as stack:
         if kept is None and cameras and options.look_at_views(scene):
@@ -254,15 +260,16 @@ class Run:
         return state
 
     def _one(self, stage: Stage, state: State) -> State:
-        options = self._options
+        options = as_done(self._options, state)
         bench = Workbench(
             options.parameters,
             memory=options.memory,
             background=options.background,
             threads=options.threads,
             interludes=self._interludes(stage, state),
-            metadata=lambda last: _metadata(last, options),
+            metadata=lambda last: _metadata(last, as_done(options, last)),
             progress=self._watch,
+            tell=self._watch.tell,
             output=options.output,
             kept=self._kept,
         )
@@ -306,7 +313,15 @@ class Run:
             seconds=self._watch.seconds,
             options=self._options,
             source_splats=len(state.source),
+            parameters=as_done(self._options, state).parameters,
         )
+
+
+def as_done(options: EncodeOptions, state: State) -> EncodeOptions:
+    """The options as a state has followed them: without a fit that was left out, for which others would be finer."""
+    if isinstance(state.learnt.get(Fit.name), LeftOut):
+        return options.changed(fit=False)
+    return options
 
 
 class Stopwatch:
@@ -314,10 +329,12 @@ class Stopwatch:
 
     Attributes:
         seconds: wall time by stage, in the order in which they began.
+        tell: takes lines about the work.
     """
 
-    def __init__(self, progress: Progress | None = None) -> None:
+    def __init__(self, progress: Progress | None = None, tell: Callable[[str], None] | None = None) -> None:
         self._progress = progress
+        self.tell: Callable[[str], None] = tell or _log.debug
         self._running: str | None = None
         self._last = time.perf_counter()
         self.seconds: dict[str, float] = {}

@@ -121,7 +121,8 @@ def forecast(
     if isinstance(prune := parts.get(Prune.name), Prune):
         pictures += views * (units.prune + units.iteration * prune.iterations)
     if isinstance(fit := parts.get(Fit.name), Fit):
-        pictures += fit.steps * fit.batch * units.fit
+        pictures += fit.cycles * fit.steps_on(device.family) * fit.batch * units.fit
+        pictures += fit.cycles * views * (units.prepare + units.iteration * fit.iterations)
     if Compact.name in parts:
         pictures += views * units.compact
         of_a_splat += units.compact_splat

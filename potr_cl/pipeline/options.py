@@ -118,12 +118,22 @@ class EncodeOptions:
     def parameters(self) -> HyperParameters:
         """The hyper-parameters that q gives, but for those that a stage replaces.
 
+        A stage that is done may have them taken from another q (:meth:`potr_cl.stages.stage.Stage.quality`), all but
+        the threshold of the pruning.
+
         Raises:
             UsageError: q or a replaced value is out of range.
         """
         given = {name: getattr(stage, name) for stage in self.stages for name in parameters(type(stage))}
         given |= {name: value for name, value in self.output.replaces.items() if given.get(name) is None}
-        return HyperParameters.from_quality(self.q, self.preset, **given)
+        asked = HyperParameters.from_quality(self.q, self.preset, **given)
+        q = self.q
+        for stage in self.stages:
+            q = stage.quality(q) if stage.asked_for else q
+        if q == self.q:
+            return asked
+        finer = HyperParameters.from_quality(q, self.preset, **given)
+        return dataclasses.replace(finer, delta_mse_max=asked.delta_mse_max)
 
     def with_parameters(self, **values: float) -> EncodeOptions:
         """The same with some hyper-parameters replaced, each in the stage that has it.

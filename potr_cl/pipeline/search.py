@@ -22,25 +22,27 @@ import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+from potr_cl.codec.blocks.geometry import GeometryOfBlocks
 from potr_cl.codec.geometry import Geometry
 from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, cameras_or_virtual, tell_losses
+from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, as_done, cameras_or_virtual, tell_losses
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.growth import FASTEST, SLOWEST, FinenessAxis, Typical, meet, with_colour_steps, with_steps
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.target import KINDS, Found, Target, Try
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.code import Code
+from potr_cl.stages.fit import Fit
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Progress, Stage, State, parameters
 
-#: A scout's pruning iterations and steps of the re-fit, and by how much what it finds is smaller than a full encode's:
-#: the logarithm of bytes, and decibels; about, and where there is a re-fit.
-_SCOUT_ITERATIONS, _SCOUT_STEPS = 12, 2
+#: A scout's pruning iterations, its steps of the re-fit and of the fit; and by how much what it finds is smaller than a
+#: full encode's: the logarithm of bytes, and decibels; about, and where there is a re-fit.
+_SCOUT_ITERATIONS, _SCOUT_STEPS, _SCOUT_FIT = 12, 2, 200
 _SCOUT_MISSES = (-0.02, -0.55)
 #: The highest q of a scout, and 1 less the lowest: the scene may be far from typical.
 _SCOUT_END = 0.9
@@ -94,7 +96,7 @@ def encode_to_target(
     options = options or EncodeOptions()
     scene = scene.rendered(antialiased)
     tell_losses(scene, options)
-    watch = Stopwatch(progress)
+    watch = Stopwatch(progress, tell)
     cameras = cameras_or_virtual(scene, cameras, options, watch)
     if target.min_psnr is not None and not cameras:
         raise UsageError("a PSNR can be reached with cameras only: without them there is no view to judge by")
@@ -129,6 +131,15 @@ class _Candidate:
     options: EncodeOptions
     value: float
     encoded: Encoded | None
+
+
+def _with_short_fit(options: EncodeOptions) -> EncodeOptions:
+    """Options whose fit, where they have one, is as rough as all of a scout."""
+    for stage in options.stages:
+        if isinstance(stage, Fit) and stage.asked_for:
+            short = _SCOUT_FIT if stage.steps == "auto" else min(stage.steps, _SCOUT_FIT)
+            return options.changed(fit={"steps": short, "cycles": 1})
+    return options
 
 
 class _Search:
@@ -208,11 +219,14 @@ class _Search:
             prune={"iterations": min(prune.iterations, _SCOUT_ITERATIONS)},
             refit={"steps": min(refit.steps, _SCOUT_STEPS), "at": ()},
         )
+        options = _with_short_fit(options)
         fewer_looks = prune.on and options.prune.iterations < prune.iterations
         shorter_refit = self._fitted and options.refit.steps < refit.steps
         if not self._views or not (fewer_looks or shorter_refit):
             return q
         thinned = self._thin(options)
+        self._mind_interrupts(thinned)
+        options = as_done(options, thinned)
         value = self._evaluate("scout", rough, thinned, self._refit(thinned, options), options).value
         if shorter_refit:
             size, psnr = _SCOUT_MISSES
@@ -224,9 +238,17 @@ class _Search:
         """A full encode."""
         options = self._options.changed(q=q)
         thinned = self._thin(options)
+        self._mind_interrupts(thinned)
+        options = as_done(options, thinned)
         found = self._evaluate("encode", q, thinned, self._refit(thinned, options), options)
         self._encoded[q] = found.value
         return found
+
+    def _mind_interrupts(self, thinned: State) -> None:
+        """Fit no more where someone has interrupted a fit."""
+        fitted = thinned.learnt.get(Fit.name)
+        if fitted is not None and fitted.ended_early:
+            self._options = self._options.changed(fit=False)
 
     def _next(self) -> float:
         """The q to encode in full next, by what is known of others."""
@@ -280,7 +302,7 @@ class _Search:
         chosen = start.options.parameters
         once = [kind for kind in self._once if kind is Prune or self._options.stage(kind).on]
         kept = {name: getattr(chosen, name) for kind in once for name in parameters(kind)}
-        options = self._options.changed(q=q).with_parameters(**kept)
+        options = as_done(self._options.changed(q=q), start.thinned).with_parameters(**kept)
         return self._evaluate("refit", q, start.thinned, self._refit(start.thinned, options), options)
 
     def _with_other_steps(self, start: _Candidate, q: float) -> _Candidate:
@@ -307,7 +329,7 @@ class _Search:
             if self._fitted and self._options.output.fixes_ac:
                 # The re-fit has rounded to the steps.
                 reduced = self._refit(start.thinned, options)
-            elif isinstance(geometry, Geometry):
+            elif isinstance(geometry, (Geometry, GeometryOfBlocks)):
                 reduced = dataclasses.replace(reduced, geometry=geometry.with_colour_steps(options.parameters))
             found = self._evaluate("colours", start.options.q, start.thinned, reduced, options)
             points[finer] = found.value

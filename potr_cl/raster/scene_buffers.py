@@ -165,6 +165,33 @@ class SceneBuffers(Owner):
         if pending is not None:
             pending.append(event)
 
+    def write_part(self, part: SceneBuffers, first: int) -> None:
+        """Set the parameters of some splats to those of another scene on the same device.
+
+        Args:
+            part: of the same SH degree.
+            first: the number here of its first splat.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        if first + part.splats > self.splats or part.sh_count != self.sh_count:
+            raise ValueError(f"{part.splats} splats from number {first} on do not fit {self.splats} splats")
+        names = {"means": 3, "scales": 3, "quaternions": 4, "log2_opacities": 1, "sh": 3 * self.sh_count}
+        with self.device.errors("cannot take a part of a scene"):
+            for name, columns in names.items():
+                cl.enqueue_copy(
+                    self.device.queue,
+                    getattr(self, name),
+                    getattr(part, name),
+                    src_origin=(0, 0, 0),
+                    dst_origin=(4 * first, 0, 0),
+                    region=(4 * part.splats, columns, 1),
+                    src_pitches=(4 * part.stride, 0),
+                    dst_pitches=(4 * self.stride, 0),
+                )
+            self.device.queue.finish()
+
     def write_sh(self, parameter: cl.Buffer, sh: FloatArray) -> None:
         """Set SH coefficients, (N, M, 3) float32 of any strides.
 

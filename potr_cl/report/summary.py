@@ -74,7 +74,7 @@ def encode_report(
         "views_between": None,
         "search": search,
         "options": options.as_dict(),
-        "parameters": dataclasses.asdict(options.parameters),
+        "parameters": dataclasses.asdict(encoded.parameters),
         "device": None,
         "seconds": seconds,
         "command": command,

@@ -127,12 +127,15 @@ class Prune(Stage):
     def run(self, state: State, bench: Workbench) -> State:
         """Remove splats, and leave a :class:`potr_cl.stages.pruning.schedule.Pruned` in ``learnt``.
 
-        And as "unseen" a :class:`potr_cl.stages.pruning.unseen.Unseen`.
+        And as "unseen" a :class:`potr_cl.stages.pruning.unseen.Unseen`; and as "price", where the number of splats is
+        not given, the ΔMSE below which a splat has gone.
         """
         hidden, area = find_unseen(state)
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
         told = state.having_learnt("unseen", Unseen(splats, len(state.scene), area, kept))
+        if self.keep is None and self.count is None:
+            told = told.having_learnt("price", bench.parameters.delta_mse_max)
         if not (kept and splats):
             return self._pruned(told, bench)
         split = set_aside(told, hidden)

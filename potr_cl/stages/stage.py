@@ -110,6 +110,7 @@ class Workbench:
         metadata: makes the file's metadata from the last state.
         output: the kind of file that is made in the end.
         progress: called to say how far the work is.
+        tell: called with a line about the work that progress has no place for.
         kept: the uncompressed scene, where it stays on the device from one stage to the next.
     """
 
@@ -121,6 +122,7 @@ class Workbench:
     interludes: tuple[Interlude, ...] = ()
     metadata: Callable[[State], bytes] = lambda state: b""
     progress: Progress = lambda what, done: None
+    tell: Callable[[str], None] = lambda line: None
     output: Output = field(default_factory=Potr)
     kept: KeptScene | None = None
 
@@ -187,6 +189,13 @@ class Stage(ABC):
     def looks_at(self, scene: Scene) -> bool:
         """Whether there is anything in this scene for which the stage has to look at views."""
         return self.asked_for and self.needs_views
+
+    def quality(self, q: float) -> float:
+        """The q whose hyper-parameters stages take where a user asks for this q, if this stage is done.
+
+        But the threshold of the pruning is that of the q that is asked for.
+        """
+        return q
 
     @property
     def removes_in(self) -> int | None:

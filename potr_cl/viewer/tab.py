@@ -203,6 +203,7 @@ class TabHandle:
         self._client.scene.set_background_image(
             shown.picture, format="jpeg", jpeg_quality=_GOOD if shown.still else _QUICK
         )
+        self._client.flush()  # else viser gathers messages for a sixtieth of a second
         if shown.still:
             self._arrange()
         look, height, width = shown.look, *shown.picture.shape[:2]

@@ -88,6 +88,7 @@ VALUES: dict[str, tuple[list[str], Any]] = {
     "--trust": ([], True),
     "--antialiased": (["yes"], True),
     "--sh-degree": (["1"], 1),
+    "--box": (["-100", "-100", "2.7", "100", "100", "100"], [-100, -100, 2.7, 100, 100, 100]),
     "--spz-version": (["3"], 3),
     "--cameras-anyway": ([], True),
     "--unseen": (["drop"], "drop"),

@@ -4,11 +4,17 @@ from __future__ import annotations
 
 import dataclasses
 import json
+import os
 import re
+import signal
+import subprocess
+import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
 
+import potr_cl
 from potr_cl import cli
 from potr_cl.formats import load_scene
 from potr_cl.formats.cameras import cameras_json
@@ -110,3 +116,45 @@ def test_encode_with_a_fit(paths, capsys):
     assert cli.main([str(word) for word in [*words[:-1], "-o", paths / "a.potr", "--fit", "100"]]) == 0
     assert f"fit        {with_fit['fit']['said']}" in capsys.readouterr().out
     assert (paths / "a.potr").read_bytes() == (paths / "100.potr").read_bytes()
+
+
+def interrupted(words, times):
+    """Run a command that would fit for hours, with so many interrupts after the second round of the fit."""
+    root = Path(potr_cl.__file__).parents[1]
+    command = [sys.executable, "-m", "potr_cl", *map(str, words)]
+    with subprocess.Popen(command, cwd=root, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True) as process:
+        assert process.stderr is not None
+        rounds = 0
+        for line in process.stderr:
+            rounds += "held-out views" in line
+            if rounds == 2 and "held-out views" in line:
+                process.send_signal(signal.SIGINT)
+            if "interrupted: what is done so far is kept" in line and times == 2:
+                process.send_signal(signal.SIGINT)
+        output, _ = process.communicate(timeout=100)
+    return process.returncode, output, rounds
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
+@pytest.mark.parametrize("command", ["encode", "fit"])
+def test_an_interrupted_fit_keeps_its_last_whole_round(paths, command):
+    if command == "encode":
+        words = ["encode", paths / "scene.ply", "--cameras", paths / "cameras.json", "--keep", "0.5"]
+        words += ["-o", paths / "out.ply", "--fit", "6000"]
+    else:
+        words = command_of(paths, "--steps", "6000")
+    code, output, rounds = interrupted(words, 1)
+    assert code == 0
+    said = re.search(r"(\d+) of (\d+) steps are kept, interrupted", output)
+    assert said is not None, output
+    kept, done = int(said[1]), int(said[2])
+    assert kept % 600 == 0
+    assert 0 < kept <= 600 * rounds <= done < 6000
+    assert len(load_scene(paths / "out.ply")) == 60
+
+
+@pytest.mark.skipif(os.name != "posix", reason="needs POSIX signals")
+def test_a_second_interrupt_ends_the_command(paths):
+    code, _, _ = interrupted(command_of(paths, "--steps", "6000"), 2)
+    assert code == 130
+    assert not (paths / "out.ply").exists()

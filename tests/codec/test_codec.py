@@ -14,7 +14,7 @@ from hypothesis.extra import numpy as hnp
 
 from potr_cl.codec import quantize
 from potr_cl.codec.container import EntropyCoder
-from potr_cl.codec.decoder import PotrFile, decode
+from potr_cl.codec.decoder import PotrFile, decode, open_file
 from potr_cl.codec.sections import Coder, Property
 from potr_cl.errors import DataError, UsageError
 from potr_cl.model.camera import camera_centres, train_views
@@ -346,5 +346,5 @@ def test_scales_of_antialiased_scenes_have_finer_steps(preset):
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda p: p.stem)
 def test_golden_metadata(path):
-    assert isinstance(PotrFile.open(path).metadata, dict)
-    json.dumps(PotrFile.open(path).metadata)
+    assert isinstance(open_file(path).metadata, dict)
+    json.dumps(open_file(path).metadata)

@@ -17,14 +17,15 @@ from potr_cl.codec import encoder, octree
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import PotrFile, decode
 from potr_cl.codec.encoder import code_scene
-from potr_cl.codec.native.functions import Functions, Tree
+from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, UsageError
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import Scene
 from potr_cl.reference.scenes import random_scene
 
-GOLDEN = sorted((Path(__file__).parents[1] / "data").glob("golden_v*.potr"))
+GOLDEN = sorted((Path(__file__).parents[1] / "data").glob("golden_v[123]*.potr"))
 ATTRIBUTES = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
 TREE = ("occupancy", "several", "multiplicities", "tail_lengths", "tails")
 PATHS = {"numpy": "0", "native": "1"}
@@ -307,11 +308,42 @@ def test_cells_that_are_not_there_are_refused(functions):
 def test_tails_and_bits_that_are_too_short_are_refused(functions):
     with pytest.raises(TypeError, match="fewer bits"):
         functions.integers_of_tokens(np.full((2, 2), 200, np.uint8), np.zeros(3, np.uint8), 0, 1 << 30, True, False)
-    tree = Tree(np.zeros(108, np.uint64), 4, 0)
-    counts = np.zeros(53, np.uint64)
-    counts[3] = 4
+    nothing = np.zeros(0, np.uint8)
+    tree = functions.octree.tree(nothing, nothing, 3, False)
+    assert tree is not None
+    with pytest.raises(TypeError, match="another number of splats"):
+        functions.octree.walk(tree, np.zeros(1, np.uint8), True, np.zeros(0, np.uint64), 2, 1)
+    with pytest.raises(TypeError, match="takes 1 of uint8"):
+        functions.octree.walk(tree, np.zeros(2, np.uint8), True, np.zeros(0, np.uint64), 1, 1)
+    walk = functions.octree.walk(tree, np.full(1, 3, np.uint8), True, np.zeros(0, np.uint64), 1, 1)
+    with pytest.raises(TypeError, match="before their tails"):
+        walk.centres(0, np.zeros(4), np.zeros(3))
     with pytest.raises(TypeError, match="tails of another size"):
-        functions.octree_centres(
-            np.zeros(1, np.uint8), np.zeros(1, np.uint8), 3, tree, np.zeros(4, np.uint8), True, counts,
-            np.zeros(0, np.uint64), np.zeros(2, np.uint8), np.zeros(4), np.zeros(3), np.zeros((4, 3), np.float32),
-        )  # fmt: skip
+        walk.check_tails(np.zeros(9, np.uint8))
+    walk.leaves(0)
+    with pytest.raises(TypeError, match="tails of another size"):
+        walk.check_tails(np.zeros(8, np.uint8))
+    with pytest.raises(TypeError, match="part that is not there"):
+        walk.leaves(1)
+
+
+@pytest.mark.parametrize("absolute", [False, True])
+@pytest.mark.parametrize("smallest", [1e-2, 1e-12])
+def test_octrees_are_walked_in_parts(choose, absolute, smallest):
+    """However many threads share out the leaves; in trees whose cells fit 32 bits, and in deeper ones."""
+    rng = np.random.default_rng(5)
+    means = np.concatenate([rng.normal(size=(9000, 3)), rng.normal(size=(2000, 3)) / 50]).astype(np.float32)
+    means = np.concatenate([means, means[:500], means[:100]])
+    tree, _ = octree.build(means, smallest, absolute=absolute)
+    assert (tree.depth > 32) == (smallest < 1e-6)
+    choose("numpy")
+    expected = octree.parse(tree, len(means))
+    choose("native")
+    for parts in (1, 2, 3, 7, 40):
+        with thread_pool(3) as pool:
+            assert np.array_equal(octree.parse(tree, len(means), pool.map, parts), expected)
+        assert np.array_equal(octree.parse(tree, len(means), backwards, parts), expected)
+
+
+def backwards(work, items):
+    return [work(item) for item in reversed(items)]

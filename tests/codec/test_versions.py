@@ -62,10 +62,10 @@ def test_version_2_is_still_written_where_it_is_asked_for(entropy):
         assert np.array_equal(getattr(decode(data), name), getattr(newest, name))
 
 
-class Version4(versions.Version2):
+class Version5(versions.Version2):
     """Opacities as they are, rotations of one factor, a single factor for all of SH: nothing else is told of it."""
 
-    number = 4
+    number = 5
     coders = frozenset({Coder.RAW, Coder.CONTEXT, Coder.ZSTD})
     separate_ac_factor = False
     rotations_need_scales = False
@@ -84,13 +84,13 @@ class Version4(versions.Version2):
 def test_a_new_version_is_one_object(monkeypatch, entropy):
     scene = random_scene(2000, 2)
     parameters = dataclasses.replace(
-        HyperParameters.from_quality(0.7, "best", sf_dc=60, sf_sh=60, sf_opacity=200, sf_rotation=100), version=4
+        HyperParameters.from_quality(0.7, "best", sf_dc=60, sf_sh=60, sf_opacity=200, sf_rotation=100), version=5
     )
-    monkeypatch.setitem(VERSIONS, 4, Version4())
+    monkeypatch.setitem(VERSIONS, 5, Version5())
     coded = code_scene(scene, parameters, entropy=EntropyCoder(entropy))
     data = b"".join(coded.pieces)
     file, source = PotrFile.from_bytes(data), scene.subset(coded.order)
-    assert file.header.version == 4
+    assert file.header.version == 5
     assert (file.header.sf_dc, file.header.sf_ac) == (60, 60)
     assert (Coder.CONTEXT in {section.coder for section in file.header.sections}) == (entropy == "context")
     back = file.scene()
@@ -99,7 +99,7 @@ def test_a_new_version_is_one_object(monkeypatch, entropy):
     assert np.array_equal(file.quaternions(), back.quaternions)
     assert np.allclose(np.linalg.norm(back.quaternions, axis=1), 1, atol=1e-6)
     monkeypatch.undo()
-    with pytest.raises(DataError, match="format version 4, this potr_cl reads up to 3"):
+    with pytest.raises(DataError, match="format version 5, this potr_cl reads up to 4"):
         decode(data)
 
 

@@ -86,6 +86,53 @@ def test_what_is_ignored_stays_ignored(tmp_path: Path) -> None:
     assert (tmp_path / "out").read_bytes() == b"half"
 
 
+#: Works in rounds; sends itself signals in the second.
+ASKED = """
+import os, signal, sys
+from potr_cl.host import signals
+from potr_cl.host.atomic_write import replacing
+signals.end_cleanly_on_signals()
+with signals.unwinding(), replacing(sys.argv[1]) as file:
+    with signals.first_interrupt_asks() as asked:
+        for number in range(9):
+            if asked:
+                break
+            if number == 1:
+                for name in sys.argv[2:]:
+                    os.kill(os.getpid(), getattr(signal, name))
+    file.write(b"%d" % number)
+"""
+
+
+def test_the_first_interrupt_asks_and_the_work_goes_on(tmp_path: Path) -> None:
+    result = run(ASKED, tmp_path / "out", "SIGINT")
+    assert result.returncode == 0, result.stderr
+    assert (tmp_path / "out").read_bytes() == b"2"
+    assert result.stderr.startswith("potr-cl: interrupted: ")
+    assert result.stderr.count("\n") == 1
+
+
+@pytest.mark.parametrize(("sent", "code"), [(("SIGINT", "SIGINT"), 130), (("SIGTERM",), 143), (("SIGHUP",), 129)])
+def test_a_second_interrupt_and_any_other_signal_end_it(tmp_path: Path, sent: tuple[str, ...], code: int) -> None:
+    result = run(ASKED, tmp_path / "out", *sent)
+    assert result.returncode == code, result.stderr
+    assert "no file is left half written" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
+def test_nobody_asks_after_the_work(tmp_path: Path) -> None:
+    program = ASKED.replace("    file.write", "    os.kill(os.getpid(), signal.SIGINT)\n    file.write")
+    result = run(program, tmp_path / "out")
+    assert result.returncode == 130, result.stderr
+
+
+def test_a_program_that_has_its_own_way_with_signals_is_not_asked(tmp_path: Path) -> None:
+    program = ASKED.replace("signals.end_cleanly_on_signals()", "")
+    result = run(program, tmp_path / "out", "SIGINT")
+    assert "KeyboardInterrupt" in result.stderr
+    assert not list(tmp_path.iterdir())
+
+
 #: Runs the program as python -m does, with a signal at the moment that a module is first asked for.
 WHILE_IMPORTING = """
 import os, runpy, signal, sys

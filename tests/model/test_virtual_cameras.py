@@ -310,3 +310,13 @@ def test_plush_is_looked_at_from_where_it_was_photographed(plush):
     # The photographs were taken from 2.6 to 7.3 units away from the toy, on a shell of about that radius.
     assert np.median(nearest) < 1.8
     assert np.quantile(nearest, 0.9) < 4
+
+
+def test_the_same_places_whatever_the_threads(monkeypatch):
+    """One processor, many, and none but the caller's own thread."""
+    wanted = place_cameras(BALL, 12, 64)
+    for processors in (1, 7):
+        monkeypatch.setattr("os.cpu_count", lambda n=processors: n)
+        for one, other in zip(wanted, place_cameras(BALL, 12, 64), strict=True):
+            assert np.array_equal(one.rotation, other.rotation)
+            assert np.array_equal(one.translation, other.translation)

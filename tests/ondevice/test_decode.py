@@ -12,7 +12,7 @@ import pytest
 
 import potr_cl
 from potr_cl.codec.container import EntropyCoder
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.decoder import AnyFile, PotrFile, open_file, scene_of_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, UsageError
@@ -43,8 +43,8 @@ def bits(buffers: SceneBuffers) -> dict[str, bytes]:
     }
 
 
-def assert_as_uploaded(file: PotrFile, device: Device, sh_degree: int | None = None) -> None:
-    with uploaded(device, file.scene(sh_degree=sh_degree)) as wanted, decode_to_device(file, device, sh_degree) as got:
+def assert_as_uploaded(file: AnyFile, device: Device, sh_degree: int | None = None) -> None:
+    with uploaded(device, scene_of_file(file, sh_degree)) as wanted, decode_to_device(file, device, sh_degree) as got:
         assert (got.splats, got.stride, got.sh_count) == (wanted.splats, wanted.stride, wanted.sh_count)
         assert (got.antialiased, got.low_pass) == (wanted.antialiased, wanted.low_pass)
         a, b = bits(wanted), bits(got)
@@ -58,7 +58,7 @@ def coded(splats: int, preset: str, entropy: EntropyCoder | None = None, q: floa
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
 def test_golden_files_have_the_bits_of_the_host(path, device):
-    assert_as_uploaded(PotrFile.open(path), device)
+    assert_as_uploaded(open_file(path), device)
 
 
 @pytest.mark.parametrize("native", ["0", ""])

@@ -1,1 +1,1 @@
-"""What only tests compare with: a decoder written from docs/format.md alone."""
+"""What only tests compare with: a decoder written from docs/format.md alone, a renderer in PyTorch."""

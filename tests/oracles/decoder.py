@@ -110,6 +110,8 @@ def decode(data: bytes) -> dict[str, Any]:
     metadata, a dict, and how the scene is to be rendered: antialiased, a bool, and low_pass, square pixels. Raises
     ValueError for a file that breaks the format.
     """
+    if data[:8] == MAGIC and data[8:10] == bytes([4, 0]):
+        return decode_blocks(data)
     header = read_header(data)
     sections = read_sections(data, header)
     return {
@@ -125,6 +127,46 @@ def decode(data: bytes) -> dict[str, Any]:
 
 
 # Container
+
+
+def decode_blocks(data: bytes) -> dict[str, Any]:
+    """Decode a file of blocks: version 4."""
+    check(len(data) >= 48, "truncated header")
+    flags, size, whole, splats, degree = struct.unpack_from("<HIQQB", data, 10)
+    count, metadata_size, zero = struct.unpack_from("<III", data, 36)
+    check(data[33:36] == bytes(3) and zero == 0, "reserved bytes are not zero")
+    check(flags in (0, 1, 3) and degree <= 3 and count >= 1, "flags, degree or number of blocks")
+    check(metadata_size <= 65536 and size == 48 + 48 * count + metadata_size + 4, "size of the header")
+    check(whole == len(data) and size <= whole, "size of the file")
+    check(struct.unpack_from("<I", data, size - 4)[0] == zlib.crc32(data[: size - 4]), "checksum of the header")
+    parts = []
+    start = size
+    for block in range(count):
+        box = struct.unpack_from("<6f", data, 48 + 48 * block)
+        own, nbytes, crc, zero = struct.unpack_from("<QQII", data, 48 + 48 * block + 24)
+        check(all(map(math.isfinite, box)) and box[0] <= box[3] and box[1] <= box[4] and box[2] <= box[5], "box")
+        check(own >= 1 and zero == 0 and start + nbytes <= whole, "entry of the table")
+        stored = data[start : start + nbytes]
+        check(zlib.crc32(stored) == crc, "checksum of a block")
+        header = read_header(stored)
+        check(header.version == 3, "version of a block")
+        check(header.splats == own and header.coefficients == (degree + 1) ** 2, "splats or degree of a block")
+        check(struct.unpack_from("<H", stored, 10)[0] == flags, "flags of a block")
+        part = decode(stored)
+        centres = part["means"].astype(np.float32)
+        low, high = np.float32(box[:3]), np.float32(box[3:])
+        check(bool(((centres >= low) & (centres <= high)).all()), "a centre outside of its block's box")
+        parts.append(part)
+        start += nbytes
+    check(start == whole, "blocks do not fill the file")
+    check(sum(len(part["means"]) for part in parts) == splats, "number of splats")
+    names = ("means", "scales", "quaternions", "opacities", "sh")
+    return {
+        **{name: np.concatenate([part[name] for part in parts]) for name in names},
+        "metadata": metadata_object(data[size - 4 - metadata_size : size - 4]),
+        "antialiased": parts[0]["antialiased"],
+        "low_pass": parts[0]["low_pass"],
+    }
 
 
 def read_header(data: bytes) -> Header:
@@ -328,7 +370,11 @@ def undo_zlib(stored: bytes, raw_size: int, name: str) -> bytes:
 
 def decode_metadata(sections: Sections) -> dict[str, Any]:
     """Parse the metadata."""
-    raw = raw_bytes(sections, METADATA)
+    return metadata_object(raw_bytes(sections, METADATA))
+
+
+def metadata_object(raw: bytes) -> dict[str, Any]:
+    """Parse the bytes of metadata."""
     if not raw:
         return {}
     try:

@@ -9,11 +9,12 @@ import pytest
 
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import UsageError
+from potr_cl.model.camera import resized
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.refit_cases import Pictures
 from potr_cl.reference.scenes import ring_of_cameras, visible_scene
-from potr_cl.stages.fit import Fit
-from potr_cl.stages.fitting.fit import FitOptions, Fitted, LeftOut, fit_scene
+from potr_cl.stages.fit import Fit, LeftOut
+from potr_cl.stages.fitting.fit import FitOptions, Fitted, fit_scene
 from potr_cl.stages.fitting.views import batches, share_out
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import State, Workbench
@@ -253,3 +254,91 @@ def test_sparse_colours_stay_sparse(family_device):
 def test_it_is_off_unless_asked_for():
     assert not Fit().asked_for
     assert Fit(steps=5).asked_for
+
+
+# ------------------------------------------------------------------------------------------ fewer splats for the fit
+
+
+def priced(source, cameras, price):
+    """As pruning has left it that removed nothing."""
+    return State.of(source, cameras).having_learnt("price", price)
+
+
+def cost(device, source, scene, cameras, price):
+    _, held_out = share_out(len(cameras), 0)
+    return mean_error(device, source, scene, [cameras[n] for n in held_out]) + price * len(scene)
+
+
+#: Of which about half of the excerpt's splats are worth it.
+PRICE = 3e-8
+
+
+@pytest.fixture
+def small_views(plush_excerpt_cameras):
+    return [resized(camera, 120, 90) for camera in plush_excerpt_cameras if camera.split == "train"]
+
+
+def test_splats_are_removed_for_the_fit_to_make_up_for(family_device, plush_excerpt, small_views):
+    before = priced(plush_excerpt, small_views, PRICE)
+    after = Fit(steps=40, further=2).run(before, bench_of(family_device))
+    told = after.learnt["fit"]
+    assert isinstance(told, Fitted)
+    assert told.spared == len(before.scene) - len(after.scene) > 300
+    assert len(after.survivors) == len(after.scene)
+    costs = [cost(family_device, plush_excerpt, state.scene, small_views, PRICE) for state in (before, after)]
+    assert costs[1] < 0.9 * costs[0]
+    assert told.without + PRICE * len(before.scene) == pytest.approx(costs[0], rel=1e-3)
+    assert told.error + PRICE * len(after.scene) == pytest.approx(costs[1], rel=1e-3)
+    assert f"{told.spared:,} splats more" in str(told)
+    assert after.learnt["price"] == PRICE
+
+
+def test_of_a_given_number_of_splats_none_are_removed(family_device, plush_excerpt, small_views):
+    after = Fit(steps=10).run(State.of(plush_excerpt, small_views), bench_of(family_device))
+    assert len(after.scene) == len(plush_excerpt)
+    assert after.learnt["fit"].spared == 0
+
+
+def test_where_too_many_are_removed_fewer_are(family_device, plush_excerpt, small_views):
+    lines = []
+    bench = dataclasses.replace(bench_of(family_device), tell=lines.append)
+    found = Fit(steps=40, further=16).run(priced(plush_excerpt, small_views, PRICE), bench)
+    wanted = Fit(steps=40, further=4).run(priced(plush_excerpt, small_views, PRICE), bench)
+    assert sum("once more" in line for line in lines) == 1
+    assert isinstance(wanted.learnt["fit"], Fitted)
+    assert np.array_equal(found.survivors, wanted.survivors)
+    assert np.array_equal(found.scene.means, wanted.scene.means)
+
+
+def test_another_cycle_is_only_kept_if_it_pays(family_device, plush_excerpt, small_views):
+    costs = []
+    for cycles in (1, 3):
+        fit = Fit(steps=40, further=4, cycles=cycles)
+        after = fit.run(priced(plush_excerpt, small_views, PRICE), bench_of(family_device))
+        costs.append(cost(family_device, plush_excerpt, after.scene, small_views, PRICE))
+        assert after.learnt["fit"].spared == len(plush_excerpt) - len(after.scene)
+    assert costs[1] <= costs[0] * (1 + 1e-6)
+
+
+@pytest.mark.parametrize(("steps", "further", "price"), [(2, 1e6, 1e-9), (2, 1e4, 1e-7)])
+def test_what_does_not_pay_is_left_out(family_device, steps, further, price):
+    source, cameras = visible_scene(60, 1, seed=3), ring_of_cameras(8, size=40)
+    before = priced(source, cameras, price)
+    after = Fit(steps=steps, further=further).run(before, bench_of(family_device))
+    assert isinstance(after.learnt["fit"], LeftOut)
+    assert "did not make up" in str(after.learnt["fit"])
+    assert after.scene is before.scene
+    assert after.survivors is before.survivors
+
+
+@pytest.mark.parametrize("wrong", [{"further": 0.5}, {"cycles": 0}, {"iterations": 0}, {"finer": -1}], ids=str)
+def test_an_option_of_the_stage_that_is_out_of_range(wrong):
+    with pytest.raises(UsageError, match="the fit"):
+        Fit(**wrong)
+
+
+def test_automatic_steps_and_what_they_are_on_each_family():
+    assert Fit(steps="auto").asked_for
+    assert 0 < Fit(steps="auto").steps_on("cpu") < Fit(steps="auto").steps_on("gpu")
+    assert Fit(steps=7).steps_on("cpu") == 7
+    assert not Fit().asked_for

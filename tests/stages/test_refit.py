@@ -267,6 +267,81 @@ def test_the_target_itself_is_left_alone(device):
     assert np.allclose(refitted.sh, scene.sh, atol=1e-4)
 
 
+# ------------------------------------------------------------------------------------------ AC coefficients rounded
+
+
+def coarse(sh, refit) -> np.ndarray:
+    """AC coefficients in steps of 0.1."""
+    return np.concatenate([sh[:, :1], np.round(sh[:, 1:] * 10) / 10], axis=1)
+
+
+@pytest.mark.parametrize("degree", [1, 3])
+def test_the_constant_coefficients_make_up_for_the_rounding_of_the_others(device, degree):
+    """They come to the least-squares solution with the others held."""
+    options = RefitOptions(steps=200, gain=0, prior=10)
+    with Case(device, visible_scene(40, degree), visible_scene(60, 2, 7), ring_of_cameras(3, size=40)) as case:
+        with ColourRefit(device, case.scene, case.cameras) as refit:
+            rounded = coarse(refit.solve(case.scene.sh, case.targets, options, check=False).sh, refit)
+            solved = refit.solve_constant(rounded, case.targets, options)
+        active = np.zeros(rounded.shape, bool)
+        active[:, 0] = True
+        start = dataclasses.replace(case.scene, sh=rounded)
+        with Case(device, start, visible_scene(60, 2, 7), case.cameras) as again:
+            reference = again.reference(prior=10, active=active, hold=True)
+        x, solution = to_ycocg(solved.sh), reference.solution()
+        assert np.allclose(solved.sh[:, 1:], rounded[:, 1:], atol=1e-6)
+        assert np.linalg.norm(x - solution) < 1e-3 * np.linalg.norm(solution - reference.start)
+        assert solved.errors[0] == pytest.approx(reference.error(reference.start), rel=1e-4)
+        assert solved.errors[1] == pytest.approx(reference.error(x), rel=1e-4)
+
+
+class Counted:
+    """Targets that count how often they are asked for."""
+
+    def __init__(self, targets) -> None:
+        self.targets, self.asked = targets, 0
+
+    def into(self, numbers, buffer) -> None:
+        self.asked += len(numbers)
+        self.targets.into(numbers, buffer)
+
+
+@pytest.mark.one_runtime
+@pytest.mark.parametrize("rounds", [True, False])
+def test_no_picture_is_looked_at_only_to_measure_what_the_next_solution_measures(case, rounds):
+    """At the start, after the choice of coefficients, after rounding, and at the end; where nothing is rounded, the
+    last two are one."""
+    targets = Counted(case.targets)
+    refitted = refit_colours(
+        case.device, case.scene, case.cameras, targets, RefitOptions(steps=4, gain=0, drop=1e-7, memory=0),
+        fix_ac=coarse if rounds else lambda sh, refit: sh,
+    )  # fmt: skip
+    assert targets.asked == (4 if rounds else 3) * len(case.cameras)
+    reference = case.reference()
+    assert refitted.errors[0] == pytest.approx(reference.error(reference.start), rel=1e-4)
+    assert refitted.errors[1] == pytest.approx(reference.error(to_ycocg(refitted.sh)), rel=1e-4)
+    assert refitted.errors[1] < refitted.errors[0]
+
+
+@pytest.mark.one_runtime
+@pytest.mark.parametrize("rounds", [True, False])
+@pytest.mark.parametrize(("seed", "steps", "dc"), [(0, 30, -3), (3, 8, -5), (7, 30, -3)])
+def test_a_solution_that_overshoots_is_taken_back_before_it_is_rounded(device, seed, steps, dc, rounds):
+    """Dark scenes without a prior, as below."""
+    scene = visible_scene(40, seed=seed)
+    scene.sh[:, 0] += dc
+    with Case(device, scene, visible_scene(60, 2, seed + 7), ring_of_cameras(3, size=40)) as case:
+        options = RefitOptions(steps=steps, selection_steps=steps, gain=0, drop=1e-15, prior=0)
+        careful = case.solve(options)
+
+        def finely(sh, refit):
+            return sh + np.float32(1e-6) if rounds else sh
+
+        refitted = refit_colours(device, scene, case.cameras, case.targets, options, fix_ac=finely)
+    assert refitted.errors[1] <= refitted.errors[0] * (1 + 1e-4)
+    assert refitted.errors[1] <= careful.errors[1] * (1 + 1e-3)
+
+
 # ------------------------------------------------------------------------------------------ same bits
 
 

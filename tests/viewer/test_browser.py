@@ -266,6 +266,21 @@ def test_a_dropped_file_is_shown_and_hostile_names_are_text(viewer, page, data):
     until(lambda: viewer.session.exhibit("B") is exhibit)
 
 
+def test_on_a_phone_nothing_hides_the_divider(viewer, browser):
+    context = browser.new_context(viewport={"width": 390, "height": 844}, is_mobile=True, has_touch=True)
+    phone = context.new_page()
+    try:
+        phone.goto(viewer.url)
+        until(lambda: phone.locator(".potr-figures b").count() > 0)
+        assert phone.evaluate("document.documentElement.scrollWidth") <= 390
+        handle = phone.evaluate("parseFloat(getComputedStyle(document.querySelector('.potr-grip'), '::after').top)")
+        panel = phone.locator("[data-potr='scenes']").bounding_box()["y"] - 60  # with its head
+        assert 40 < handle + 17 < panel
+    finally:
+        context.close()
+        until(lambda: len(viewer.painter.visitors) < 2)
+
+
 def test_a_bad_file_is_told(viewer, page):
     before = viewer.session.exhibit("B")
     drop(page, "scene.ply", b"this is no scene", "B")

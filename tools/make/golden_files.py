@@ -1,4 +1,4 @@
-"""Make the golden files of the versions of the format that presets write, 1 and 3; those of version 2 stay as they are.
+"""Make the golden files of the versions of the format that are written, 1, 3 and 4; those of version 2 stay.
 
     python -m tools.make.golden_files
 
@@ -17,7 +17,10 @@ from pathlib import Path
 
 import numpy as np
 
-from potr_cl.codec.decoder import PotrFile
+from potr_cl.codec.blocks.encoder import code_blocks
+from potr_cl.codec.blocks.geometry import GeometryOfBlocks, quantise
+from potr_cl.codec.blocks.splitting import blocks_of
+from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
@@ -29,6 +32,15 @@ KEEP = EncodeOptions.for_preset("paper", prune=False, compact=False)
 
 def _with_means(scene: Scene, means: np.ndarray) -> Scene:
     return Scene(means.astype(np.float32), scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh)
+
+
+def in_blocks(scene: Scene, most_a_block: int) -> bytes:
+    """A scene in blocks of so few splats, each with steps of colours of its own."""
+    parameters = HyperParameters.from_quality(0.5, "best")
+    geometry = quantise(scene, parameters, ring_of_cameras(8), rows=blocks_of(scene.means, most_a_block))
+    geometry = geometry.with_steps(np.exp(np.random.default_rng(3).normal(size=len(scene))))
+    assert isinstance(geometry, GeometryOfBlocks)
+    return b"".join(code_blocks(scene, geometry, b'{"q":0.5}').pieces)
 
 
 def main() -> None:
@@ -78,13 +90,16 @@ def main() -> None:
             random_scene(400, 0, seed=18, extent=1e3), None, best.with_parameters(sf_scale=1e8, sf_dc=1e6)
         ),
     }
-    for name, encoded in scenes.items():
-        version = PotrFile.from_bytes(b"".join(encoded.pieces)).header.version
+    files = {name: b"".join(encoded.pieces) for name, encoded in scenes.items()}
+    files["degree2_blocks"] = in_blocks(random_scene(900, 2, seed=19), 250)
+    files["degree1_antialiased_blocks"] = in_blocks(random_scene(40, 1, seed=20).rendered(True), 39)
+    for name, data in files.items():
+        version = int.from_bytes(data[8:10], "little")
         path = DATA / f"golden_v{version}_{name}.potr"
         if path.exists():
             print(f"{path.name} exists: kept")
             continue
-        path.write_bytes(b"".join(encoded.pieces))
+        path.write_bytes(data)
         # A program of its own: what the package's decoder makes of the file must not count here.
         command = [sys.executable, "-m", "tests.oracles.decoder", str(path), str(path.with_suffix(".npz"))]
         subprocess.run(command, cwd=DATA.parents[1], check=True)

@@ -3,9 +3,9 @@
     python -m tools.stress.run [options]
 
 Each stage is judged on what it was given, so that an error belongs to one kernel: projection on the scene, tile lists,
-order and compositing on the ellipses that projection left, removal effects on the same, the ridge on its own systems,
-the re-fit on small scenes. Inputs (tools.stress.cases): cases made by hand, and some that hypothesis makes worse and
-worse.
+order and compositing on the ellipses that projection left, removal effects on the same, derivatives of pictures on the
+scene (tools.stress.derivatives), the ridge on its own systems, the re-fit on small scenes. Inputs (tools.stress.cases):
+cases made by hand, and some that hypothesis makes worse and worse.
 
 Beside each error stands what the kernel cannot help: how much the float64 result moves when the numbers that the kernel
 gets are rounded to float32 (random relative changes of up to 2^-24, a few draws). An error of a few times that is the
@@ -28,6 +28,7 @@ import subprocess
 import sys
 import tempfile
 from collections.abc import Callable, Iterator
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any, cast
@@ -66,6 +67,7 @@ from tools.stress.cases import (
     ridge_systems,
     small_scenes,
 )
+from tools.stress.derivatives import check_derivatives, tellable
 
 F64 = NDArray[np.float64]
 Mask = NDArray[np.bool_]
@@ -95,6 +97,9 @@ WHAT = {
     "render": "of a pixel of the whole rasterizer, the same",
     "removal: importance": "of a splat's importance, relative",
     "removal: effect": "of a splat's ΔMSE, relative to the sum of its terms' magnitudes",
+    "fit: finite": "a derivative of a picture that is not finite",
+    "fit: gradient": "of the pictures' derivatives by a kind of parameters, relative to their length",
+    "fit: J x": "x · Jᵀ J x over |J x|², less 1",
     "ridge": "weighted colour error above the optimum, relative to the largest coefficient or 1",
     "re-fit: optimum": "colour error in the pictures above the optimum, or above where the solver had to stop",
     "re-fit: loss": "how much more squared error than the start has, relative",
@@ -130,8 +135,8 @@ def rounded(values: F64, rng: np.random.Generator) -> F64:
     return values * (1 + ULP * rng.uniform(-1, 1, values.shape))
 
 
-def projected(case: Case, rng: np.random.Generator | None = None) -> reference.Projected:
-    """The definition of projection, of the case or of what rounding may make of it."""
+def stand_in(case: Case, rng: np.random.Generator | None = None) -> tuple[Scene, Camera]:
+    """The case's scene and view in float64, or what rounding may make of them."""
     scene, view = case.scene, case.view
     quaternions = scene.quaternions.astype(np.float64)
     length = np.linalg.norm(quaternions, axis=1, keepdims=True)
@@ -155,7 +160,13 @@ def projected(case: Case, rng: np.random.Generator | None = None) -> reference.P
             fx=float(rounded(np.array(view.fx), rng)),
             fy=float(rounded(np.array(view.fy), rng)),
         )
-    stand_in = SimpleNamespace(
+    count = len(means)
+
+    class Precise(SimpleNamespace):
+        def __len__(self) -> int:
+            return count
+
+    precise = Precise(
         means=means,
         log_scales=log_scales,
         quaternions=quaternions,
@@ -165,8 +176,13 @@ def projected(case: Case, rng: np.random.Generator | None = None) -> reference.P
         antialiased=scene.antialiased,
         low_pass=scene.low_pass,
     )
+    return cast(Scene, precise), view
+
+
+def projected(case: Case, rng: np.random.Generator | None = None) -> reference.Projected:
+    """The definition of projection, of the case or of what rounding may make of it."""
     with np.errstate(all="ignore"):
-        return reference.project(cast(Scene, stand_in), view, case.rules)
+        return reference.project(*stand_in(case, rng), case.rules)
 
 
 @dataclasses.dataclass
@@ -414,10 +430,10 @@ def difference(image: F64, transmittance: F64, true: Composited, brightest: floa
     return np.maximum(error, np.abs(transmittance - true.transmittance))
 
 
-def check_render(case: Case, lists: Lists, pixels: Pixels) -> Measures:
-    """The picture by the definition alone, where no threshold and no tie in depth is near."""
+def check_render(case: Case, lists: Lists, pixels: Pixels) -> tuple[Measures, Mask | None]:
+    """The picture by the definition alone, where no threshold and no tie in depth is near; and where that is."""
     if case.rules.square_extent:
-        return {}
+        return {}, None
     rng = np.random.default_rng(SEED)
     true = projected(case)
     raw = alphas_of_covariances(true, pixels)
@@ -455,7 +471,7 @@ def check_render(case: Case, lists: Lists, pixels: Pixels) -> Measures:
         clear &= ~(raw[near] >= 0.5 / 255).any(axis=0)
     error = difference(lists.image, lists.transmittance, picture, brightest)
     expected = ULP + max(float(change[clear].max(initial=0)) for change in changes)
-    return {"render": (float(error[clear].max(initial=0)), expected)}
+    return {"render": (float(error[clear].max(initial=0)), expected)}, clear
 
 
 def check_removal(
@@ -525,8 +541,14 @@ def check(device: Device, case: Case) -> Measures:
         found = check_projection(case, lists, pixels)
         found |= check_lists(case, lists, pixels, raw, member)
         composited, clear = check_composite(case, lists, pixels, raw, inside)
-        found |= composited | check_render(case, lists, pixels)
-        return found | check_removal(case, rasterizer, lists, pixels, raw, inside, clear)
+        render, tellable_pixels = check_render(case, lists, pixels)
+        found |= composited | render
+        found |= check_removal(case, rasterizer, lists, pixels, raw, inside, clear)
+    true = projected(case)
+    shown = np.isin(true.index, lists.intersections)
+    sound = tellable(true.covariance[shown], true.colour[shown])
+    draw = partial(stand_in, case)
+    return found | check_derivatives(device, case.scene, case.view, case.rules, tellable_pixels, sound, draw, DRAWS)
 
 
 def check_ridge(device: Device, case: RidgeCase) -> Measures:

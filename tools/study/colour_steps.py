@@ -88,10 +88,10 @@ def coded(
         nonlocal geometry
         if way.steps:
             geometry = geometry.with_steps(refit.worth()[:, 0])
-        constant, others = geometry.colour_steps()
+        grid = ColourGrid.of(geometry)
         if way.rounds:
-            return ColourGrid(constant, others, geometry.order)
-        return rounded_ac(sh, others) if way.rounded else sh
+            return grid
+        return rounded_ac(sh, grid.others) if way.rounded else sh
 
     decoded = geometry.decoded(state.scene.sh)
     with Rasterizer(device, state.source) as rasterizer:

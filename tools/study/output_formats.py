@@ -7,8 +7,9 @@
 ``measure`` prunes each scene once for each quality, and from there makes every output of :data:`PLAN`; a file of each
 is kept in DIR. It also writes the whole scene with convert's writers. It stops before a step that would begin after S
 seconds. ``judge`` has splat-transform (npm's @playcanvas/splat-transform) decode the kept files to PLY and judges
-those, on any machine. ``report`` prints Markdown: how many times smaller a file of the same PSNR is than the other
-writers' files of FORMATS.json, which tools.study.compare_formats has made; --json keeps the tables for docs/benchmarks.
+those, on any machine. ``report`` prints Markdown: how many times smaller a file of the same PSNR, and of the same loss
+on photographs, is than the other writers' files of FORMATS.json, which tools.study.compare_formats has made, by
+interpolation; --json keeps the tables for docs/benchmarks. Results may be given in several files.
 """
 
 from __future__ import annotations
@@ -61,7 +62,7 @@ def _measure(args: argparse.Namespace) -> None:
     def in_time() -> bool:
         return bool(time.perf_counter() - began < args.seconds)
 
-    for q in PLAN:
+    for q, names in _plan(args).items():
         for folder in args.scenes:
             if not in_time():
                 break
@@ -69,22 +70,28 @@ def _measure(args: argparse.Namespace) -> None:
                 entry = results["scenes"].setdefault(
                     evaluator.name, {**evaluator.facts(), "encodes": [], "converts": []}
                 )
-                options = EncodeOptions(q=q)
+                options = EncodeOptions(q=q).changed(fit={"steps": args.fit})
                 watch = Stopwatch()
                 first = [type(stage) for stage in options.stages]
                 state = Run(options, watch, device).stages(
                     State.of(evaluator.source, train_views(evaluator.cameras)), first[: first.index(Refit)]
                 )
-                for name in PLAN[q]:
+                for name in names:
                     if in_time():
                         entry["encodes"].append(_encoded(args, evaluator, state, q, name, dict(watch.seconds), device))
                         write_json(args.json, results)
-    for folder in args.scenes:
+    for folder in args.scenes if args.whole else []:
         with EvaluatedScene(folder, device) as evaluator:
             for suffix in CONVERTED:
                 if in_time():
                     results["scenes"][evaluator.name]["converts"].append(_converted(args, evaluator, suffix))
                     write_json(args.json, results)
+
+
+def _plan(args: argparse.Namespace) -> dict[float, tuple[str, ...]]:
+    """The outputs to make of each quality."""
+    plan = {q: args.formats or PLAN.get(q, PLAN[0.5]) for q in args.q or PLAN}
+    return {q: tuple(names) for q, names in plan.items()}
 
 
 def _encoded(
@@ -104,13 +111,15 @@ def _encoded(
     encoded = run.finished(run.stages(state, [Refit, Code]))
     kept = None
     if suffix in _READ_BY_OTHERS:
-        path = args.keep / evaluator.name / f"{q:g}{'v' + version if version else ''}{suffix}"
+        fit = f"fit{args.fit}" if args.fit else ""
+        path = args.keep / evaluator.name / f"{q:g}{'v' + version if version else ''}{fit}{suffix}"
         path.parent.mkdir(parents=True, exist_ok=True)
         encoded.save(path)
         kept = str(path.relative_to(args.keep))
     point = {
         "format": name,
         "q": q,
+        "fit": args.fit,
         "bytes": encoded.nbytes,
         "splats": len(encoded.order),
         "properties": output.properties(encoded.data),
@@ -118,7 +127,11 @@ def _encoded(
         "file": kept,
         **evaluator(encoded.scene),
     }
-    print(f"{evaluator.name} {name} q {q:g}: {point['bytes']} bytes, {point['psnr']:.2f} dB", flush=True)
+    print(
+        f"{evaluator.name} {name} q {q:g} fit {args.fit}: {point['splats']} splats, {point['bytes']} bytes, "
+        f"{point['psnr']:.2f} dB, lost {point.get('psnr_loss') or 0:.2f} dB",
+        flush=True,
+    )
     return point
 
 
@@ -162,7 +175,12 @@ def _judge(args: argparse.Namespace) -> None:
 
 
 def _report(args: argparse.Namespace) -> None:
-    results, others = json.loads(args.results.read_text()), json.loads(args.formats.read_text())
+    *files, others = (json.loads(path.read_text()) for path in [*args.results, args.formats])
+    results = files[0]
+    for more in files[1:]:
+        for name, entry in more["scenes"].items():
+            for kind in ("encodes", "converts"):
+                results["scenes"][name][kind] += entry[kind]
     tables = Results(None, args.json)
     for name, entry in results["scenes"].items():
         table = tables.table(
@@ -170,6 +188,7 @@ def _report(args: argparse.Namespace) -> None:
             f"Encodes straight to other formats: {name}, all test views",
             Column("format"),
             Column("q", format="g"),
+            Column("fit", "steps"),
             Column("splats", format=","),
             Column("size", "MB", ".2f"),
             Column("PSNR", "dB", ".2f"),
@@ -177,36 +196,55 @@ def _report(args: argparse.Namespace) -> None:
             Column("PSNR by splat-transform", "dB", ".2f"),
             Column("time after pruning", "s", ".1f"),
         )
-        for point in sorted(entry["encodes"], key=lambda p: (p["format"], p["q"])):
-            after = sum(value for stage, value in point["seconds"].items() if stage in ("refit", "pack"))
+        for point in sorted(entry["encodes"], key=lambda p: (p["format"], p.get("fit", 0), p["q"])):
+            after = sum(value for stage, value in point["seconds"].items() if stage in ("fit", "refit", "pack"))
             other = point.get("other_reader", {}).get("psnr")
             table.add(
-                point["format"], point["q"], point["splats"], point["bytes"] / 1e6, point["psnr"],
-                point.get("psnr_loss"), other, after,
+                point["format"], point["q"], point.get("fit") or None, point["splats"], point["bytes"] / 1e6,
+                point["psnr"], point.get("psnr_loss"), other, after,
             )  # fmt: skip
         for point in entry["converts"]:
             table.add(
-                f"{point['format']}, all splats", None, entry["source_splats"], point["bytes"] / 1e6, point["psnr"],
-                point.get("psnr_loss"), None, point["seconds"],
+                f"{point['format']}, all splats", None, None, entry["source_splats"], point["bytes"] / 1e6,
+                point["psnr"], point.get("psnr_loss"), None, point["seconds"],
             )  # fmt: skip
         times = tables.table(
             f"outputs_gain_{name}",
-            f"How many times smaller than other writers' files of the same PSNR, by interpolation: {name}",
+            f"How many times smaller than other writers' files of the same PSNR, and of the same loss: {name}",
             Column("format"),
+            Column("fit", "steps"),
             Column("other writer's size", "MB", ".2f"),
             Column("PSNR", "dB", ".2f"),
             Column("encode at that PSNR", "MB", ".2f"),
             Column("times smaller", format=".2f"),
+            Column("lost", "dB", ".2f"),
+            Column("encode at that loss", "MB", ".2f"),
+            Column("times smaller at that loss", format=".2f"),
         )
+        kinds = sorted({(point["format"], point.get("fit", 0)) for point in entry["encodes"]})
         for other in others["scenes"].get(name, {}).get("formats", []):
-            for kind in sorted({point["format"] for point in entry["encodes"]}):
+            for kind, fit in kinds:
                 if kind.partition(":")[0].lstrip(".") != other["format"].lstrip("."):
                     continue
-                points = [point for point in entry["encodes"] if point["format"] == kind]
-                size = size_at(points, "psnr", other["psnr"]) if len(points) > 1 else None
-                times.add(
-                    kind, other["bytes"] / 1e6, other["psnr"], size and size / 1e6, size and other["bytes"] / size
-                )
+                points = [p for p in entry["encodes"] if (p["format"], p.get("fit", 0)) == (kind, fit)]
+                cells: list[Any] = [kind, fit or None, other["bytes"] / 1e6]
+                # A curve rises with PSNR and falls with what is lost.
+                for key, sign in (("psnr", 1), ("psnr_loss", -1)):
+                    curve = [{"bytes": p["bytes"], key: sign * p[key]} for p in points if p.get(key) is not None]
+                    value = other.get(key)
+                    cells += [value, *_gain(curve, key, None if value is None else sign * value, other["bytes"])]
+                times.add(*cells)
+
+
+def _gain(curve: list[dict[str, Any]], key: str, value: float | None, other: int) -> tuple[Any, Any]:
+    """Where a curve reaches a value, in MB, and how many times smaller that is; bounds where all of it is better."""
+    if value is None or not curve:
+        return None, None
+    least = min(curve, key=lambda p: int(p["bytes"]))
+    if value <= least[key]:
+        return f"below {least['bytes'] / 1e6:.2f}", f"more than {other / least['bytes']:.2f}"
+    size = size_at(curve, key, value) if len(curve) > 1 else None
+    return size and size / 1e6, size and other / size
 
 
 def main() -> None:
@@ -221,10 +259,14 @@ def main() -> None:
         sub.set_defaults(run=run)
         if name == "measure":
             sub.add_argument("--seconds", type=float, default=1e9, help="begin nothing after so long")
+            sub.add_argument("--q", type=float, nargs="*", help="qualities; default: those of the plan")
+            sub.add_argument("--formats", nargs="*", help="outputs of each; default: the plan's")
+            sub.add_argument("--fit", type=int, default=0, metavar="STEPS", help="fit all parameters too")
+            sub.add_argument("--no-whole", dest="whole", action="store_false", help="no files of the whole scene")
         else:
             sub.add_argument("--transform", default="splat-transform", help="the command; default %(default)s")
     sub = commands.add_parser("report")
-    sub.add_argument("results", type=Path)
+    sub.add_argument("results", type=Path, nargs="+", metavar="OUT.json")
     sub.add_argument("formats", type=Path, help="of tools.study.compare_formats")
     sub.add_argument("--json", type=Path)
     sub.set_defaults(run=_report)

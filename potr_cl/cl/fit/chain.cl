@@ -20,19 +20,13 @@
 #include "include/sh_basis.clh"
 #include "include/sh_slopes.clh"
 
+#include "fit/projection.clh"
+
 #ifndef ANTIALIASED
 #define ANTIALIASED 0
 #endif
-#ifndef LOW_PASS
-#define LOW_PASS 0.3f
-#define LOW_PASS_SQUARED 0.09f
-#endif
 
 #define SUMS 9
-/* As in project.cl. */
-#define EXPONENT_SCALE 0.84932180f
-#define AXIS_LIMIT 1e8f
-#define LN2 0.69314718f
 #define LARGEST 1e30f
 
 /* Takes the totals of LANES splats, times a factor, and sets them to 0. Returns in which lanes any was not 0. */
@@ -101,10 +95,8 @@ kernel void chain(
     const vfloat qx = VLOAD(index, quaternions + column);
     const vfloat qy = VLOAD(index, quaternions + 2 * column);
     const vfloat qz = VLOAD(index, quaternions + 3 * column);
-    const vfloat axes[9] = {
-        1.0f - 2.0f * (qy * qy + qz * qz), 2.0f * (qx * qy + qw * qz), 2.0f * (qx * qz - qw * qy),
-        2.0f * (qx * qy - qw * qz), 1.0f - 2.0f * (qx * qx + qz * qz), 2.0f * (qy * qz + qw * qx),
-        2.0f * (qx * qz + qw * qy), 2.0f * (qy * qz - qw * qx), 1.0f - 2.0f * (qx * qx + qy * qy)};
+    vfloat axes[9];
+    axes_of(qw, qx, qy, qz, axes);
     vfloat by_axes[9];
     for (int i = 0; i < 9; ++i)
         by_axes[i] = (vfloat)(0.0f);
@@ -119,85 +111,56 @@ kernel void chain(
         seen_ever = seen_ever || seen;
         global const View *view = &views[number].view;
 
-        /* The projection, as far as it is needed. */
-        const vfloat dx = (VLOAD(index, means) - view->camera_centre_high[0]) - view->camera_centre_low[0];
-        const vfloat dy = (VLOAD(index, means + column) - view->camera_centre_high[1]) - view->camera_centre_low[1];
-        const vfloat dz = (VLOAD(index, means + 2 * column) - view->camera_centre_high[2]) - view->camera_centre_low[2];
+        const Projection p = projected(means, scales, column, index, axes, view);
         global const float *w = view->rotation;
-        const vfloat inverse_z = 1.0f / (w[6] * dx + w[7] * dy + w[8] * dz);
-        const vfloat across = (w[0] * dx + w[1] * dy + w[2] * dz) * inverse_z;
-        const vfloat down = (w[3] * dx + w[4] * dy + w[5] * dz) * inverse_z;
-        const vfloat ratio_x = fmin(fmax(across, -view->limit_x), view->limit_x);
-        const vfloat ratio_y = fmin(fmax(down, -view->limit_y), view->limit_y);
-        vfloat turned[9], along_x[3], along_y[3], mx[3], my[3];
-        for (int k = 0; k < 3; ++k) {
-            const vfloat *axis = axes + 3 * k;
-            for (int i = 0; i < 3; ++i)
-                turned[3 * k + i] = w[3 * i] * axis[0] + w[3 * i + 1] * axis[1] + w[3 * i + 2] * axis[2];
-            const vfloat scale = VLOAD(index, scales + k * column) * inverse_z;
-            along_x[k] = view->fx * scale;
-            along_y[k] = view->fy * scale;
-            mx[k] = along_x[k] * (turned[3 * k] - ratio_x * turned[3 * k + 2]);
-            my[k] = along_y[k] * (turned[3 * k + 1] - ratio_y * turned[3 * k + 2]);
-        }
-        vfloat sxx = mx[0] * mx[0] + mx[1] * mx[1] + mx[2] * mx[2];
-        const vfloat sxy = mx[0] * my[0] + mx[1] * my[1] + mx[2] * my[2];
-        vfloat syy = my[0] * my[0] + my[1] * my[1] + my[2] * my[2];
-        const vfloat n[3] = {
-            mx[1] * my[2] - mx[2] * my[1], mx[2] * my[0] - mx[0] * my[2], mx[0] * my[1] - mx[1] * my[0]};
-        const vfloat sharp = n[0] * n[0] + n[1] * n[1] + n[2] * n[2];
-        const vfloat determinant = sharp + LOW_PASS * (sxx + syy) + LOW_PASS_SQUARED;
-        sxx += LOW_PASS;
-        syy += LOW_PASS;
-        const vfloat a = EXPONENT_SCALE * sqrt(syy / determinant);
-        const vfloat b = -a * (sxy / syy);
-        const vfloat c = EXPONENT_SCALE / sqrt(syy);
+        const vfloat a = p.a, b = p.b, c = p.c, inverse_z = p.inverse_z;
 
         /* The centre on screen, and the covariance: L^T M L, where M has the sums of e U^2, e U V and e V^2, and
-           L = (a b; 0 c). */
+           L = (a b; 0 c), which takes (mx, my) to (u, v). */
         const vfloat by_x = 2.0f * LN2 * a * sums[4];
         const vfloat by_y = 2.0f * LN2 * (b * sums[4] + c * sums[5]);
-        const float factor = 2.0f * LN2 * LN2;
-        const vfloat by_xx = factor * a * a * sums[6];
-        const vfloat by_xy = factor * a * (b * sums[6] + c * sums[7]);
-        const vfloat by_yy = factor * (b * b * sums[6] + 2.0f * b * c * sums[7] + c * c * sums[8]);
+        const float factor = 4.0f * LN2 * LN2;
+        const vfloat uu = factor * sums[6], uv = factor * sums[7], vv = factor * sums[8];
 #if ANTIALIASED
-        const vint loses = sharp / determinant > LEAST_COMPENSATION_SQUARED;
-        const vfloat by_sharp = loses ? sums[3] * (1.0f / sharp - 1.0f / determinant) : (vfloat)(0.0f);
-        const vfloat by_trace = loses ? -LOW_PASS * sums[3] / determinant : (vfloat)(0.0f);
+        const vint loses = p.sharp / p.determinant > LEAST_COMPENSATION_SQUARED;
+        const vfloat by_sharp = loses ? sums[3] * (1.0f / p.sharp - 1.0f / p.determinant) : (vfloat)(0.0f);
+        const vfloat by_trace = loses ? -LOW_PASS * sums[3] / p.determinant : (vfloat)(0.0f);
 #endif
         vfloat by_ratio_x = (vfloat)(0.0f), by_ratio_y = (vfloat)(0.0f), by_size = (vfloat)(0.0f);
         for (int k = 0; k < 3; ++k) {
-            vfloat by_mx = 2.0f * (by_xx * mx[k] + by_xy * my[k]);
-            vfloat by_my = 2.0f * (by_xy * mx[k] + by_yy * my[k]);
+            const vfloat by_u = uu * p.u[k] + uv * p.v[k], by_v = uv * p.u[k] + vv * p.v[k];
+            vfloat by_mx = a * by_u, by_my = b * by_u + c * by_v;
+            vfloat by_scale = by_u * p.u[k] + by_v * p.v[k];
 #if ANTIALIASED
             const int i = (k + 1) % 3, j = (k + 2) % 3;
-            by_mx += by_sharp * (my[i] * n[j] - my[j] * n[i]) + by_trace * mx[k];
-            by_my += by_sharp * (n[i] * mx[j] - n[j] * mx[i]) + by_trace * my[k];
+            const vfloat more_x = by_sharp * (p.my[i] * p.n[j] - p.my[j] * p.n[i]) + by_trace * p.mx[k];
+            const vfloat more_y = by_sharp * (p.n[i] * p.mx[j] - p.n[j] * p.mx[i]) + by_trace * p.my[k];
+            by_mx += more_x;
+            by_my += more_y;
+            by_scale += more_x * p.mx[k] + more_y * p.my[k];
 #endif
-            /* Axes so long that the projection cuts them do not change. */
-            const vint kept = fmax(fabs(mx[k]), fabs(my[k])) < AXIS_LIMIT;
+            const vint kept = axis_changes(&p, k);
             by_mx = kept ? by_mx : (vfloat)(0.0f);
             by_my = kept ? by_my : (vfloat)(0.0f);
-            const vfloat by_scale = by_mx * mx[k] + by_my * my[k];
+            by_scale = kept ? by_scale : (vfloat)(0.0f);
             by_size += by_scale;
             add_to(gradient + (3 + k) * column, index, seen, by_scale);
-            const vfloat of_x = by_mx * along_x[k], of_y = by_my * along_y[k];
-            const vfloat of_z = -(ratio_x * of_x + ratio_y * of_y);
-            by_ratio_x -= of_x * turned[3 * k + 2];
-            by_ratio_y -= of_y * turned[3 * k + 2];
+            const vfloat of_x = by_mx * p.along_x[k], of_y = by_my * p.along_y[k];
+            const vfloat of_z = -(p.ratio_x * of_x + p.ratio_y * of_y);
+            by_ratio_x -= of_x * p.turned[3 * k + 2];
+            by_ratio_y -= of_y * p.turned[3 * k + 2];
             for (int i = 0; i < 3; ++i) {
                 const vfloat value = w[i] * of_x + w[3 + i] * of_y + w[6 + i] * of_z;
                 by_axes[3 * k + i] += seen ? value : (vfloat)(0.0f);
             }
         }
 
-        const vfloat free_x = fabs(across) < view->limit_x ? by_ratio_x : (vfloat)(0.0f);
-        const vfloat free_y = fabs(down) < view->limit_y ? by_ratio_y : (vfloat)(0.0f);
+        const vfloat free_x = fabs(p.across) < view->limit_x ? by_ratio_x : (vfloat)(0.0f);
+        const vfloat free_y = fabs(p.down) < view->limit_y ? by_ratio_y : (vfloat)(0.0f);
         const vfloat by_tx = inverse_z * (view->fx * by_x + free_x);
         const vfloat by_ty = inverse_z * (view->fy * by_y + free_y);
         const vfloat by_tz =
-            -inverse_z * ((view->fx * by_x + free_x) * across + (view->fy * by_y + free_y) * down + by_size);
+            -inverse_z * ((view->fx * by_x + free_x) * p.across + (view->fy * by_y + free_y) * p.down + by_size);
 
         /* The colour: its coefficients, and the direction that it is seen from. Channels that are cut are 0. */
         vfloat channels[3] = {sums[0], sums[1], sums[2]};
@@ -215,8 +178,8 @@ kernel void chain(
         channels[1] = green > 0.0f ? channels[1] : (vfloat)(0.0f);
         channels[2] = blue > 0.0f ? channels[2] : (vfloat)(0.0f);
 #endif
-        const vfloat nearness = 1.0f / sqrt(dx * dx + dy * dy + dz * dz);
-        const vfloat x = dx * nearness, y = dy * nearness, z = dz * nearness;
+        const vfloat nearness = 1.0f / sqrt(p.away[0] * p.away[0] + p.away[1] * p.away[1] + p.away[2] * p.away[2]);
+        const vfloat x = p.away[0] * nearness, y = p.away[1] * nearness, z = p.away[2] * nearness;
         vfloat basis[SH_COUNT], by_basis[SH_COUNT];
         sh_basis(x, y, z, basis);
         for (int m = 0; m < SH_COUNT; ++m) {

@@ -6,135 +6,16 @@
 
 #include <string.h>
 
-#include "bundles.h"
+#include "bundles_tokens.h"
 
-typedef struct {
-    const uint8_t *words;
-    size_t read, available;
-} reader;
-
-/* Gives each of `count` states that is below 2^16 a word. Returns 0, or 1 if there are too few words. */
-static int renormalise(reader *r, uint32_t *states, size_t count)
+/* A stream of some items: from w->expected, where the sums of terms, constant and bias stand in rows, to w->tokens, to
+ * `sizes`, which has room for as many rows, and, where tokens have bits beside them, to w->extra. Returns 0, or 1 if
+ * there are too few words. */
+static int decode_items(const stream_model *model, reader *r, uint32_t *states, size_t lanes, size_t items, work *w,
+    int16_t *sizes)
 {
-    for (size_t i = 0; i < count; i++)
-        if (states[i] < LOWEST) {
-            if (r->read == r->available)
-                return 1;
-            uint16_t word;
-            memcpy(&word, r->words + 2 * r->read++, 2);
-            states[i] = states[i] << 16 | word;
-        }
-    return 0;
-}
-
-/* The bits beside the tokens of a row. Bits beyond the 32nd are lost: the caller knows that there are none. */
-static int take_bits(reader *r, uint32_t *states, size_t count, const uint8_t *tokens, uint32_t *extra)
-{
-    memset(extra, 0, count * sizeof *extra);
-    for (unsigned shift = 0;; shift += CHUNK) {
-        int more = 0;
-        for (size_t i = 0; i < count; i++) {
-            const unsigned all = extra_bits(tokens[i]);
-            if (all <= shift)
-                continue;
-            const unsigned bits = all - shift < CHUNK ? all - shift : CHUNK;
-            extra[i] |= (states[i] & ((1u << bits) - 1)) << shift;
-            states[i] >>= bits;
-            more = 1;
-        }
-        if (!more)
-            return 0;
-        if (renormalise(r, states, count))
-            return 1;
-    }
-}
-
-/* A row of `count` tokens, at most LANES, whose expected sizes are known. Words are read without asking whether there
- * are more: `count` of them at least are there. Returns how many were read.
- *
- * Whether a state takes a word is as good as chance, and processors foretell such branches wrongly: so every lane is
- * given the next word, and only those that need it go on to the one after. */
-static INLINE size_t row_of_tokens(
-    const stream_model *model, const uint8_t *restrict expected, const uint8_t *restrict words,
-    uint32_t *restrict states, int32_t *restrict recent, uint8_t *restrict tokens, size_t count)
-{
-    uint32_t found[LANES], next[LANES], place[LANES];
-    int32_t sizes[LANES];
-    uint16_t low[LANES];
-    const uint8_t *const classes = model->classes, *const slots = model->slots;
-    const uint32_t *const intervals = model->intervals;
-    const int16_t *const size_of = model->sizes;
-    for (size_t i = 0; i < count; i++)
-        place[i] = states[i] & (TOTAL - 1);
-    for (size_t i = 0; i < count; i++) {
-        const uint32_t context = classes[expected[i]];
-        const uint32_t token = slots[context << PRECISION | place[i]];
-        found[i] = intervals[context << 8 | token];
-        tokens[i] = (uint8_t)token;
-        sizes[i] = size_of[token];
-    }
-    for (size_t i = 0; i < count; i++)
-        next[i] = (found[i] & 0xffff) * (states[i] >> PRECISION) + place[i] - (found[i] >> 16);
-    size_t read = 0;
-    for (size_t i = 0; i < count; i++) {
-        memcpy(&low[i], words + 2 * read, 2);
-        read += next[i] < LOWEST;
-    }
-    for (size_t i = 0; i < count; i++)
-        states[i] = next[i] < LOWEST ? next[i] << 16 | low[i] : next[i];
-    for (size_t i = 0; i < count; i++)
-        recent[i] += 2 * sizes[i] - (recent[i] >> 2);
-    return read;
-}
-
-static INLINE void expected_sizes(
-    const int32_t *restrict base, int32_t weight, const int32_t *restrict recent, uint8_t *restrict expected,
-    size_t count)
-{
-    for (size_t i = 0; i < count; i++) {
-        const int32_t size = (base[i] + weight * recent[i]) >> 8;
-        expected[i] = (uint8_t)(size < 0 ? 0 : size > LARGEST_SIZE ? LARGEST_SIZE : size);
-    }
-}
-
-/* A stream of some items: from w->expected, where the sums of terms, constant and bias stand in rows, to w->tokens and,
- * where tokens have bits beside them, w->extra. Returns 0, or 1 if there are too few words. */
-POTR_WIDE_INTEGERS
-static int decode_items(
-    const stream_model *model, reader *r, uint32_t *states, size_t lanes, size_t items, work *w)
-{
-    int32_t recent[LANES] = { 0 };
-    uint8_t expected[LANES];
-    const size_t steps = (items + lanes - 1) / lanes;
-    for (size_t step = 0; step < steps; step++) {
-        const size_t count = (items - step + steps - 1) / steps;
-        const int32_t *const base = w->expected + step * LANES;
-        uint8_t *const tokens = w->tokens + step * LANES;
-        if (count == LANES && r->available - r->read >= LANES) {
-            expected_sizes(base, model->recent, recent, expected, LANES);
-            r->read += row_of_tokens(model, expected, r->words + 2 * r->read, states, recent, tokens, LANES);
-        } else {
-            expected_sizes(base, model->recent, recent, expected, count);
-            /* Near the end: a lane at a time, with a word to spare or one that must not be needed. */
-            for (size_t i = 0; i < count; i++) {
-                static const uint8_t none[2] = { 0, 0 };
-                const int left = r->available > r->read;
-                const size_t needed = row_of_tokens(
-                    model, expected + i, left ? r->words + 2 * r->read : none, states + i, recent + i, tokens + i, 1);
-                if (needed && !left)
-                    return 1;
-                r->read += needed;
-            }
-        }
-        if (model->alphabet > DIRECT) {
-            uint8_t any = 0;
-            for (size_t i = 0; i < count; i++)
-                any |= tokens[i];
-            if (any & DIRECT && take_bits(r, states, count, tokens, w->extra + step * LANES))
-                return 1;
-        }
-    }
-    return 0;
+    const rows_of_tokens rows = { w->expected, w->tokens, sizes, w->extra };
+    return decode_tokens(model, r, states, lanes, items, &rows);
 }
 
 static INLINE int32_t integer_of(const work *w, size_t at)
@@ -148,6 +29,19 @@ static INLINE int32_t integer_of(const work *w, size_t at)
 static INLINE int32_t from_zigzag(int32_t u)
 {
     return (int32_t)((uint32_t)u >> 1) ^ -(u & 1);
+}
+
+/* Tokens where no splat is, to the end of the rows: what lanes without one have found there may stand for anything. */
+static void clear_idle(uint8_t *tokens, size_t splats, size_t whole)
+{
+    const size_t steps = steps_of(splats);
+    memset(tokens + LANES * steps, 0, whole - LANES * steps);
+    if (splats == LANES * steps)
+        return;
+    for (size_t step = 0; step < steps; step++) {
+        const size_t count = (splats - step + steps - 1) / steps;
+        memset(tokens + step * LANES + count, 0, LANES - count);
+    }
 }
 
 /* Weighted sums of terms in rows. */
@@ -170,19 +64,27 @@ static void add_terms(
     }
 }
 
-/* The sizes of the tokens of a stream of an item a splat, and its integers. */
-static void keep_dense(const stream_model *model, const work *w, size_t places, int is_signed, int16_t *sizes,
-    int32_t *integers)
+/* The integers of a stream of an item a splat. Nearly all are tokens by themselves. */
+POTR_WIDE_INTEGERS
+static void keep_dense(const stream_model *model, const work *w, size_t places, int is_signed, int32_t *restrict integers)
 {
-    for (size_t i = 0; i < places; i++)
-        sizes[i] = model->sizes[w->tokens[i]];
-    if (model->alphabet <= DIRECT) {
+    const uint8_t *const tokens = w->tokens;
+    if (is_signed)
         for (size_t i = 0; i < places; i++)
-            integers[i] = is_signed ? from_zigzag(w->tokens[i]) : w->tokens[i];
+            integers[i] = from_zigzag(tokens[i]);
+    else
+        for (size_t i = 0; i < places; i++)
+            integers[i] = tokens[i];
+    if (model->alphabet <= DIRECT)
         return;
+    for (size_t first = 0; first < places; first += LANE) {
+        uint8_t any = 0;
+        for (size_t i = first; i < first + LANE; i++)
+            any |= tokens[i];
+        for (size_t i = first; any & DIRECT && i < first + LANE; i++)
+            if (tokens[i] & DIRECT)
+                integers[i] = is_signed ? from_zigzag(integer_of(w, i)) : integer_of(w, i);
     }
-    for (size_t i = 0; i < places; i++)
-        integers[i] = is_signed ? from_zigzag(integer_of(w, i)) : integer_of(w, i);
 }
 
 /* Streams of an item a splat: `known` terms, and then those of the streams before. */
@@ -198,10 +100,10 @@ static int dense_section(
         terms[k] = known[k];
     for (size_t s = 0; s < number; s++) {
         add_terms(w->expected, models[s].constant, models[s].weights, terms, known_number + s, whole);
-        memset(w->tokens, 0, whole);
-        if (decode_items(&models[s], r, states, lanes, splats, w))
+        if (decode_items(&models[s], r, states, lanes, splats, w, sizes[s]))
             return TOO_FEW_WORDS;
-        keep_dense(&models[s], w, whole, is_signed, sizes[s], integers[s]);
+        clear_idle(w->tokens, splats, whole);
+        keep_dense(&models[s], w, whole, is_signed, integers[s]);
         terms[known_number + s] = sizes[s];
     }
     return r->read == r->available ? FINE : TOO_MANY_WORDS;
@@ -293,11 +195,8 @@ static int decode_band(
     const int16_t *const of_items[5] = { w->sums[0], w->sums[1], w->sums[2], w->mask_sizes, w->step_sizes };
     const stream_model *model = &models[MASK_STREAM];
     add_terms(w->expected, model->constant, model->weights, known, 11, whole);
-    memset(w->tokens, 0, whole);
-    if (decode_items(model, r, states, lanes, splats, w))
+    if (decode_items(model, r, states, lanes, splats, w, w->mask_sizes))
         return TOO_FEW_WORDS;
-    for (size_t i = 0; i < whole; i++)
-        w->mask_sizes[i] = model->sizes[w->tokens[i]];
     uint16_t *const place = w->places[band];
     uint8_t *const coefficient = w->coefficients[band];
     const size_t items = list_items(w, lanes, steps, splats, place, coefficient);
@@ -309,7 +208,7 @@ static int decode_band(
     for (size_t lane = 0, i = 0; i < items; lane++)
         for (size_t at = lane, end = i + item_steps < items ? i + item_steps : items; i < end; i++, at += LANES)
             w->expected[at] = w->of_splats[place[i]] + model->biases[coefficient[i]];
-    if (decode_items(model, r, states, lanes, items, w))
+    if (decode_items(model, r, states, lanes, items, w, w->sizes))
         return TOO_FEW_WORDS;
     for (size_t lane = 0, i = 0; i < items; lane++)
         for (size_t at = lane, end = i + item_steps < items ? i + item_steps : items; i < end; i++, at += LANES)
@@ -337,13 +236,13 @@ static int decode_band(
                     sum += model->weights[6 + b] * w->value_sizes[b][i];
                 w->expected[at] = sum;
             }
-        if (decode_items(model, r, states, lanes, chosen, w))
+        if (decode_items(model, r, states, lanes, chosen, w, w->sizes))
             return TOO_FEW_WORDS;
         for (size_t lane = 0, k = 0; k < chosen; lane++)
             for (size_t at = lane, end = k + item_steps < chosen ? k + item_steps : chosen; k < end; k++, at += LANES) {
                 const size_t i = w->chosen[k];
                 channel[i] = from_zigzag(integer_of(w, at) + 1);
-                w->value_sizes[c][i] = model->sizes[w->tokens[at]];
+                w->value_sizes[c][i] = w->sizes[at];
             }
     }
     for (size_t c = 0; c < 3; c++)
@@ -360,12 +259,20 @@ static int at_end(const uint32_t *states, size_t lanes)
     return FINE;
 }
 
+/* Of a chain; lanes that are not there rest. */
+static void first_states(const uint32_t *all, uint64_t bundle, size_t lanes, uint32_t *states)
+{
+    for (size_t i = 0; i < LANES; i++)
+        states[i] = LOWEST;
+    memcpy(states, all + bundle * LANES, lanes * sizeof *states);
+}
+
 int decode_bundle(
     const bundled_file *file, uint64_t bundle, int sections, int rotations, work *w, int *section)
 {
     const size_t splats = splats_of(file, bundle), lanes = lanes_of(splats);
     uint32_t states[LANES];
-    memcpy(states, file->states + bundle * LANES, lanes * sizeof *states);
+    first_states(file->states, bundle, lanes, states);
     memset(w->sums, 0, sizeof w->sums);
     memset(w->items, 0, sizeof w->items);
     const int16_t *const known[5] = { w->opacity_sizes, w->scale_sizes[0], w->scale_sizes[1], w->scale_sizes[2],
@@ -412,7 +319,7 @@ int decode_bundle(
                 terms[3 + k] = w->difference_sizes[k];
             }
             uint32_t own[LANES];
-            memcpy(own, file->rotation_states + bundle * LANES, lanes * sizeof *own);
+            first_states(file->rotation_states, bundle, lanes, own);
             wrong = dense_section(models + ROTATION_STREAM, 3, terms, 6, 1, &r, own, lanes, splats, w,
                 w->rotation_sizes, w->rotations);
             if (!wrong)
@@ -429,10 +336,11 @@ int decode_bundle(
 
 /* What each slot of a model's contexts stands for, and the interval of each token.
  *
- * frequencies: (contexts, alphabet). slots: (contexts · 4096). intervals: (contexts · 256). Returns 0, or 1 where a
- * context's frequencies do not add up to 4096. */
+ * frequencies: (contexts, alphabet). sizes: (alphabet). slots: (contexts · 4096 + 3). intervals: (contexts · 256).
+ * Returns 0, or 1 where a context's frequencies do not add up to 4096. */
 POTR_EXPORT int potr_bundles_table(
-    const uint16_t *frequencies, size_t contexts, size_t alphabet, uint8_t *slots, uint32_t *intervals)
+    const uint16_t *frequencies, size_t contexts, size_t alphabet, const int16_t *sizes, uint8_t *slots,
+    uint32_t *intervals)
 {
     for (size_t context = 0; context < contexts; context++) {
         const uint16_t *row = frequencies + context * alphabet;
@@ -441,13 +349,17 @@ POTR_EXPORT int potr_bundles_table(
             const uint32_t frequency = row[token];
             if (frequency > TOTAL - at)
                 return 1;
+            if (!frequency)
+                continue;
             memset(slots + context * TOTAL + at, (int)token, frequency);
-            intervals[context * TOKENS + token] = at << 16 | frequency;
+            intervals[context * TOKENS + token] =
+                (frequency - 1) | at << PRECISION | (uint32_t)(sizes[token] & LARGEST_SIZE) << 2 * PRECISION;
             at += frequency;
         }
         if (at != TOTAL)
             return 1;
     }
+    memset(slots + contexts * TOTAL, 0, 3);
     return 0;
 }
 

@@ -42,14 +42,15 @@ static INLINE unsigned extra_bits(unsigned token)
 /* What is known of a stream. */
 typedef struct {
     const uint8_t *classes;    /* (256) context of each expected size */
-    const uint8_t *slots;      /* (contexts · 4096) token of each slot */
-    const uint32_t *intervals; /* (contexts · 256) of each token: frequency, and from bit 16 on the sum of those below */
+    const uint8_t *slots;      /* (contexts · 4096 + 3) token of each slot */
+    const uint32_t *intervals; /* (contexts · 256) of each token: frequency less 1, from bit 12 on the sum of those below,
+                                  from bit 24 on the size, where all sizes are that small */
     const int16_t *sizes;      /* (256) of each token */
     int32_t weights[TERMS];    /* of its terms */
     int32_t biases[8];         /* by coefficient */
     int32_t recent, constant;
     int32_t alphabet;
-    int32_t unused;
+    int32_t by_vectors;        /* whether all sizes are below 256, and the processor has what potr_bundles_vectors says */
 } stream_model;
 
 /* What gives each splat the steps of its colours; groups is NULL where all steps are the same. */
@@ -89,6 +90,7 @@ typedef struct {
     /* Of the stream that is being decoded: in rows of its own. */
     int32_t expected[ITEMS + LANES];
     uint8_t tokens[ITEMS + LANES];
+    int16_t sizes[ITEMS + LANES];
     uint32_t extra[ITEMS + LANES];
     /* Of the degree that is being decoded. */
     int32_t of_splats[BUNDLE];

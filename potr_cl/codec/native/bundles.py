@@ -44,7 +44,7 @@ class _Stream(ctypes.Structure):
         ("recent", _NUMBER),
         ("constant", _NUMBER),
         ("alphabet", _NUMBER),
-        ("unused", _NUMBER),
+        ("by_vectors", _NUMBER),
     )
 
 
@@ -217,6 +217,7 @@ class BundledFile:
         sections: by their place in the order of decoding (opacity, scale, DC, degrees 1 to 3, rotation); opacity's at
             least.
         steps: of colours, for files that have them.
+        vectors: whether to look tokens up by vectors, where the processor can.
     """
 
     def __init__(
@@ -225,8 +226,10 @@ class BundledFile:
         splats: int,
         sections: Mapping[int, SectionWords],
         steps: ColourSteps | None = None,
+        vectors: bool = True,
     ) -> None:
         self._c = functions
+        self._vectors = bool(vectors and functions["potr_bundles_vectors"]())
         self._splats = splats
         self._kept: list[NDArray[Any]] = []
         self._file = _File()
@@ -271,7 +274,8 @@ class BundledFile:
             raise TypeError("the native path was given contexts without frequencies, or tokens without sizes")
         if len(model.terms) > _WEIGHTS or len(model.biases) > _BIASES:
             raise TypeError("the native path was given too many weights")
-        slots, intervals = np.empty(contexts * _TOTAL, np.uint8), np.empty(contexts * _TOKENS, np.uint32)
+        # Vectors of slots are looked up with some bytes too many.
+        slots, intervals = np.empty(contexts * _TOTAL + 3, np.uint8), np.empty(contexts * _TOKENS, np.uint32)
         frequencies = np.ascontiguousarray(model.frequencies, np.uint16)
         sizes = np.zeros(_TOKENS, np.int16)
         sizes[: len(model.sizes)] = model.sizes
@@ -279,6 +283,7 @@ class BundledFile:
             address(frequencies, np.uint16, frequencies.size),
             contexts,
             alphabet,
+            address(sizes, np.int16, _TOKENS),
             address(slots, np.uint8, len(slots), True),
             address(intervals, np.uint32, len(intervals), True),
         ):
@@ -290,6 +295,7 @@ class BundledFile:
         to.weights[: len(model.terms)] = list(model.terms)
         to.biases[: len(model.biases)] = list(model.biases)
         to.recent, to.constant, to.alphabet = model.recent, model.constant, alphabet
+        to.by_vectors = self._vectors and int(sizes[:alphabet].max()) < _TOKENS
 
     def work(self) -> U8:
         """What a thread needs to decode bundles, one at a time."""

@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import ctypes
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -18,6 +17,7 @@ from potr_cl.codec.native.arrays import KINDS, address, addresses, kind_of
 from potr_cl.codec.native.bundles import BundledFile, SectionWords
 from potr_cl.codec.native.bundles_encode import BundleEncoder
 from potr_cl.codec.native.declarations import declared
+from potr_cl.codec.native.octree import OctreeFunctions
 from potr_cl.codec.native.quantising import Quantising
 from potr_cl.codec.steps.rule import ColourSteps
 
@@ -34,25 +34,9 @@ U64 = NDArray[np.uint64]
 
 _TOTAL = 4096  # what a context's frequencies add up to
 _CONTEXT_TERMS = 5
-_LEVELS = 53  # of an octree, and lengths of tails
-_TREE_WORDS = 2 * (_LEVELS + 1)
 
 #: Integers of the kind "medium" are below this in magnitude, so that sums of three fit.
 _MEDIUM = 1 << 29
-
-
-@dataclass(frozen=True)
-class Tree:
-    """A tree that was found to be sound, by :meth:`Functions.octree_levels`.
-
-    Attributes:
-        levels: where its levels begin, for the functions that follow.
-        singles, crowded: leaves with a lone splat, and with several.
-    """
-
-    levels: U64
-    singles: int
-    crowded: int
 
 
 class Functions:
@@ -63,6 +47,7 @@ class Functions:
 
     Attributes:
         quantising: those of the encoder that are about splats, and not about integers.
+        octree: those about positions.
 
     Raises:
         AttributeError: one is missing.
@@ -71,6 +56,7 @@ class Functions:
     def __init__(self, library: ctypes.CDLL) -> None:
         self._c = declared(library)
         self.quantising = Quantising(self._c)
+        self.octree = OctreeFunctions(self._c)
 
     def bundled_file(self, splats: int, sections: Mapping[int, SectionWords], steps: ColourSteps | None) -> BundledFile:
         """Sections of coder 4, as :class:`potr_cl.codec.native.bundles.BundledFile` takes them."""
@@ -296,88 +282,6 @@ class Functions:
             address(words, np.uint16, cells.size, True),
         )
         return words[cells.size - number :]
-
-    # ---------------------------------------------------------------------------------------------- octree
-
-    def octree_levels(self, occupancy: U8, several: U8, depth: int, crowded_root: bool) -> Tree | None:
-        """Check a tree; None if its streams contradict each other. ``depth`` is 0 to 52."""
-        levels = np.empty(_TREE_WORDS, np.uint64)
-        singles, crowded = ctypes.c_uint64(), ctypes.c_uint64()
-        wrong = self._c["potr_octree_levels"](
-            address(occupancy, np.uint8, len(occupancy)),
-            len(occupancy),
-            address(several, np.uint8, len(several)),
-            len(several),
-            depth,
-            crowded_root,
-            address(levels, np.uint64, _TREE_WORDS, True),
-            ctypes.byref(singles),
-            ctypes.byref(crowded),
-        )
-        return None if wrong else Tree(levels, singles.value, crowded.value)
-
-    def octree_tails(
-        self, occupancy: U8, several: U8, depth: int, tree: Tree, tail_lengths: U8, absolute: bool
-    ) -> U64 | None:
-        """(53,) leaves with a tail of each length; None if one leads below ``depth``."""
-        counts = np.empty(_LEVELS, np.uint64)
-        wrong = self._c["potr_octree_tails"](
-            address(occupancy, np.uint8, len(occupancy)),
-            len(occupancy),
-            address(several, np.uint8, len(several)),
-            depth,
-            address(tree.levels, np.uint64, _TREE_WORDS),
-            address(tail_lengths, np.uint8, tree.singles),
-            tree.singles,
-            tree.crowded,
-            absolute,
-            address(counts, np.uint64, _LEVELS, True),
-        )
-        return None if wrong else counts
-
-    def octree_centres(
-        self,
-        occupancy: U8,
-        several: U8,
-        depth: int,
-        tree: Tree,
-        tail_lengths: U8,
-        absolute: bool,
-        counts: U64,
-        multiplicities: U64,
-        tails: U8,
-        sides: F64,
-        origin: F64,
-        means: F32,
-    ) -> int:
-        """Centres of all splats into ``means`` (splats, 3).
-
-        Returns:
-            0; 1 if the padding of a plane of ``tails`` is not zero; 2 if there are not as many splats.
-        """
-        reach = np.cumsum(counts[::-1].astype(np.int64))[::-1][1:]
-        if len(tails) != int((3 * ((reach + 7) // 8)).sum()) or int(counts.sum()) != tree.singles:
-            raise TypeError("the native path was given tails of another size than their lengths ask for")
-        return int(
-            self._c["potr_octree_centres"](
-                address(occupancy, np.uint8, len(occupancy)),
-                len(occupancy),
-                address(several, np.uint8, len(several)),
-                depth,
-                address(tree.levels, np.uint64, _TREE_WORDS),
-                address(tail_lengths, np.uint8, tree.singles),
-                tree.singles,
-                tree.crowded,
-                absolute,
-                address(counts, np.uint64, _LEVELS),
-                address(multiplicities, np.uint64, tree.crowded),
-                address(tails, np.uint8, len(tails)),
-                address(sides, np.float64, depth + 1),
-                address(origin, np.float64, 3),
-                address(means, np.float32, 3 * len(means), True),
-                len(means),
-            )
-        )
 
     # ---------------------------------------------------------------------------------------------- values
 

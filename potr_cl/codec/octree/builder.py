@@ -1,10 +1,11 @@
-"""Centres to an octree's streams: :func:`build`."""
+"""Centres to an octree's streams: :func:`build`; or to the order of its leaves alone: :func:`leaf_order`."""
 
 from __future__ import annotations
 
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec.octree.morton import spread
 from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, U64, OctreeStreams
 
 #: Splats worked on at a time where each stands for itself: the temporaries of a block stay in the cache.
@@ -31,24 +32,9 @@ def build(
         The streams, and ``order`` (N,): the splats' indices in the order of the leaves.
     """
     n = len(means)
-    axes = [means[:, a].astype(np.float64) for a in range(3)]
-    low = [float(a.min()) for a in axes]
-    side = max(float(a.max()) - lo for a, lo in zip(axes, low, strict=True))
-
-    resolution = np.maximum(np.maximum(np.abs(axes[0]), np.abs(axes[1])), np.abs(axes[2])) * 2.0**-23
-    limit: F64 = np.maximum(tolerance, resolution)
-    depth = _depth_for(side, float(limit.min()))
-
-    # Coordinates in units of the deepest cells; the centre test below works with real distances, so that a rounding
-    # into the neighbouring cell cannot break the criterion.
-    cells = 2.0**depth
-    grid = [
-        np.minimum((axis - lo) * (cells / side if side > 0 else 0.0), cells - 1).astype(np.uint64)
-        for axis, lo in zip(axes, low, strict=True)
-    ]
-
+    axes, low, side, limit, depth, grid = _gridded(means, tolerance)
     words = _morton_words(grid, depth)
-    order = np.argsort(words[0], kind="stable") if len(words) == 1 else np.lexsort(words[::-1])
+    order = _depth_first(words)
     grid = [g[order] for g in grid]
     common = _common_levels([w[order] for w in words], depth)
     del words
@@ -87,6 +73,37 @@ def build(
     return streams, order
 
 
+def leaf_order(means: NDArray[np.float32], tolerance: F64 | float) -> NDArray[np.int64]:
+    """The order that :func:`build` returns, without the streams."""
+    *_, depth, grid = _gridded(means, tolerance)
+    return _depth_first(_morton_words(grid, depth))
+
+
+def _gridded(
+    means: NDArray[np.float32], tolerance: F64 | float
+) -> tuple[list[F64], list[float], float, F64, int, list[U64]]:
+    """Coordinates by axis; the cube's corner and side; tolerances; the deepest level, and coordinates in its cells.
+
+    The test of centres works with real distances, so that a rounding into the neighbouring cell cannot break it.
+    """
+    axes = [means[:, a].astype(np.float64) for a in range(3)]
+    low = [float(a.min()) for a in axes]
+    side = max(float(a.max()) - lo for a, lo in zip(axes, low, strict=True))
+    resolution = np.maximum(np.maximum(np.abs(axes[0]), np.abs(axes[1])), np.abs(axes[2])) * 2.0**-23
+    limit: F64 = np.maximum(tolerance, resolution)
+    depth = _depth_for(side, float(limit.min()))
+    cells = 2.0**depth
+    grid = [
+        np.minimum((axis - lo) * (cells / side if side > 0 else 0.0), cells - 1).astype(np.uint64)
+        for axis, lo in zip(axes, low, strict=True)
+    ]
+    return axes, low, side, limit, depth, grid
+
+
+def _depth_first(words: list[U64]) -> NDArray[np.int64]:
+    return np.argsort(words[0], kind="stable") if len(words) == 1 else np.lexsort(words[::-1])
+
+
 def _depth_for(side: float, tolerance: float) -> int:
     """The first level whose cells' half diagonal is below the tolerance (with a margin for rounding)."""
     half_diagonal = side * (np.sqrt(3) / 2)
@@ -116,22 +133,9 @@ def _morton_words(grid: list[U64], depth: int) -> list[U64]:
             bits = np.zeros(len(word[block]), np.uint64)
             for axis, g in enumerate(grid):
                 part = g[block] >> np.uint64(shift) if shift >= 0 else g[block] << np.uint64(-shift)
-                bits |= _spread(part & np.uint64(0x1FFFFF)) << np.uint64(axis)
+                bits |= spread(part & np.uint64(0x1FFFFF)) << np.uint64(axis)
             word[block] = bits
     return words
-
-
-def _spread(x: U64) -> U64:
-    """Move bit i to bit 3 i, for 21 bits."""
-    for shift, mask in (
-        (32, 0x1F00000000FFFF),
-        (16, 0x1F0000FF0000FF),
-        (8, 0x100F00F00F00F00F),
-        (4, 0x10C30C30C30C30C3),
-        (2, 0x1249249249249249),
-    ):
-        x = (x | (x << np.uint64(shift))) & np.uint64(mask)
-    return x
 
 
 def _common_levels(words: list[U64], depth: int) -> NDArray[np.int8]:

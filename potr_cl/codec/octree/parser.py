@@ -12,20 +12,25 @@ from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import native
 from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, OctreeStreams
 from potr_cl.errors import DataError
+from potr_cl.host.threads import Run
 
 _LARGEST_FLOAT32 = float(np.finfo(np.float32).max)
 #: Leaves worked on at a time where each stands for itself: the temporaries of a block stay in the cache.
 _BLOCK = 1 << 15
+#: Splats of a part that is worth a thread's while.
+_PART = 1 << 10
 
 Cells = NDArray[np.unsignedinteger]
 
 
-def parse(streams: OctreeStreams, splats: int) -> NDArray[np.float32]:
+def parse(streams: OctreeStreams, splats: int, run: Run = map, parts: int = 1) -> NDArray[np.float32]:
     """Leaf centres of a serialised octree.
 
     Args:
         streams: as :func:`build` made them, or as read from a file: nothing in them is trusted.
         splats: N, the number of splats that the streams must hold.
+        run: shares out the parts of the native path's work.
+        parts: at most so many.
 
     Returns:
         (N, 3) float32 centres, world units, in the order of the leaves.
@@ -35,7 +40,7 @@ def parse(streams: OctreeStreams, splats: int) -> NDArray[np.float32]:
     """
     functions = native()
     if functions is not None:
-        return _parse_natively(functions, streams, splats)
+        return _parse_natively(functions, streams, splats, run, parts)
     depth = streams.depth
     levels = _parse_tree(streams)
     singles = sum(level.singles for level in levels)
@@ -95,39 +100,36 @@ def parse(streams: OctreeStreams, splats: int) -> NDArray[np.float32]:
     return means
 
 
-def _parse_natively(functions: Functions, streams: OctreeStreams, splats: int) -> NDArray[np.float32]:
+def _parse_natively(
+    functions: Functions, streams: OctreeStreams, splats: int, run: Run, parts: int
+) -> NDArray[np.float32]:
     """:func:`parse` by the native path."""
-    occupancy, several, depth = streams.occupancy, streams.several, streams.depth
-    tree = functions.octree_levels(occupancy, several, _checked_depth(depth), _crowded_root(streams))
+    depth = _checked_depth(streams.depth)
+    tree = functions.octree.tree(streams.occupancy, streams.several, depth, _crowded_root(streams))
     if tree is None:
         raise _no_tree()
     _check_leaves(streams, tree.singles, tree.crowded, splats)
     if streams.absolute:
         _check_leaf_levels(streams)
-    counts = functions.octree_tails(occupancy, several, depth, tree, streams.tail_lengths, streams.absolute)
-    if counts is None:
-        raise _too_deep(depth)
-    _check_tail_size(np.cumsum(counts[::-1].astype(np.int64))[::-1], len(streams.tails))
-    means = np.empty((splats, 3), np.float32)
-    sides = np.ldexp(streams.side, -np.arange(depth + 1))
-    wrong = functions.octree_centres(
-        occupancy,
-        several,
-        depth,
+    walk = functions.octree.walk(
         tree,
         streams.tail_lengths,
         streams.absolute,
-        counts,
         streams.multiplicities,
-        streams.tails,
-        sides,
-        np.array(streams.origin, np.float64),
-        means,
+        splats,
+        max(1, min(parts, splats // _PART)),
     )
-    if wrong:
+    list(run(walk.leaves, range(walk.parts)))
+    counts = walk.counts
+    if counts is None:
+        raise _too_deep(depth)
+    _check_tail_size(np.cumsum(counts[::-1].astype(np.int64))[::-1], len(streams.tails))
+    if not walk.check_tails(streams.tails):
         raise _padded_wrongly()
-    _check_centres(streams, means)
-    return means
+    sides, origin = np.ldexp(streams.side, -np.arange(depth + 1)), np.array(streams.origin, np.float64)
+    list(run(lambda part: walk.centres(part, sides, origin), range(walk.parts)))
+    _check_centres(streams, walk.means)
+    return walk.means
 
 
 def _checked_depth(depth: int) -> int:

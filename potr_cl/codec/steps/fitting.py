@@ -61,12 +61,41 @@ def fit_steps(
     Returns:
         None where they would not pay, or nothing is known of the effects.
     """
-    n = len(effects)
-    h = np.asarray(effects, np.float64)
-    mean = float(np.add.reduce(h)) / max(n, 1)
+    return fit_steps_of_blocks([(scales, opacities, effects)], sf_opacity)[0]
+
+
+def fit_steps_of_blocks(
+    blocks: Sequence[tuple[Sequence[Levels], Levels, NDArray[np.floating]]], sf_opacity: float
+) -> list[ColourSteps | None]:
+    """The same for a scene in blocks, each with a rule of its own; equal effects have equal steps in all of them.
+
+    The mean squared error that the steps of all blocks add is that of steps that are the same for all.
+
+    Args:
+        blocks: scales, opacities and effects of each.
+        sf_opacity: scale factor of the opacities' logits.
+
+    Returns:
+        As :func:`fit_steps`, for each block.
+    """
+    n = sum(len(effects) for _, _, effects in blocks)
+    mean = sum(float(np.add.reduce(effects, dtype=np.float64)) for _, _, effects in blocks) / max(n, 1)
     if n < FEWEST or not 0 < mean < np.inf:
-        return None
-    h = h / mean
+        return [None] * len(blocks)
+    fitted = [
+        _fitted(scales, opacities, sf_opacity, np.asarray(effects, np.float64) / mean)
+        for scales, opacities, effects in blocks
+    ]
+    of_power = {power: _offset([(weights, h) for _, weights, h in fitted], power) for power in _POWERS}
+    offsets = (of_power[_POWERS[0]], of_power[_POWERS[1]])
+    return [replace(steps, offsets=offsets) for steps, _, _ in fitted]
+
+
+def _fitted(
+    scales: Sequence[Levels], opacities: Levels, sf_opacity: float, h: F64
+) -> tuple[ColourSteps, NDArray[np.int64], F64]:
+    """The rule of some splats but for its offsets, their weights, and their effects over the mean effect."""
+    n = len(h)
     spaces = KNOTS - 1
     knot_shift = max(int(np.ceil(np.log2(max(_LOGITS * sf_opacity / spaces, 1)))), 0)
     first_knot = min(int(_FIRST_LOGIT * sf_opacity) >> knot_shift, 255)
@@ -89,7 +118,7 @@ def fit_steps(
     weights = steps.weights(scales, opacities)
     steps = replace(steps, groups=_groups(raised * np.exp2(-weights / OCTAVE), _GROUP_BITS))
     weights += GROUP_UNIT * np.repeat(steps.groups.astype(np.int64), 1 << _GROUP_BITS)[:n]
-    return replace(steps, offsets=(_offset(weights, h, _POWERS[0]), _offset(weights, h, _POWERS[1])))
+    return steps, weights, h
 
 
 #: Of the rule's numbers: logarithms' factors are fractions.
@@ -152,9 +181,12 @@ def _groups(left: F64, bits: int) -> NDArray[np.int8]:
     return np.clip(np.rint(octaves * (OCTAVE / GROUP_UNIT)), -_MOST_OF_GROUP, _MOST_OF_GROUP).astype(np.int8)
 
 
-def _offset(weights: NDArray[np.int64], effects: F64, power: int) -> int:
+def _offset(blocks: Sequence[tuple[NDArray[np.int64], F64]], power: int) -> int:
     """What is added to weights times their power, for the error of equal steps: half a class, to round, and more."""
-    classes = weights * power / (1 << CLASS_SHIFT)
-    error = float(np.add.reduce(effects * np.exp2(-classes / 2))) / float(np.add.reduce(effects))
-    more = 2 * np.log2(error)
+    error = total = 0.0
+    for weights, effects in blocks:
+        classes = weights * power / (1 << CLASS_SHIFT)
+        error += float(np.add.reduce(effects * np.exp2(-classes / 2)))
+        total += float(np.add.reduce(effects))
+    more = 2 * np.log2(error / total)
     return int(np.clip(round((more + 0.5) * (1 << CLASS_SHIFT)), -32768, 32767))

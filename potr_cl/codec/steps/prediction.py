@@ -77,7 +77,7 @@ def from_residuals(residuals: I64, classes: I8) -> I64:
         by_class[k, :, 0] = _turned(table[index], runs)
     last = np.zeros((BEFORE, channels, runs), np.int64)
     total = np.zeros((channels, runs), np.int64)
-    for t in range(RUN):
+    for t in range(min(RUN, n)):
         level = laid[t]
         level += (total * by_class[1, t] + _HALF) >> _MEAN_SHIFT
         value = level * by_class[0, t]

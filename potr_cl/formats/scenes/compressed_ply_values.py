@@ -7,7 +7,8 @@ without the largest.
 
 from __future__ import annotations
 
-from dataclasses import dataclass, replace
+from collections.abc import Sequence
+from dataclasses import dataclass, fields, replace
 from typing import Any
 
 import numpy as np
@@ -47,6 +48,13 @@ class PackedGeometry:
     rotations: Words
     scales: Words
     opacities: U8
+
+    @staticmethod
+    def joined(parts: Sequence[PackedGeometry]) -> PackedGeometry:
+        """One of several, each of which but the last has whole chunks."""
+        return PackedGeometry(
+            *(np.concatenate([getattr(part, each.name) for part in parts]) for each in fields(PackedGeometry))
+        )
 
 
 def packed_geometry(scene: Scene) -> PackedGeometry:

@@ -8,7 +8,7 @@ import itertools
 import logging
 import os
 import stat
-from collections.abc import Iterator
+from collections.abc import Iterable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -114,20 +114,67 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
 
 def pieces(scene: Scene) -> Iterator[bytes | memoryview]:
     """The bytes of :func:`save`, to be written one after another; each is good until the next is asked for."""
-    rest = scene.sh.shape[1] - 1
-    names = ["x", "y", "z", *_NORMALS, *_property_names(rest * 3)[3:]]
-    end = len(names)
-    if scene.low_pass == MIP_SPLATTING_LOW_PASS:
-        names.append(FILTER_3D)
+    return pieces_of_parts([scene], len(scene))
+
+
+def save_parts(path: str | os.PathLike[str], parts: Iterable[Scene], splats: int) -> None:
+    """Write a scene that comes in parts, which need not be in memory together, as :func:`save` writes a whole one.
+
+    Args:
+        path: of the file to write.
+        parts: at least one, of the same SH degree and filter.
+        splats: of all parts together.
+
+    Raises:
+        As :func:`save`.
+        DataError: the parts do not belong together, or hold another number of splats.
+    """
+    with replacing(path) as file:
+        for piece in pieces_of_parts(parts, splats):
+            file.write(piece)
+
+
+def pieces_of_parts(parts: Iterable[Scene], splats: int) -> Iterator[bytes | memoryview]:
+    """The bytes of :func:`save_parts`, as those of :func:`pieces`.
+
+    Raises:
+        DataError: as :func:`save_parts`.
+    """
+    kind: tuple[int, bool, float] | None = None
+    left = splats
+    for part in parts:
+        its_kind = part.sh_degree, part.antialiased, part.low_pass
+        if kind is None:
+            kind = its_kind
+            names = _written_names(part)
+            yield _written_header(part, names, splats)
+        left -= len(part)
+        if its_kind != kind or left < 0:
+            raise DataError(f"the parts of the scene do not belong together, or hold more than {splats} splats")
+        yield from _rows(part, names)
+    if left:
+        raise DataError(f"the parts of the scene lack {left} of {splats} splats")
+
+
+def _written_names(scene: Scene) -> list[str]:
+    names = ["x", "y", "z", *_NORMALS, *_property_names((scene.sh.shape[1] - 1) * 3)[3:]]
+    return [*names, FILTER_3D] if scene.low_pass == MIP_SPLATTING_LOW_PASS else names
+
+
+def _written_header(scene: Scene, names: list[str], splats: int) -> bytes:
     header = ["ply", "format binary_little_endian 1.0"]
     if scene.antialiased:
         header.append(f"comment {ANTIALIASED_COMMENT}")
-    header.append(f"element vertex {len(scene)}")
+    header.append(f"element vertex {splats}")
     header += [f"property float {name}" for name in names]
-    header += ["end_header", ""]
+    return "\n".join([*header, "end_header", ""]).encode("ascii")
+
+
+def _rows(scene: Scene, names: list[str]) -> Iterator[memoryview]:
+    rest = scene.sh.shape[1] - 1
+    end = len(names) - (names[-1] == FILTER_3D)
     height = _BLOCK_BYTES // (4 * len(names))
     rows = np.zeros((min(height, len(scene)), len(names)), dtype="<f4")
-    yield "\n".join(header).encode("ascii")
     for start in range(0, len(scene), height):
         span = slice(start, min(start + height, len(scene)))
         block = rows[: span.stop - start]

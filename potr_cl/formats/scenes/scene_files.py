@@ -223,7 +223,7 @@ def arranged(scene: Scene) -> Scene:
 def arrangement(scene: Scene) -> NDArray[np.int64]:
     """(N,) the numbers of a scene's splats in an order that has neighbours together."""
     side = max(float(axis.max()) - float(axis.min()) for axis in scene.means.T)
-    return octree.build(scene.means, max(side * 2.0**-20, 1e-30))[1]
+    return octree.leaf_order(scene.means, max(side * 2.0**-20, 1e-30))
 
 
 def unit_quaternions(scene: Scene) -> Scene:

@@ -18,6 +18,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DataError
 from potr_cl.host.atomic_write import replacing
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
 
 U8 = NDArray[np.uint8]
@@ -132,17 +133,13 @@ def members(images: SogImages) -> Iterator[tuple[str, bytes]]:
     """
     width, height = _size(len(images))
 
-    def image(pixels: U8, columns: int = width, rows: int = height) -> bytes:
-        # The last pixel goes on to the end of the image: what is repeated takes the fewest bytes.
-        padded = np.empty((columns * rows, pixels.shape[1]), np.uint8)
-        padded[: len(pixels)], padded[len(pixels) :] = pixels, pixels[-1]
-        return _webp(padded.reshape(rows, columns, -1))
-
-    yield "means_l.webp", image((images.steps & 0xFF).astype(np.uint8))
-    yield "means_u.webp", image((images.steps >> 8).astype(np.uint8))
-    yield "quats.webp", image(images.quaternions)
-    yield "scales.webp", image(images.scales)
-    yield "sh0.webp", image(images.colours)
+    pictures: list[tuple[str, U8, int, int]] = [
+        ("means_l.webp", (images.steps & 0xFF).astype(np.uint8), width, height),
+        ("means_u.webp", (images.steps >> 8).astype(np.uint8), width, height),
+        ("quats.webp", images.quaternions, width, height),
+        ("scales.webp", images.scales, width, height),
+        ("sh0.webp", images.colours, width, height),
+    ]
     meta: dict[str, Any] = {
         "version": 2,
         "asset": {"generator": "potr_cl"},
@@ -160,16 +157,28 @@ def members(images: SogImages) -> Iterator[tuple[str, bytes]]:
     if palette is not None:
         entries, coefficients, _ = palette.entries.shape
         rows = -(-entries // PALETTE_COLUMNS)
-        yield "shN_centroids.webp", image(palette.entries.reshape(-1, 3), PALETTE_COLUMNS * coefficients, rows)
+        columns = PALETTE_COLUMNS * coefficients
+        pictures.append(("shN_centroids.webp", palette.entries.reshape(-1, 3), columns, rows))
         labels = np.zeros((len(images), 3), np.uint8)
         labels[:, 0], labels[:, 1] = palette.labels & 0xFF, palette.labels >> 8
-        yield "shN_labels.webp", image(labels)
+        pictures.append(("shN_labels.webp", labels, width, height))
         bands = math.isqrt(coefficients + 1) - 1
         meta["shN"] = {"count": entries, "bands": bands, "codebook": _book(palette.book)}
         named["shN"] = ["shN_centroids.webp", "shN_labels.webp"]
     for name, files in named.items():
         meta[name]["files"] = files
+    with thread_pool() as pool:
+        yield from pool.map(_image, pictures)
     yield DESCRIPTION, json.dumps(meta, separators=(",", ":")).encode()
+
+
+def _image(picture: tuple[str, U8, int, int]) -> tuple[str, bytes]:
+    """The name and the bytes of a picture: its pixels one after another, its columns and rows."""
+    name, pixels, columns, rows = picture
+    # The last pixel goes on to the end of the image: what is repeated takes the fewest bytes.
+    padded = np.empty((columns * rows, pixels.shape[1]), np.uint8)
+    padded[: len(pixels)], padded[len(pixels) :] = pixels, pixels[-1]
+    return name, _webp(padded.reshape(rows, columns, -1))
 
 
 def _size(splats: int) -> tuple[int, int]:

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import Run
 from potr_cl.model.placement.colour_memory import remembered
 from potr_cl.model.placement.matter import CROWDED, Frame, Matter, cell_of, surroundings
 from potr_cl.model.placement.sampling import F64, low_discrepancy, on_sphere
@@ -53,23 +54,25 @@ class Candidates:
     trained: bool
 
 
-def candidates_of(frame: Frame, matter: Matter, half_view: float) -> Candidates:
+def candidates_of(frame: Frame, matter: Matter, half_view: float, run: Run = map) -> Candidates:
     """All views from all places that are free; from the freest tenth if too few are.
 
     Args:
         frame, matter: of the scene.
         half_view: tan of half the field of view, both ways.
+        run: in place of :func:`map`, to work with several threads.
     """
     places, tangents = places_to_try(frame, half_view)
-    horizons, blocked = zip(*[surroundings(camera_centre, matter) for camera_centre in places], strict=True)
+    horizons, blocked = zip(*run(lambda place: surroundings(place, matter), places), strict=True)
     crowd = np.array(blocked)
     free = np.flatnonzero(crowd <= max(CROWDED, float(np.quantile(crowd, 0.1))))
-    views = [
-        views_from(places[place], tangents[place], tangents[place] / half_view, horizons[place], frame, matter)
-        for place in free
-    ]
+
+    def look(place: int) -> tuple[F64, F32, NDArray[np.uint8]]:
+        return views_from(places[place], tangents[place], tangents[place] / half_view, horizons[place], frame, matter)
+
+    views = list(run(look, free))
     worths = [worth for _, worth, _ in views]
-    memory = remembered(places[free], [np.maximum.reduce(worth) for worth in worths], matter)
+    memory = remembered(places[free], [np.maximum.reduce(worth) for worth in worths], matter, run)
     if memory is not None:
         plausible = np.clip((memory - _UNTRAINED) / (_TRAINED - _UNTRAINED), 0, 1)
         worths = [worth * part for worth, part in zip(worths, plausible.astype(np.float32), strict=True)]

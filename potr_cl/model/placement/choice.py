@@ -33,12 +33,14 @@ def pick(candidates: Candidates, count: int) -> list[int]:
 def _pick_among(views: NDArray[np.int64], candidates: Candidates, count: int, seen: F32) -> list[int]:
     """At most ``count`` of the views; notes in ``seen`` (K, bins) what they show."""
     targets = np.arange(len(seen))
+    flat, rows, new = seen.reshape(-1), targets * seen.shape[1], np.ones(len(seen), np.float32)
 
     def gain(view: int) -> float:
-        return float(candidates.worth[view] @ (1 / (1 + seen[targets, candidates.bins[view]])))
+        return float(candidates.worth[view] @ (1 / (1 + flat.take(rows + candidates.bins[view]))))
 
     # Gains only fall, so an old one bounds the new one from above.
-    heap = [(-gain(view), view) for view in views.tolist()]
+    first = gain if seen.any() else lambda view: float(candidates.worth[view] @ new)
+    heap = [(-first(view), view) for view in views.tolist()]
     heapq.heapify(heap)
     picked: list[int] = []
     while heap and len(picked) < count:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import Run
 from potr_cl.model.placement.matter import Matter
 from potr_cl.model.placement.sampling import F64
 from potr_cl.model.spherical_harmonics import energy
@@ -15,7 +16,7 @@ F32 = NDArray[np.float32]
 _INFORMATIVE = 100
 
 
-def remembered(places: F64, shown: list[F32], matter: Matter) -> F64 | None:
+def remembered(places: F64, shown: list[F32], matter: Matter, run: Run = map) -> F64 | None:
     """(places,) how well the colours of what one sees from a place remember a view from there; None: they cannot tell.
 
     It is the energy of the visible splats' colours towards the place, as a part of what the same splats have towards
@@ -26,11 +27,12 @@ def remembered(places: F64, shown: list[F32], matter: Matter) -> F64 | None:
         places: (P, 3) positions in the frame's units.
         shown: (K,) of each place, what can be seen of each target from there, 0 to 1.
         matter: of the scene.
+        run: in place of :func:`map`, to work with several threads.
     """
-    memory = ColourMemory(places, matter)
+    memory = ColourMemory(places, matter, run)
     if not memory.tells:
         return None
-    return np.array([memory.of(place, visible) for place, visible in zip(places, shown, strict=True)])
+    return np.array(list(run(lambda number: memory.of_known(number, shown[number]), range(len(places)))))
 
 
 class ColourMemory:
@@ -39,17 +41,18 @@ class ColourMemory:
     Args:
         places: (P, 3) positions in the frame's units.
         matter: of the scene.
+        run: in place of :func:`map`, to work with several threads.
 
     Attributes:
         tells: whether the colours can tell anything.
     """
 
-    def __init__(self, places: F64, matter: Matter) -> None:
+    def __init__(self, places: F64, matter: Matter, run: Run = map) -> None:
         self._matter = matter
         self._informative = matter.colours.any(axis=(1, 2))
         # A function of the first degree alone varies as much away from a view as towards it.
         self.tells = matter.colours.shape[1] >= 8 and np.count_nonzero(self._informative) >= _INFORMATIVE
-        self._energies = np.stack([self._energy(place) for place in places]) if self.tells else None
+        self._energies = np.stack(list(run(self._energy, places))) if self.tells else None
 
     def of(self, place: F64, shown: F32) -> float:
         """How well they remember a place, (3,), from where ``shown``, (K,), is seen; see :func:`remembered`."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import Run
 from potr_cl.model.placement.sampling import F64, low_discrepancy
 from potr_cl.model.placement.surface import points_on_splats
 from potr_cl.model.scene import Scene
@@ -68,11 +69,16 @@ class Matter:
     areas: F32
 
 
-def frame_of(scene: Scene) -> Frame:
-    """Medians, which neither floaters nor a far shell move."""
+def frame_of(scene: Scene, run: Run = map) -> Frame:
+    """Medians, which neither floaters nor a far shell move.
+
+    Args:
+        scene: at least one splat.
+        run: in place of :func:`map`, to work with several threads.
+    """
     means = scene.means.astype(np.float64)
     weights = np.where(scene.opacities > _OPAQUE, scene.opacities, 1e-6).astype(np.float64)
-    centre = np.array([_weighted_quantile(means[:, axis], weights, 0.5) for axis in range(3)])
+    centre = np.array(list(run(lambda axis: _weighted_quantile(axis, weights, 0.5), means.T)))
     offsets = means - centre
     distance = np.linalg.norm(offsets, axis=1)
     unit = _weighted_quantile(distance, weights, 0.5)

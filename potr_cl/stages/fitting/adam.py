@@ -10,10 +10,9 @@ from numpy.typing import NDArray
 
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.activation import LARGEST_SCALE, unit_quaternions
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
 from potr_cl.stages.fitting.derivatives import Columns
+from potr_cl.stages.fitting.parameters import Parameters
 
 #: How fast the moments forget (Kingma and Ba, 2015).
 _DECAY_MEAN, _DECAY_SQUARE = 0.9, 0.999
@@ -55,8 +54,8 @@ class Limits:
     opacity_logits: tuple[float, float]
 
 
-class Adam(Owner):
-    """The parameters of a scene on a device, and the moments of their gradient.
+class Adam(Parameters):
+    """The parameters of a scene, and the moments of their gradient.
 
     Args:
         device: to compute on.
@@ -73,20 +72,15 @@ class Adam(Owner):
     def __init__(
         self, device: Device, scene: Scene, buffers: SceneBuffers, columns: Columns, rates: Rates, limits: Limits
     ) -> None:
-        self._device, self._scene, self._buffers, self._columns = device, scene, buffers, columns
-        self._start = _columns_of(scene, columns, buffers.stride)
+        super().__init__(device, scene, buffers, columns)
         self._taken = 0
-        self._memory = Memory(device)
         try:
-            nbytes = self._start.nbytes
-            self._parameters = self._memory.upload(self._start, "the parameters")
-            self._kept = self._memory.upload(self._start, "the best parameters")
+            nbytes = self.values.size
             self._moments = [self._memory.allocate(nbytes, "the gradient's moments") for _ in range(2)]
             for moment in self._moments:
                 cl.enqueue_fill_buffer(device.queue, moment, np.float32(0), 0, nbytes)
             self._steps = self._memory.upload(_steps(columns, rates, limits), "the steps")
             self._step = device.shared_kernel("fit/adam.cl", "adam")
-            self._activate = device.shared_kernel("fit/adam.cl", "activate")
         except BaseException:
             self.close()
             raise
@@ -99,9 +93,9 @@ class Adam(Owner):
             part: of the rates that this step is long.
         """
         self._taken += 1
-        buffers, columns = self._buffers, self._columns
+        buffers, columns = self.buffers, self.columns
         self._step.bind(
-            parameters=self._parameters,
+            parameters=self.values,
             gradient=gradient,
             means=self._moments[0],
             squares=self._moments[1],
@@ -115,48 +109,7 @@ class Adam(Owner):
             debias_square=1 / (1 - _DECAY_SQUARE**self._taken),
         )
         self._step.launch((buffers.stride, columns.count), (SPLAT_GROUP, 1))
-        self._give()
-
-    def _give(self) -> None:
-        """Write the parameters to the rasterizer's buffers, as its projection takes them."""
-        buffers = self._buffers
-        self._activate.bind(
-            parameters=self._parameters,
-            splats=buffers.splats,
-            stride=buffers.stride,
-            sh_columns=self._columns.sh,
-            largest_scale=LARGEST_SCALE,
-            means=buffers.means,
-            scales=buffers.scales,
-            quaternions=buffers.quaternions,
-            log2_opacities=buffers.log2_opacities,
-            sh=buffers.sh,
-        )
-        self._activate.launch((buffers.stride,), (SPLAT_GROUP,))
-
-    def keep(self) -> None:
-        """Remember the parameters as they are, in place of what was remembered before."""
-        cl.enqueue_copy(self._device.queue, self._kept, self._parameters)
-
-    def kept(self) -> Scene:
-        """The scene as it was when :meth:`keep` was called last. Splats that have not moved are the same bit by bit."""
-        columns = self._columns
-        found = self._device.download(self._kept, self._start.shape, np.float32)
-        moved = np.flatnonzero((found != self._start)[:, : len(self._scene)].any(axis=0))
-        rows = found[:, moved].T
-        scene = self._scene
-        arrays = {}
-        for name in ("means", "log_scales", "quaternions", "opacity_logits"):
-            former = getattr(scene, name)
-            arrays[name] = former.copy()
-            arrays[name][moved] = rows[:, getattr(columns, name)].reshape(len(moved), *former.shape[1:])
-        sh = np.array(scene.sh, np.float32)
-        sh[moved] = rows[:, 11:].reshape(len(moved), *sh.shape[1:])
-        return Scene(**arrays, sh=sh, antialiased=scene.antialiased, low_pass=scene.low_pass)
-
-    def close(self) -> None:
-        """Give all device memory back."""
-        self._memory.close()
+        self.give()
 
 
 def _steps(columns: Columns, rates: Rates, limits: Limits) -> FloatArray:
@@ -167,15 +120,3 @@ def _steps(columns: Columns, rates: Rates, limits: Limits) -> FloatArray:
     steps[columns.log_scales, 1:3] = limits.log_scales
     steps[columns.opacity_logits, 1:3] = limits.opacity_logits
     return steps
-
-
-def _columns_of(scene: Scene, columns: Columns, stride: int) -> FloatArray:
-    """(columns, stride) the parameters of a scene; quaternions of length 1."""
-    result = np.zeros((columns.count, stride), np.float32)
-    some = slice(0, len(scene))
-    result[columns.means, some] = scene.means.T
-    result[columns.log_scales, some] = scene.log_scales.T
-    result[columns.quaternions, some] = unit_quaternions(scene.quaternions).T
-    result[columns.opacity_logits, some] = scene.opacity_logits
-    result[11:, some] = scene.sh.reshape(len(scene), -1).T
-    return result

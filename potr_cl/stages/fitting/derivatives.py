@@ -137,14 +137,14 @@ class PictureDerivatives(Owner):
             some = cameras[number : number + at_a_time]
             try:
                 views = self._prepared(some)
-                self._totals_for(views)
+                self._reserve(views)
             except DeviceMemoryError:
                 self._release()
                 if len(some) == 1:
                     raise
                 at_a_time = (len(some) + 1) // 2
                 continue
-            self._enqueue(views, some, target, pixels, given, unit)
+            self.add_prepared(views, target, pixels, given, unit)
             number += len(some)
             pixels += views.pixels
 
@@ -156,7 +156,7 @@ class PictureDerivatives(Owner):
             self._views = self.rasterizer.prepare_set(cameras)
         return self._views
 
-    def _totals_for(self, views: ViewSet) -> None:
+    def _reserve(self, views: ViewSet) -> None:
         if self._totals.reserve(_SUMS * views.stride * len(views.views)):
             # They become zero again whenever they have been used.
             cl.enqueue_fill_buffer(self._device.queue, self._totals.buffer, np.uint32(0), 0, self._totals.nbytes)
@@ -164,9 +164,21 @@ class PictureDerivatives(Owner):
         if self._factors.reserve(4 * len(views.views)):
             self._written = None
 
-    def _enqueue(
-        self, views: ViewSet, cameras: Sequence[Camera], target: cl.Buffer, first: int, given: bool, unit: float
+    def add_prepared(
+        self, views: ViewSet, target: cl.Buffer, first_pixel: int = 0, given: bool = False, unit: float = 1.0
     ) -> None:
+        """:meth:`add` views that the rasterizer has prepared since the parameters changed last.
+
+        Args:
+            views: as many as one launch can do.
+            target, given, unit: as of :meth:`add`.
+            first_pixel: where the views' pixels begin in ``target``.
+
+        Raises:
+            DeviceError: the sums do not fit the device, or the device failed.
+        """
+        self._reserve(views)
+        cameras = [view.camera for view in views.views]
         queue = self._device.queue
         scale = fixed_point_scale(max(c.width for c in cameras), max(c.height for c in cameras))
         factors = [REFERENCE_PIXELS / (c.width * c.height) / (scale * (1.0 if given else unit)) for c in cameras]
@@ -178,7 +190,7 @@ class PictureDerivatives(Owner):
                 views=views,
                 background=self.rasterizer.background,
                 target=target,
-                first_pixel=first,
+                first_pixel=first_pixel,
                 given=given,
                 unit=unit,
                 scale=scale,
@@ -199,6 +211,15 @@ class PictureDerivatives(Owner):
         )
         lanes = self._launcher.lanes
         self._chain.launch((parameters.stride // lanes,), (SPLAT_GROUP // lanes,))
+
+    def squared_error(self, views: ViewSet) -> float:
+        """The sum of v² over the pixels and channels of the views that were added last, which are these.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        sums = self._device.download(self._errors.buffer, (views.tiles,), np.float32)
+        return float(sums.sum(dtype=np.float64))
 
     def read(self) -> FloatArray:
         """(N, columns) float32, the gradient."""

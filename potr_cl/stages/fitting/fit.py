@@ -15,7 +15,7 @@ import logging
 import math
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, Protocol
 
 import numpy as np
 
@@ -94,6 +94,9 @@ class Fitted:
         steps: that were taken, and kept: of these, up to the round that is kept.
         errors: mean squared error of the held-out views before the first round, and after each.
         held_out: how many views these are.
+        ended_early: whether someone has asked it to end.
+        spared: how many splats were removed before it for it to make up for.
+        without: the error of these views before those were removed; None where none were.
     """
 
     scene: Scene
@@ -101,6 +104,14 @@ class Fitted:
     kept: int
     errors: tuple[float, ...]
     held_out: int
+    ended_early: bool = False
+    spared: int = 0
+    without: float | None = None
+
+    @property
+    def error(self) -> float:
+        """Of the held-out views, of the scene that is kept."""
+        return min(self.errors)
 
     @property
     def psnr(self) -> tuple[float, float]:
@@ -110,29 +121,25 @@ class Fitted:
     @property
     def facts(self) -> dict[str, Any]:
         """All but the scene, by name."""
-        return {"steps": self.steps, "kept": self.kept, "held_out": self.held_out, "errors": list(self.errors)}
+        names = ("steps", "kept", "held_out", "ended_early", "spared", "without")
+        return {name: getattr(self, name) for name in names} | {"errors": list(self.errors)}
 
     def __str__(self) -> str:
         before, after = self.psnr
         views = f"{self.held_out} view{'s' if self.held_out > 1 else ''} held out"
         steps = f"{self.kept} of {self.steps} steps are kept"
-        return f"{steps}: PSNR {before:.2f} dB before, {after:.2f} dB after, {views}"
+        if self.ended_early:
+            steps += ", interrupted"
+        said = f"{steps}: PSNR {before:.2f} dB before, {after:.2f} dB after, {views}"
+        if self.spared and self.without is not None:
+            said += f"; {_decibels(self.without):.2f} dB with {self.spared:,} splats more, without it"
+        return said
 
 
-@dataclass(frozen=True)
-class LeftOut:
-    """That a fit was left out, because there are too few views for any to be held out."""
+class SupportsBool(Protocol):
+    """What is true or false whenever it is looked at."""
 
-    @property
-    def facts(self) -> dict[str, Any]:
-        """None."""
-        return {}
-
-    def __str__(self) -> str:
-        return (
-            "the fit was left out: it needs two training views or more, because one of them is held out and tells "
-            "whether it helps"
-        )
+    def __bool__(self) -> bool: ...
 
 
 #: Called with the steps done, and their greatest number.
@@ -149,6 +156,7 @@ def fit_scene(
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: FitProgress | None = None,
     tell: Callable[[str], None] | None = None,
+    asked: SupportsBool = False,
 ) -> Fitted:
     """Fit all parameters of a scene to pictures of some views.
 
@@ -162,6 +170,7 @@ def fit_scene(
         background: R, G, B behind the scene.
         progress: called after each step.
         tell: called with a line for each round.
+        asked: whether to end before the next step, with the best of the whole rounds; looked at after each.
 
     Raises:
         UsageError: there are fewer than two given views, so that none can be held out.
@@ -183,7 +192,29 @@ def fit_scene(
         rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
         with Adam(device, scene, rasterizer.parameters, derivatives.columns, rates, _limits(scene)) as adam:
             fit = _Fit(options, derivatives, adam, pictures, judges, cameras)
-            return fit.run(fit_to, progress, tell or logger.debug)
+            return fit.run(fit_to, progress, tell or logger.debug, asked)
+
+
+def held_out_error(
+    device: Device,
+    scene: Scene,
+    cameras: Sequence[Camera],
+    targets: Targets,
+    added: int = 0,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> float:
+    """The mean squared error of a scene in the views that a fit to these views holds out: what it is judged by.
+
+    Args:
+        device, scene, cameras, targets, added, background: as of :func:`fit_scene`.
+    """
+    _, held_out = share_out(len(cameras) - added, added)
+    with (
+        Rasterizer(device, scene, background=background) as rasterizer,
+        TargetPictures(device, cameras, targets, 0) as pictures,
+    ):
+        views = [cameras[number] for number in held_out]
+        return _Judges(rasterizer, views, [pictures.download(number) for number in held_out]).error()
 
 
 class _Judges:
@@ -225,7 +256,9 @@ class _Fit:
         self._options, self._derivatives, self._adam = options, derivatives, adam
         self._pictures, self._judges, self._cameras = pictures, judges, cameras
 
-    def run(self, fit_to: Sequence[int], progress: FitProgress | None, tell: Callable[[str], None]) -> Fitted:
+    def run(
+        self, fit_to: Sequence[int], progress: FitProgress | None, tell: Callable[[str], None], asked: SupportsBool
+    ) -> Fitted:
         options = self._options
         errors = [self._judges.error()]
         pace = min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
@@ -235,11 +268,13 @@ class _Fit:
         for round_number in range(1, options.rounds + 1):
             end = options.steps * round_number // options.rounds
             unit = _unit(errors[-1])
-            while done < end:
+            while done < end and not asked:
                 self._step(next(order), unit, pace * slowing**done)
                 done += 1
                 if progress is not None:
                     progress(done, options.steps)
+            if done < end:
+                break
             errors.append(self._judges.error())
             now, first = _decibels(errors[-1]), _decibels(errors[0])
             tell(f"fit: {done} steps, held-out views {now:.2f} dB, {first:.2f} dB at first")
@@ -250,7 +285,7 @@ class _Fit:
                 since += 1
             if since >= options.patience:
                 break
-        return Fitted(self._adam.kept(), done, kept, tuple(errors), len(self._judges))
+        return Fitted(self._adam.kept(), done, kept, tuple(errors), len(self._judges), bool(asked))
 
     def _step(self, numbers: Sequence[int], unit: float, part: float) -> None:
         cameras = [self._cameras[number] for number in numbers]

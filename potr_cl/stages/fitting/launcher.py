@@ -1,4 +1,4 @@
-"""How a device sums the picture's derivatives over the pixels. :func:`launcher_for` chooses the way once."""
+"""How a device sweeps over pixels for derivatives of pictures. :func:`launcher_for` chooses the way once."""
 
 from __future__ import annotations
 
@@ -8,11 +8,11 @@ from potr_cl.opencl.device import Device
 from potr_cl.raster.rules import RasterRules
 from potr_cl.stages.fitting.launch_cpu import CpuLauncher
 from potr_cl.stages.fitting.launch_gpu import GpuLauncher
-from potr_cl.stages.fitting.pixel_sums import PixelSums
+from potr_cl.stages.fitting.pixel_sums import PixelSums, PixelTangents
 
 
 class Launcher(Protocol):
-    """Goes back from pixels to splats in one kernel family's way."""
+    """Goes from pixels back to splats, and from splats to pixels, in one kernel family's way."""
 
     @property
     def lanes(self) -> int:
@@ -29,6 +29,14 @@ class Launcher(Protocol):
 
         Raises:
             DeviceError: the device refused it.
+        """
+        ...
+
+    def tangents(self, tangents: PixelTangents) -> None:
+        """Enqueue the changes of some views' pixels.
+
+        Raises:
+            DeviceError: the device refused it, or the kernel cannot be built.
         """
         ...
 

@@ -1,4 +1,4 @@
-"""What both kernel families are told of the sums over pixels: :class:`PixelSums`, and macros of the kernels."""
+"""What both kernel families are told of a sweep over pixels: :class:`PixelSums`, its counterpart, and macros."""
 
 from __future__ import annotations
 
@@ -63,11 +63,49 @@ class PixelSums:
         }
 
 
-def macros(rules: RasterRules) -> dict[str, Any]:
-    """Macros that the kernels of both families need."""
-    return {
-        "ALPHA_CAP": float(rules.alpha_cap),
-        "TRANSMITTANCE_THRESHOLD": rules.transmittance_threshold,
-        "LARGEST_VALUE": LARGEST_VALUE,
-        "LARGEST_GAP": LARGEST_GAP,
-    }
+@dataclass(frozen=True)
+class PixelTangents:
+    """What both kernel families are told to composite.
+
+    Attributes:
+        views: prepared, with their geometry.
+        background: R, G, B behind the splats.
+        changes: (views, stride, 12) float32, as cl/fit/splat_tangents.cl says.
+        first_pixel: where these views' pixels begin in the result.
+        result: (pixels, 3) float32.
+    """
+
+    views: ViewSet
+    background: tuple[float, float, float]
+    changes: cl.Buffer
+    first_pixel: int
+    result: cl.Buffer
+
+    @property
+    def arguments(self) -> dict[str, Any]:
+        """The arguments that the kernels of both families have, by name."""
+        views = self.views
+        red, green, blue = self.background
+        return {
+            "shapes": views.shapes,
+            "colours": views.colours,
+            "changes": self.changes,
+            "offsets": views.offsets,
+            "intersections": views.intersections,
+            "subtiles": views.subtiles,
+            "red": red,
+            "green": green,
+            "blue": blue,
+            "first_pixel": self.first_pixel,
+            "result": self.result,
+        }
+
+
+def pixel_macros(rules: RasterRules) -> dict[str, Any]:
+    """Macros that all these kernels need."""
+    return {"ALPHA_CAP": float(rules.alpha_cap), "TRANSMITTANCE_THRESHOLD": rules.transmittance_threshold}
+
+
+def sums_macros(rules: RasterRules) -> dict[str, Any]:
+    """Macros that the kernels of the sums need, of both families."""
+    return pixel_macros(rules) | {"LARGEST_VALUE": LARGEST_VALUE, "LARGEST_GAP": LARGEST_GAP}

@@ -52,6 +52,10 @@ class Layout:
         """What the kernels must know of it when they are built."""
         return {"LANES": self.lanes, "SH_COUNT": self.sh_count}
 
+    def some(self, constant: bool) -> dict[str, int]:
+        """The same for kernels that look at all coefficients, or at the constant ones, whose columns come first."""
+        return {**self.macros, "SH_COUNT": 1} if constant else self.macros
+
     def over_splats(self, kernel: Kernel, *others: int) -> None:
         """Launch a bound kernel over all splats, and in the second dimension over ``others``."""
         group = max(_GROUP // self.lanes, 1)
@@ -215,6 +219,12 @@ class Coefficients(Owner):
             yield slice(first, min(first + _TURNED, self.layout.splats))
 
     # ------------------------------------------------------------------------------------------ which may change
+
+    def activate_constant(self) -> None:
+        """Say that the constant coefficients may change and no others."""
+        words = np.zeros((2, self.layout.stride), np.uint32)
+        words[0] = 0b111
+        self.restore_flags(words)
 
     def activate(self, active: NDArray[np.bool_] | None) -> None:
         """Say which coefficients may change.

@@ -73,10 +73,16 @@ class ColourMap(Owner):
         self._coefficients = coefficients
         self._background = background
         self._launcher = launcher
-        self._view_colours = device.shared_kernel("refit/view_colours.cl", "view_colours", **layout.macros)
-        self._gathers = [
-            device.shared_kernel("refit/gather.cl", "gather", WEIGHTS=weights, **layout.macros) for weights in (0, 1)
-        ]
+        self._view_colours = {
+            constant: device.shared_kernel("refit/view_colours.cl", "view_colours", **layout.some(constant))
+            for constant in (False, True)
+        }
+        self._gathers = {
+            (constant, weights): device.shared_kernel(
+                "refit/gather.cl", "gather", WEIGHTS=int(weights), **layout.some(constant)
+            )
+            for constant, weights in ((False, False), (False, True), (True, False))
+        }
         self.total_weight = 3 * REFERENCE_PIXELS * len(cameras)
         self._weights = [_weight(camera) for camera in cameras]
         self._fixed_points = self._launcher.fixed_point_scales(cameras)
@@ -110,7 +116,14 @@ class ColourMap(Owner):
 
     # ------------------------------------------------------------------------------------------ products
 
-    def gradient(self, x: cl.Buffer, targets: Targets, result: cl.Buffer, blocks: SplatBlocks | None = None) -> float:
+    def gradient(
+        self,
+        x: cl.Buffer,
+        targets: Targets,
+        result: cl.Buffer,
+        blocks: SplatBlocks | None = None,
+        constant: bool = False,
+    ) -> float:
         """result += Aᵀ W (pictures(x) - targets), half the gradient of the squared error at x.
 
         Colours that are cut at 0 at x are settled: they have no part in it.
@@ -120,6 +133,7 @@ class ColourMap(Owner):
             targets: what the pictures should show.
             result: a vector.
             blocks: the splats' own blocks of Aᵀ W A are added to them; cuts are left out of account there.
+            constant: leave the result's AC coefficients alone. Not together with blocks.
 
         Returns:
             The squared error |pictures(x) - targets|² by W.
@@ -131,20 +145,21 @@ class ColourMap(Owner):
         self._upload_scales(1.0)
         for numbers in self._views.launches:
             with self._views.ready(numbers) as (views, _):
-                self._enqueue_colours(views, x, views.colours, direction=False, unit=1.0)
+                self._enqueue_colours(views, x, views.colours, None)
                 pictures = self._targets.pictures(targets, numbers)
                 self._enqueue_sweep(numbers, views, views.colours, pictures, blocks is not None)
-                self._enqueue_gather(numbers, views, result, blocks)
+                self._enqueue_gather(numbers, views, result, blocks, constant)
                 error += self._error(numbers, views)
         return error
 
-    def normal(self, direction: cl.Buffer, at: cl.Buffer, result: cl.Buffer) -> None:
+    def normal(self, direction: cl.Buffer, at: cl.Buffer, result: cl.Buffer, constant: bool = False) -> None:
         """result += Aᵀ W A direction, nothing if the direction is 0 or not finite.
 
         Args:
             direction: a vector. It may be of any length: it is scaled so that the fixed point of the sums fits.
             at: the vector that :meth:`gradient` was given last, with the same content.
             result: another vector.
+            constant: the direction's AC coefficients are all 0, and those of the result are left alone.
 
         Raises:
             DeviceError: the device failed.
@@ -157,10 +172,10 @@ class ColourMap(Owner):
         for numbers in self._views.launches:
             with self._views.ready(numbers) as (views, anew):
                 if anew:  # which colours are cut is not known any more
-                    self._enqueue_colours(views, at, views.colours, direction=False, unit=1.0)
-                self._enqueue_colours(views, direction, self._change, direction=True, unit=unit)
+                    self._enqueue_colours(views, at, views.colours, None)
+                self._enqueue_colours(views, direction, self._change, unit, constant)
                 self._enqueue_sweep(numbers, views, self._change, None, False)
-                self._enqueue_gather(numbers, views, result, None)
+                self._enqueue_gather(numbers, views, result, None, constant)
 
     # ------------------------------------------------------------------------------------------ their parts
 
@@ -170,20 +185,23 @@ class ColourMap(Owner):
         scales = np.array([weight / (fixed_point * unit) for weight, fixed_point in pairs], np.float32)
         cl.enqueue_copy(self._device.queue, self._scales, scales, is_blocking=True)
 
-    def _enqueue_colours(self, views: ViewSet, x: cl.Buffer, result: cl.Buffer, direction: bool, unit: float) -> None:
-        """Enqueue the views' colours, or ``unit`` times those that a direction adds where none is cut at 0."""
-        self._view_colours.bind(
+    def _enqueue_colours(
+        self, views: ViewSet, x: cl.Buffer, result: cl.Buffer, unit: float | None, constant: bool = False
+    ) -> None:
+        """Enqueue the views' colours, or what ``unit`` times a direction adds to them where none is cut at 0."""
+        kernel = self._view_colours[constant]
+        kernel.bind(
             coefficients=x,
             means=self._means,
             stride=self._layout.stride,
             views=views.table,
             view_count=len(views.views),
-            direction=direction,
-            unit=np.float32(unit),
+            direction=unit is not None,
+            unit=np.float32(1.0 if unit is None else unit),
             free=views.colours,
             colours=result,
         )
-        self._layout.over_splats(self._view_colours, -(-len(views.views) // _COLOURED))
+        self._layout.over_splats(kernel, -(-len(views.views) // _COLOURED))
 
     def _enqueue_sweep(
         self, numbers: range, views: ViewSet, colours: cl.Buffer, target: cl.Buffer | None, weights: bool
@@ -201,9 +219,11 @@ class ColourMap(Owner):
             weights,
         )
 
-    def _enqueue_gather(self, numbers: range, views: ViewSet, result: cl.Buffer, blocks: SplatBlocks | None) -> None:
+    def _enqueue_gather(
+        self, numbers: range, views: ViewSet, result: cl.Buffer, blocks: SplatBlocks | None, constant: bool
+    ) -> None:
         """Enqueue the way from the views' sums to the coefficients, and to the blocks if the sums have their part."""
-        gather = self._gathers[blocks is not None]
+        gather = self._gathers[constant, blocks is not None]
         gather.bind(
             totals=self._totals,
             means=self._means,

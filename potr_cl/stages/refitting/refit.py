@@ -10,6 +10,7 @@ This is not in the paper, which solves for each splat alone.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
@@ -88,11 +89,14 @@ class Refitted:
         sh: (N, M, 3) float32 coefficients, R, G, B.
         errors: mean squared error over views, pixels and channels before, and after.
         steps: conjugate-gradient steps that were taken.
+        worst: mean squared error that a solution may have and still be one: that of its start, or what was left when
+            coefficients had been given up.
     """
 
     sh: FloatArray
     errors: tuple[float, float]
     steps: int
+    worst: float = math.inf
 
 
 def refit_colours(
@@ -134,18 +138,39 @@ def refit_colours(
             progress(done, steps + more)
 
     with ColourRefit(device, scene, cameras, background=background, memory=options.memory) as refit:
-        found = refit.solve(scene.sh, targets, options, active, progress=report)
-        fixed = found.sh if fix_ac is None else fix_ac(found.sh, refit)
-        if isinstance(fixed, ColourGrid):
-            return refit.rounded(fixed, found, targets, options)
-        if fixed is found.sh:
-            return found
-        constant = np.zeros(fixed.shape, bool)
-        constant[:, 0] = True
-        few = replace(options, drop=0.0, steps=_CONSTANT_STEPS)
-        again = refit.solve(fixed, targets, few, constant, hold=True, again=True)
-        again.sh[:, 1:] = fixed[:, 1:]  # they were rounded once more on their way through Y, Co, Cg
-        return Refitted(again.sh, (found.errors[0], again.errors[1]), found.steps + again.steps)
+
+        def solve(check: bool) -> Refitted:
+            return refit.solve(scene.sh, targets, options, active, progress=report, check=check)
+
+        if fix_ac is None:
+            return solve(check=True)
+        found = solve(check=False)
+        result, at_start = _with_ac_fixed(found, fix_ac, refit, targets, options)
+        # How good the solution was, the next one has measured at its start: that saves a sweep. Only if it looks bad is
+        # it measured by itself, because the rounding may be what was bad. Where many colours were cut at 0 on the way,
+        # it is the solution.
+        if not at_start <= found.worst and not refit.error(found.sh, targets) <= found.worst:
+            result, _ = _with_ac_fixed(solve(check=True), fix_ac, refit, targets, options)
+        return result
+
+
+def _with_ac_fixed(
+    found: Refitted,
+    fix_ac: Callable[[FloatArray, ColourRefit], FloatArray | ColourGrid],
+    refit: ColourRefit,
+    targets: Targets,
+    options: RefitOptions,
+) -> tuple[Refitted, float]:
+    """Round a solution's AC coefficients and solve for the constant ones; also the error between the two."""
+    fixed = fix_ac(found.sh, refit)
+    if isinstance(fixed, ColourGrid):
+        return refit.rounded(fixed, found, targets, options)
+    if fixed is found.sh:
+        error = refit.error(fixed, targets) if math.isnan(found.errors[1]) else found.errors[1]
+        return replace(found, errors=(found.errors[0], error)), error
+    again = refit.solve_constant(fixed, targets, replace(options, steps=_CONSTANT_STEPS))
+    again.sh[:, 1:] = fixed[:, 1:]  # they were rounded once more on their way through Y, Co, Cg
+    return Refitted(again.sh, (found.errors[0], again.errors[1]), found.steps + again.steps), again.errors[0]
 
 
 class ColourRefit(Owner):
@@ -198,7 +223,7 @@ class ColourRefit(Owner):
         active: NDArray[np.bool_] | None = None,
         hold: bool = False,
         progress: Callable[[int, int], None] | None = None,
-        again: bool = False,
+        check: bool = True,
     ) -> Refitted:
         """Re-fit the active coefficients, after choosing among them if the options say so.
 
@@ -209,7 +234,8 @@ class ColourRefit(Owner):
             active: (N, M, 3) in Y, Co, Cg: the coefficients that may change; all by default.
             hold: whether the other coefficients keep their values; if not, they become 0.
             progress: called with the steps done and their greatest number.
-            again: whether the solution before was for nearly the same colours: it saves some work.
+            check: measure the error of the solution, and keep the start if that was better; if not, that error is not a
+                number.
 
         Raises:
             DeviceError: the device failed.
@@ -228,10 +254,30 @@ class ColourRefit(Owner):
             if progress is not None:
                 progress(steps, total)
 
-        solved = solver.solve(self.colour_map, targets, descent, selection, after_step, again)
+        solved = solver.solve(self.colour_map, targets, descent, selection, after_step, check=check)
+        worst = max(solved.errors[0], solved.start)
+        return Refitted(coefficients.read_sh(solver.x), solved.errors, solved.steps, worst)
+
+    def solve_constant(self, sh: FloatArray, targets: Targets, options: RefitOptions) -> Refitted:
+        """Re-fit the constant coefficients alone, after :meth:`solve` for nearly the same colours.
+
+        Args:
+            sh: (N, M, 3) R, G, B, the start; AC coefficients stay.
+            targets, options: as :meth:`solve` takes them; none are given up.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        coefficients, solver = self.coefficients, self._solver
+        coefficients.write_sh(solver.x, sh)
+        coefficients.activate_constant()
+        descent = Descent(options.steps, options.gain, Ridge(options.lam, options.chroma_factor, options.prior))
+        solved = solver.solve(self.colour_map, targets, descent, constant=True)
         return Refitted(coefficients.read_sh(solver.x), solved.errors, solved.steps)
 
-    def rounded(self, grid: ColourGrid, found: Refitted, targets: Targets, options: RefitOptions) -> Refitted:
+    def rounded(
+        self, grid: ColourGrid, found: Refitted, targets: Targets, options: RefitOptions
+    ) -> tuple[Refitted, float]:
         """The last solution as a file can hold it, but for the last constant coefficients.
 
         Args:
@@ -239,21 +285,35 @@ class ColourRefit(Owner):
             found: the last solution, nothing having been solved since.
             targets, options: that it was solved with.
 
+        Returns:
+            That, and the mean squared error after the first round of rounding.
+
         Raises:
             DeviceError: the device failed.
         """
-        solver, steps = self._solver, found.steps
+        solver, steps, errors = self._solver, found.steps, []
         ridge = Ridge(options.lam, options.chroma_factor, options.prior)
         worth = _WORTH * options.drop * self.colour_map.total_weight
         with Rounding(self.coefficients, grid) as rounding:
             *first, last = ROUNDS
             for each in first:
                 rounding.round(solver.x, solver.blocks, each, worth)
-                steps += solver.step_on(self.colour_map, targets, Descent(each.steps, 0.0, ridge))
+                gone_on = solver.go_on(self.colour_map, targets, Descent(each.steps, 0.0, ridge))
+                steps += gone_on.steps
+                errors.append(gone_on.start)
             rounding.round(solver.x, solver.blocks, last, worth)
-            solved = solver.solve(self.colour_map, targets, Descent(last.steps, 0.0, ridge), known=True)
+            solved = solver.solve(self.colour_map, targets, Descent(last.steps, 0.0, ridge), constant=True)
         sh = self.coefficients.read_sh(solver.x)
-        return Refitted(sh, (found.errors[0], solved.errors[1]), steps + solved.steps)
+        return Refitted(sh, (found.errors[0], solved.errors[1]), steps + solved.steps), errors[0]
+
+    def error(self, sh: FloatArray, targets: Targets) -> float:
+        """Mean squared error of the pictures with colours (N, M, 3) R, G, B.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        self.coefficients.write_sh(self._solver.x, sh)
+        return self._solver.error(self.colour_map, targets)
 
     def worth(self) -> FloatArray:
         """(N, M) float32: by how much the mean squared error grows for an error of 1 in a coefficient of one channel.

@@ -13,6 +13,7 @@ less than a given squared error, and solves again for the rest.
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
@@ -65,36 +66,43 @@ class Solved:
     Attributes:
         errors: mean squared error over views, pixels and channels before, and after.
         steps: conjugate-gradient steps that were taken and kept.
+        start: mean squared error where the last of them began, after the choice.
     """
 
     errors: tuple[float, float]
     steps: int
+    start: float
 
 
 @dataclass(frozen=True)
 class _Problem:
-    """The map, and the pictures to come near to."""
+    """The map, the pictures to come near to, and whether DC alone may change."""
 
     colour_map: ColourMap
     targets: Targets
+    constant: bool
 
 
 @dataclass(frozen=True)
 class _NormalEquations:
-    """The matrix Aᵀ W A + ridge of the conjugate gradients; colours are cut at 0 as they are ``at`` a vector."""
+    """The matrix Aᵀ W A + ridge of the conjugate gradients; colours are cut at 0 as they are ``at`` a vector.
+
+    With ``constant``, only DC may change.
+    """
 
     colour_map: ColourMap
     coefficients: Coefficients
     blocks: SplatBlocks
     ridge: Ridge
     at: cl.Buffer
+    constant: bool
 
     def precondition(self, residual: cl.Buffer, result: cl.Buffer) -> None:
         self.blocks.precondition(residual, self.ridge, result)
 
     def product(self, direction: cl.Buffer, result: cl.Buffer) -> None:
         self.coefficients.zero(result)
-        self.colour_map.normal(direction, self.at, result)
+        self.colour_map.normal(direction, self.at, result, self.constant)
         self.coefficients.add_ridge(result, direction, self.ridge)
 
 
@@ -133,7 +141,8 @@ class ColourSolver(Owner):
         descent: Descent,
         selection: Selection | None = None,
         after_step: Callable[[int], None] = lambda steps: None,
-        known: bool = False,
+        constant: bool = False,
+        check: bool = True,
     ) -> Solved:
         """Solve for the active coefficients, after choosing among them if there is to be a choice.
 
@@ -143,40 +152,56 @@ class ColourSolver(Owner):
             descent: to the solution.
             selection: what comes first.
             after_step: called with the number of steps done.
-            known: whether the splats' blocks are taken from the solution before, of nearly the same colours: they are
-                only what the steps are preconditioned with.
+            constant: the constant coefficients alone are active. The splats' blocks are then those of the solution
+                before, of nearly the same colours: they are only what the steps are preconditioned with.
+            check: measure the true error of the result, and go back if the start was better. If not, the error after
+                the solution is not a number.
 
         Raises:
             DeviceError: the device failed.
         """
-        problem = _Problem(colour_map, targets)
-        if not known:
+        problem = _Problem(colour_map, targets, constant)
+        if not constant:
             self.blocks.zero()
         self._coefficients.copy(self._start, self.x)
         ridge = (selection.descent if selection else descent).ridge
-        first = self._linearise(problem, ridge, None if known else self.blocks)
+        first = self._linearise(problem, ridge, None if constant else self.blocks)
         state, steps = first, 0
         if selection is not None:
             state, steps = self._choose(problem, first, selection, descent.ridge, after_step)
         more = self._descend(problem, state, descent, lambda done: after_step(steps + done))
+        whole = colour_map.total_weight
+        start = state.error / whole
+        if not check:
+            return Solved((first.error / whole, math.nan), steps + more, start)
         last = self._halve_until_better(problem, state, descent.ridge)
         if last is None:
             last, more = state, 0
-        whole = colour_map.total_weight
-        return Solved((first.error / whole, last.error / whole), steps + more)
+        return Solved((first.error / whole, last.error / whole), steps + more, start)
 
-    def step_on(self, colour_map: ColourMap, targets: Targets, descent: Descent) -> int:
-        """Go on from where x is, a few steps that nobody checks, with the blocks of the solution before.
-
-        Returns:
-            Conjugate-gradient steps that were taken.
+    def error(self, colour_map: ColourMap, targets: Targets) -> float:
+        """Mean squared error at ``x``.
 
         Raises:
             DeviceError: the device failed.
         """
-        problem = _Problem(colour_map, targets)
+        self._coefficients.zero(self._residual)
+        return colour_map.gradient(self.x, targets, self._residual) / colour_map.total_weight
+
+    def go_on(self, colour_map: ColourMap, targets: Targets, descent: Descent) -> Solved:
+        """Go on from where x is, some steps that nobody checks, with the blocks of the solution before.
+
+        Returns:
+            What it did; the error after it is not a number.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        problem = _Problem(colour_map, targets, constant=False)
         state = self._start_here(problem, descent.ridge)
-        return self._descend(problem, state, descent, lambda done: None)
+        steps = self._descend(problem, state, descent, lambda done: None)
+        start = state.error / colour_map.total_weight
+        return Solved((start, math.nan), steps, start)
 
     def _linearise(self, problem: _Problem, ridge: Ridge, blocks: SplatBlocks | None = None) -> _State:
         """Settle which colours are cut, and make the residual: minus half the objective's gradient at x."""
@@ -184,7 +209,7 @@ class ColourSolver(Owner):
         change, pulled = self._gradients.direction, self._gradients.product
         shrinking = replace(ridge, prior=0.0)
         vectors.zero(residual)
-        error = problem.colour_map.gradient(self.x, problem.targets, residual, blocks)
+        error = problem.colour_map.gradient(self.x, problem.targets, residual, blocks, problem.constant)
         vectors.add_ridge(residual, self.x, shrinking)
         vectors.zero(pulled)
         vectors.add_ridge(pulled, self.x, shrinking)
@@ -197,7 +222,9 @@ class ColourSolver(Owner):
 
     def _descend(self, problem: _Problem, state: _State, how: Descent, after_step: Callable[[int], None]) -> int:
         """Take conjugate-gradient steps from where x was linearised; returns their number."""
-        equations = _NormalEquations(problem.colour_map, self._coefficients, self.blocks, how.ridge, at=self._start)
+        equations = _NormalEquations(
+            problem.colour_map, self._coefficients, self.blocks, how.ridge, at=self._start, constant=problem.constant
+        )
         return self._gradients.descend(
             equations, self.x, self._residual, state.objective, how.steps, how.gain, after_step
         )

@@ -18,6 +18,7 @@ from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.reference.scenes import random_scene
 from tools.stress.hostile import (
+    blocked_files,
     camera_files,
     picture_files,
     ply_files,
@@ -77,6 +78,14 @@ def _equal_splats(version: int) -> Files:
     alike = random_scene(1, 0).subset(np.zeros(400_000, np.int64))
     parameters = dataclasses.replace(HyperParameters.from_quality(0.5, "best"), version=version)
     return {"a.potr": b"".join(code_scene(alike, parameters).pieces)}
+
+
+def _blocks(blocks: int, own: int = 65_536, **claims: Any) -> Files:
+    """A file of equal blocks, each a leaf of its own splats; ``claims`` replace what its header says."""
+    body = _potr(own, 0, _one_leaf(own), version=3)["a.potr"]
+    table = [blocked_files.Block((-9.0,) * 3 + (9.0,) * 3, own, body)] * blocks
+    file = blocked_files.File(4, 0, blocks * own, 0, bytes(3), 0, b"", table)
+    return {"a.potr": dataclasses.replace(file, **claims).bytes()}
 
 
 def _long_description(coder: int) -> Files:
@@ -297,6 +306,12 @@ BOMBS: dict[str, dict[str, Callable[[], Files]]] = {
         "1.3 million cells above 32,768 splats": _all_cells,
         "the most splats that are let through": _as_much_as_is_let_through(1),
         "the most splats, 8 planes each": _as_much_as_is_let_through(8),
+    },
+    "potr-blocks": {
+        "2³² - 1 blocks claimed": lambda: _blocks(1, count=(1 << 32) - 1),
+        "2⁶³ splats claimed": lambda: _blocks(1, splats=1 << 63),
+        "1,000 blocks of 65,536 splats": lambda: _blocks(1000),
+        "a block of 10 million splats": lambda: _blocks(1, 10_000_000),
     },
     "ply": {
         "2³¹ splats claimed, binary": lambda: _ply_count("binary_little_endian", 1 << 31),

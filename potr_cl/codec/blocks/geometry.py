@@ -1,0 +1,134 @@
+"""The quantised geometry of a scene in blocks: :class:`GeometryOfBlocks`, made by :func:`quantise`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from dataclasses import dataclass, replace
+from functools import cached_property
+from typing import TypeAlias
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec import quantize
+from potr_cl.codec.blocks.splitting import MOST_WHOLE, blocks_of
+from potr_cl.codec.geometry import Geometry, distances_to_views, quantise_geometry, quantise_in_world_units
+from potr_cl.codec.steps.fitting import fit_steps_of_blocks
+from potr_cl.codec.versions import VERSIONS
+from potr_cl.host.threads import Run
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray, Scene
+
+#: Blocks that are quantised side by side: each takes some hundred bytes a splat meanwhile.
+_SIDE_BY_SIDE = 4
+
+
+@dataclass(frozen=True)
+class GeometryOfBlocks:
+    """A scene's quantised geometry, block by block; what it offers is that of :class:`Geometry`.
+
+    Attributes:
+        asked: the parameters that it was quantised with.
+        parameters: those in world units, the same for all blocks.
+        rows: the numbers in the scene of each block's splats, ascending.
+        blocks: each block's geometry; its order is one of the block's splats.
+    """
+
+    asked: quantize.HyperParameters
+    parameters: quantize.HyperParameters
+    rows: tuple[NDArray[np.int64], ...]
+    blocks: tuple[Geometry, ...]
+
+    @cached_property
+    def order(self) -> NDArray[np.int64]:
+        """(N,) index in the scene of each splat of the file."""
+        return np.concatenate([rows[block.order] for rows, block in zip(self.rows, self.blocks, strict=True)])
+
+    def decoded(self, sh: FloatArray) -> Scene:
+        """See :meth:`Geometry.decoded`."""
+        n = sum(map(len, self.rows))
+        first = self.blocks[0]
+        scene = Scene(
+            np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty((n, 4), np.float32),
+            np.empty(n, np.float32), sh, first.antialiased, first.low_pass,
+        )  # fmt: skip
+        for rows, block in zip(self.rows, self.blocks, strict=True):
+            part = block.decoded(_colourless(len(rows)))
+            scene.means[rows], scene.log_scales[rows] = part.means, part.log_scales
+            scene.quaternions[rows], scene.opacity_logits[rows] = part.quaternions, part.opacity_logits
+        return scene
+
+    def colour_classes(self) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+        """See :meth:`Geometry.colour_classes`."""
+        found = [block.colour_classes() for block in self.blocks]
+        return np.concatenate([dc for dc, _ in found]), np.concatenate([ac for _, ac in found])
+
+    def with_steps(self, effects: NDArray[np.floating]) -> GeometryOfBlocks:
+        """See :meth:`Geometry.with_steps`."""
+        own = [
+            (block.scales, block.opacities, effects[rows[block.order]])
+            for rows, block in zip(self.rows, self.blocks, strict=True)
+        ]
+        steps = fit_steps_of_blocks(own, self.parameters.sf_opacity)
+        blocks = tuple(replace(block, steps=each) for block, each in zip(self.blocks, steps, strict=True))
+        return replace(self, blocks=blocks)
+
+    def with_colour_steps(self, parameters: quantize.HyperParameters) -> GeometryOfBlocks:
+        """See :meth:`Geometry.with_colour_steps`."""
+        blocks = tuple(block.with_colour_steps(parameters) for block in self.blocks)
+        return replace(self, asked=parameters, parameters=blocks[0].parameters, blocks=blocks)
+
+
+#: A scene's quantised geometry, as one piece or in blocks.
+AnyGeometry: TypeAlias = Geometry | GeometryOfBlocks
+
+
+def quantise(
+    scene: Scene,
+    parameters: quantize.HyperParameters,
+    views: Sequence[Camera],
+    run: Run = map,
+    rows: Sequence[NDArray[np.int64]] | None = None,
+) -> AnyGeometry:
+    """Quantise a scene's geometry, in blocks if it has many splats.
+
+    What a splat's values are rounded to does not depend on the blocks, but for its centre, which lies in the octree of
+    its block.
+
+    Args:
+        scene, parameters, views, run: as of :func:`potr_cl.codec.geometry.quantise_geometry`.
+        rows: of the blocks; None: as :func:`potr_cl.codec.blocks.splitting.blocks_of` has it, if there are many splats.
+
+    Raises:
+        As :func:`potr_cl.codec.geometry.quantise_geometry`.
+    """
+    if rows is None and in_blocks(len(scene), parameters):
+        rows = blocks_of(scene.means)
+    if rows is None:
+        return quantise_geometry(scene, parameters, views, run)
+    nearest = distances_to_views(scene.means, views, run)
+    world = VERSIONS[parameters.version].in_world_units(parameters, scene, nearest)
+
+    def quantised(own: NDArray[np.int64]) -> Geometry:
+        return quantise_in_world_units(_without_colours(scene, own), parameters, world, nearest[own])
+
+    blocks: list[Geometry] = []
+    for start in range(0, len(rows), _SIDE_BY_SIDE):
+        blocks += run(quantised, rows[start : start + _SIDE_BY_SIDE])
+    return GeometryOfBlocks(parameters, world, tuple(rows), tuple(blocks))
+
+
+def in_blocks(splats: int, parameters: quantize.HyperParameters) -> bool:
+    """Whether a scene of so many splats is cut into blocks."""
+    return VERSIONS[parameters.version].in_blocks and splats > MOST_WHOLE
+
+
+def _without_colours(scene: Scene, rows: NDArray[np.int64]) -> Scene:
+    return Scene(
+        scene.means[rows], scene.log_scales[rows], scene.quaternions[rows], scene.opacity_logits[rows],
+        _colourless(len(rows)), scene.antialiased, scene.low_pass,
+    )  # fmt: skip
+
+
+def _colourless(splats: int) -> FloatArray:
+    return np.broadcast_to(np.float32(0), (splats, 1, 3))

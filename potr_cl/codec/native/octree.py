@@ -1,0 +1,222 @@
+"""Octrees by C: :class:`OctreeFunctions` finds a tree sound, :class:`Walk` finds its leaves' centres, part by part.
+
+C trusts what it is told: that is made here, of arrays whose sizes are checked.
+"""
+
+from __future__ import annotations
+
+import ctypes
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.native.arrays import address
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+U8 = NDArray[np.uint8]
+U64 = NDArray[np.uint64]
+
+_LEVELS = 53  # of an octree, and lengths of tails
+_TREE_WORDS = 2 * (_LEVELS + 1)
+#: Coordinates of cells of trees that are deeper do not fit 32 bits.
+_DEEPEST_NARROW = 32
+
+
+@dataclass(frozen=True)
+class Tree:
+    """A tree that was found to be sound, by :meth:`OctreeFunctions.tree`.
+
+    Attributes:
+        occupancy, several: its streams.
+        depth: 0 to 52.
+        levels: where its levels begin.
+        singles, crowded: leaves with a lone splat, and with several.
+    """
+
+    occupancy: U8
+    several: U8
+    depth: int
+    levels: U64
+    singles: int
+    crowded: int
+
+
+class OctreeFunctions:
+    """What the library offers for octrees.
+
+    Args:
+        functions: of the library.
+    """
+
+    def __init__(self, functions: Mapping[str, Any]) -> None:
+        self._c = functions
+
+    def tree(self, occupancy: U8, several: U8, depth: int, crowded_root: bool) -> Tree | None:
+        """Check a tree; None if its streams contradict each other. ``depth`` is 0 to 52."""
+        levels = np.empty(_TREE_WORDS, np.uint64)
+        singles, crowded = ctypes.c_uint64(), ctypes.c_uint64()
+        wrong = self._c["potr_octree_levels"](
+            address(occupancy, np.uint8, len(occupancy)),
+            len(occupancy),
+            address(several, np.uint8, len(several)),
+            len(several),
+            depth,
+            crowded_root,
+            address(levels, np.uint64, _TREE_WORDS, True),
+            ctypes.byref(singles),
+            ctypes.byref(crowded),
+        )
+        return None if wrong else Tree(occupancy, several, depth, levels, singles.value, crowded.value)
+
+    def walk(self, tree: Tree, tail_lengths: U8, absolute: bool, multiplicities: U64, splats: int, parts: int) -> Walk:
+        """A walk through a tree's leaves, see :class:`Walk`."""
+        return Walk(self._c, tree, tail_lengths, absolute, multiplicities, splats, parts)
+
+
+class _Leaves(ctypes.Structure):
+    _fields_ = tuple((name, ctypes.c_void_p) for name in ("means", "cells", "levels", "tails"))
+
+
+class Walk:
+    """The leaves of a tree in depth-first order, in parts that threads share out.
+
+    First :meth:`leaves` of each part, in any order, then :meth:`check_tails`, then :meth:`centres` of each part.
+
+    Args:
+        functions: of the library.
+        tree: sound.
+        tail_lengths: one a leaf with a lone splat.
+        absolute: as of :class:`potr_cl.codec.octree.OctreeStreams`.
+        multiplicities: of the other leaves; with these there are ``splats``, N.
+        splats: N.
+        parts: at most so many.
+
+    Attributes:
+        parts: how many there are.
+        means: (N, 3) float32, filled once all is done.
+
+    Raises:
+        TypeError: there are not as many splats, or arrays have wrong sizes.
+    """
+
+    def __init__(
+        self,
+        functions: Mapping[str, Any],
+        tree: Tree,
+        tail_lengths: U8,
+        absolute: bool,
+        multiplicities: U64,
+        splats: int,
+        parts: int,
+    ) -> None:
+        self._c, self._tree, self._absolute = functions, tree, absolute
+        self._tail_lengths, self._multiplicities = tail_lengths, multiplicities
+        self._size = functions["potr_octree_cut"]()
+        self._cuts = np.empty((parts + 1) * self._size // 8, np.uint64)
+        self._lengths_at = address(tail_lengths, np.uint8, tree.singles)
+        self._multiplicities_at = address(multiplicities, np.uint64, tree.crowded)
+        self._occupancy_at = address(tree.occupancy, np.uint8, len(tree.occupancy))
+        self._several_at = address(tree.several, np.uint8, len(tree.several))
+        self._cuts_at = address(self._cuts, np.uint64, len(self._cuts), True)
+        self.parts: int = functions["potr_octree_cuts"](
+            self._occupancy_at,
+            len(tree.occupancy),
+            self._several_at,
+            tree.depth,
+            address(tree.levels, np.uint64, _TREE_WORDS),
+            tree.singles,
+            tree.crowded,
+            self._multiplicities_at,
+            splats,
+            parts,
+            self._cuts_at,
+        )
+        if not self.parts:
+            raise TypeError("the native path was given a tree of another number of splats")
+        self.means = np.empty((splats, 3), np.float32)
+        self._cells = np.empty((splats, 3), np.uint64) if tree.depth > _DEEPEST_NARROW else None
+        self._shapes = np.empty((2, splats), np.uint8)
+        shapes = address(self._shapes, np.uint8, 2 * splats, True)
+        self._leaves = _Leaves(
+            address(self.means, np.float32, 3 * splats, True),
+            None if self._cells is None else address(self._cells, np.uint64, 3 * splats, True),
+            shapes,
+            shapes + splats,
+        )
+        self._counts = np.zeros((self.parts, _LEVELS), np.uint64)
+        self._deep = np.zeros(self.parts, bool)
+        self._tails: U8 | None = None
+
+    def leaves(self, part: int) -> None:
+        """Find a part's leaves."""
+        cuts = self._cuts_of(part)
+        self._deep[part] = self._c["potr_octree_leaves"](
+            self._occupancy_at,
+            self._several_at,
+            self._tree.depth,
+            *cuts,
+            self._lengths_at,
+            self._absolute,
+            self._multiplicities_at,
+            ctypes.byref(self._leaves),
+            address(self._counts[part], np.uint64, _LEVELS, True),
+        )
+
+    @property
+    def counts(self) -> U64 | None:
+        """(53,) leaves with a tail of each length, once all leaves are found; None if one leads below the depth."""
+        return None if self._deep.any() else self._counts.sum(axis=0, dtype=np.uint64)
+
+    def check_tails(self, tails: U8) -> bool:
+        """Whether the padding of the planes of ``tails``, the bytes that :attr:`counts` ask for, is zero.
+
+        Raises:
+            TypeError: these are another number of bytes, or leaves are still to be found.
+        """
+        counts = self.counts
+        reach = np.cumsum((np.zeros(_LEVELS, np.uint64) if counts is None else counts)[::-1].astype(np.int64))[::-1]
+        if counts is None or reach[0] != self._tree.singles or len(tails) != int((3 * ((reach[1:] + 7) // 8)).sum()):
+            raise TypeError("the native path was given tails of another size than their lengths ask for")
+        self._all_counts = counts
+        # Leaves with a tail of each length come after all that have longer ones, and after those of the parts before.
+        self._ranks = (reach - counts.astype(np.int64)).astype(np.uint64) + np.cumsum(
+            self._counts, axis=0, dtype=np.uint64
+        )
+        self._ranks -= self._counts
+        self._tails_at = address(tails, np.uint8, len(tails))
+        self._tails = tails
+        return not self._c["potr_octree_padding"](address(counts, np.uint64, _LEVELS), self._tails_at)
+
+    def centres(self, part: int, sides: F64, origin: F64) -> None:
+        """A part of :attr:`means`.
+
+        Args:
+            part: which.
+            sides: (depth + 1,) edges of the cells of each level.
+            origin: (3,).
+
+        Raises:
+            TypeError: tails are still to be checked.
+        """
+        if self._tails is None:
+            raise TypeError("the native path was asked for centres before their tails were checked")
+        self._c["potr_octree_centres"](
+            *self._cuts_of(part),
+            address(self._all_counts, np.uint64, _LEVELS),
+            address(self._ranks[part], np.uint64, _LEVELS),
+            self._multiplicities_at,
+            self._tails_at,
+            address(sides, np.float64, self._tree.depth + 1),
+            address(origin, np.float64, 3),
+            ctypes.byref(self._leaves),
+        )
+
+    def _cuts_of(self, part: int) -> tuple[int, int]:
+        """Where a part begins and ends."""
+        if not 0 <= part < self.parts:
+            raise TypeError("the native path was asked for a part that is not there")
+        return self._cuts_at + part * self._size, self._cuts_at + (part + 1) * self._size

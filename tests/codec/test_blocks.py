@@ -1,0 +1,387 @@
+"""Files of blocks: what is in them, what is read of them, and files of them that lie."""
+
+from __future__ import annotations
+
+import json
+import os
+import struct
+import threading
+import tracemalloc
+import zlib
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+import potr_cl
+from potr_cl import cli
+from potr_cl.codec.blocks import geometry as blocks_geometry
+from potr_cl.codec.blocks import splitting
+from potr_cl.codec.blocks.encoder import code_blocks
+from potr_cl.codec.blocks.file import BlockedFile
+from potr_cl.codec.blocks.geometry import GeometryOfBlocks, quantise
+from potr_cl.codec.blocks.splitting import blocks_of
+from potr_cl.codec.container import EntropyCoder
+from potr_cl.codec.decoder import PotrFile, decode, open_file
+from potr_cl.codec.encoder import Coded, code_scene
+from potr_cl.codec.geometry import quantise_geometry
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.errors import DataError, UsageError
+from potr_cl.formats.scenes import ply
+from potr_cl.model.scene import Scene
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from tests.oracles.decoder import decode as decode_independently
+
+ARRAYS = ("means", "log_scales", "quaternions", "opacity_logits", "sh")
+BEST = HyperParameters.from_quality(0.5, "best")
+HEADER, ENTRY = struct.Struct("<8sHHIQQB3sIII"), struct.Struct("<6fQQII")
+
+
+def in_blocks(scene: Scene, most: int, effects=None, threads: int = 0, **options) -> Coded:
+    geometry = quantise(scene, BEST, ring_of_cameras(4), rows=blocks_of(scene.means, most))
+    assert isinstance(geometry, GeometryOfBlocks)
+    if effects is not None:
+        geometry = geometry.with_steps(effects)
+    return code_blocks(scene, geometry, b'{"q":0.5}', threads=threads, **options)
+
+
+def effects_of(scene: Scene) -> np.ndarray:
+    return np.exp(np.random.default_rng(3).normal(size=len(scene)))
+
+
+@pytest.fixture(scope="module")
+def scene() -> Scene:
+    return random_scene(3000, 2, seed=4)
+
+
+@pytest.fixture(scope="module")
+def data(scene) -> bytes:
+    return b"".join(in_blocks(scene, 800, effects_of(scene)).pieces)
+
+
+def same(one: Scene, other: Scene) -> bool:
+    return all(np.array_equal(getattr(one, name), getattr(other, name)) for name in ARRAYS)
+
+
+# What is in them -----------------------------------------------------------------------------------------------------
+
+
+def test_values_are_those_of_one_piece(scene):
+    """But for centres, each block's octree being its own, within the tolerance of both."""
+    apart, whole = in_blocks(scene, 800), code_scene(scene, BEST, ring_of_cameras(4))
+    a, b = decode(b"".join(apart.pieces)), decode(b"".join(whole.pieces))
+    back_a, back_b = np.argsort(apart.order), np.argsort(whole.order)
+    assert sorted(apart.order) == list(range(len(scene)))
+    for name in ARRAYS[1:]:
+        assert np.array_equal(getattr(a, name)[back_a], getattr(b, name)[back_b]), name
+    error_a = np.linalg.norm(a.means[back_a] - scene.means, axis=1)
+    error_b = np.linalg.norm(b.means[back_b] - scene.means, axis=1)
+    assert np.sqrt((error_a**2).mean()) < 1.2 * np.sqrt((error_b**2).mean())
+
+
+@pytest.mark.parametrize("entropy", ["context", "zstd"])
+def test_the_number_of_threads_changes_nothing(scene, entropy):
+    coded = [in_blocks(scene, 400, effects_of(scene), n, entropy=EntropyCoder(entropy, 3)).pieces for n in (1, 16)]
+    assert b"".join(coded[0]) == b"".join(coded[1])
+    files = [open_file(b"".join(pieces)) for pieces in coded]
+    assert same(files[0].scene(threads=1), files[1].scene(threads=16))
+
+
+def test_the_independent_decoder_agrees(data):
+    scene, independent = decode(data), decode_independently(data)
+    assert np.array_equal(scene.means, independent["means"].astype(np.float32))
+    assert np.allclose(np.exp(scene.log_scales), independent["scales"], rtol=1e-5)
+    assert np.allclose(scene.opacities, independent["opacities"], atol=1e-6)
+    assert np.allclose(scene.sh, independent["sh"], rtol=1e-6, atol=1e-6)
+    assert independent["metadata"] == open_file(data).metadata == {"q": 0.5}
+
+
+def test_equal_effects_have_equal_steps_in_all_blocks():
+    """Where little shows, steps are coarser, though all splats of that block show little; the error is shared out."""
+    scene = random_scene(4000, 0, seed=6)
+    left = scene.means[:, 0] < np.median(scene.means[:, 0])
+    effects = np.where(left, 100.0, 1.0) * effects_of(scene)
+    rows = (np.flatnonzero(left), np.flatnonzero(~left))
+    geometry = quantise(scene, BEST, [], rows=rows)
+    whole = quantise_geometry(scene, BEST, []).with_steps(effects)
+    assert isinstance(geometry, GeometryOfBlocks)
+    dc, _ = geometry.with_steps(effects).colour_classes()
+    found, wanted = np.empty(len(scene)), np.empty(len(scene))
+    found[geometry.order], wanted[whole.order] = dc, whole.colour_classes()[0]
+    assert found[left].mean() - found[~left].mean() > 5
+    assert abs(found[left].mean() - wanted[left].mean()) < 2
+    assert abs(found[~left].mean() - wanted[~left].mean()) < 2
+
+
+def test_blocks_are_neighbours_and_all_are_taken():
+    means = np.random.default_rng(0).normal(size=(5000, 3)).astype(np.float32)
+    means[7] = 1e30
+    blocks = blocks_of(means, 700)
+    assert len(blocks) == 8
+    assert max(map(len, blocks)) <= 700
+    assert np.array_equal(np.sort(np.concatenate(blocks)), np.arange(5000))
+    volumes = [np.prod(means[rows[rows != 7]].std(axis=0)) for rows in blocks]
+    assert np.mean(volumes) < 0.4 * np.prod(np.delete(means, 7, axis=0).std(axis=0))
+    everywhere_the_same = blocks_of(np.zeros((100, 3), np.float32), 40)
+    assert [len(rows) for rows in everywhere_the_same] == [33, 33, 34]
+
+
+def test_many_splats_are_written_in_blocks(monkeypatch, plush_excerpt, plush_excerpt_cameras):
+    """By a whole encode, of so many splats that are left; few stay what they were, byte for byte."""
+    options = EncodeOptions.for_preset("best", between=False)
+    few = encode(plush_excerpt, plush_excerpt_cameras, options)
+    assert few.data[8] == 3
+    monkeypatch.setattr(blocks_geometry, "MOST_WHOLE", 300)
+    monkeypatch.setattr(splitting.blocks_of, "__defaults__", (256,))
+    many = encode(plush_excerpt, plush_excerpt_cameras, options)
+    file = open_file(many.data)
+    assert isinstance(file, BlockedFile)
+    assert len(file.table.blocks) == -(-len(many.order) // 256)
+    assert file.metadata["source_splats"] == len(plush_excerpt)
+    assert abs(len(many.order) - len(few.order)) <= 2
+    assert many.refitted is not None
+    assert many.refitted.errors[1] < 1.1 * few.refitted.errors[1]
+    assert same(many.scene, decode(many.data))
+    in_place = plush_excerpt.subset(many.order).means - many.scene.means
+    assert np.abs(in_place).max() < 0.02
+
+
+@pytest.mark.slow
+def test_they_cost_next_to_nothing():
+    scene = random_scene(200_000, 3, seed=9)
+    whole = code_scene(scene, BEST, ring_of_cameras(4))
+    assert in_blocks(scene, 100_000).nbytes < 1.005 * whole.nbytes
+
+
+# What is read of them ------------------------------------------------------------------------------------------------
+
+
+def spoilt_but(data: bytes, spare: list[int]) -> bytes:
+    changed = bytearray(data)
+    for number, block in enumerate(open_file(data).table.blocks):
+        if number not in spare:
+            changed[block.offset + 2000 : block.offset + block.nbytes] = bytes(block.nbytes - 2000)
+    return bytes(changed)
+
+
+def test_blocks_decode_alone(data, tmp_path):
+    whole, table = decode(data), open_file(data).table
+    for number, block in enumerate(table.blocks):
+        file = tmp_path / "a.potr"
+        file.write_bytes(spoilt_but(data, [number]))
+        opened = open_file(file)
+        assert same(opened.part(number), whole.subset(np.arange(block.first, block.first + block.splats)))
+    with pytest.raises(DataError, match=r"a.potr': block \d is damaged"):
+        decode(file)
+
+
+def test_a_box_reads_only_what_it_meets(data):
+    whole, table = decode(data), open_file(data).table
+    middle = np.median(whole.means[: table.blocks[0].splats], axis=0).tolist()
+    box = [*(x - 0.5 for x in middle), *(x + 0.5 for x in middle)]
+    met = open_file(data).numbers(potr_cl.model.box.Box.of(box))
+    assert 0 < len(met) < len(table.blocks)
+    found = potr_cl.decode(spoilt_but(data, met), box=box)
+    inside = ((whole.means >= box[:3]) & (whole.means <= box[3:])).all(axis=1)
+    assert 0 < len(found) < len(whole)
+    assert same(found, whole.subset(np.flatnonzero(inside)))
+
+
+@pytest.mark.parametrize("kind", ["blocks", "one piece"])
+def test_a_box_of_any_file(kind, scene, data, tmp_path):
+    data = data if kind == "blocks" else b"".join(code_scene(scene, BEST).pieces)
+    (tmp_path / "a.potr").write_bytes(data)
+    whole, box = decode(data), ["-0.5", "-90", "0", "0.25", "90", "2"]
+    command = ["decode", str(tmp_path / "a.potr"), "-o", str(tmp_path / "a.ply"), "--box", *box]
+    assert cli.main(command) == 0
+    found = ply.load(tmp_path / "a.ply")
+    numbers = np.float32(box)
+    inside = ((whole.means >= numbers[:3]) & (whole.means <= numbers[3:])).all(axis=1)
+    assert same(found, whole.subset(np.flatnonzero(inside)))
+
+
+@pytest.mark.parametrize(
+    "box", [[90, 90, 90, 91, 91, 91], [1, 0, 0, 0, 1, 1], [0, 0, 0, 1, 1], [0, 0, 0, 1, 1, float("nan")]]
+)
+def test_boxes_that_are_refused(box, data, scene):
+    for file in (data, b"".join(code_scene(scene, BEST).pieces)):
+        with pytest.raises(UsageError, match="box"):
+            potr_cl.decode(file, box=box)
+
+
+@pytest.mark.parametrize("degree", range(4))
+def test_a_lower_degree(degree, data):
+    whole, part = decode(data), decode(data, sh_degree=degree)
+    assert np.array_equal(part.sh, whole.sh[:, : (min(degree, 2) + 1) ** 2])
+    assert np.array_equal(part.means, whole.means)
+    with pytest.raises(UsageError, match="SH degree 4"):
+        decode(data, sh_degree=4)
+
+
+@pytest.mark.skipif(not hasattr(os, "mkfifo"), reason="there are no named pipes")
+def test_from_a_pipe(data, tmp_path):
+    os.mkfifo(tmp_path / "pipe")
+    writer = threading.Thread(target=(tmp_path / "pipe").write_bytes, args=(data,))
+    writer.start()
+    assert same(decode(tmp_path / "pipe"), decode(data))
+    writer.join()
+
+
+def test_info_lists_the_blocks(data, tmp_path, capsys):
+    (tmp_path / "a.potr").write_bytes(data)
+    found = potr_cl.info(tmp_path / "a.potr")
+    assert [block["splats"] for block in found["blocks"]] == [750] * 4
+    assert found["splats"] == 3000
+    assert sum(entry["bytes"] for entry in found["sections"].values()) == len(data)
+    json.dumps(found.facts)
+    assert cli.main(["info", str(tmp_path / "a.potr")]) == 0
+    out = capsys.readouterr().out
+    assert "blocks          4, of 750 to 750 splats" in out
+
+
+def test_a_file_that_gets_shorter_while_it_is_open(data, tmp_path):
+    path = tmp_path / "a.potr"
+    path.write_bytes(data)
+    file = open_file(path)
+    path.write_bytes(data[: len(data) // 2])
+    with pytest.raises(DataError, match="block"):
+        file.scene()
+    path.unlink()
+    with pytest.raises(UsageError, match="cannot read"):
+        file.scene()
+
+
+# Files that lie ------------------------------------------------------------------------------------------------------
+
+
+def relabelled(data: bytes, block: int | None = None, **fields) -> bytes:
+    """With other numbers in the header, or in a block's entry, and the checksum made right."""
+    head = list(HEADER.unpack_from(data))
+    names = ["magic", "version", "flags", "size", "whole", "splats", "degree", "zeros", "count", "metadata", "reserved"]
+    if block is None:
+        for name, value in fields.items():
+            head[names.index(name)] = value
+        data = HEADER.pack(*head) + data[HEADER.size :]
+    else:
+        at = HEADER.size + ENTRY.size * block
+        entry = list(ENTRY.unpack_from(data, at))
+        names = ["x0", "y0", "z0", "x1", "y1", "z1", "splats", "nbytes", "crc", "zero"]
+        for name, value in fields.items():
+            entry[names.index(name)] = value
+        data = data[:at] + ENTRY.pack(*entry) + data[at + ENTRY.size :]
+    size = open_size(data)
+    return data[: size - 4] + struct.pack("<I", zlib.crc32(data[: size - 4])) + data[size:]
+
+
+def open_size(data: bytes) -> int:
+    return min(int.from_bytes(data[12:16], "little"), len(data))
+
+
+LIES = {
+    "no block": ((None, {"count": 0}), "its size does not fit"),
+    "countless blocks": ((None, {"count": 2**32 - 1}), "its size does not fit"),
+    "countless splats": ((None, {"splats": 2**63}), "not all of its splats"),
+    "one more splat": ((None, {"splats": 3001}), "not all of its splats"),
+    "one splat less": ((None, {"splats": 2999}), "more than the file has"),
+    "degree": ((None, {"degree": 4}), "makes no sense"),
+    "another degree": ((None, {"degree": 1}), "block 0 is not what the table says"),
+    "flags": ((None, {"flags": 2}), "unknown"),
+    "antialiased": ((None, {"flags": 1}), "block 0 is not what the table says"),
+    "reserved": ((None, {"reserved": 1}), "unknown"),
+    "zeros": ((None, {"zeros": b"\0\0\1"}), "unknown"),
+    "file size": ((None, {"whole": 10}), "followed by something else"),
+    "header of gigabytes": ((None, {"size": 2**32 - 1}), "does not fit|truncated"),
+    "splats of a block": ((1, {"splats": 2**62}), "more than the file has"),
+    "no splat": ((1, {"splats": 0}), "claims 0 splats"),
+    "bytes of a block": ((1, {"nbytes": 2**63}), "more than the file has"),
+    "too few bytes": ((1, {"nbytes": 10}), "do not fill the file"),
+    "checksum": ((1, {"crc": 1}), "block 1 is damaged"),
+    "an entry's zero": ((1, {"zero": 1}), "makes no sense"),
+    "NaN": ((1, {"x0": float("nan")}), "makes no sense"),
+    "infinity": ((1, {"x1": float("inf")}), "makes no sense"),
+    "inside out": ((1, {"x0": 9.0, "x1": 8.0}), "makes no sense"),
+    "another box": ((1, {"x0": 8.0, "x1": 9.0}), "block 1 holds centres outside of its box"),
+}
+
+
+@pytest.mark.parametrize("lie", LIES)
+def test_lies_are_found(lie, data):
+    (block, fields), message = LIES[lie]
+    lying = relabelled(data, block, **fields)
+    with pytest.raises(DataError, match=message):
+        decode(lying)
+    with pytest.raises(ValueError, match=r"."):
+        decode_independently(lying)
+
+
+def test_a_table_that_promises_more_than_its_blocks_have(data):
+    """Before memory is taken for it: all that the table promises would pass for real in a file of this size."""
+    blocks = open_file(data).table.blocks
+    more = 60_000
+    lying = relabelled(relabelled(data, 0, splats=blocks[0].splats + more), splats=3000 + more)
+    assert isinstance(open_file(lying), BlockedFile)
+    tracemalloc.start()
+    with pytest.raises(DataError, match="block 0 is not what the table says"):
+        decode(lying)
+    assert tracemalloc.get_traced_memory()[1] < 1 << 20
+    tracemalloc.stop()
+
+
+def test_a_bomb_in_the_table(data):
+    lying = relabelled(relabelled(data, 3, splats=1 << 40), splats=2250 + (1 << 40))
+    with pytest.raises(DataError, match="--trust"):
+        decode(lying)
+    with pytest.raises(DataError, match="block 3 is not what the table says"):
+        decode(lying, trust=True)
+
+
+def assembled_of(bodies: list[bytes], splats: list[int], degree: int = 2) -> bytes:
+    size = HEADER.size + ENTRY.size * len(bodies) + 4
+    head = HEADER.pack(
+        b"POTR\r\n\x1a\n", 4, 0, size, size + sum(map(len, bodies)), sum(splats), degree, bytes(3), len(bodies), 0, 0
+    )
+    for body, own in zip(bodies, splats, strict=True):
+        head += ENTRY.pack(*(-1e9,) * 3, *(1e9,) * 3, own, len(body), zlib.crc32(body), 0)
+    return head + struct.pack("<I", zlib.crc32(head)) + b"".join(bodies)
+
+
+def test_blocks_are_of_version_3(data, scene):
+    """No block is a file of blocks: there is no going round in circles."""
+    one = b"".join(code_scene(scene, BEST).pieces)
+    assert len(decode(assembled_of([one, one], [3000, 3000]))) == 6000
+    old = b"".join(code_scene(scene, HyperParameters.from_quality(0.5)).pieces)
+    for body, said in ((data, "a file of blocks stands where"), (old, "format version 1, which no block may be of")):
+        for lying in (assembled_of([body], [3000]), assembled_of([one, body], [3000, 3000])):
+            with pytest.raises(DataError, match=said):
+                decode(lying)
+            with pytest.raises(ValueError, match=r"."):
+                decode_independently(lying)
+
+
+def test_single_bytes_changed(data):
+    """Every byte is covered by a checksum: none can be changed unseen."""
+    rng = np.random.default_rng(1)
+    for at in [*range(0, HEADER.size), *rng.integers(HEADER.size, len(data), 200)]:
+        changed = bytearray(data)
+        changed[at] ^= 1 << rng.integers(8)
+        with pytest.raises(DataError):
+            decode(bytes(changed))
+
+
+@pytest.mark.parametrize("left", [0, 7, 8, 30, 47, 48, 100, 250, 1000, -1])
+def test_truncated(left, data, tmp_path):
+    (tmp_path / "a.potr").write_bytes(data[:left])
+    with pytest.raises(DataError):
+        decode(data[:left])
+    with pytest.raises(DataError, match=r"a\.potr"):
+        decode(tmp_path / "a.potr")
+
+
+def test_one_piece_is_asked_for(data, tmp_path):
+    Path(tmp_path / "a.potr").write_bytes(data)
+    with pytest.raises(DataError, match="a file of blocks"):
+        PotrFile.open(tmp_path / "a.potr")
+    with pytest.raises(DataError, match="a file of blocks"):
+        PotrFile.from_bytes(data)
