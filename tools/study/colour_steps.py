@@ -26,7 +26,7 @@ from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.geometry import quantise_geometry
 from potr_cl.codec.quantize import HyperParameters, to_ycocg
 from potr_cl.model.camera import Camera, test_views, train_views
-from potr_cl.model.scene import FloatArray
+from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.pipeline.encode import Run, Stopwatch
@@ -115,15 +115,24 @@ def measure(
     state: State, q: float, options: EncodeOptions, device: Device, views: Sequence[Camera]
 ) -> list[dict[str, Any]]:
     """Bytes and PSNR of every way at one quality."""
-    refit = options.stage(Refit)
     figures = []
     chosen = EvaluationViews(list(views), "test", len(views))
     with Evaluator(device, state.source, chosen, (0.0, 0.0, 0.0)) as evaluator:
         for way in WAYS:
-            how = RefitOptions(steps=refit.steps, drop=options.parameters.drop)
-            data = coded(state, way, options.parameters, q, device, how)
+            data = coded(state, way, options.parameters, q, device, refit_options(options))
             figures.append({"way": way.name, "q": q, "bytes": len(data), "psnr": evaluator.psnr(decode(data))})
     return figures
+
+
+def pruned_state(scene: Scene, views: Sequence[Camera], options: EncodeOptions, device: Device) -> State:
+    """What the stages before the re-fit leave."""
+    first = [type(stage) for stage in options.stages if not isinstance(stage, Refit | Code)]
+    return Run(options, Stopwatch(), device).stages(State.of(scene, views), first)
+
+
+def refit_options(options: EncodeOptions) -> RefitOptions:
+    """How an encode with these options re-fits."""
+    return RefitOptions(steps=options.stage(Refit).steps, drop=options.parameters.drop)
 
 
 def _measure(args: argparse.Namespace) -> None:
@@ -134,8 +143,7 @@ def _measure(args: argparse.Namespace) -> None:
         results["scenes"][folder.resolve().name] = figures = []
         for q in args.qualities:
             options = EncodeOptions.for_preset("best", q=q)
-            first = [type(stage) for stage in options.stages if not isinstance(stage, Refit | Code)]
-            state = Run(options, Stopwatch(), device).stages(State.of(scene, train_views(cameras)), first)
+            state = pruned_state(scene, train_views(cameras), options, device)
             figures += measure(state, q, options, device, test_views(cameras)[:: args.every])
             write_json(args.json, results)
 

@@ -120,11 +120,15 @@ def test_ablation(monkeypatch, folder, tmp_path, capsys):
     call(monkeypatch, ablation, "measure", folder, "--json", out)
     steps = json.loads(out.read_text())["scenes"]["excerpt"]["steps"]
     sizes = [step["bytes"] for step in steps]
-    assert len(steps) == 7
-    assert sizes == sorted(sizes, reverse=True), "a part of the codec adds bytes"
+    assert len(steps) == 12
+    assert sizes[:6] == sorted(sizes[:6], reverse=True), "a part of the codec adds bytes"
+    assert sizes[-1] < sizes[5]
     assert steps[0]["psnr"] == steps[1]["psnr"]
     for step in steps[1:]:
         listed = sum(step["bytes_a_splat"].values()) * step["splats"]
         assert 0 < step["bytes"] - listed < 3000, "more than the header is missing"
-    call(monkeypatch, ablation, "report", out)
-    assert "| AC | 180 |" in capsys.readouterr().out
+    call(monkeypatch, ablation, "report", out, "--json", tmp_path / "results.json")
+    assert "| as PLY | 12.00 |" in capsys.readouterr().out
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert [len(results[name]["rows"]) for name in ("excerpt", "bytes_excerpt")] == [13, 13]
+    assert results["excerpt"]["machine"] == json.loads(out.read_text())["machine"]
