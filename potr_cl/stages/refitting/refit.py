@@ -37,7 +37,8 @@ from potr_cl.stages.refitting.targets import Targets
 #: Steps in which the constant coefficients are solved for once more, after the others have been rounded.
 _CONSTANT_STEPS = 3
 #: What a coefficient that becomes 0 as it is rounded is worth, as a part of what one is worth that is given up before.
-_WORTH = 0.0
+#: What the others of the splat are counted on to make up for is more than they can.
+_WORTH = 0.4
 
 
 @dataclass(frozen=True)

@@ -1,15 +1,15 @@
 """Colours rounded to the steps of a file in rounds, between which the others are solved for again: :class:`Rounding`.
 
 A coefficient that is rounded alone leaves an error in the pictures, and those of many splats add up. What is not
-rounded yet can take most of it back. So every second splat comes first: its AC coefficients one after another, each
+rounded yet can take most of it back. So half of the splats come first: their AC coefficients one after another, each
 making up for those before it within the splat (cl/refit/rounding.cl; Babai: "On Lovász' lattice reduction and the
 nearest lattice point problem", 1986, the nearest-plane method), and then the constant ones. All that is still free
-takes some steps towards the pictures. Then come the AC coefficients of the other splats, and at last their constant
-ones.
+takes some steps towards the pictures. Then come the AC coefficients of the other splats and half of their constant
+ones, and after some more steps the rest. Each lies among others that are rounded at another time.
 
-A coefficient becomes one step smaller than the nearest level where the bits that this saves are worth more than the
-error that it adds: rate-distortion optimised quantisation (Karczewicz, Ye, Chong: "Rate distortion optimized
-quantization", VCEG-AH21, 2008), with an error that counts what the others make up for.
+An AC coefficient becomes 0 instead of one step where the bits that this saves are worth more than the error that it
+adds: rate-distortion optimised quantisation (Karczewicz, Ye, Chong: "Rate distortion optimized quantization",
+VCEG-AH21, 2008), with an error that counts what the others of the splat make up for.
 """
 
 from __future__ import annotations
@@ -27,9 +27,9 @@ from potr_cl.stages.refitting.coefficients import Coefficients
 
 _SOURCE = "refit/rounding.cl"
 #: What one step less saves of several, as a part of what it saves to have 0.
-_LESS = 0.15
-#: Splats are due in so many turns: in turn 0 every second one in the order of the file, in turn 1 the others.
-TURNS = 2
+_LESS = 0.0
+#: Splats are due in so many turns: every fourth one in the order of the file in turn 0, the next ones in turn 1, …
+TURNS = 4
 _NEVER = np.iinfo(np.int32).max
 
 
@@ -38,18 +38,18 @@ class Round:
     """What is rounded together.
 
     Attributes:
-        turn: of splats that are due in this turn and before.
-        constant: whether the constant coefficients too, besides all others.
+        others: the AC coefficients of splats that are due in this turn and before.
+        constant: the constant coefficients of splats that are due in this turn and before; -1: none.
         steps: that what is free then takes towards the pictures.
     """
 
-    turn: int
-    constant: bool
+    others: int
+    constant: int
     steps: int
 
 
 #: The constant coefficients of the last turn stay as they are: they are rounded as the file is made.
-ROUNDS = (Round(turn=0, constant=True, steps=3), Round(turn=1, constant=False, steps=2))
+ROUNDS = (Round(others=1, constant=1, steps=3), Round(others=3, constant=2, steps=2))
 
 
 class Rounding(Owner):
@@ -102,16 +102,15 @@ class Rounding(Owner):
             turns=self._turns,
             steps=self._others,
             stride=stride,
-            turn=this.turn,
+            turn=this.others,
             to_zero=np.float32(worth),
             to_less=np.float32(worth * _LESS),
         )
         layout.over_splats(self._round_ac)
-        if this.constant:
-            self._round_constant.bind(
-                coefficients=x, active=active, turns=self._turns, steps=self._constant, stride=stride, turn=this.turn
-            )
-            layout.over_splats(self._round_constant)
+        self._round_constant.bind(
+            coefficients=x, active=active, turns=self._turns, steps=self._constant, stride=stride, turn=this.constant
+        )
+        layout.over_splats(self._round_constant)
 
     def close(self) -> None:
         """Give the device's memory back."""
