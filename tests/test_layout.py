@@ -20,24 +20,27 @@ FOLDERS: dict[str, set[str]] = {
     "model": {"errors", "host"},
     "opencl": {"errors", "host"},
     "raster": {"errors", "host", "model", "opencl"},
+    "workers": {"errors", "host", "opencl"},
     "codec": {"errors", "host", "model"},
     "ondevice": {"errors", "host", "model", "opencl", "raster", "codec"},
-    "clustering": {"errors", "model", "opencl"},
+    "clustering": {"errors", "host", "model", "opencl"},
     "formats": {"plain_text", "errors", "host", "model", "opencl", "codec", "clustering"},
     "quality": {"errors", "host", "model", "opencl", "raster", "formats"},
     "outputs": {"errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "clustering"},
-    "stages": {"errors", "host", "model", "opencl", "raster", "codec", "quality", "outputs"},
-    "pipeline": {"errors", "host", "model", "opencl", "raster", "codec", "formats", "stages", "quality", "outputs"},
+    "stages": {"errors", "host", "model", "opencl", "raster", "workers", "codec", "quality", "outputs"},
+    "pipeline": {
+        "errors", "host", "model", "opencl", "raster", "workers", "codec", "formats", "stages", "quality", "outputs",
+    },
     "report": {"plain_text", "errors", "host", "model", "opencl", "codec", "formats", "quality", "pipeline"},
     "viewer": {"plain_text", "errors", "host", "model", "opencl", "raster", "formats", "quality", "report"},
     "reference": {"errors", "model", "opencl", "raster", "stages"},
     "api": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages",
-        "quality", "pipeline", "report", "outputs", "viewer",
+        "quality", "pipeline", "report", "outputs", "viewer", "workers",
     },
     "cli": {
         "plain_text", "errors", "host", "model", "opencl", "raster", "codec", "ondevice", "formats", "stages",
-        "quality", "pipeline", "report", "viewer", "api", "outputs",
+        "quality", "pipeline", "report", "viewer", "api", "outputs", "workers",
     },
 }  # fmt: skip
 #: They offer the whole package under short names, and start it.

@@ -10,6 +10,7 @@ bench.encode           run time against error of every stage and variant on ever
 bench.rasterizer       frames a second, and time against splats, pixels and overlap
 bench.pruning          what does pruning keep, against other pruners, and what may its sweeps skip?
 bench.refit            what does the re-fit of the colours bring, and what does it take?
+bench.fit              how fast are the fit's steps, and how exact its derivatives?
 bench.compaction       speed of the compaction, and its error against float64
 bench.compact_at       when within the pruning schedule to compact?
 bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
@@ -43,6 +44,7 @@ study.compare_formats      what would people use instead?
 study.output_formats       how small are encodes to the formats that viewers open, and what do others read of them?
 study.virtual_views        how many virtual views, how large, how wide, at what time and memory?
 study.rates                where do the bits go, and what do they buy?
+study.gauss_newton         does Gauss-Newton fit a pruned scene in less time than Adam?
 study.antialiasing         what is lost if an antialiased scene is encoded as a classic one?
 study.compaction_curves    what does the compaction do to sparsity and pictures?
 study.removal_exactness    how far are predicted removal effects from removals in float64?

@@ -13,12 +13,10 @@ from typing import Any
 from potr_cl.api.inputs import (
     CamerasSource,
     ColourSource,
-    DeviceSource,
     SceneSource,
     bytes_of_source,
     cameras_of,
     colour_of,
-    device_of,
     name_of,
     scene_of,
 )
@@ -30,6 +28,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import several_are_named
 from potr_cl.outputs.output import Output
 from potr_cl.outputs.registry import OUTPUTS, output_of, output_of_suffix
 from potr_cl.pipeline.amounts import as_bytes, size_in_bytes
@@ -49,6 +48,7 @@ from potr_cl.report.summary import encode_report, photographs_report, quality_re
 from potr_cl.stages.code import Code
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Progress, Stage, flags
+from potr_cl.workers.opening import ClusterSource, DevicesSource, open_workers
 
 
 def encode(
@@ -56,8 +56,9 @@ def encode(
     cameras: CamerasSource | None = None,
     options: EncodeOptions | None = None,
     progress: Progress | None = None,
-    device: DeviceSource = None,
+    device: DevicesSource = None,
     *,
+    cluster: ClusterSource = None,
     q: float | None = None,
     preset: Preset | None = None,
     max_size: int | str | None = None,
@@ -87,7 +88,9 @@ def encode(
         options: all at once, instead of the keywords or to be changed by them.
         progress: called with a stage's name and the part of it that is done.
         device: computes, or what it is called; by default the one that should be fastest. If its memory is too small,
-            less is kept in it, and if that is not enough, a CPU does the work. A warning says so.
+            less is kept in it, and if that is not enough, a CPU does the work. A warning says so. Several share the
+            views out among them: a list, "all", or "0,1".
+        cluster: a Dask cluster whose workers share the views out among them: its scheduler's address, or a client.
         q: quality, 0 (smallest) to 1 (best); 0.5 by default.
         preset: best, fast or paper; best by default.
         max_size: find the quality that fills this size: bytes, or a text such as "8MB".
@@ -125,7 +128,6 @@ def encode(
     check_photographs_have_cameras(settings, cameras is not None)
     if report is None and report_view is not None:
         raise UsageError("report_view needs report, the page that shows it")
-    opened = None if device is None else device_of(device)
     views = cameras_of(cameras)
     what = scene_of(scene, trust, antialiased)
     if views is None and virtual_views is not None and settings.look_at_views(what):
@@ -136,6 +138,10 @@ def encode(
     if report_view is not None and judging is not None:
         judging.named(report_view)  # an unknown name is told before the work
     with contextlib.ExitStack() as stack:
+        workers = None
+        if device is not None or cluster is not None or several_are_named():
+            workers = stack.enter_context(open_workers(device, cluster))
+        opened, pool = (None, None) if workers is None else (workers.device, workers.pool)
         file = stack.enter_context(replacing(output)) if output is not None else None
         page = stack.enter_context(replacing(report)) if report is not None else None
         found: Found | None = None
@@ -143,9 +149,9 @@ def encode(
         if target is None:
             if judging is not None and opened is not None:
                 kept = stack.enter_context(KeptScene(opened, what))
-            encoded = run_stages(what, views, settings, progress, opened, kept=kept, tell=tell)
+            encoded = run_stages(what, views, settings, progress, opened, kept=kept, tell=tell, pool=pool)
         else:
-            found = encode_to_target(what, views, target, settings, progress, opened, tell)
+            found = encode_to_target(what, views, target, settings, progress, opened, tell, pool=pool)
             encoded = found.encoded
         if file is None and page is None:
             return encoded

@@ -11,11 +11,9 @@ from potr_cl.api.encoding import Judge, encode_options, output_choice, views_or_
 from potr_cl.api.inputs import (
     CamerasSource,
     ColourSource,
-    DeviceSource,
     SceneSource,
     bytes_of_source,
     cameras_of,
-    device_of,
     name_of,
     scene_of,
 )
@@ -33,6 +31,8 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.report.summary import decibels
 from potr_cl.stages.stage import Progress
+from potr_cl.workers.opening import ClusterSource, DevicesSource, open_workers
+from potr_cl.workers.pool import Pool
 
 
 def encode_ladder(
@@ -42,8 +42,9 @@ def encode_ladder(
     cameras: CamerasSource | None = None,
     options: EncodeOptions | None = None,
     progress: Progress | None = None,
-    device: DeviceSource = None,
+    device: DevicesSource = None,
     *,
+    cluster: ClusterSource = None,
     preset: Preset | None = None,
     virtual_views: int | None = None,
     to: str | None = None,
@@ -66,8 +67,8 @@ def encode_ladder(
         scene: to encode, or its file.
         output: a folder for the files and their ladder.json; it is made if need be.
         ladder: the qualities, 0 to 1: a list, or a text such as "0.1,0.3,0.5".
-        cameras, options, progress, device, preset, virtual_views, background, memory, threads, trust, antialiased,
-            cameras_anyway, choices: as of :func:`potr_cl.encode`.
+        cameras, options, progress, device, cluster, preset, virtual_views, background, memory, threads, trust,
+            antialiased, cameras_anyway, choices: as of :func:`potr_cl.encode`.
         to, spz_version: the kind of files, as of :func:`potr_cl.encode`.
         tell: told a line about each file that is written.
 
@@ -84,10 +85,14 @@ def encode_ladder(
     given = cameras_of(cameras)
     what = scene_of(scene, trust, antialiased)
     looks = settings.look_at_views(what)
-    opened = device_of(device) if looks or given is not None else None
     views = views_or_placed(what, given, virtual_views) if looks else given
     name = name_of(scene)
-    return make_ladder(what, name, views, settings, steps, Path(output), opened, progress, tell, trust)
+    if not looks and given is None:
+        return make_ladder(what, name, views, settings, steps, Path(output), None, progress, tell, trust)
+    with open_workers(device, cluster) as workers:
+        return make_ladder(
+            what, name, views, settings, steps, Path(output), workers.device, progress, tell, trust, pool=workers.pool
+        )
 
 
 def ladder_files(folder: Path, scene: Path, steps: Sequence[float], suffix: str) -> list[Path]:
@@ -121,6 +126,7 @@ def make_ladder(
     tell: Callable[[str], None] | None = None,
     trust: bool = False,
     judged: bool = True,
+    pool: Pool | None = None,
 ) -> Ladder:
     """The same for a scene that has been read and views that have been chosen.
 
@@ -129,6 +135,7 @@ def make_ladder(
         steps: the qualities, rising.
         device: None if nothing is to be rendered.
         judged: whether to judge each file.
+        pool: workers that views are shared out to, of which the device is the first.
 
     Raises:
         As :func:`encode_ladder`.
@@ -141,7 +148,7 @@ def make_ladder(
     views = EvaluationViews.of(list(cameras)) if cameras is not None and device is not None and judged else None
     rungs = []
     for q, file in zip(steps, files[:-1], strict=True):
-        encoded = run_stages(scene, cameras, options.changed(q=q), progress, device)
+        encoded = run_stages(scene, cameras, options.changed(q=q), progress, device, pool=pool)
         psnr = ssim = None
         judged_on = None if views is None else encoded.device or device
         with proved(encoded, trust, judged_on) as written:

@@ -35,7 +35,7 @@ from potr_cl.cli.scenes import (
 from potr_cl.cli.stage_flags import add_stage_flags, stage_choices
 from potr_cl.cli.terminal import note, say_document, say_done, say_line
 from potr_cl.cli.views import add_cameras_options, given_cameras, virtual_cameras
-from potr_cl.errors import DeviceError, UsageError
+from potr_cl.errors import DeviceError, PotrError, UsageError
 from potr_cl.formats.images import parse_colour
 from potr_cl.formats.registry import suffixes_read
 from potr_cl.host.atomic_write import replacing
@@ -57,6 +57,7 @@ from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.report.html import PicturePair, html_report
 from potr_cl.report.summary import encode_report, format_encode_report, search_report
 from potr_cl.stages.refit import Refit
+from potr_cl.workers.opening import Workers, open_workers
 
 
 def _options(args: argparse.Namespace, source_bytes: int | None = None, output: Output | None = None) -> EncodeOptions:
@@ -92,13 +93,13 @@ class _Shared:
 
     Attributes:
         target: a size or a PSNR to reach, if one is asked for.
-        opened: the device, which is opened while the first scene is read; None where none is needed.
+        opened: what computes, which is opened while the first scene is read; None where none is needed.
         cameras: of the file that ``--cameras`` names.
         ground_truth: the photographs that ``--photos`` names.
     """
 
     target: Target | None
-    opened: Future[Device] | None
+    opened: Future[Workers] | None
     cameras: list[Camera] | None
     ground_truth: GroundTruth | None
 
@@ -117,6 +118,8 @@ def _encode(args: argparse.Namespace) -> None:
         raise UsageError("--report is about one scene: encode one at a time")
     with contextlib.ExitStack() as stack:
         opened = stack.enter_context(thread_pool(1)).submit(_opened, args) if _looks(args, options) else None
+        if opened is not None:
+            stack.callback(_leave, opened)
         cameras = given_cameras(args)
         ground_truth = None
         if refit.ground_truth is not None and cameras is not None:
@@ -128,11 +131,16 @@ def _encode(args: argparse.Namespace) -> None:
         for_each_scene(works, lambda one: _encode_one(one, shared, several=len(works) > 1), args.json)
 
 
-def _opened(args: argparse.Namespace) -> Device:
-    """The device, which begins to load what the last encode with this preset has needed."""
-    device = Device(args.device)
-    device.prepare_for(f"encode {args.preset}")
-    return device
+def _opened(args: argparse.Namespace) -> Workers:
+    """What computes; the device begins to load what the last encode with this preset has needed."""
+    workers = open_workers(args.device, args.cluster)
+    workers.device.prepare_for(f"encode {args.preset}")
+    return workers
+
+
+def _leave(opened: Future[Workers]) -> None:
+    with contextlib.suppress(PotrError):
+        opened.result().close()
 
 
 def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> None:
@@ -143,7 +151,8 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
         scene = read_scene(args, args.scene)
         # Drivers take as long to open a device.
         check_frame(scene, cameras, options.cameras_anyway)
-        device = opened.result() if opened is not None and options.look_at_views(scene) else None
+        workers = opened.result() if opened is not None and options.look_at_views(scene) else None
+        device, pool = (None, None) if workers is None else (workers.device, workers.pool)
         kept = None if device is None or target is not None else stack.enter_context(KeptScene(device, scene))
         progress = stack.enter_context(contextlib.closing(Progress()))
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None
@@ -159,10 +168,10 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
                 _ = views and views.named(args.report_view)  # an unknown name is told before the work
             if target is None:
                 encoded = encode(
-                    scene, cameras, options, progress, device, kept=kept, in_frame=True, tell=progress.tell
+                    scene, cameras, options, progress, device, kept=kept, in_frame=True, tell=progress.tell, pool=pool
                 )
             else:
-                found = encode_to_target(scene, cameras, target, options, progress, device, progress.tell)
+                found = encode_to_target(scene, cameras, target, options, progress, device, progress.tell, pool=pool)
                 encoded, options, search = found.encoded, found.options, search_report(target, found)
             judged_on = None if views is None else encoded.device
             # What cannot be decoded must not replace what can.
@@ -200,7 +209,7 @@ def _evaluate(
     candidate: Drawable,
     views: EvaluationViews,
     device: Device | None,
-    opened: Future[Device] | None,
+    opened: Future[Workers] | None,
     watch: Stopwatch,
     ground_truth: GroundTruth | None,
     kept: KeptScene | None,
@@ -213,7 +222,7 @@ def _evaluate(
     try:
         judge = Judge(
             views,
-            device or (Device(args.device) if opened is None else opened.result()),
+            device or (Device(args.device) if opened is None else opened.result().device),
             parse_colour(args.background),
             ground_truth,
             kept,
@@ -315,5 +324,12 @@ def add_encode(commands: Commands) -> None:
     add_trust_option(p)
     add_antialiased_option(p)
     add_memory_option(p)
-    add_device_options(p)
+    add_device_options(
+        p, "; of several the views are shared out: all (of the best one's kind), or indices with commas, 0,1"
+    )
+    p.add_argument(
+        "--cluster",
+        metavar="ADDRESS",
+        help="a Dask cluster whose workers do the views: its scheduler's address, tcp://HOST:8786",
+    )
     p.set_defaults(run=_encode, checked_suffix=encoded_suffix)

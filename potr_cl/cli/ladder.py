@@ -16,9 +16,9 @@ from potr_cl.cli.views import given_cameras, virtual_cameras
 from potr_cl.errors import UsageError
 from potr_cl.formats.ladder import Ladder, qualities
 from potr_cl.formats.registry import extensions
-from potr_cl.opencl.device import Device
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.summary import decibels
+from potr_cl.workers.opening import open_workers
 
 
 def encode_ladder(args: argparse.Namespace, options: EncodeOptions) -> None:
@@ -38,10 +38,13 @@ def encode_ladder(args: argparse.Namespace, options: EncodeOptions) -> None:
     check_files(args, ladder_files(folder, name, steps, options.output.suffix))
     options = options.changed(source_bytes=size_of_file(source))
     cameras = given_cameras(args)
-    with contextlib.closing(Progress()) as progress:
+    with contextlib.closing(Progress()) as progress, contextlib.ExitStack() as stack:
         scene = read_scene(args, source)
         looks = options.look_at_views(scene)
-        device = Device(args.device) if looks or not (cameras is None or args.no_quality) else None
+        workers = None
+        if looks or not (cameras is None or args.no_quality):
+            workers = stack.enter_context(open_workers(args.device, args.cluster))
+        device, pool = (None, None) if workers is None else (workers.device, workers.pool)
         if cameras is None and looks:
             cameras = virtual_cameras(args, scene, progress)
         if device is not None and cameras is not None:
@@ -49,7 +52,7 @@ def encode_ladder(args: argparse.Namespace, options: EncodeOptions) -> None:
             note(f"{len(steps)} qualities: so many times as long", "detail")
         ladder = make_ladder(
             scene, name, cameras, options, steps, folder, device, progress, progress.tell, args.trust,
-            judged=not args.no_quality,
+            judged=not args.no_quality, pool=pool,
         )  # fmt: skip
     if args.json:
         say_document(ladder.document())

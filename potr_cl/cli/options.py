@@ -22,7 +22,11 @@ def add_memory_option(p: argparse._ActionsContainer) -> None:
     )
 
 
-def add_device_options(p: argparse._ActionsContainer) -> None:
+def add_device_options(p: argparse._ActionsContainer, several: str = "") -> None:
+    """
+    Args:
+        several: what the help says besides, where a command takes several devices.
+    """
     p.add_argument(
         "--background",
         default="black",
@@ -33,7 +37,7 @@ def add_device_options(p: argparse._ActionsContainer) -> None:
         "--device",
         metavar="DEVICE",
         help="index, part of a name, cpu or gpu, as the command devices lists them; "
-        f"default: ${DEVICE_VARIABLE}, else the one that should be fastest",
+        f"default: ${DEVICE_VARIABLE}, else the one that should be fastest{several}",
     )
 
 

@@ -8,8 +8,12 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import thread_pool
+
 #: Bits of a coordinate: three of them fit a 64-bit number.
 _BITS = 16
+#: Points that a thread works on at a time: their temporaries stay in the cache.
+_BLOCK = 1 << 14
 
 
 def along_curve(coordinates: NDArray[np.uint16]) -> NDArray[np.int64]:
@@ -18,7 +22,20 @@ def along_curve(coordinates: NDArray[np.uint16]) -> NDArray[np.int64]:
     Args:
         coordinates: (N, 3) uint16.
     """
-    axes = list(coordinates.T.astype(np.uint16))
+    places = np.empty(len(coordinates), np.uint64)
+
+    def find(start: int) -> None:
+        some = slice(start, start + _BLOCK)
+        places[some] = _places(coordinates[some])
+
+    with thread_pool() as pool:
+        list(pool.map(find, range(0, len(places), _BLOCK)))
+    return np.argsort(places, kind="stable")
+
+
+def _places(coordinates: NDArray[np.uint16]) -> NDArray[np.uint64]:
+    """(n,) how far along the curve points are."""
+    axes = [np.ascontiguousarray(axis, np.uint16) for axis in coordinates.T.copy()]
     # From Cartesian coordinates to those of the curve, a cube after the other, the largest first.
     for bit in range(_BITS - 1, 0, -1):
         below = np.uint16((1 << bit) - 1)
@@ -39,4 +56,4 @@ def along_curve(coordinates: NDArray[np.uint16]) -> NDArray[np.int64]:
     for bit in range(_BITS - 1, -1, -1):
         for axis in turned_axes:
             places = places << np.uint64(1) | axis >> np.uint64(bit) & np.uint64(1)
-    return np.argsort(places, kind="stable")
+    return places

@@ -23,6 +23,7 @@ from numpy.typing import NDArray
 
 from potr_cl.clustering.comparison import U32, Lists, Points
 from potr_cl.clustering.rows import centres_of_sums, errors_at_zero, rows_of_points
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 
@@ -32,6 +33,8 @@ _F64 = NDArray[np.float64]
 _NEIGHBOURS = 8
 #: Centres that most points have, with which all points are compared where labels take bits.
 _POPULAR = 64
+#: Cells whose neighbours a thread finds at a time.
+_CELLS_AT_ONCE = 32
 #: Fewer centres than this are one cell.
 _FEW = 512
 #: Steps of Lloyd's algorithm: for the cells, and by default for the centres.
@@ -267,10 +270,15 @@ def _neighbours(cells: FloatArray, homes: U32, popular: int) -> Lists:
     many = min(_NEIGHBOURS, len(lived_in))
     places = cells.reshape(len(cells), -1).astype(np.float64)
     runs = np.empty((len(cells), many + (popular > 0), 2), np.uint32)
-    for number, place in enumerate(places):
-        away = np.square(places[lived_in] - place).sum(axis=1)
-        near = lived_in[np.argsort(away, kind="stable")[:many]]
-        runs[number, :many, 0], runs[number, :many, 1] = firsts[near], counts[near]
+
+    def find(start: int) -> None:
+        for number in range(start, min(start + _CELLS_AT_ONCE, len(places))):
+            away = np.square(places[lived_in] - places[number]).sum(axis=1)
+            near = lived_in[np.argsort(away, kind="stable")[:many]]
+            runs[number, :many, 0], runs[number, :many, 1] = firsts[near], counts[near]
+
+    with thread_pool() as pool:
+        list(pool.map(find, range(0, len(places), _CELLS_AT_ONCE)))
     if popular:
         runs[:, many] = len(homes), popular
     return Lists(runs.reshape(-1, 2), (np.arange(len(cells) + 1) * runs.shape[1]).astype(np.uint32))

@@ -10,10 +10,13 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
 
 #: Floats in a row are a multiple of this.
 QUARTER = 4
+#: Points that a thread works on at a time.
+_BLOCK = 1 << 14
 
 
 def width_of(groups: int, coordinates: int) -> int:
@@ -30,10 +33,15 @@ def rows_of_points(points: FloatArray, weights: FloatArray) -> FloatArray:
     """
     n, groups, coordinates = points.shape
     rows = np.zeros((n, width_of(groups, coordinates)), np.float32)
-    rows[:, :groups] = weights
-    weighted = rows[:, groups : groups * (1 + coordinates)].reshape(n, groups, coordinates)
-    np.multiply(points, weights[:, :, None] * np.float32(-2), out=weighted)
-    rows[:, groups : groups * (1 + coordinates)] = weighted.reshape(n, -1)
+
+    def fill(start: int) -> None:
+        some = slice(start, start + _BLOCK)
+        rows[some, :groups] = weights[some]
+        weighted = points[some] * (weights[some, :, None] * np.float32(-2))
+        rows[some, groups : groups * (1 + coordinates)] = weighted.reshape(len(weighted), -1)
+
+    with thread_pool() as pool:
+        list(pool.map(fill, range(0, n, _BLOCK)))
     return rows
 
 
@@ -65,5 +73,15 @@ def centres_of_sums(sums: FloatArray, centres: FloatArray) -> FloatArray:
 
 def errors_at_zero(points: FloatArray, weights: FloatArray) -> NDArray[np.float64]:
     """(N,) the constant of each point: its distance to zero."""
-    errors: NDArray[np.float64] = np.einsum("ngc,ngc,ng->n", points, points, weights, dtype=np.float64, optimize=False)
+    errors = np.empty(len(points))
+
+    def add(start: int) -> None:
+        some = slice(start, start + _BLOCK)
+        np.einsum(
+            "ngc,ngc,ng->n", points[some], points[some], weights[some], dtype=np.float64, optimize=False,
+            out=errors[some],
+        )  # fmt: skip
+
+    with thread_pool() as pool:
+        list(pool.map(add, range(0, len(points), _BLOCK)))
     return errors

@@ -6,9 +6,9 @@ Threads share the bundles out. Integers of a bundle become values while they are
 from __future__ import annotations
 
 from collections.abc import Callable
-from dataclasses import dataclass
-from functools import cached_property
-from threading import Lock
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -21,12 +21,13 @@ from potr_cl.codec.bundles.levels import joined
 from potr_cl.codec.bundles.sections import MAIN, Key
 from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
+from potr_cl.codec.context.tokens import largest_integer
 from potr_cl.codec.dequantizer import Dequantizer
 from potr_cl.codec.native.bundles import BEYOND_TABLE, BundledFile, Tables, ValueArrays
 from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
 from potr_cl.codec.versions import VERSIONS
-from potr_cl.host.threads import thread_pool
+from potr_cl.host.threads import Run, SharedWork, thread_pool
 
 if TYPE_CHECKING:
     from potr_cl.codec.destination import Activation, Destination
@@ -35,8 +36,8 @@ if TYPE_CHECKING:
 _SIDE_BY_SIDE = 32
 #: Bundles whose integers a thread joins at a time.
 _HANDED = 4
-#: Bundles that each thread decodes before it is told which values are there.
-_ROUNDS = 2
+#: Parts of the positions for each thread, so that none waits long for another.
+_PARTS = 2
 #: Levels whose values are looked up.
 _TABLE = 1 << 16
 
@@ -70,37 +71,61 @@ class BundledScene:
         self,
         arrays: ValueArrays,
         threads: int = 1,
-        centres: Callable[[], None] | None = None,
-        filled: Callable[[int, int], None] = lambda start, stop: None,
+        centres: Callable[[Run, int], None] | None = None,
+        filled: Callable[[int, int], None] | None = None,
     ) -> None:
         """Fill some arrays; sections of others are not looked at.
 
         Args:
             arrays: what to decode.
-            threads: to work with.
-            centres: what else to do meanwhile.
-            filled: told from one splat to another which values are there; others are decoded meanwhile.
+            threads: to work with, this one included.
+            centres: what else to do meanwhile; it is told how to share out work, and into how many parts.
+            filled: told from one splat to another which values are there, by this thread; others decode meanwhile.
 
         Raises:
             DataError: damaged.
         """
-        number, splats = self.reader.bundles.number, self.header.splats
-        native = self.reader.bundled_file(self._wanted(arrays)) is not None
-        parts = max(number // (_ROUNDS * threads), 1) if native else -(-number // _SIDE_BY_SIDE)
-        ends = [number * (part + 1) // parts for part in range(parts)]
-        ready = 0
-        with thread_pool(threads) as pool:
-            first = [] if centres is None else [pool.submit(centres)]
-            for start, end in zip([0, *ends], ends, strict=False):
-                futures = [pool.submit(work) for work in self._jobs(arrays, threads, range(start, end))]
-                if ready < start * BUNDLE:
-                    filled(ready, start * BUNDLE)
-                    ready = start * BUNDLE
-                for future in futures:
+        work, number = SharedWork(), self.reader.bundles.number
+        # More threads than half the bundles would share memory and caches for nothing.
+        helpers = min(threads, max(number // 2, 2)) - (filled is None)
+        first = []
+        if centres is not None:
+            first.append(work.add(partial(centres, work.run, _PARTS * threads if helpers else 1)))
+        with thread_pool(max(helpers, 1)) as pool:
+            try:
+                if helpers and first:  # while this thread opens the sections
+                    pool.submit(work.do)
+                job = self._job(arrays)
+                shares = job.shares(number)
+                if job.file is None:  # by NumPy, in one thread: others would wait for the interpreter
+                    self._one_by_one(job, shares, filled or _nobody)
+                    shares = []
+                futures = [work.add(partial(job, some)) for some in shares]
+                for _ in range(helpers if shares else 0):
+                    pool.submit(work.do)
+                if filled is None:
+                    work.do()
+                self._tell(shares, futures, filled or _nobody)
+                for future in first:
                     future.result()
-            filled(ready, splats)
-            for future in first:
-                future.result()
+            finally:
+                work.forget()
+
+    def _one_by_one(self, job: Job, shares: list[range], filled: Callable[[int, int], None]) -> None:
+        for bundles in shares:
+            job(bundles)
+            filled(bundles.start * BUNDLE, min(bundles.stop * BUNDLE, self.header.splats))
+
+    def _tell(self, shares: list[range], futures: list[Future[None]], filled: Callable[[int, int], None]) -> None:
+        """Wait for shares of the bundles, and tell of all that are done at a time."""
+        ready = done = 0
+        while done < len(futures):
+            futures[done].result()
+            while done < len(futures) and futures[done].done() and futures[done].exception() is None:
+                done += 1
+            stop = min(shares[done - 1].stop * BUNDLE, self.header.splats)
+            filled(ready, stop)
+            ready = stop
 
     def hand_to(self, destination: Destination, sh_count: int, threads: int) -> None:
         """Hand all integers but those of the centres to a destination, with so many SH coefficients of a channel.
@@ -133,10 +158,10 @@ class BundledScene:
         """What makes values of levels."""
         header, activation = self.header, self.activation
         version = VERSIONS[header.version]
-        levels = np.arange(_TABLE)
+        levels = np.arange(self._largest_level(MAIN[1]) + 1)
         classes = np.arange(-CLASSES, CLASSES).astype(np.int8)
         scales = version.dequantize_scales(levels, header.sf_scale)
-        opacities = version.dequantize_opacities(levels, header.sf_opacity)
+        opacities = version.dequantize_opacities(np.arange(self._largest_level(MAIN[0]) + 1), header.sf_opacity)
         return Tables(
             scales if activation is None else activation.scales(scales),
             opacities if activation is None else activation.opacities(opacities),
@@ -144,15 +169,21 @@ class BundledScene:
             factors(header.sf_ac, classes),
             *prediction.tables(),
             header.sf_rotation,
+            activation is not None,
         )
 
-    def _jobs(self, arrays: ValueArrays, threads: int, bundles: range) -> list[Job]:
+    def _largest_level(self, key: Key) -> int:
+        """Of a section, or the largest that is looked up."""
+        section = self.reader.section(key)
+        alphabets = [fitted.alphabet for fitted in section.streams] if section is not None else [1]
+        return min(largest_integer(max(alphabets) - 1), _TABLE - 1)
+
+    def _job(self, arrays: ValueArrays) -> Job:
         wanted = self._wanted(arrays)
         file = self.reader.bundled_file(wanted)
         if file is not None:
             _ = self.tables  # made once, before threads ask for them
-        share = _Share(bundles, 1 if file is not None else _SIDE_BY_SIDE)
-        return [Job(self, arrays, wanted, file, share) for _ in range(threads if file is not None else 1)]
+        return Job(self, arrays, wanted, file)
 
     def _wanted(self, arrays: ValueArrays) -> Wanted:
         rotations = arrays.quaternions is not None
@@ -164,6 +195,10 @@ class BundledScene:
         degree = round(sh_count**0.5) - 1
         # To the end of the chain where all is asked for: so its end is checked.
         return Wanted(len(MAIN) if degree == self.header.sh_degree else 3 + degree, rotations)
+
+
+def _nobody(start: int, stop: int) -> None:
+    """Is told which values are there."""
 
 
 @dataclass(frozen=True)
@@ -198,51 +233,51 @@ def _wide(largest: int) -> type[np.generic]:
     return np.int32 if largest < 1 << 29 else np.int64
 
 
-class _Share:
-    """Gives every thread the next bundles."""
-
-    def __init__(self, bundles: range, at_once: int) -> None:
-        self._stop, self._at_once = bundles.stop, at_once
-        self._next, self._lock = bundles.start, Lock()
-
-    def take(self) -> range:
-        with self._lock:
-            first = self._next
-            self._next = min(first + self._at_once, self._stop)
-            return range(first, self._next)
-
-
 @dataclass(frozen=True)
 class Job:
-    """A thread's part of a decode: calling it takes bundles until none are left."""
+    """What decodes bundles, by any thread."""
 
     scene: BundledScene
     arrays: ValueArrays
     wanted: Wanted
     file: BundledFile | None
-    share: _Share
+    _works: list[NDArray[np.uint8]] = field(default_factory=list)
 
-    def __call__(self) -> None:
-        """Raises DataError if damaged."""
-        work = None if self.file is None else self.file.work()
-        while len(bundles := self.share.take()):
-            if self.file is None or work is None:
-                self._by_numpy(bundles)
-                continue
-            said, section = self.file.values(
-                bundles.start, self.wanted.sections, self.wanted.rotations, work, self.arrays, self.scene.tables
-            )
-            if said == BEYOND_TABLE:
-                self._by_numpy(bundles)
-            else:
-                check_said(self.scene.reader, said, section)
+    def shares(self, number: int) -> list[range]:
+        """The bundles of a file, as they are decoded at a time."""
+        at_once = 1 if self.file is not None else _SIDE_BY_SIDE
+        return [range(first, min(first + at_once, number)) for first in range(0, number, at_once)]
+
+    def __call__(self, bundles: range) -> None:
+        """Decode one of the shares.
+
+        Raises:
+            DataError: damaged.
+        """
+        if self.file is None:
+            self._by_numpy(bundles)
+            return
+        # What a thread has worked with the next one takes.
+        work = self._works.pop() if self._works else self.file.work()
+        said, section = self.file.values(
+            bundles.start, self.wanted.sections, self.wanted.rotations, work, self.arrays, self.scene.tables
+        )
+        self._works.append(work)
+        if said == BEYOND_TABLE:
+            self._by_numpy(bundles)
+        else:
+            check_said(self.scene.reader, said, section)
 
     def _by_numpy(self, bundles: range) -> None:
         header = self.scene.header
         levels = self.scene.reader.levels(bundles.start, bundles.stop, self.wanted)
         Dequantizer(header, VERSIONS[header.version]).of_levels(levels, self.scene.reader.steps, self.arrays)
-        activation, own = self.scene.activation, slice(levels.start, levels.stop)
-        if activation is not None and self.arrays.log_scales is not None:
-            self.arrays.log_scales[own] = activation.scales(self.arrays.log_scales[own])
-        if activation is not None and self.arrays.logits is not None:
-            self.arrays.logits[own] = activation.opacities(self.arrays.logits[own])
+        activation, own = self.scene.activation, self.arrays.part(levels.start, levels.stop)
+        if activation is None:
+            return
+        if own.log_scales is not None:
+            own.log_scales[...] = activation.scales(own.log_scales)
+        if own.logits is not None:
+            own.logits[...] = activation.opacities(own.logits)
+        if own.quaternions is not None:
+            own.quaternions[...] = activation.rotations(own.quaternions)

@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
+from potr_cl.codec.native.library import native
 from potr_cl.codec.steps.rule import factors
 from potr_cl.host.threads import Run
 from potr_cl.model.scene import FloatArray
@@ -43,9 +44,19 @@ def colour_levels(
     levels: NDArray[np.signedinteger] = np.empty((count, 3, len(sh)), np.int16)
     wide: list[tuple[tuple[int, int, slice], quantize.Integers]] = []
 
+    functions = native()
+    whole = columns if columns.flags.c_contiguous else sh if sh.flags.c_contiguous else None
+
     def take(start: int) -> None:
         rows = order[start : start + _BLOCK]
         block = slice(start, start + len(rows))
+        if functions is not None and whole is not None and whole.dtype == np.float32:
+            dc, ac = (
+                np.full(len(rows), scale_factor) if not part.any() else factors(scale_factor, part[block]).astype(float)
+                for scale_factor, part in zip((parameters.sf_dc, parameters.sf_sh), classes, strict=True)
+            )
+            if functions.quantising.colour_levels(whole, whole is columns, rows, dc, ac, start, levels):
+                return
         planar = (
             np.array([[column.take(rows) for column in rgb] for rgb in columns])
             if contiguous

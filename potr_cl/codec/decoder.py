@@ -8,7 +8,7 @@ from __future__ import annotations
 import os
 import stat
 from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import FIRST_EXCEPTION, Future, wait
+from concurrent.futures import Future
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -35,7 +35,7 @@ from potr_cl.codec.sections import Coder, Property, Section
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
-from potr_cl.host.threads import thread_pool
+from potr_cl.host.threads import Run, SharedWork, first_error, thread_pool
 from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene, most_coefficients
 
@@ -106,6 +106,9 @@ class PotrFile:
         Raises:
             DataError: damaged.
         """
+        return self._means(map, 1)
+
+    def _means(self, run: Run, parts: int) -> NDArray[np.float32]:
         header = self.header
         planes = self._planes(Property.MULTIPLICITY)
         raw = self._raw(Property.MULTIPLICITY)
@@ -123,7 +126,7 @@ class PotrFile:
             tails=self._raw(Property.TAIL),
             absolute=self.rules.absolute_leaf_levels,
         )
-        return octree.parse(tree, header.splats)
+        return octree.parse(tree, header.splats, run, parts)
 
     def log_scales(self) -> NDArray[np.float32]:
         """(N, 3) float32 natural logarithms of standard deviations. Raises DataError if damaged."""
@@ -164,7 +167,7 @@ class PotrFile:
             DataError: damaged.
         """
         count = self.sh_count(degree)
-        arrays = SceneArrays(self.header, self.rules, count, zeros=self._bundled is not None)
+        arrays = SceneArrays(self.header, self.rules, count)
         if self._bundled:
             self._bundled.fill(ValueArrays(sh=arrays.values.sh))
             return arrays.sh
@@ -194,8 +197,7 @@ class PotrFile:
             DataError: damaged.
         """
         try:
-            zeros = self._bundled is not None
-            arrays = SceneArrays(self.header, self.rules, self.sh_count(sh_degree), zeros)
+            arrays = SceneArrays(self.header, self.rules, self.sh_count(sh_degree))
             self.decode_into(arrays, threads, sh_degree)
         except MemoryError:
             needed = self.header.splats * (11 + 3 * self.sh_count(sh_degree)) * 4
@@ -228,7 +230,7 @@ class PotrFile:
             (self._contextual(Property.OPACITY), opacities),
         ]
         threads = min(threads or min(os.cpu_count() or 1, _MOST_THREADS), self._threads_in_memory())
-        self._run(jobs, lambda: destination.take_means(self.means()), threads)
+        self._run(jobs, lambda run, parts: destination.take_means(self._means(run, parts)), threads)
 
     def sh_count(self, degree: int | None = None) -> int:
         """How many SH coefficients of a channel there are up to a degree, which need not be in the file; None: all.
@@ -243,7 +245,7 @@ class PotrFile:
         """Those of the file's version."""
         return VERSIONS[self.header.version]
 
-    def _run(self, jobs: list[tuple[bool, _Job]], centres: Callable[[], None], threads: int) -> None:
+    def _run(self, jobs: list[tuple[bool, _Job]], centres: Callable[[Run, int], None], threads: int) -> None:
         """Do some jobs, each with whether it takes the context coder, and decode the centres.
 
         By NumPy the context coder makes many short calls, in which threads would only wait for each other: one makes
@@ -251,13 +253,15 @@ class PotrFile:
         """
         alone = native() is None
         left: list[Future[None]] = []
+        work = SharedWork()
 
-        def leave(work: Callable[[], None]) -> None:
+        def leave(what: Callable[[], None]) -> None:
             # What waits holds memory; where much does, threads are not what is missing.
             if sum(not future.done() for future in left) < _MOST_WAITING:
-                left.append(pool.submit(work))
+                left.append(work.add(what))
+                pool.submit(work.do)
             else:
-                work()
+                what()
 
         submit: _Submit = _now if threads == 1 else leave
 
@@ -267,29 +271,31 @@ class PotrFile:
 
         contextual = [job for takes_coder, job in jobs if takes_coder]
         with thread_pool(threads) as pool:
-            coded = [pool.submit(in_turn, some) for some in ([contextual] if alone else [[job] for job in contextual])]
-            means = pool.submit(centres)
-            others = [pool.submit(job, _now) for takes_coder, job in jobs if not takes_coder]
-            first: list[Future[Any]] = [*coded, means, *others]
-            for futures in (first, left):
-                wait(futures, return_when=FIRST_EXCEPTION)
-                for future in futures:
-                    if future.done() and (error := future.exception()) is not None:
+            try:
+                coded = [partial(in_turn, some) for some in ([contextual] if alone else [[job] for job in contextual])]
+                others = [partial(job, _now) for takes_coder, job in jobs if not takes_coder]
+                first = [work.add(what) for what in (*coded, partial(centres, work.run, threads), *others)]
+                for _ in range(min(threads, len(first))):
+                    pool.submit(work.do)
+                for futures in (first, left):
+                    if (error := first_error(futures)) is not None:
                         raise error
+            finally:
+                work.forget()
 
     def _decode_bundles(
         self, scene: BundledScene, destination: Destination, threads: int, sh_degree: int | None
     ) -> None:
-        def centres() -> None:
-            destination.take_means(self.means())
+        def centres(run: Run, parts: int) -> None:
+            destination.take_means(self._means(run, parts))
 
         if isinstance(destination, Fillable):
             replace(scene, activation=destination.activation).fill(
-                destination.values, threads, centres, destination.filled
+                destination.values, threads, centres, destination.filled if destination.is_told else None
             )
             return
         scene.hand_to(destination, self.sh_count(sh_degree), threads)
-        centres()
+        centres(map, 1)
 
     # ------------------------------------------------------------------------------------------ inside
 

@@ -141,28 +141,29 @@ class Dequantizer:
     def of_levels(self, levels: Levels, steps: ColourSteps | None, arrays: ValueArrays) -> None:
         """The values of some splats' levels, by NumPy, into the arrays that there are, of all of the file's splats."""
         version, header = self.version, self.header
-        own = slice(levels.start, levels.stop)
+        own = arrays.part(levels.start, levels.stop)
         scales = levels.scales or []
-        if arrays.logits is not None and levels.opacities is not None:
-            arrays.logits[own] = version.dequantize_opacities(levels.opacities, header.sf_opacity)
-        if arrays.log_scales is not None:
+        if own.logits is not None and levels.opacities is not None:
+            own.logits[...] = version.dequantize_opacities(levels.opacities, header.sf_opacity)
+        if own.log_scales is not None:
             for axis, level in enumerate(scales):
-                arrays.log_scales[own, axis] = version.dequantize_scales(level, header.sf_scale)
-        if arrays.quaternions is not None and levels.rotations is not None:
+                own.log_scales[:, axis] = version.dequantize_scales(level, header.sf_scale)
+        if own.quaternions is not None and levels.rotations is not None:
             turning = version.rotation_factors(scales, header.sf_rotation)
-            quantize.dequantize_rotations(levels.rotations, turning, arrays.quaternions[own])
-        if arrays.sh is None or levels.dc is None or levels.opacities is None:
+            quantize.dequantize_rotations(levels.rotations, turning, own.quaternions)
+        if own.sh is None or levels.dc is None or levels.opacities is None:
             return
+        own.sh[1:] = 0
         dc, ac = np.zeros((2, levels.stop - levels.start), np.int8)
         if steps is not None:
             dc, ac = steps.classes(scales, levels.opacities, levels.start)
         residuals = np.stack([channel.astype(np.int64) for channel in levels.dc])
-        _to_rgb(list(from_residuals(residuals, dc)), factors(header.sf_dc, dc), arrays.sh[0, :, own])
+        _to_rgb(list(from_residuals(residuals, dc)), factors(header.sf_dc, dc), own.sh[0])
         divisors = factors(header.sf_ac, ac)
         for items in levels.ac:
             rgb = np.empty(items.channels.shape, np.float32)
             _to_rgb(list(items.channels.astype(np.int64)), divisors[items.splats], rgb)
-            arrays.sh[items.coefficients, :, levels.start + items.splats] = rgb.T
+            own.sh[items.coefficients, :, items.splats] = rgb.T
 
     def _blocks(self, streams: Sequence[IntegerStream]) -> Iterator[tuple[slice, list[NDArray[np.integer]]]]:
         """The integers of some streams side by side, block by block."""

@@ -54,13 +54,19 @@ class Destination(Protocol):
 
 
 class Activation(Protocol):
-    """What a destination wants instead of logarithms of scales and logits of opacities, value by value."""
+    """What a destination wants instead of logarithms of scales and logits of opacities, value by value.
+
+    It gets quaternions of unit length, which :meth:`rotations` and the native path make.
+    """
 
     def scales(self, log_scales: F32) -> F32:
         """Instead of natural logarithms of standard deviations, of any shape."""
 
     def opacities(self, logits: F32) -> F32:
         """Instead of logits of opacities."""
+
+    def rotations(self, quaternions: F32) -> F32:
+        """(n, 4) quaternions, as long as 1 in double precision, then rounded."""
 
 
 class Fillable(ABC):
@@ -80,6 +86,9 @@ class Fillable(ABC):
     def take_means(self, means: F32) -> None:
         """Centres, (N, 3) float32, world units."""
 
+    #: Whether :meth:`filled` is called.
+    is_told = False
+
     def filled(self, start: int, stop: int) -> None:  # noqa: B027 (most have nothing left to do)
         """The arrays hold the values from one splat to another; told once of each, in their order."""
 
@@ -91,10 +100,9 @@ class SceneArrays(Fillable):
         header: of the file.
         version: the rules of the file's version.
         sh_count: SH coefficients of a channel that are wanted.
-        zeros: whether colours are filled in only where they are not 0.
     """
 
-    def __init__(self, header: Header, version: FormatVersion, sh_count: int, zeros: bool = False) -> None:
+    def __init__(self, header: Header, version: FormatVersion, sh_count: int) -> None:
         n = header.splats
         self._header = header
         self._dequantizer = Dequantizer(header, version)
@@ -102,7 +110,7 @@ class SceneArrays(Fillable):
         self._log_scales = np.empty((n, 3), np.float32)
         self._quaternions = np.empty((n, 4), np.float32)
         self._opacity_logits = np.empty(n, np.float32)
-        self._planar = (np.zeros if zeros else np.empty)((sh_count, 3, n), np.float32)
+        self._planar = np.empty((sh_count, 3, n), np.float32)
 
     @property
     def values(self) -> ValueArrays:

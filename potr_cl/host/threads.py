@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import os
+from collections import deque
 from collections.abc import Callable, Iterable, Iterator
-from concurrent.futures import Future, ThreadPoolExecutor
+from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
+from functools import partial
 from typing import Any, TypeVar
 
 T = TypeVar("T")
@@ -32,3 +34,74 @@ def in_background(work: Callable[..., T], *args: Any) -> Future[T]:
     future = pool.submit(work, *args)
     pool.shutdown(wait=False)
     return future
+
+
+class SharedWork:
+    """Tasks that some threads take one by one, each the next that nobody has taken.
+
+    A task may share out parts of its own work (:meth:`run`): these come before all other tasks, and the thread that
+    shares them out does what nobody else takes, so that it never waits for a thread to be free.
+    """
+
+    def __init__(self) -> None:
+        self._tasks: deque[_Task] = deque()
+
+    def add(self, work: Callable[[], Any]) -> Future[Any]:
+        """A task behind all others; what it returns or raises is the future's."""
+        self._tasks.append(task := _Task(work))
+        return task.future
+
+    def do(self) -> None:
+        """A thread's share: tasks until none are left that nobody has taken. What they raise is in their futures."""
+        while True:
+            try:
+                task = self._tasks.popleft()
+            except IndexError:
+                return
+            task.do()
+
+    def run(self, work: Callable[[Any], Any], items: Iterable[Any]) -> list[Any]:
+        """Call a function with each item, with the help of threads that do their share meanwhile (:data:`Run`).
+
+        Raises:
+            What one of the calls raises; others may not have been made then.
+        """
+        tasks = [_Task(partial(work, item)) for item in items]
+        self._tasks.extendleft(reversed(tasks))
+        for task in tasks:
+            task.do()
+        return [task.future.result() for task in tasks]
+
+    def forget(self) -> None:
+        """Leave what nobody has taken undone."""
+        self._tasks.clear()
+
+
+class _Task:
+    """Something to be done once, by whoever comes first."""
+
+    def __init__(self, work: Callable[[], Any]) -> None:
+        self._work = work
+        self._mine = deque((True,))  # what is popped is nobody else's
+        self.future: Future[Any] = Future()
+
+    def do(self) -> None:
+        try:
+            self._mine.pop()
+        except IndexError:
+            return
+        try:
+            self.future.set_result(self._work())
+        except Exception as error:  # the one who asks for the result is told
+            self.future.set_exception(error)
+        except BaseException as error:  # Ctrl-C
+            self.future.set_exception(error)
+            raise
+
+
+def first_error(futures: Iterable[Future[Any]]) -> BaseException | None:
+    """Wait until all is done, or until something raised: what the first in their order has raised, or None."""
+    futures = list(futures)
+    done, _ = wait(futures, return_when=FIRST_EXCEPTION)
+    errors = (future.exception() for future in futures if future in done)
+    return next((error for error in errors if error is not None), None)

@@ -48,6 +48,9 @@ class Activated:
     def opacities(self, logits: F32) -> F32:
         return log2_opacities(logits).astype(np.float32)
 
+    def rotations(self, quaternions: F32) -> F32:
+        return unit_quaternions(quaternions).astype(np.float32)
+
 
 class DeviceDequantiser(Fillable):
     """Takes a file's splats (:class:`potr_cl.codec.destination.Destination`) into a device's buffers.
@@ -114,24 +117,26 @@ class DeviceDequantiser(Fillable):
     def values(self) -> ValueArrays:
         """Arrays of the host, for files whose integers become values as they are decoded."""
         n = self._header.splats
-        shapes = {"log_scales": (n, 3), "quaternions": (n, 4), "logits": (n,)}
-        made = {name: np.empty(shape, np.float32) for name, shape in shapes.items()}
-        return ValueArrays(**made, sh=np.zeros((self._buffers.sh_count, 3, n), np.float32))
+        shapes = {"log_scales": (3, n), "quaternions": (4, n), "logits": (n,), "sh": (self._buffers.sh_count, 3, n)}
+        return ValueArrays(**{name: np.empty(shape, np.float32) for name, shape in shapes.items()}, columns=True)
+
+    is_told = True
 
     def filled(self, start: int, stop: int) -> None:
         """Upload these splats' values."""
-        arrays, buffers, pending = self.values, self._buffers, self._pending
+        arrays, buffers, own = self.values, self._buffers, slice(start, stop)
         assert arrays.log_scales is not None
         assert arrays.logits is not None
         assert arrays.quaternions is not None
         assert arrays.sh is not None
-        own = slice(start, stop)
-        units = _units(arrays.quaternions[own])
         with self._lock:
-            buffers.write_columns(buffers.sh, 0, arrays.sh.reshape(3 * buffers.sh_count, -1), pending, own)
-            buffers.write_columns(buffers.log2_opacities, 0, arrays.logits[None], pending, own)
-            buffers.write_rows(buffers.scales, arrays.log_scales[own], "the scales", pending, start)
-            buffers.write_rows(buffers.quaternions, units, "the rotations", pending, start)
+            for parameter, columns in (
+                (buffers.sh, arrays.sh.reshape(3 * buffers.sh_count, -1)),
+                (buffers.quaternions, arrays.quaternions),
+                (buffers.scales, arrays.log_scales),
+                (buffers.log2_opacities, arrays.logits[None]),
+            ):
+                buffers.write_columns(parameter, 0, columns, self._pending, own)
 
     def take_colours(
         self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, factors: ColourFactors

@@ -191,8 +191,17 @@ def choose_device(spec: str | None = None) -> DeviceInfo:
     Raises:
         DeviceError: there is no device, none that ``spec`` fits, or none of those can compile.
     """
+    return _first_able(fitting_devices(spec))
+
+
+def _first_able(infos: Sequence[DeviceInfo]) -> DeviceInfo:
+    """The first of these devices that can compile.
+
+    Raises:
+        DeviceError: none can.
+    """
     unable: list[DeviceInfo] = []
-    for info in fitting_devices(spec):
+    for info in infos:
         if compiler_fault(info) is None:
             if not _passed_over.issuperset(unable):
                 _passed_over.update(unable)
@@ -200,6 +209,50 @@ def choose_device(spec: str | None = None) -> DeviceInfo:
             return info
         unable.append(info)
     raise DeviceError(compiles_nothing(unable))
+
+
+def several_are_named() -> bool:
+    """Whether the environment names several devices, for those that ask for none."""
+    named = os.environ.get(DEVICE_VARIABLE, "")
+    return named.strip().lower() == "all" or "," in named
+
+
+def _by_preference() -> list[DeviceInfo]:
+    """All devices, best first.
+
+    Raises:
+        DeviceError: there is none.
+    """
+    devices = sorted(list_devices(), key=_preference)
+    if not devices:
+        raise DeviceError(
+            f"no OpenCL device found: install your GPU's OpenCL driver, or a CPU runtime by {_cpu_runtime_advice()}"
+        )
+    return devices
+
+
+def choose_devices(spec: str | None = None) -> list[DeviceInfo]:
+    """The devices that a name of several stands for, or the one that :func:`choose_device` takes.
+
+    Args:
+        spec: "all", the best device and all others of its kind and platform; indices of :func:`list_devices` with
+            commas between them, "0,1"; or what :func:`fitting_devices` takes.
+
+    Raises:
+        DeviceError: there is no such device, one is named twice, or one cannot compile.
+    """
+    spec = spec or os.environ.get(DEVICE_VARIABLE)
+    parts = [part.strip() for part in (spec or "").split(",")]
+    if spec and spec.strip().lower() == "all":
+        every = _by_preference()
+        best = _first_able(every)
+        alike = [info for info in every if (info.kind, info.platform) == (best.kind, best.platform)]
+        return [best, *(info for info in alike if info != best and compiler_fault(info) is None)]
+    if len(parts) > 1 and all(part.isdecimal() and len(part) < 9 for part in parts):
+        if len(set(map(int, parts))) < len(parts):
+            raise DeviceError(f"'{spec}' names a device twice: name each once")
+        return [choose_device(part) for part in parts]
+    return [choose_device(spec)]
 
 
 def fitting_devices(spec: str | None = None) -> list[DeviceInfo]:
@@ -212,15 +265,13 @@ def fitting_devices(spec: str | None = None) -> list[DeviceInfo]:
     Raises:
         DeviceError: there is no device, or none that ``spec`` fits.
     """
-    devices = sorted(list_devices(), key=_preference)
-    if not devices:
-        raise DeviceError(
-            f"no OpenCL device found: install your GPU's OpenCL driver, or a CPU runtime by {_cpu_runtime_advice()}"
-        )
+    devices = _by_preference()
     spec = spec or os.environ.get(DEVICE_VARIABLE)
     if not spec:
         return devices
     wanted = spec.strip().lower()
+    if wanted == "all" or re.fullmatch(r"\d+(\s*,\s*\d+)+", wanted):
+        raise DeviceError(f"'{spec}' names several devices, but only encode shares its work out: name one")
     if wanted.isdecimal() and len(wanted) < 9:
         matches = [d for d in devices if d.index == int(wanted)]
     elif wanted in ("cpu", "gpu"):

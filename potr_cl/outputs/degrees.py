@@ -3,9 +3,14 @@
 from __future__ import annotations
 
 import numpy as np
+from numpy.typing import NDArray
 
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray
 from potr_cl.outputs.output import Request
+
+#: Splats worked on at a time.
+_BLOCK = 1 << 14
 
 
 def worthwhile_degree(
@@ -26,7 +31,14 @@ def worthwhile_degree(
     degree = SH_COEFFICIENTS.index(sh.shape[1])
     if worth is None:
         return degree
-    errors = np.einsum("nm,nmc->m", worth, sh * sh, dtype=np.float64)
+
+    def error(start: int) -> NDArray[np.float64]:
+        some = slice(start, start + _BLOCK)
+        errors: NDArray[np.float64] = (worth[some] * np.square(sh[some]).sum(axis=2)).sum(axis=0, dtype=np.float64)
+        return errors
+
+    with thread_pool(request.threads) as pool:
+        errors = sum(pool.map(error, range(0, len(sh), _BLOCK)), np.zeros(sh.shape[1]))
     while degree > 0:
         first, end = SH_COEFFICIENTS[degree - 1], SH_COEFFICIENTS[degree]
         splat = other_bytes + bytes_a_coefficient * (end - 1)

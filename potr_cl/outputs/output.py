@@ -146,7 +146,7 @@ class Output(ABC):
 
     def fix_ac(
         self, rounded: Rounded, sh: FloatArray, worth: FloatArray | None, request: Request
-    ) -> tuple[Rounded, FloatArray | ColourGrid]:
+    ) -> tuple[Rounded, FloatArray]:
         """Choose the AC coefficients that the file will hold: levels, bits or a palette.
 
         It is called once, after the re-fit, or by :meth:`file` where there was none. The re-fit then solves for the
@@ -161,10 +161,27 @@ class Output(ABC):
 
         Returns:
             What :meth:`file` is given, and the coefficients as readers will see them. ``sh`` itself where nothing is
-            rounded that anybody could see. A :class:`ColourGrid` where each coefficient is rounded to steps of its
-            splat: the re-fit then does it.
+            rounded that anybody could see.
         """
         return rounded, sh
+
+    def on_grid(self, request: Request) -> bool:
+        """Whether colours are rounded to the steps of :meth:`colour_grid`, and :meth:`fix_ac` does nothing."""
+        return False
+
+    def colour_grid(self, rounded: Rounded, effects: FloatArray, request: Request) -> tuple[Rounded, ColourGrid]:
+        """The steps of colours, where they follow from the geometry and ``effects`` alone.
+
+        So the re-fit can ask while it solves, and round in rounds. Only for outputs that are :meth:`on_grid`.
+
+        Args:
+            rounded, request: as of :meth:`fix_ac`.
+            effects: (N,) float32, ``worth`` of the constant coefficients.
+
+        Returns:
+            What :meth:`file` is given, and the steps.
+        """
+        raise NotImplementedError
 
     @abstractmethod
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
@@ -184,8 +201,7 @@ class Output(ABC):
         """Rounded geometry and fixed AC coefficients, where :meth:`file` gets none from a re-fit."""
         if rounded is not None:
             return rounded, scene.sh
-        rounded, sh = self.fix_ac(self.geometry(scene, request), scene.sh, None, request)
-        return rounded, scene.sh if isinstance(sh, ColourGrid) else sh
+        return self.fix_ac(self.geometry(scene, request), scene.sh, None, request)
 
     def read(self, data: bytes, trust: bool = False) -> Scene:
         """The scene that a file's readers will see.

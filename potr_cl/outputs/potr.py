@@ -42,7 +42,7 @@ _NAMES = {
 
 @dataclass(frozen=True)
 class Potr(Output):
-    """A .potr file: :mod:`potr_cl.codec`. Colours are rounded to steps finer than one sees."""
+    """A .potr file: :mod:`potr_cl.codec`. AC coefficients are rounded to steps finer than one sees."""
 
     format: ClassVar[SceneFormat] = FORMAT
     choices: ClassVar[frozenset[str]] = frozenset(
@@ -56,14 +56,14 @@ class Potr(Output):
         with thread_pool(request.threads) as pool:
             return quantise(scene, request.parameters, request.views, pool.map)
 
-    def fix_ac(
-        self, rounded: Rounded, sh: FloatArray, worth: FloatArray | None, request: Request
-    ) -> tuple[Rounded, FloatArray | ColourGrid]:
-        """Fit the steps of colours to each splat, in the versions of the format that have such."""
+    def on_grid(self, request: Request) -> bool:
+        """In the versions of the format that have steps of each splat."""
+        return VERSIONS[request.parameters.version].colour_steps
+
+    def colour_grid(self, rounded: Rounded, effects: FloatArray, request: Request) -> tuple[Rounded, ColourGrid]:
+        """Fit the steps of colours to each splat."""
         assert isinstance(rounded, (Geometry, GeometryOfBlocks))
-        if worth is None or not VERSIONS[request.parameters.version].colour_steps:
-            return rounded, sh
-        geometry = rounded.with_steps(worth[:, 0])
+        geometry = rounded.with_steps(effects)
         return geometry, ColourGrid.of(geometry)
 
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:

@@ -97,12 +97,15 @@ class Sog(Output):
             return replace(rounded, worth=bits), sh
         device = request.device or Device()
         order = rounded.order
-        points, weights = np.ascontiguousarray(sh[order, 1:]), np.ascontiguousarray(bits[order, 1:])
+        points = np.ascontiguousarray(sh.take(order, axis=0)[:, 1:])
+        weights = np.ascontiguousarray(bits.take(order, axis=0)[:, 1:])
         most = min(max(int(len(points) * _MOST_A_SPLAT), 1), PALETTE)
         found = cluster(device, points, weights, most, Rate(_BITS_AN_ENTRY))
         palette = _coded(device, points, weights, found.centres, found.labels)
         fixed = sh.copy()
-        fixed[order, 1:] = palette.book[palette.entries][palette.labels]
+        back = np.empty_like(order)
+        back[order] = np.arange(len(order))
+        fixed[:, 1:] = palette.book.take(palette.entries).take(palette.labels.take(back), axis=0)
         if made_up is not None:
             fixed[:, 0] += np.einsum("nm,nmc->nc", made_up, sh[:, 1:] - fixed[:, 1:])
         return replace(rounded, worth=bits, palette=palette), fixed

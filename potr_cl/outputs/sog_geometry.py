@@ -60,10 +60,10 @@ class SogGeometry:
         back[self.order] = np.arange(len(self.order))
         return replace(
             scene,
-            means=unpacked_means(self.steps, self.least, self.most)[back],
-            log_scales=self.scale_book[self.scales][back],
-            quaternions=unpacked_rotations(self.quaternions)[back],
-            opacity_logits=opacity_logits()[self.opacities][back],
+            means=unpacked_means(self.steps, self.least, self.most).take(back, axis=0),
+            log_scales=self.scale_book.take(self.scales.take(back, axis=0)),
+            quaternions=unpacked_rotations(self.quaternions).take(back, axis=0),
+            opacity_logits=opacity_logits().take(self.opacities.take(back)),
         )
 
 
@@ -82,21 +82,29 @@ def rounded_geometry(scene: Scene, parameters: HyperParameters, distances: NDArr
     world = version.in_world_units(parameters, scene, distances)
     least, most, steps = _positions(scene, np.maximum(world.gamma, world.beta * distances))
     order = along_curve(steps)
-    imaginary, log_scales = canonical_rotations(scene.quaternions[order], scene.log_scales[order])
+    imaginary, log_scales = canonical_rotations(
+        scene.quaternions.take(order, axis=0), scene.log_scales.take(order, axis=0)
+    )
     levels = [version.quantize_scales(axis.astype(np.float64), world.sf_scale) for axis in log_scales.T]
     factors = version.rotation_factors(levels, world.sf_rotation)
     scale_levels = np.stack(levels, axis=1)
-    book = np.unique(np.rint(codebook(scale_levels.reshape(-1).astype(np.float32), None, CODEBOOK)).astype(np.int64))
-    logits = version.quantize_opacities(scene.opacity_logits[order].astype(np.float64), world.sf_opacity)
+    least_level = int(scale_levels.min())
+    counts = np.bincount((scale_levels - least_level).reshape(-1))
+    there = np.flatnonzero(counts)
+    values = (there + least_level).astype(np.float32)
+    book = np.unique(np.rint(codebook(values, counts[there].astype(np.float64), CODEBOOK)).astype(np.int64))
+    entries = np.zeros(len(counts), np.uint8)
+    entries[there] = nearest(values, book.astype(np.float32))
+    logits = version.quantize_opacities(scene.opacity_logits.take(order).astype(np.float64), world.sf_opacity)
     decoded = version.dequantize_opacities(logits, world.sf_opacity).astype(np.float64)
     return SogGeometry(
         order,
         least,
         most,
-        steps[order],
+        steps.take(order, axis=0),
         _rotations(imaginary, factors, (scale_levels == scale_levels[:, :1]).all(axis=1)),
         version.dequantize_scales(book, world.sf_scale),
-        nearest(scale_levels.astype(np.float32), book.astype(np.float32)).astype(np.uint8),
+        entries.take(scale_levels - least_level),
         np.rint(255 / (1 + np.exp(-decoded))).astype(np.uint8),
     )
 

@@ -36,6 +36,7 @@ from potr_cl.stages.refitting.photographs import PhotographChoice
 from potr_cl.stages.refitting.refit import Refitted
 from potr_cl.stages.stage import Interlude, Progress, Stage, State, Workbench
 from potr_cl.stages.views_between import Added
+from potr_cl.workers.pool import Pool, Traffic
 
 _log = logging.getLogger("potr_cl")
 
@@ -60,6 +61,7 @@ class Encoded:
         options: that it was encoded with: those that were given, or that a search for a size or a PSNR has found.
         source_splats: how many splats the source scene has.
         parameters: the hyper-parameters that the stages took.
+        shared: who did the work, where views were shared out.
     """
 
     pieces: list[bytes]
@@ -76,6 +78,7 @@ class Encoded:
     options: EncodeOptions
     source_splats: int
     parameters: HyperParameters
+    shared: SharedOut | None = None
 
     def __repr__(self) -> str:
         q = f"q {self.options.q:.4g} of preset {self.options.preset}"
@@ -102,6 +105,30 @@ class Encoded:
         with replacing(path) as file:
             for piece in self.pieces:
                 file.write(piece)
+
+
+@dataclass(frozen=True)
+class SharedOut:
+    """How views were shared out.
+
+    Attributes:
+        workers: their names.
+        sent, received: bytes that went to them and came from them.
+    """
+
+    workers: tuple[str, ...]
+    sent: int
+    received: int
+
+    @staticmethod
+    def by(pool: Pool, before: Traffic) -> SharedOut:
+        """What a pool has done since its traffic was ``before``."""
+        now = pool.traffic
+        return SharedOut(pool.names, now.sent - before.sent, now.received - before.received)
+
+    def __str__(self) -> str:
+        megabytes = f"{self.sent / 1e6:,.0f} MB sent, {self.received / 1e6:,.0f} MB received"
+        return f"views shared out to {len(self.workers)} workers: {megabytes}"
 
 
 @dataclass(frozen=True)
@@ -152,6 +179,7 @@ def encode(
     antialiased: bool | None = None,
     kept: KeptScene | None = None,
     in_frame: bool = False,
+    pool: Pool | None = None,
     tell: Callable[[str], None] | None = None,
 ) -> Encoded:
     """Encode a scene.
@@ -167,6 +195,7 @@ def encode(
         antialiased: whether to take it as an antialiased scene; None: as what it says that it is.
         kept: the scene on the device, if it will be needed there afterwards.
         in_frame: whether :func:`check_frame` has found the cameras to be in the scene's frame.
+        pool: workers that views are shared out to, of which ``device`` is the first; None: the device does all.
         tell: told a line for every round of a fit.
 
     Raises:
@@ -182,9 +211,9 @@ def encode(
     cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame)
     with ExitStack() as stack:
         if kept is None and cameras and options.look_at_views(scene):
-            device = device or Device()
+            device = device or (Device() if pool is None else pool.first)
             kept = stack.enter_context(KeptScene(device, scene))
-        run = Run(options, watch, device, kept)
+        run = Run(options, watch, device, kept, pool)
         return run.finished(run.stages(State.of(scene, train_views(cameras) if cameras else [])))
 
 
@@ -237,15 +266,23 @@ class Run:
         watch: keeps the time and passes the progress on.
         device: the first to be tried; by default the best one there is, opened when a stage needs it.
         kept: the uncompressed scene on that device.
+        pool: workers that views are shared out to, as long as the work is done on the pool's first device.
 
     Attributes:
         device: the one on which the last stage ran that needs views; None if none did.
     """
 
     def __init__(
-        self, options: EncodeOptions, watch: Stopwatch, device: Device | None = None, kept: KeptScene | None = None
+        self,
+        options: EncodeOptions,
+        watch: Stopwatch,
+        device: Device | None = None,
+        kept: KeptScene | None = None,
+        pool: Pool | None = None,
     ) -> None:
         self.device: Device | None = None
+        self._pool = pool
+        self._before = Traffic() if pool is None else dataclasses.replace(pool.traffic)
         self._options, self._watch, self._given, self._kept = options, watch, device, kept
 
     def stages(self, state: State, only: Sequence[type[Stage]] | None = None) -> State:
@@ -283,7 +320,8 @@ class Run:
             return state
 
         def work(device: Device, memory: int | None) -> State:
-            return stage.run(state, dataclasses.replace(bench, device=device, memory=memory))
+            pool = self._pool if self._pool is not None and device is self._pool.first else None
+            return stage.run(state, dataclasses.replace(bench, device=device, memory=memory, pool=pool))
 
         device = self.device or self._given or Device()
         state, self.device = on_device(device, options.memory, work)
@@ -313,14 +351,18 @@ class Run:
             seconds=self._watch.seconds,
             options=self._options,
             source_splats=len(state.source),
+            shared=None if self._pool is None else SharedOut.by(self._pool, self._before),
             parameters=as_done(self._options, state).parameters,
         )
 
 
 def as_done(options: EncodeOptions, state: State) -> EncodeOptions:
-    """The options as a state has followed them: without a fit that was left out, for which others would be finer."""
-    if isinstance(state.learnt.get(Fit.name), LeftOut):
+    """The options as a state has followed them: only a fit that made up for splats has the others round finer."""
+    fitted = state.learnt.get(Fit.name)
+    if isinstance(fitted, LeftOut):
         return options.changed(fit=False)
+    if isinstance(fitted, Fitted) and not fitted.spared:
+        return options.changed(fit={"finer": 0.0})
     return options
 
 

@@ -26,6 +26,7 @@ from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.between.amount import most_needed
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.fit import Fit
+from potr_cl.stages.fitting.memory import fit_bytes
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.sweep_options import default_memory
 from potr_cl.stages.refit import Refit
@@ -121,8 +122,8 @@ def forecast(
     if isinstance(prune := parts.get(Prune.name), Prune):
         pictures += views * (units.prune + units.iteration * prune.iterations)
     if isinstance(fit := parts.get(Fit.name), Fit):
-        pictures += fit.cycles * fit.steps_on(device.family) * fit.batch * units.fit
-        pictures += fit.cycles * views * (units.prepare + units.iteration * fit.iterations)
+        pictures += fit.steps_on(device.family) * fit.batch * units.fit
+        pictures += views * (fit.views_on(device.family) + units.prepare + units.iteration * fit.iterations)
     if Compact.name in parts:
         pictures += views * units.compact
         of_a_splat += units.compact_splat
@@ -133,6 +134,12 @@ def forecast(
     work = pictures * seconds + len(scene) * of_a_splat
     budget = default_memory(device) if options.memory is None else options.memory
     memory = len(scene) * _DEVICE_SPLAT + min(views * nbytes * _VIEWS, budget)
+    if isinstance(fit, Fit):
+        pixels = float(np.mean([camera.width * camera.height for camera in cameras]))
+        together = fit.batch if device.family == "gpu" else 1
+        view = nbytes - _PIXEL * pixels
+        needed = fit_bytes(len(scene), len(scene), 3 * scene.sh.shape[1], together, int(views), view, pixels, budget)
+        memory = max(memory, needed)
     if device.info.kind == "cpu":
         memory += _PROCESS + len(scene) * _HOST_SPLAT
     return Forecast(work * (_SEARCH if search else 1), memory, seconds, pictures)

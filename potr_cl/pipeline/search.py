@@ -39,6 +39,7 @@ from potr_cl.stages.fit import Fit
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import Progress, Stage, State, parameters
+from potr_cl.workers.pool import Pool
 
 #: A scout's pruning iterations, its steps of the re-fit and of the fit; and by how much what it finds is smaller than a
 #: full encode's: the logarithm of bytes, and decibels; about, and where there is a re-fit.
@@ -78,6 +79,7 @@ def encode_to_target(
     device: Device | None = None,
     tell: Callable[[str], None] | None = None,
     antialiased: bool | None = None,
+    pool: Pool | None = None,
 ) -> Found:
     """Encode a scene so that it meets a target, as well (or as small) as that allows.
 
@@ -86,6 +88,7 @@ def encode_to_target(
         target: what to reach.
         options: its q is not looked at; single parameters that are given stay as they are.
         tell: told a line for every step.
+        pool: as :func:`potr_cl.pipeline.encode.encode` takes it.
 
     Raises:
         UnreachableError: no q meets the target.
@@ -103,14 +106,15 @@ def encode_to_target(
 
     def work(device: Device, memory: int | None) -> Found:
         search = _Search(
-            scene, cameras or [], target, options.changed(memory=memory), watch, device, tell or (lambda _line: None)
-        )
+            scene, cameras or [], target, options.changed(memory=memory), watch, device, tell or (lambda _line: None),
+            pool,
+        )  # fmt: skip
         try:
             return search.run()
         finally:
             search.close()
 
-    found, _ = on_device(device or Device(), options.memory, work)
+    found, _ = on_device(device or (Device() if pool is None else pool.first), options.memory, work)
     return found
 
 
@@ -152,7 +156,9 @@ class _Search:
         watch: Stopwatch,
         device: Device,
         tell: Callable[[str], None],
+        pool: Pool | None = None,
     ) -> None:
+        self._pool = pool
         self._scene = scene
         self._cameras = cameras
         self._views = train_views(cameras) if cameras else []
@@ -368,14 +374,14 @@ class _Search:
         return self._run(thinned, options, self._repeated)
 
     def _run(self, state: State, options: EncodeOptions, only: list[type[Stage]]) -> State:
-        run = Run(options, self._watch, self._device)
+        run = Run(options, self._watch, self._device, pool=self._pool)
         state = run.stages(state, only)
         self._used = run.device or self._used
         self._device = run.device or self._device
         return state
 
     def _code(self, state: State, options: EncodeOptions) -> Encoded:
-        run = Run(options, self._watch, self._device)
+        run = Run(options, self._watch, self._device, pool=self._pool)
         return dataclasses.replace(run.finished(run.stages(state, [Code])), device=self._used)
 
     def _evaluate(self, kind: str, q: float, thinned: State, reduced: State, options: EncodeOptions) -> _Candidate:

@@ -233,6 +233,41 @@ class SceneBuffers(Owner):
 Drawable: TypeAlias = "Scene | SceneBuffers"
 
 
+def gathered(scene: SceneBuffers, splats: NDArray[np.int64]) -> SceneBuffers:
+    """Some splats of a scene on a device, there.
+
+    Args:
+        scene: that has them.
+        splats: (n,) their numbers.
+
+    Raises:
+        DeviceError: they do not fit the device beside the scene.
+    """
+    device = scene.device
+    part = SceneBuffers(device, len(splats), scene.sh_count, scene.antialiased, scene.low_pass)
+    try:
+        gather = device.shared_kernel("raster/gather_columns.cl", "gather_columns")
+        columns = {"means": 3, "scales": 3, "quaternions": 4, "log2_opacities": 1, "sh": 3 * scene.sh_count}
+        with Memory(device) as memory:
+            numbers = memory.upload(splats.astype(np.uint32), "the numbers of some splats")
+            for name, count in columns.items():
+                gather.bind(
+                    columns=getattr(scene, name),
+                    stride=scene.stride,
+                    numbers=numbers,
+                    count=len(splats),
+                    result_stride=part.stride,
+                    result=getattr(part, name),
+                )
+                gather.launch((part.stride, count), (SPLAT_GROUP, 1))
+            with device.errors("cannot take a part of a scene"):
+                device.queue.finish()
+    except BaseException:
+        part.close()
+        raise
+    return part
+
+
 def uploaded(device: Device, scene: Scene) -> SceneBuffers:
     """A scene's parameters on a device: copied, later changes of its arrays are not seen.
 

@@ -76,6 +76,7 @@ def encode_report(
         "options": options.as_dict(),
         "parameters": dataclasses.asdict(encoded.parameters),
         "device": None,
+        "shared": None,
         "seconds": seconds,
         "command": command,
         "versions": {"potr_cl": __version__, "python": platform.python_version()}
@@ -92,6 +93,8 @@ def encode_report(
         report["fit"] = {**encoded.fitted.facts, "said": str(encoded.fitted)}
     if encoded.between is not None:
         report["views_between"] = {**dataclasses.asdict(encoded.between), "said": str(encoded.between)}
+    if encoded.shared is not None:
+        report["shared"] = {**dataclasses.asdict(encoded.shared), "said": str(encoded.shared)}
     if encoded.device is not None:
         info = encoded.device.info
         report["device"] = {"name": info.name, "platform": info.platform, "version": info.version}
@@ -214,4 +217,6 @@ def format_encode_report(report: dict[str, Any]) -> str:
     lines.append(f"time       {total:.1f} s: " + ", ".join(f"{stage} {time:.1f}" for stage, time in times.items()))
     if report["device"] is not None:
         lines.append(f"device     {report['device']['name']} ({report['device']['platform']})")
+    if report["shared"] is not None:
+        lines.append(f"workers    {report['shared']['said']}")
     return "\n".join(lines)

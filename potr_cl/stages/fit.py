@@ -7,12 +7,15 @@ views that are held out: a splat is worth the error for which pruning would have
 from __future__ import annotations
 
 import dataclasses
+import math
 from contextlib import ExitStack
 from dataclasses import dataclass
 from typing import Any, Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.signals import first_interrupt_asks
+from potr_cl.model.views_between import views_between
+from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
@@ -21,15 +24,23 @@ from potr_cl.stages.prune import Prune
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
-#: By so much a fit lessens the harm of a splat that is gone, about (docs/benchmarks/fit.md).
-FURTHER = 5.0
-#: By how much finer than q the re-fit and the coder round, so that the PSNR is about that of q without a fit: at q = 0;
-#: less and less up to q = 1, because a fit brings the more, the fewer splats are left.
-FINER = 0.115
+#: Times the threshold of pruning up to which a fit makes up for splats, about (docs/benchmarks/fit.md): for this
+#: threshold, and for others as much more as its root is larger, because a fit brings the more, the fewer splats are
+#: left; but not more than the most.
+FURTHER, _AT_THRESHOLD, _MOST_FURTHER = 3.5, 10**-9.3, 20.0
+#: By how much of its way to 1 the q is higher whose steps give about the PSNR that q has without a fit.
+FINER = 0.18
 #: Steps that "auto" stands for.
-STEPS: dict[Family, int] = {"cpu": 500, "gpu": 1500}
-#: How often it is tried at least, each time from a lower threshold on, before it is left out.
-_TRIES = 2
+STEPS: dict[Family, int] = {"cpu": 500, "gpu": 1200}
+#: Views between for each given one that a fit looks at: they keep it from fitting the given ones too closely.
+BETWEEN: dict[Family, float] = {"cpu": 1.0, "gpu": 3.0}
+#: Part of the steps in each cycle but the last.
+_FIRST = 0.25
+#: What a splat costs as a multiple of the error for which pruning would have let it go: what it adds to the error when
+#: it is rounded comes on top.
+_WORTH = 1.25
+#: What is left of the cost has to be less than this part of it: a few held-out views are no exact judges.
+_LESS = 0.97
 #: Why a fit was left out.
 _TOO_FEW_VIEWS = "it needs two training views or more, because one of them is held out and tells whether it helps"
 _NO_GAIN = "on the views that were held out it did not make up for the splats that were removed before it"
@@ -75,11 +86,14 @@ class Fit(Stage):
 
     Attributes:
         steps: the most steps of the fit; with 0 it is left out. "auto": as many as pay on the device.
-        further: times the ΔMSE_MAX of the pruning before it up to which splats are removed for the fit to make up for;
-            1: none are.
+        further: times the ΔMSE_MAX of the pruning before it up to which splats are removed for the fit to make up for,
+            where that is 10^-9.3; with its root more for a larger one. 0: none are removed.
         finer: by how much of its way to 1 the q is higher whose hyper-parameters the re-fit and the coder take.
-        cycles: how often at most splats are removed and a fit follows: as long as that pays.
+        cycles: how often splats are removed and a fit follows, each time up to a higher threshold; before the first of
+            several, none are.
         iterations: of the pruning in each of them.
+        between: views between that the fit looks at, for each given view, unless there are more already. "auto": as
+            many as pay on the device.
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -103,8 +117,9 @@ class Fit(Stage):
     )
     further: float = option(FURTHER)
     finer: float = option(FINER)
-    cycles: int = option(1)
+    cycles: int = option(2)
     iterations: int = option(16)
+    between: float | Literal["auto"] = option("auto")
     batch: int = option(FitOptions.batch)
     rounds: int = option(FitOptions.rounds)
     patience: int = option(FitOptions.patience)
@@ -114,8 +129,10 @@ class Fit(Stage):
 
     def __post_init__(self) -> None:
         _ = self._options("gpu", None)
-        if not 1 <= self.further <= 1e6:
-            raise UsageError(f"the fit's further pruning is {self.further:g}, it must be from 1 to 1,000,000")
+        if not 0 <= self.further <= 1e6:
+            raise UsageError(f"the fit's further pruning is {self.further:g}, it must be from 0 to 1,000,000")
+        if self.between != "auto" and not 0 <= self.between <= 100:
+            raise UsageError(f"the fit's views between are {self.between:g}, they must be from 0 to 100")
         if not 0 <= self.finer <= 1:
             raise UsageError(f"the fit's finer quality is {self.finer:g}, it must be from 0 to 1")
         for name in ("cycles", "iterations"):
@@ -133,6 +150,10 @@ class Fit(Stage):
         """The most steps on a device of a family."""
         return STEPS[family] if self.steps == "auto" else self.steps
 
+    def views_on(self, family: Family) -> float:
+        """Views between that it looks at on a device of a family, for each given one."""
+        return BETWEEN[family] if self.between == "auto" else self.between
+
     def _options(self, family: Family, memory: int | None) -> FitOptions:
         return FitOptions(
             steps=self.steps_on(family),
@@ -144,6 +165,11 @@ class Fit(Stage):
             seed=self.seed,
             memory=memory,
         )
+
+    def limit(self, price: float) -> float:
+        """The threshold up to which splats are removed for a fit to make up for, where pruning had this one."""
+        further = self.further * math.sqrt(price / _AT_THRESHOLD)
+        return price * min(max(further, 1.0), _MOST_FURTHER)
 
     def run(self, state: State, bench: Workbench) -> State:
         """Remove splats, fit, and leave a :class:`potr_cl.stages.fitting.fit.Fitted` in ``learnt``.
@@ -159,42 +185,59 @@ class Fit(Stage):
             source = bench.drawable(state.source)
             rasterizer = stack.enter_context(Rasterizer(bench.opened, source, background=bench.background))
             asked = stack.enter_context(first_interrupt_asks())
-            return self._cycles(state, bench, RenderedTargets(rasterizer, state.views), asked)
+            found = self._cycles(self._looking_between(state, bench), bench, rasterizer, asked)
+        return dataclasses.replace(found, views=state.views, added=state.added)
 
-    def _cycles(self, state: State, bench: Workbench, targets: Targets, asked: SupportsBool) -> State:
-        """Remove splats and fit by turns, each time up to a lower threshold, and keep what costs least."""
+    def _looking_between(self, state: State, bench: Workbench) -> State:
+        """The state with the views that the fit looks at."""
+        given = state.views[: len(state.views) - state.added]
+        each = self.views_on(bench.opened.family)
+        if is_virtual(given) or each * len(given) <= state.added:
+            return state
+        added = views_between(state.source, given, each)
+        return dataclasses.replace(state, views=(*given, *added), added=len(added))
+
+    def _cycles(self, state: State, bench: Workbench, rasterizer: Rasterizer, asked: SupportsBool) -> State:
+        """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least."""
+        targets = RenderedTargets(rasterizer, state.views)
         price: float | None = state.learnt.get("price")
-        worth = price or 0.0
+        worth = 0.0 if price is None else _WORTH * price
         without = held_out_error(bench.opened, state.scene, state.views, targets, state.added, bench.background)
-        best, least, taken = state, without + worth * len(state.scene), None
-        tries = 1 if price is None else max(self.cycles, _TRIES)
-        accepted = 0
-        for number in range(tries):
-            start = best if price is None else self._pruned(best, price * self.further ** (0.5**number), bench)
+        least = without + worth * len(state.scene)
+        further = 1.0
+        if price is not None:
+            least *= _LESS
+            further = self.limit(price) / price
+        last = best = state
+        taken: Fitted | None = None
+        steps_of = self._steps_of_cycles(bench.opened.family, price is not None and further > 1)
+        total, done = sum(steps_of), 0
+        for number, steps in enumerate(steps_of):
+            part = number / (len(steps_of) - 1) if len(steps_of) > 1 else 1.0
+            if price is not None and further > 1 and part > 0:
+                last = self._pruned(last, price * further**part, bench)
 
-            def progress(done: int, steps: int, number: int = number) -> None:
-                bench.progress("fit", min((number + done / steps) / self.cycles, 0.99))
+            def progress(now: int, _steps: int, before: int = done) -> None:
+                bench.progress("fit", 0.99 * (before + now) / total)
 
-            fitted = self._fitted(start, bench, targets, progress, asked)
+            fitted = self._fitted(last, bench, targets, steps, progress, asked)
+            last, done = dataclasses.replace(last, scene=fitted.scene, geometry=None), done + steps
             cost = fitted.error + worth * len(fitted.scene)
             if price is None or cost < least:
-                if taken is not None:
-                    steps, kept = taken.steps + fitted.steps, taken.kept + fitted.kept
-                    fitted = dataclasses.replace(fitted, steps=steps, kept=kept)
-                taken = dataclasses.replace(fitted, spared=len(state.scene) - len(fitted.scene), without=without)
-                best, least = dataclasses.replace(start, scene=fitted.scene, geometry=None), cost
-                accepted += 1
-                if accepted == self.cycles:
-                    break
-            elif taken is not None:
-                break
+                spared = len(state.scene) - len(fitted.scene)
+                best, least, taken = last, cost, dataclasses.replace(fitted, spared=spared, without=without)
             if asked:
                 break
-            if number + 1 < tries:
-                bench.tell("fit: once more, with fewer splats removed before it")
         if taken is None:
             return state.having_learnt(self.name, LeftOut(_INTERRUPTED if asked else _NO_GAIN, bool(asked)))
         return best.having_learnt(self.name, taken)
+
+    def _steps_of_cycles(self, family: Family, removing: bool) -> list[int]:
+        """The steps of the fit in each cycle."""
+        steps = self.steps_on(family)
+        cycles = min(self.cycles, steps) if removing else 1
+        first = max(int(_FIRST * steps), 1)
+        return [*[first] * (cycles - 1), max(steps - first * (cycles - 1), 1)]
 
     def _pruned(self, state: State, limit: float, bench: Workbench) -> State:
         """The state without the splats that a fit will make up for."""
@@ -204,9 +247,15 @@ class Fit(Stage):
         return dataclasses.replace(left, learnt=state.learnt)
 
     def _fitted(
-        self, state: State, bench: Workbench, targets: Targets, progress: FitProgress, asked: SupportsBool
+        self,
+        state: State,
+        bench: Workbench,
+        targets: Targets,
+        steps: int,
+        progress: FitProgress,
+        asked: SupportsBool,
     ) -> Fitted:
-        options = self._options(bench.opened.family, bench.memory)
+        options = dataclasses.replace(self._options(bench.opened.family, bench.memory), steps=steps)
         if "compact" in state.learnt:
             options = dataclasses.replace(options, rates=dataclasses.replace(options.rates, ac=0.0))
         return fit_scene(

@@ -8,9 +8,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
-from potr_cl.stages.pruning.measured import Measured, measurement
+from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import Pruned, PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.unseen import CHOICES, Unseen, as_of_whole, find_unseen, put_back, set_aside
@@ -182,7 +181,7 @@ class _Course:
         sh: (N, M, 3) the colours that all splats of the state's scene have by now.
     """
 
-    def __init__(self, state: State, removal: RemovalSweep) -> None:
+    def __init__(self, state: State, removal: Removal) -> None:
         self._state, self._removal = state, removal
         self.sh = state.scene.sh
 

@@ -16,7 +16,14 @@ from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
-from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, Refitted, active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit import (
+    ColourRefit,
+    HelpFrom,
+    RefitOptions,
+    Refitted,
+    active_coefficients,
+    refit_colours,
+)
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
@@ -132,15 +139,26 @@ class Refit(Stage):
             def progress(done: int, steps: int) -> None:
                 bench.progress("refit", (number + done / steps) / fits)
 
-            def fix_ac(sh: FloatArray, refit: ColourRefit) -> FloatArray | ColourGrid:
+            def fix_ac(sh: FloatArray, refit: ColourRefit) -> FloatArray:
                 nonlocal geometry
                 request = replace(bench.request(state), blocks=refit.blocks)
                 geometry, fixed = bench.output.fix_ac(rounded, sh, refit.worth(), request)
                 return fixed
 
+            def colour_grid(effects: FloatArray) -> ColourGrid:
+                nonlocal geometry
+                geometry, grid = bench.output.colour_grid(rounded, effects, bench.request(state))
+                return grid
+
+            on_grid = bench.output.on_grid(bench.request(state))
             found = refit_colours(
                 bench.opened, decoded, views, targets, options, active, bench.background, progress,
-                fix_ac if bench.output.fixes_ac else None,
+                fix_ac=None if on_grid or not bench.output.fixes_ac else fix_ac,
+                # Photographs lie where the master reads them.
+                help_from=HelpFrom(bench.pool, state.source)
+                if bench.pool and isinstance(targets, RenderedTargets)
+                else None,
+                colour_grid=colour_grid if on_grid else None,
             )  # fmt: skip
             return found, geometry
 
@@ -190,6 +208,7 @@ class RefitOnTheWay(Stage):
                 RefitOptions(steps=self.steps, memory=bench.memory),
                 background=bench.background,
                 progress=lambda done, steps: bench.progress("refit", 0.99 * done / steps),
+                help_from=None if bench.pool is None else HelpFrom(bench.pool, state.source),
             )
         bench.progress("refit", 1.0)
         return state.recoloured(refitted.sh)

@@ -27,6 +27,7 @@ from potr_cl.outputs.output import Output, Request, Rounded
 from potr_cl.outputs.potr import Potr
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
+from potr_cl.workers.pool import Pool
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -112,6 +113,7 @@ class Workbench:
         progress: called to say how far the work is.
         tell: called with a line about the work that progress has no place for.
         kept: the uncompressed scene, where it stays on the device from one stage to the next.
+        pool: workers that views are shared out to; None: the device does all of them.
     """
 
     parameters: HyperParameters
@@ -125,6 +127,7 @@ class Workbench:
     tell: Callable[[str], None] = lambda line: None
     output: Output = field(default_factory=Potr)
     kept: KeptScene | None = None
+    pool: Pool | None = None
 
     def drawable(self, scene: Scene) -> Drawable:
         """What to give to a rasterizer for a scene: it may lie on the device already."""

@@ -15,13 +15,13 @@ from potr_cl.codec.bundles.decoder import Reader, Wanted
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.encoder import code_scene
-from potr_cl.codec.native.library import VARIABLE, native
+from potr_cl.codec.native.library import VARIABLE, VECTORS_VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import Coder, Property
 from potr_cl.codec.steps.rule import KNOTS, ColourSteps
 from potr_cl.errors import DataError
 
-PATHS = {"numpy": "0", "native": "1"}
+PATHS = {"numpy": "0", "native": "1", "native, without wide vectors": "1"}
 DEGREES = {3: 9, 12: 15, 27: 21}
 NONE = lambda: None  # noqa: E731
 #: Around where bundles and lanes begin and end.
@@ -31,9 +31,11 @@ SIZES = (1, 2, 255, 256, 257, 300, 7937, 8191, 8192, 8193, 8448, 16385)
 @pytest.fixture(params=PATHS)
 def path(request, monkeypatch):
     monkeypatch.delenv(VARIABLE, raising=False)
-    if request.param == "native" and native() is None:
+    if request.param != "numpy" and native() is None:
         pytest.skip("the compiled library is not there: python -m tools.make.native, or pip install -e .")
     monkeypatch.setenv(VARIABLE, PATHS[request.param])
+    if request.param == "native, without wide vectors":
+        monkeypatch.setenv(VECTORS_VARIABLE, "0")
     return request.param
 
 
@@ -154,7 +156,7 @@ def test_both_paths_write_the_same_bytes(monkeypatch, splats, spread):
     values = integers(splats, spread, spread=spread)
     classes = classes_of(values, steps_of(splats))
     coded = []
-    for way in PATHS.values():
+    for way in "01":
         monkeypatch.setenv(VARIABLE, way)
         coded.append(encoder.encode(values, classes))
     assert coded[0] == coded[1]
@@ -234,7 +236,7 @@ def test_both_paths_say_the_same_of_damaged_sections(monkeypatch, small, data):
             section += bytes(2 * data.draw(st.integers(1, 4)))
         stored[key] = bytes(section)
     found = []
-    for way in PATHS.values():
+    for way in "01":
         monkeypatch.setenv(VARIABLE, way)
         found.append(outcome(stored, 400, steps))
     assert (found[0] is None) == (found[1] is None)
@@ -306,7 +308,7 @@ def test_threads_and_paths_decode_the_same_bits(monkeypatch, plush_excerpt, thre
     monkeypatch.delenv(VARIABLE, raising=False)
     data = version_3(plush_excerpt)
     scenes = []
-    for way in PATHS.values() if native() is not None else ["0"]:
+    for way in "01" if native() is not None else "0":
         monkeypatch.setenv(VARIABLE, way)
         scenes.append(PotrFile.from_bytes(data).scene(threads))
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
@@ -328,7 +330,7 @@ def test_levels_beyond_what_is_looked_up(monkeypatch, plush_excerpt):
     file = PotrFile.from_bytes(data)
     assert file.header.find(Property.OPACITY).coder == Coder.BUNDLES
     scenes = []
-    for way in PATHS.values():
+    for way in "01":
         monkeypatch.setenv(VARIABLE, way)
         scenes.append(PotrFile.from_bytes(data).scene(1))
     for name in ("log_scales", "quaternions", "opacity_logits", "sh"):

@@ -3,11 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
 
 from potr_cl.codec import quantize
+from potr_cl.codec.colours import colour_levels
 from potr_cl.codec.geometry import quantise_geometry
 from potr_cl.codec.native.library import VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
@@ -101,6 +103,29 @@ def test_coefficients_without_a_level_are_refused_alike(value, monkeypatch):
             quantize.nonzero_levels(sh, 10.0)
 
 
+@pytest.mark.parametrize("largest", [0.0, 100.0, 1023.0, 40_000.0, 1e9])
+@pytest.mark.parametrize("layout", ["rows", "columns", "neither"])
+def test_levels_of_colours(largest, layout, both):
+    """Levels of 16, 32 and 64 bits; halves between two levels; the classes of some splats, or of none."""
+    rng = np.random.default_rng(7)
+    number, count = 40_000, 4
+    sh = (rng.normal(0, 0.3, (number, count, 3)) * rng.choice([0, 1, 3], (number, 1, 3))).astype(np.float32)
+    sh[:100] = np.round(sh[:100] * 64) / 64
+    sh[number // 2, 1] = (largest, -largest, largest / 2)
+    if layout == "columns":
+        sh = np.ascontiguousarray(sh.transpose(1, 2, 0)).transpose(2, 0, 1)
+    elif layout == "neither":
+        sh = np.repeat(sh, 2, axis=0)[::2]
+    parameters = replace(HyperParameters.from_quality(0.5, "best"), sf_dc=64.0, sf_sh=32.0)
+    some = rng.integers(-9, 9, number).astype(np.int8)
+    for classes in ((some, some[::-1].copy()), (np.zeros(number, np.int8), some)):
+        for order in (rng.permutation(number), np.arange(number - 7)):
+            chosen = tuple(each[: len(order)] for each in classes)
+            a, b = both(partial(colour_levels, sh[: len(order)], order, parameters, chosen, map))
+            assert_same_bits(a, b)
+            assert a.dtype == (np.int16 if largest * 64 < 2**15 else np.int32 if largest < 1e6 else np.int64)
+
+
 @pytest.mark.parametrize("views", [0, 1, 5])
 def test_geometry(views, both):
     scene = random_scene(3000, 0, seed=4)
@@ -125,10 +150,21 @@ def test_what_does_not_fit_is_refused_before_c_sees_it():
         quantising.nearest(ones, np.ones((2, 3)), np.empty(5))
     with pytest.raises(TypeError):
         quantising.nearest(ones.astype(np.float64), np.ones((2, 3)), np.empty(4))  # type: ignore[arg-type]
-    with pytest.raises(TypeError):
-        quantising.ycocg_columns(sh, np.empty((1, 3, 3), np.float32))
-    with pytest.raises(TypeError):
-        quantising.ycocg_columns(sh.transpose(2, 1, 0), np.empty((1, 3, 4), np.float32))
+    order, factors, levels = np.arange(4), np.ones(4), np.empty((1, 3, 4), np.int16)
+    for arguments in (
+        (sh.astype(np.float64), False, order, factors, factors, 0, levels),
+        (sh.transpose(2, 1, 0), True, order, factors, factors, 0, levels),
+        (sh, True, order, factors, factors, 0, levels),
+        (sh, False, order + 1, factors, factors, 0, levels),
+        (sh, False, order - 1, factors, factors, 0, levels),
+        (sh, False, order, factors[:3], factors, 0, levels),
+        (sh, False, order, factors, factors[:3], 0, levels),
+        (sh, False, order, factors, factors, 1, levels),
+        (sh, False, order, factors, factors, -1, levels),
+        (sh, False, order, factors, factors, 0, levels.astype(np.int32)),
+    ):
+        with pytest.raises(TypeError):
+            quantising.colour_levels(*arguments)
     for number in (-1, 4):
         with pytest.raises(TypeError, match="not there"):
             quantising.canonical(

@@ -9,6 +9,7 @@ import pytest
 
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
+from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
 from potr_cl.reference.refit_cases import Case, Linearised, Pictures
 from potr_cl.reference.scenes import plain_splats, ring_of_cameras, straight_camera, tilted_camera, visible_scene
@@ -281,18 +282,51 @@ def test_the_constant_coefficients_make_up_for_the_rounding_of_the_others(device
     options = RefitOptions(steps=200, gain=0, prior=10)
     with Case(device, visible_scene(40, degree), visible_scene(60, 2, 7), ring_of_cameras(3, size=40)) as case:
         with ColourRefit(device, case.scene, case.cameras) as refit:
-            rounded = coarse(refit.solve(case.scene.sh, case.targets, options, check=False).sh, refit)
-            solved = refit.solve_constant(rounded, case.targets, options)
+            rounded = coarse(refit.solve(case.scene.sh, case.targets, options).sh, refit)
+            solved = refit.solve_constant(case.targets, options, rounded)
+            sh = refit.colours()
         active = np.zeros(rounded.shape, bool)
         active[:, 0] = True
         start = dataclasses.replace(case.scene, sh=rounded)
         with Case(device, start, visible_scene(60, 2, 7), case.cameras) as again:
             reference = again.reference(prior=10, active=active, hold=True)
-        x, solution = to_ycocg(solved.sh), reference.solution()
-        assert np.allclose(solved.sh[:, 1:], rounded[:, 1:], atol=1e-6)
+        x, solution = to_ycocg(sh), reference.solution()
+        assert np.allclose(sh[:, 1:], rounded[:, 1:], atol=1e-6)
         assert np.linalg.norm(x - solution) < 1e-3 * np.linalg.norm(solution - reference.start)
         assert solved.errors[0] == pytest.approx(reference.error(reference.start), rel=1e-4)
         assert solved.errors[1] == pytest.approx(reference.error(x), rel=1e-4)
+
+
+def test_the_grid_is_asked_for_with_what_constants_are_worth(case):
+    """In a thread of its own, while the re-fit solves."""
+    told = []
+
+    def worth(sh, refit):
+        told.append(refit.worth()[:, 0])
+        return sh
+
+    def colour_grid(effects):
+        told.append(effects)
+        ones = np.ones(len(effects), np.float32)
+        return ColourGrid(ones, ones, np.arange(len(effects)))
+
+    options = RefitOptions(steps=6, gain=0, drop=1e-7)
+    refit_colours(case.device, case.scene, case.cameras, case.targets, options, fix_ac=worth)
+    refit_colours(case.device, case.scene, case.cameras, case.targets, options, colour_grid=colour_grid)
+    assert np.array_equal(told[0], told[1])
+
+
+@pytest.mark.parametrize("degree", [0, 2, 3])
+def test_colours_come_to_the_device_and_back(device, degree):
+    """In rows as trainers write them, and coefficient by coefficient as a re-fit leaves them."""
+    scene = visible_scene(300, degree)
+    with ColourRefit(device, scene, ring_of_cameras(1, size=20)) as refit:
+        vectors = refit.coefficients
+        x = vectors.vector()
+        for sh in (scene.sh, np.ascontiguousarray(scene.sh.transpose(1, 2, 0)).transpose(2, 0, 1)):
+            vectors.write_sh(x, sh)
+            assert np.abs(vectors.read(x) - to_ycocg(scene.sh)).max() < 1e-6 * np.abs(scene.sh).max()
+            assert np.abs(vectors.read_sh(x) - scene.sh).max() < 1e-6 * np.abs(scene.sh).max()
 
 
 class Counted:

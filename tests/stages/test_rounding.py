@@ -111,11 +111,13 @@ def test_what_no_view_sees_goes_to_its_nearest_level(device):
     assert np.count_nonzero(got.after[20:, 1:]) > 300
 
 
-def fitted(case: Case, fix_ac, drop: float = 1e-8) -> np.ndarray:
+def fitted(case: Case, grid: ColourGrid | None, fix_ac=None) -> np.ndarray:
     """(N, M, 3) Y, Co, Cg, what a re-fit leaves."""
-    return to_ycocg(
-        refit_colours(case.device, case.scene, case.cameras, case.targets, RefitOptions(drop=drop), fix_ac=fix_ac).sh
-    )
+    colour_grid = None if grid is None else lambda effects: grid
+    options = RefitOptions(drop=1e-8)
+    device, scene, cameras, targets = case.device, case.scene, case.cameras, case.targets
+    found = refit_colours(device, scene, cameras, targets, options, fix_ac=fix_ac, colour_grid=colour_grid)
+    return to_ycocg(found.sh)
 
 
 def nearest(x: np.ndarray, grid: ColourGrid) -> np.ndarray:
@@ -147,14 +149,14 @@ def test_rounds_leave_less_error_than_the_nearest_levels(device):
         x[:, 0] = to_ycocg(sh)[:, 0]
         return to_rgb(x).astype(np.float32)
 
-    plain, rounds = (nearest(fitted(case, how), grid) for how in (round_ac, lambda sh, refit: grid))
+    plain, rounds = nearest(fitted(case, None, round_ac), grid), nearest(fitted(case, grid), grid)
     case.rasterizer.close()
     assert error(rounds) < 0.8 * error(plain)
 
 
 def test_all_but_the_last_constant_coefficients_are_on_the_grid(case):
     grid = grid_of(60, 0.2)
-    x = fitted(case, lambda sh, refit: grid)
+    x = fitted(case, grid)
     off = np.abs(x - nearest(x, grid))
     assert off[:, 1:].max() < 1e-5
     due = in_turn(grid, TURNS - 2)
@@ -164,14 +166,14 @@ def test_all_but_the_last_constant_coefficients_are_on_the_grid(case):
 
 def test_same_bits_every_time(case):
     grid = grid_of(60)
-    assert np.array_equal(*(fitted(case, lambda sh, refit: grid) for _ in range(2)))
+    assert np.array_equal(*(fitted(case, grid) for _ in range(2)))
 
 
 @pytest.mark.one_runtime
 def test_absurd_coefficients_stay_finite(case):
     grid = grid_of(60)
     case.scene.sh[::3] *= np.float32(1e12)
-    assert np.isfinite(fitted(case, lambda sh, refit: grid)).all()
+    assert np.isfinite(fitted(case, grid)).all()
 
 
 @pytest.mark.one_runtime
@@ -180,4 +182,4 @@ def test_few_splats(device, count):
     scene = visible_scene(count, 3)
     with Case(device, scene, visible_scene(5, 2, seed=7), ring_of_cameras(3, size=40)) as case:
         grid = dataclasses.replace(grid_of(count), order=np.arange(count))
-        assert np.isfinite(fitted(case, lambda sh, refit: grid)).all()
+        assert np.isfinite(fitted(case, grid)).all()

@@ -29,6 +29,7 @@ from potr_cl.codec.destination import SceneArrays
 from potr_cl.codec.native.bundles import BundledFile, ValueArrays
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import VARIABLE
+from potr_cl.codec.native.octree import OctreeFunctions, Walk
 from tools.results import Column, Results
 
 #: What a clock is put around: where it is, its name there, what the table calls it.
@@ -42,10 +43,11 @@ _CLOCKS: tuple[tuple[Any, str, str], ...] = (
     (BundledFile, "values", "bundles to values"),
     (bundled_scene.BundledScene, "tables", "tables of values"),
     (decoder, "unpack_integers", "multiplicities"),
-    (Functions, "octree_levels", "octree: levels"),
-    (Functions, "octree_tails", "octree: lengths of tails"),
-    (Functions, "octree_centres", "octree: centres"),
-    (Functions, "joined_planes", "byte planes"),
+    (OctreeFunctions, "tree", "octree: levels"),
+    (Walk, "__init__", "octree: parts"),
+    (Walk, "leaves", "octree: leaves"),
+    (Walk, "centres", "octree: centres"),
+    (Functions, "join_planes", "byte planes"),
     (Functions, "widened", "byte planes"),
     (Functions, "look_up", "scales, opacities"),
     (Functions, "rotations", "rotations"),
@@ -135,7 +137,7 @@ def _of_bundles(data: bytes, runs: int) -> dict[str, float]:
     if file.header.version < 3 or not any(section.coder.name == "BUNDLES" for section in file.header.sections):
         return {}
     count = file.sh_count()
-    destination = SceneArrays(file.header, file.rules, count, zeros=True)
+    destination = SceneArrays(file.header, file.rules, count)
     tables, bundles = scene.tables, range(scene.reader.bundles.number)
 
     def decoded(sections: int, rotations: bool, arrays: ValueArrays) -> Callable[[], None]:
@@ -165,7 +167,7 @@ def _of_bundles(data: bytes, runs: int) -> dict[str, float]:
     of["values, to memory that was written to before"] = written - before - of["integers: rotations"]
 
     def fresh() -> None:
-        arrays = SceneArrays(file.header, file.rules, count, zeros=True)
+        arrays = SceneArrays(file.header, file.rules, count)
         decoded(last, True, arrays.values)()
 
     of["memory that was not"] = _least(fresh, runs) - written

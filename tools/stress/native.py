@@ -35,7 +35,7 @@ import numpy as np
 from potr_cl.codec import bundled_scene, decoder, encoder
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.native import arrays, bundles, functions
-from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE
+from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, VECTORS_VARIABLE
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError
 from potr_cl.reference.scenes import random_scene
@@ -125,6 +125,7 @@ def work(seed: int, first: int, stop: int, compare: int, version: int) -> None:
         for number in range(first, stop):
             data = changed_file(seed, number, version)
             os.environ[VARIABLE] = "1"
+            os.environ[VECTORS_VARIABLE] = str(number // 3 % 2)  # with and without, whatever else goes by the number
             os.pwrite(at, b"%20d" % number, 0)
             try:
                 file = PotrFile.from_bytes(data)

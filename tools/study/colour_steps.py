@@ -84,19 +84,23 @@ def coded(
     parameters = dataclasses.replace(parameters, version=way.version, **constants)
     geometry = quantise_geometry(state.scene, parameters, state.views)
 
-    def fix_ac(sh: FloatArray, refit: ColourRefit) -> FloatArray | ColourGrid:
+    def colour_grid(effects: FloatArray) -> ColourGrid:
         nonlocal geometry
         if way.steps:
-            geometry = geometry.with_steps(refit.worth()[:, 0])
-        grid = ColourGrid.of(geometry)
-        if way.rounds:
-            return grid
+            geometry = geometry.with_steps(effects)
+        return ColourGrid.of(geometry)
+
+    def fix_ac(sh: FloatArray, refit: ColourRefit) -> FloatArray:
+        grid = colour_grid(refit.worth_of_constants())
         return rounded_ac(sh, grid.others) if way.rounded else sh
 
     decoded = geometry.decoded(state.scene.sh)
     with Rasterizer(device, state.source) as rasterizer:
         targets = RenderedTargets(rasterizer, state.views)
-        fitted = refit_colours(device, decoded, state.views, targets, options, fix_ac=fix_ac)
+        fitted = refit_colours(
+            device, decoded, state.views, targets, options,
+            fix_ac=None if way.rounds else fix_ac, colour_grid=colour_grid if way.rounds else None,
+        )  # fmt: skip
     scene = dataclasses.replace(state.scene, sh=fitted.sh)
     return b"".join(code_scene(scene, parameters, state.views, geometry=geometry).pieces)
 

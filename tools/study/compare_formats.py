@@ -133,12 +133,12 @@ def measured_formats(path: Path) -> dict[str, list[dict[str, Any]]]:
     heads = [column["name"] for column in content["sizes"]["columns"]]
     for cells in content["sizes"]["rows"]:
         row = dict(zip(heads, cells, strict=True))
-        name = re.match(r"`(\.[a-z.]+)`", row["format"])
-        if name is None or name[1] == ".sog":  # was measured earlier
+        suffix = re.match(r"`(\.[a-z.]+)`", row["format"])
+        if suffix is None or suffix[1] == ".sog":  # was measured earlier
             continue
         for scene, rows in found.items():
             size, psnr, lost = (row[f"{scene}: {what}"] for what in ("size", "PSNR", "lost"))
-            rows.append({"format": name[1], "bytes": size * 1e6, "psnr": psnr, "psnr_loss": lost, "measured": True})
+            rows.append({"format": suffix[1], "bytes": size * 1e6, "psnr": psnr, "psnr_loss": lost, "measured": True})
     for scene, rows in found.items():
         for name, (size, lost, psnr) in EARLIER[scene].items():
             rows.append({"format": name, "bytes": size * 1e6, "psnr": psnr, "psnr_loss": lost, "measured": False})

@@ -1,15 +1,16 @@
 """Encodes straight to the formats that viewers open: bytes and loss, judged through our readers and through others'.
 
     python -m tools.study.output_formats measure SCENE … --json OUT.json --keep DIR [--seconds S] [options]
-    python -m tools.study.output_formats judge SCENE … --json OUT.json --keep DIR [--transform COMMAND]
+    python -m tools.study.output_formats judge SCENE … --json OUT.json --keep DIR [--reader NAME] [--transform COMMAND]
     python -m tools.study.output_formats report OUT.json FORMATS.json [--json RESULTS.json]
 
 ``measure`` prunes each scene once for each quality, and from there makes every output of :data:`PLAN`; a file of each
 is kept in DIR. It also writes the whole scene with convert's writers. It stops before a step that would begin after S
-seconds. ``judge`` has splat-transform (npm's @playcanvas/splat-transform) decode the kept files to PLY and judges
-those, on any machine. ``report`` prints Markdown: how many times smaller a file of the same PSNR, and of the same loss
-on photographs, is than the other writers' files of FORMATS.json, which tools.study.compare_formats has made, by
-interpolation; --json keeps the tables for docs/benchmarks. Results may be given in several files.
+seconds. ``judge`` has splat-transform (npm's @playcanvas/splat-transform) or gaussforge (PyPI's, with Niantic's own
+library for SPZ) decode the kept files to PLY and judges those, on any machine. ``report`` prints Markdown: how many
+times smaller a file of the same PSNR, and of the same loss on photographs, is than the other writers' files of
+FORMATS.json, which tools.study.compare_formats has made, by interpolation; --json keeps the tables for docs/benchmarks.
+Results may be given in several files.
 """
 
 from __future__ import annotations
@@ -149,26 +150,46 @@ def _converted(args: argparse.Namespace, evaluator: EvaluatedScene, suffix: str)
 
 
 def _judge(args: argparse.Namespace) -> None:
-    """Add to each kept file's point what it loses as splat-transform decodes it."""
+    """Add to each kept file's point what it loses as another reader decodes it."""
     results = json.loads(args.json.read_text())
     device = Device(args.device)
-    command = shlex.split(args.transform)
     for folder in args.scenes:
         with EvaluatedScene(folder, device) as evaluator, tempfile.TemporaryDirectory() as temporary:
             for point in results["scenes"][evaluator.name]["encodes"]:
-                if point["file"] is None or "other_reader" in point:
+                readers = point.setdefault("other_readers", {})
+                if point["file"] is None or args.reader in readers:
                     continue
                 decoded = Path(temporary) / "decoded.ply"
-                made = subprocess.run(
-                    [*command, "-w", str(args.keep / point["file"]), str(decoded)], capture_output=True, text=True
-                )
-                if made.returncode:
-                    print(f"{point['file']}: refused: {made.stderr.strip()[-300:]}", file=sys.stderr)
+                complaint = READERS[args.reader](args.keep / point["file"], decoded, args.transform)
+                if complaint:
+                    print(f"{point['file']}: refused: {complaint[-300:]}", file=sys.stderr)
                     continue
-                point["other_reader"] = evaluator(load_scene(decoded))
+                readers[args.reader] = evaluator(load_scene(decoded))
                 write_json(args.json, results)
-                other = point["other_reader"]["psnr"]
-                print(f"{point['file']}: {point['psnr']:.3f} dB, {other:.3f} dB by splat-transform", flush=True)
+                other = readers[args.reader]["psnr"]
+                print(f"{point['file']}: {point['psnr']:.3f} dB, {other:.3f} dB by {args.reader}", flush=True)
+
+
+def _by_splat_transform(file: Path, ply: Path, command: str) -> str:
+    """Decode a file to a PLY; what is wrong with it, or nothing."""
+    made = subprocess.run([*shlex.split(command), "-w", str(file), str(ply)], capture_output=True, text=True)
+    return made.stderr.strip() or "it failed" if made.returncode else ""
+
+
+def _by_gaussforge(file: Path, ply: Path, _: str) -> str:
+    """The same with a library of another author."""
+    import gaussforge
+
+    kind = file.name.removesuffix(".ply").rpartition(".")[2]
+    made = gaussforge.GaussForge().convert(file.read_bytes(), "compressed.ply" if kind == "compressed" else kind, "ply")
+    if made.get("error"):
+        return str(made["error"])
+    ply.write_bytes(bytes(made["data"]))
+    return ""
+
+
+#: Who may read the files besides the package.
+READERS = {"splat-transform": _by_splat_transform, "gaussforge": _by_gaussforge}
 
 
 # ------------------------------------------------------------------------------------------------ report
@@ -193,20 +214,21 @@ def _report(args: argparse.Namespace) -> None:
             Column("size", "MB", ".2f"),
             Column("PSNR", "dB", ".2f"),
             Column("lost", "dB", ".2f"),
-            Column("PSNR by splat-transform", "dB", ".2f"),
+            *(Column(f"PSNR by {reader}", "dB", ".2f") for reader in READERS),
             Column("time after pruning", "s", ".1f"),
         )
         for point in sorted(entry["encodes"], key=lambda p: (p["format"], p.get("fit", 0), p["q"])):
             after = sum(value for stage, value in point["seconds"].items() if stage in ("fit", "refit", "pack"))
-            other = point.get("other_reader", {}).get("psnr")
+            readers = point.get("other_readers", {})
+            others_psnr = [readers.get(reader, {}).get("psnr") for reader in READERS]
             table.add(
                 point["format"], point["q"], point.get("fit") or None, point["splats"], point["bytes"] / 1e6,
-                point["psnr"], point.get("psnr_loss"), other, after,
+                point["psnr"], point.get("psnr_loss"), *others_psnr, after,
             )  # fmt: skip
         for point in entry["converts"]:
             table.add(
                 f"{point['format']}, all splats", None, None, entry["source_splats"], point["bytes"] / 1e6,
-                point["psnr"], point.get("psnr_loss"), None, point["seconds"],
+                point["psnr"], point.get("psnr_loss"), *[None] * len(READERS), point["seconds"],
             )  # fmt: skip
         times = tables.table(
             f"outputs_gain_{name}",
@@ -264,7 +286,8 @@ def main() -> None:
             sub.add_argument("--fit", type=int, default=0, metavar="STEPS", help="fit all parameters too")
             sub.add_argument("--no-whole", dest="whole", action="store_false", help="no files of the whole scene")
         else:
-            sub.add_argument("--transform", default="splat-transform", help="the command; default %(default)s")
+            sub.add_argument("--reader", choices=READERS, default="splat-transform")
+            sub.add_argument("--transform", default="splat-transform", help="its command; default %(default)s")
     sub = commands.add_parser("report")
     sub.add_argument("results", type=Path, nargs="+", metavar="OUT.json")
     sub.add_argument("formats", type=Path, help="of tools.study.compare_formats")

@@ -271,8 +271,9 @@ def keep_tables(measured: dict[str, Any], path: Path) -> None:
         Column("SSIM against photographs", format=".4f"),
     )
     for name, entry in scenes.items():
-        truth = (entry["uncompressed"].get("truth_psnr"), entry["uncompressed"].get("truth_ssim"))
-        table.add(name, entry["source_splats"], entry["source_bytes"], entry["test_views"], *truth)
+        plain = entry["uncompressed"]
+        counts = (entry["source_splats"], entry["source_bytes"], entry["test_views"])
+        table.add(name, *counts, plain.get("truth_psnr"), plain.get("truth_ssim"))
     table = results.table(
         "stages",
         "Whole encodes at quality 0.5, stage by stage, in a process that has encoded before",
@@ -290,10 +291,10 @@ def keep_tables(measured: dict[str, Any], path: Path) -> None:
         for series, curve in entry["series"].items():
             for p in curve["encodes"]:
                 if p["q"] == 0.5:
-                    size = (p["bytes"], entry["source_bytes"] / p["bytes"])
+                    smaller = entry["source_bytes"] / p["bytes"]
                     seconds = [sum(p["seconds"].get(part, 0.0) for part in parts) for parts in _STAGES.values()]
                     table.add(
-                        name, series, p["splats"], *size, p["psnr"], p.get("psnr_loss"), *seconds,
+                        name, series, p["splats"], p["bytes"], smaller, p["psnr"], p.get("psnr_loss"), *seconds,
                         sum(p["seconds"].values()),
                     )  # fmt: skip
 

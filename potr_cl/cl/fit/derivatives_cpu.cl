@@ -21,34 +21,12 @@
 #include "include/splat.clh"
 #include "include/subtile_vectors.clh"
 #include "include/subtile_walk.clh"
+/* memory[2 j] and memory[2 j + 1] become the alphas and weights of the j-th splat. */
+#define REMEMBER(memory, j, alpha, weight) \
+    VSTORE(alpha, 2 * (j), memory);        \
+    VSTORE(weight, 2 * (j) + 1, memory)
+#include "include/subtile_blend.clh"
 #include "fit/sums.clh"
-
-/* A sub-tile's walk forward. Its transmittances and colours move on; memory[2 j] and memory[2 j + 1] become the alphas
-   and weights of the j-th splat. Returns the number of splats before the last pixel's end. */
-inline uint walk(
-    const Splat *splats, const ushort *list, uint length, float2 first, vfloat t[1], vfloat rgb[3], float *memory)
-{
-    vfloat through = t[0], r = rgb[0], g = rgb[1], b = rgb[2];
-    uint j = 0;
-    while (j < length && VANY(through > 0.0f)) {
-        const uint stop = min(j + PAIRS_AT_ONCE, length);
-        for (; j < stop; ++j) {
-            const Splat *splat = &splats[list[j]];
-            const vfloat power = splat_power(splat, first);
-            BLEND(weight, power, through);
-            r = MAD(weight, (vfloat)(splat->red), r);
-            g = MAD(weight, (vfloat)(splat->green), g);
-            b = MAD(weight, (vfloat)(splat->blue), b);
-            VSTORE(goes_on ? alpha : (vfloat)(0.0f), 2 * j, memory);
-            VSTORE(weight, 2 * j + 1, memory);
-        }
-    }
-    t[0] = through;
-    rgb[0] = r;
-    rgb[1] = g;
-    rgb[2] = b;
-    return j;
-}
 
 /* A sub-tile's walk back over what the walk forward remembers: memory[2 j] becomes e. */
 inline void walk_back(
@@ -173,7 +151,7 @@ kernel void derivatives(
             for (int i = 0; i < SUBTILES; ++i) {
                 const uint length = count ? lengths[i] : 0;
                 const float2 first = subtile_centre(origin, i);
-                const uint walked = walk(splats, lists[i], length, first, &t[i], rgb[i], memory);
+                const uint walked = blend(splats, lists[i], length, first, &t[i], rgb[i], memory);
                 const vfloat through = fabs(t[i]);
                 if (is_last && pass == (twice ? 0 : 1)) {
                     /* The pixels' colours are known. */
@@ -181,23 +159,8 @@ kernel void derivatives(
                         MAD(through, (vfloat)(red), rgb[i][0]),
                         MAD(through, (vfloat)(green), rgb[i][1]),
                         MAD(through, (vfloat)(blue), rgb[i][2])};
-                    for (int channel = 0; channel < 3; ++channel)
-                        VSTORE(colour[channel], 0, values[i][channel]);
-                    for (int lane = 0; lane < LANES; ++lane) {
-                        const int column = origin.x + SUBTILE_COLUMN(i) + lane % SUBTILE_WIDTH;
-                        const int row = origin.y + SUBTILE_ROW(i) + lane / SUBTILE_WIDTH;
-                        const int inside = column < view.width && row < view.height;
-                        const size_t pixel = 3 * ((size_t)row * view.width + column);
-                        for (int channel = 0; channel < 3; ++channel) {
-                            float value = 0.0f;
-                            if (inside)
-                                value = given ? target[pixel + channel] :
-                                                (values[i][channel][lane] - target[pixel + channel]) * unit;
-                            value = clamp(value, -LARGEST_VALUE, LARGEST_VALUE);
-                            error += value * value;
-                            values[i][channel][lane] = value;
-                        }
-                    }
+                    error += pixel_values(
+                        colour, i, origin, view.width, view.height, target, 1, given, unit, LARGEST_VALUE, values[i]);
                     whole[i] = (vfloat)(0.0f);
                     for (int channel = 0; channel < 3; ++channel)
                         whole[i] = MAD(colour[channel], VLOAD(0, values[i][channel]), whole[i]);

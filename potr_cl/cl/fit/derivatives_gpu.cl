@@ -76,27 +76,12 @@ void derivatives(
     /* From here on r, g, b are the pixels' numbers v. */
     Mine mine = pixels_of(group, origin, lid);
     float error = 0.0f;
-    int end = 0;
+    const int end = pixel_values(
+        &state, mine, picture, red, green, blue, target, 1, given, unit, LARGEST_VALUE, &error);
     for (int p = 0; p < PIXELS; ++p) {
         const int i = mine.first + p * SHARE;
-        const float t = fabs(state.t[i]);
-        float r = 0.0f, g = 0.0f, b = 0.0f;
-        if (inside(mine, p, picture)) {
-            global const float *pixel = target + 3 * pixel_number(mine, p, picture);
-            r = given ? pixel[0] : (MAD(t, red, state.r[i]) - pixel[0]) * unit;
-            g = given ? pixel[1] : (MAD(t, green, state.g[i]) - pixel[1]) * unit;
-            b = given ? pixel[2] : (MAD(t, blue, state.b[i]) - pixel[2]) * unit;
-        }
-        r = clamp(r, -LARGEST_VALUE, LARGEST_VALUE);
-        g = clamp(g, -LARGEST_VALUE, LARGEST_VALUE);
-        b = clamp(b, -LARGEST_VALUE, LARGEST_VALUE);
-        error += r * r + g * g + b * b;
-        state.t[i] = t;
-        state.r[i] = r;
-        state.g[i] = g;
-        state.b[i] = b;
-        behind[i] = MAD(r, red, MAD(g, green, b * blue));
-        end = max(end, state.last[i] + 1);
+        state.t[i] = fabs(state.t[i]);
+        behind[i] = MAD(state.r[i], red, MAD(state.g[i], green, state.b[i] * blue));
     }
     atomic_max(&ends[mine.subtile], end);
     pair_w[lid] = error;

@@ -25,6 +25,36 @@ kernel void regularise(
         }
 }
 
+/* Columns in R, G, B, as rows of a scene are turned to columns, become Y, Co, Cg where they are. */
+kernel void to_ycocg(global float *columns, ulong stride)
+{
+    const size_t index = get_global_id(0);
+    for (int m = 0; m < SH_COUNT; ++m) {
+        global float *three = columns + 3 * m * stride;
+        /* In this order nothing overflows. */
+        const vfloat r = 0.5f * VLOAD(index, three), g = 0.5f * VLOAD(index, three + stride);
+        const vfloat b = 0.5f * VLOAD(index, three + 2 * stride);
+        VSTORE(MAD(0.5f, r, MAD(0.5f, b, g)), index, three);
+        VSTORE(r - b, index, three + stride);
+        VSTORE(MAD(-0.5f, r, MAD(-0.5f, b, g)), index, three + 2 * stride);
+    }
+}
+
+/* The way back, to other columns. In this order nothing overflows that did not in R, G, B. */
+kernel void to_rgb(global const float *columns, ulong stride, global float *result)
+{
+    const size_t index = get_global_id(0);
+    for (int m = 0; m < SH_COUNT; ++m) {
+        global const float *three = columns + 3 * m * stride;
+        global float *rgb = result + 3 * m * stride;
+        const vfloat y = VLOAD(index, three), co = VLOAD(index, three + stride);
+        const vfloat cg = VLOAD(index, three + 2 * stride);
+        VSTORE((y - cg) + co, index, rgb);
+        VSTORE(y + cg, index, rgb + stride);
+        VSTORE((y - cg) - co, index, rgb + 2 * stride);
+    }
+}
+
 /* y = a y + b x. */
 kernel void combine(float a, global float *y, float b, global const float *x)
 {

@@ -1,6 +1,9 @@
 /* From the sums of a sweep back to the coefficients: the second half of the transposed map. It also adds up the splats'
    own blocks of the normal equations.
 
+   What views add to coefficients and blocks is made integers, view by view, before it is added up. So the sums are the
+   same whatever views are done together, in whatever order and on however many devices.
+
    Macros: LANES (splats a work-item), SH_COUNT, WEIGHTS (1: the totals hold the sums of w^2 too, for the blocks). */
 
 #include "refit/refit.clh"
@@ -46,8 +49,17 @@ inline int take_totals(global long *totals, float scale, vfloat *sums)
 #endif
 }
 
+/* Numbers of less than 62 bits as integers, with the fraction cut off; in two parts, as to_fixed of totals.clh. */
+inline vlong to_fixed_lanes(vfloat value)
+{
+    const vint high = CONVERT_VINT(value * 0x1p-31f);
+    const vint low = CONVERT_VINT(value - CONVERT_VFLOAT(high) * 0x1p31f);
+    return (CONVERT_VLONG(high) << 31) + CONVERT_VLONG(low);
+}
+
 /* The totals of a set's views, times the view's scale, onto the coefficients: result += basis x (Y, Co, Cg) of the free
-   channels' sums, view by view. With WEIGHTS also blocks += the sum of w^2 x basis x basis. Leaves the totals zero. */
+   channels' sums, view by view. With WEIGHTS also blocks += the sum of w^2 x basis x basis. Both are columns of
+   integers; the scales say what is 1. Leaves the totals zero. */
 kernel void gather(
     global long *totals,
     global const float *means,
@@ -57,11 +69,11 @@ kernel void gather(
     global const float *scales,
     uint first_scale,
     global const float4 *free,
-    global float *result,
-    global float *blocks)
+    global long *result,
+    global long *blocks)
 {
     const size_t index = get_global_id(0);
-    vfloat results[3 * SH_COUNT];
+    vlong results[3 * SH_COUNT];
     int any_view = 0;
     for (uint number = 0; number < view_count; ++number) {
         const size_t place = number * stride / LANES + index;
@@ -82,17 +94,28 @@ kernel void gather(
         const vfloat channels[3] = {r + g + b, r - b, g - r - b};
         for (int m = 0; m < SH_COUNT; ++m)
             for (int c = 0; c < 3; ++c)
-                results[3 * m + c] = MAD(basis[m], channels[c], results[3 * m + c]);
+                results[3 * m + c] += to_fixed_lanes(basis[m] * channels[c]);
 #if WEIGHTS
         const vfloat weight = sums[3];
         for (int i = 0; i < SH_COUNT; ++i)
             for (int j = i; j < SH_COUNT; ++j) {
-                global float *column = blocks + AT(i, j) * stride;
-                VSTORE(MAD(weight * basis[i], basis[j], VLOAD(index, column)), index, column);
+                global long *column = blocks + AT(i, j) * stride;
+                VSTORE(VLOAD(index, column) + to_fixed_lanes(weight * basis[i] * basis[j]), index, column);
             }
 #endif
     }
     if (any_view)
         for (int i = 0; i < 3 * SH_COUNT; ++i)
             VSTORE(results[i], index, result + i * stride);
+}
+
+/* result += unit x sums, and the sums become 0. One number a work-item. */
+kernel void from_fixed(global long *sums, float unit, global float *result)
+{
+    const size_t i = get_global_id(0);
+    const long sum = sums[i], high = (sum + (1l << 30)) >> 31;
+    /* In two parts of 32 bits: conversions of 64 are calls on some CPU runtimes. */
+    const float value = MAD((float)(int)high, 0x1p31f, (float)(int)(sum - (high << 31)));
+    result[i] = MAD(value, unit, result[i]);
+    sums[i] = 0;
 }

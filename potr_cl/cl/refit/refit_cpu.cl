@@ -17,37 +17,13 @@
 #include "include/splat.clh"
 #include "include/subtile_vectors.clh"
 #include "include/subtile_walk.clh"
+#define REMEMBER(memory, j, alpha, weight) VSTORE(weight, j, memory)
+#include "include/subtile_blend.clh"
 #include "refit/refit.clh"
 
 #ifndef SUMS_AHEAD
 #define SUMS_AHEAD 16
 #endif
-
-/* A sub-tile's walk over its list. Its transmittances and colours move on; weights[j] becomes the weight of the j-th
-   splat. Returns the number of splats before the last pixel's end. */
-inline uint blend(
-    const Splat *splats, const ushort *list, uint length, float2 first, vfloat t[1], vfloat rgb[3], float *weights)
-{
-    vfloat through = t[0], r = rgb[0], g = rgb[1], b = rgb[2];
-    uint j = 0;
-    while (j < length && VANY(through > 0.0f)) {
-        const uint stop = min(j + PAIRS_AT_ONCE, length);
-        for (; j < stop; ++j) {
-            const Splat *splat = &splats[list[j]];
-            const vfloat power = splat_power(splat, first);
-            BLEND(weight, power, through);
-            r = MAD(weight, (vfloat)(splat->red), r);
-            g = MAD(weight, (vfloat)(splat->green), g);
-            b = MAD(weight, (vfloat)(splat->blue), b);
-            VSTORE(weight, j, weights);
-        }
-    }
-    t[0] = through;
-    rgb[0] = r;
-    rgb[1] = g;
-    rgb[2] = b;
-    return j;
-}
 
 /* sums[list[j]] += the sums over the pixels of weights[j] x values, and of its square. */
 inline void sum_pairs(const ushort *list, uint length, float *weights, const float values[3][LANES], float4 *sums)
@@ -124,23 +100,13 @@ kernel void refit_sweep(
                 if (from + count >= end && pass == (twice ? 0 : 1)) {
                     /* The pixels' values are known. */
                     const vfloat through = fabs(t[i]);
-                    VSTORE(MAD(through, (vfloat)(red), rgb[i][0]), 0, values[i][0]);
-                    VSTORE(MAD(through, (vfloat)(green), rgb[i][1]), 0, values[i][1]);
-                    VSTORE(MAD(through, (vfloat)(blue), rgb[i][2]), 0, values[i][2]);
-                    for (int lane = 0; lane < LANES; ++lane) {
-                        const int column = origin.x + SUBTILE_COLUMN(i) + lane % SUBTILE_WIDTH;
-                        const int row = origin.y + SUBTILE_ROW(i) + lane / SUBTILE_WIDTH;
-                        const int inside = column < view.width && row < view.height;
-                        const size_t pixel = 3 * ((size_t)row * view.width + column);
-                        for (int channel = 0; channel < 3; ++channel) {
-                            float value = inside ? values[i][channel][lane] : 0.0f;
-                            if (has_target && inside)
-                                value -= target[pixel + channel];
-                            value = clamp(value, -LARGEST_VALUE, LARGEST_VALUE);
-                            error += value * value;
-                            values[i][channel][lane] = value;
-                        }
-                    }
+                    const vfloat colour[3] = {
+                        MAD(through, (vfloat)(red), rgb[i][0]),
+                        MAD(through, (vfloat)(green), rgb[i][1]),
+                        MAD(through, (vfloat)(blue), rgb[i][2])};
+                    error += pixel_values(
+                        colour, i, origin, view.width, view.height, target, has_target, 0, 1.0f, LARGEST_VALUE,
+                        values[i]);
                 }
                 if (pass == 1)
                     sum_pairs(lists[i], walked, weights, values[i], sums);

@@ -63,32 +63,11 @@ void refit_sweep(
     /* From here on r, g, b are the pixels' values to multiply by. */
     Mine mine = pixels_of(lid / SHARE, origin, lid);
     float error = 0.0f;
-    int end = 0;
-    for (int p = 0; p < PIXELS; ++p) {
-        const int i = mine.first + p * SHARE;
-        const float through = fabs(state.t[i]);
-        float r = 0.0f, g = 0.0f, b = 0.0f;
-        if (inside(mine, p, picture)) {
-            r = MAD(through, red, state.r[i]);
-            g = MAD(through, green, state.g[i]);
-            b = MAD(through, blue, state.b[i]);
-            if (has_target) {
-                global const float *pixel = target + 3 * (views->first_pixel + pixel_number(mine, p, picture));
-                r -= pixel[0];
-                g -= pixel[1];
-                b -= pixel[2];
-            }
-        }
-        r = clamp(r, -LARGEST_VALUE, LARGEST_VALUE);
-        g = clamp(g, -LARGEST_VALUE, LARGEST_VALUE);
-        b = clamp(b, -LARGEST_VALUE, LARGEST_VALUE);
-        error += r * r + g * g + b * b;
-        state.r[i] = r;
-        state.g[i] = g;
-        state.b[i] = b;
-        state.t[i] = 1.0f;
-        end = max(end, state.last[i] + 1);
-    }
+    const int end = pixel_values(
+        &state, mine, picture, red, green, blue, target + 3 * (size_t)views->first_pixel, has_target, 0, 1.0f,
+        LARGEST_VALUE, &error);
+    for (int p = 0; p < PIXELS; ++p)
+        state.t[mine.first + p * SHARE] = 1.0f;
     item_errors[lid] = error;
     if (swept > 0)
         end_subtile(&walk, mine.subtile, end);

@@ -19,7 +19,7 @@ from potr_cl.codec.bundles.ranges import Words, decode_stream, integer_type
 from potr_cl.codec.bundles.sections import MAIN, ORDER, ROTATION, Key, Section
 from potr_cl.codec.bundles.streams import band, differences, step_terms, streams_of
 from potr_cl.codec.native.bundles import FINE, TOO_FEW_WORDS, BundledFile
-from potr_cl.codec.native.library import native
+from potr_cl.codec.native.library import native, vectors
 from potr_cl.codec.rans import LOWEST, check_end, no_words_left
 from potr_cl.codec.sections import Property
 from potr_cl.codec.steps.rule import ColourSteps
@@ -135,7 +135,7 @@ class Reader:
             there = {number: section for number, section in sections.items() if section is not None}
             fit = all(section.fits for section in there.values())
             words = {number: section.for_native() for number, section in there.items()}
-            self._files[wanted] = functions.bundled_file(self.bundles.splats, words, steps) if fit else None
+            self._files[wanted] = functions.bundled_file(self.bundles.splats, words, steps, vectors()) if fit else None
         return self._files[wanted]
 
 

@@ -135,4 +135,7 @@ static INLINE size_t steps_of(size_t splats)
  * *section becomes the one at fault. */
 int decode_bundle(const bundled_file *file, uint64_t bundle, int sections, int rotations, work *w, int *section);
 
+/* n quaternions w, x, y, z of any length, as long as 1. */
+void potr_unit_quaternions(const float *restrict quaternions, size_t n, float *restrict units);
+
 #endif

@@ -102,7 +102,9 @@ class _Values(ctypes.Structure):
         ("step", _POINTER),
         ("inverse", _POINTER),
         ("sf_rotation", ctypes.c_float),
-        ("unused", ctypes.c_float),
+        ("coefficients", _NUMBER),
+        ("columns", _NUMBER),
+        ("units", _NUMBER),
     )
 
 
@@ -153,13 +155,26 @@ class ValueArrays:
         log_scales: (N, 3).
         quaternions: (N, 4).
         logits: (N,).
-        sh: (M, 3, N), which holds zeros.
+        sh: (M, 3, N).
+        columns: whether log_scales is (3, N) instead, and quaternions (4, N).
     """
 
     log_scales: F32 | None = None
     quaternions: F32 | None = None
     logits: F32 | None = None
     sh: F32 | None = None
+    columns: bool = False
+
+    def part(self, start: int, stop: int) -> ValueArrays:
+        """Those from one splat to another, as views in which a splat is a row."""
+        scales, turned = (self._rows(array, start, stop) for array in (self.log_scales, self.quaternions))
+        logits = None if self.logits is None else self.logits[start:stop]
+        return ValueArrays(scales, turned, logits, None if self.sh is None else self.sh[:, :, start:stop])
+
+    def _rows(self, array: F32 | None, start: int, stop: int) -> F32 | None:
+        if array is None:
+            return None
+        return array[:, start:stop].T if self.columns else array[start:stop]
 
 
 @dataclass(frozen=True)
@@ -171,6 +186,7 @@ class Tables:
         sf_dc, sf_ac: (64,) scale factors of each class of steps.
         steps, inverses: (64,) int64 of each class of steps, of the prediction of DC.
         sf_rotation: scale factor.
+        units: whether quaternions are made as long as 1 in double precision.
     """
 
     scales: F32
@@ -180,6 +196,7 @@ class Tables:
     steps: NDArray[np.int64]
     inverses: NDArray[np.int64]
     sf_rotation: float
+    units: bool = False
 
 
 @dataclass(frozen=True)
@@ -375,6 +392,9 @@ class BundledFile:
             address(tables.steps, np.int64, 2 * CLASSES),
             address(tables.inverses, np.int64, 2 * CLASSES),
             tables.sf_rotation,
+            max(planes - 1, 0),
+            arrays.columns,
+            tables.units,
         )
         section = ctypes.c_int()
         said = self._c["potr_bundles_values"](

@@ -9,17 +9,19 @@
 
 /* Where the values of a file's splats go; NULL where they are not asked for. */
 typedef struct {
-    float *log_scales;  /* (N, 3) */
-    float *quaternions; /* (N, 4) w, x, y, z */
+    float *log_scales;  /* (N, 3), or (3, N) where `columns` says so */
+    float *quaternions; /* (N, 4) w, x, y, z, or (4, N) */
     float *logits;      /* (N) */
     float *dc;          /* (3, N) R, G, B */
-    float *ac;          /* (coefficients, 3, N), from coefficient 1 on; it holds zeros */
+    float *ac;          /* (coefficients, 3, N), from coefficient 1 on */
     const float *scale_table;   /* value of each level, */
     const float *opacity_table; /* and so many levels each */
     uint64_t scale_levels, opacity_levels;
     const float *sf_dc, *sf_ac;      /* (64) scale factors of each class of steps */
     const uint64_t *step, *inverse;  /* (64) of each class of steps, of the prediction of DC */
-    float sf_rotation, unused;
+    float sf_rotation;
+    int32_t coefficients;            /* from coefficient 1 on */
+    int32_t columns, units;          /* units: whether quaternions become as long as 1 in double precision */
 } scene_values;
 
 /* Values of a table for the levels in rows, every `stride`-th number of `out`; whether a level is beyond the table. */
@@ -38,9 +40,10 @@ static int look_up(
     return 0;
 }
 
-static void rotations(const work *w, float factor, size_t lanes, size_t steps, size_t splats, float *out)
+static void rotations(
+    const work *w, const scene_values *values, size_t lanes, size_t steps, size_t splats, uint64_t first, uint64_t all)
 {
-    float x[LANE], y[LANE], z[LANE], factors[LANE], rest[LANE];
+    float x[LANE], y[LANE], z[LANE], factors[LANE], rest[LANE], rows[4 * LANE], units[4 * LANE];
     for (size_t lane = 0; lane < lanes; lane++) {
         const size_t begin = lane * steps, number = splats - begin < steps ? splats - begin : steps;
         for (size_t step = 0; step < number; step++) {
@@ -54,7 +57,7 @@ static void rotations(const work *w, float factor, size_t lanes, size_t steps, s
             z[step] = (float)w->rotations[2][place];
         }
         for (size_t i = 0; i < number; i++)
-            factors[i] = sqrtf(factors[i]) * factor;
+            factors[i] = sqrtf(factors[i]) * values->sf_rotation;
         for (size_t i = 0; i < number; i++) {
             x[i] /= factors[i];
             y[i] /= factors[i];
@@ -67,12 +70,24 @@ static void rotations(const work *w, float factor, size_t lanes, size_t steps, s
             rest[i] = sqrtf(left > 0 ? left : 0);
         }
         for (size_t i = 0; i < number; i++) {
-            float *const to = out + 4 * (begin + i);
+            float *const to = rows + 4 * i;
             to[0] = rest[i];
             to[1] = x[i];
             to[2] = y[i];
             to[3] = z[i];
         }
+        const float *from = rows;
+        if (values->units) {
+            potr_unit_quaternions(rows, number, units);
+            from = units;
+        }
+        float *const out = values->quaternions + (values->columns ? 1 : 4) * (first + begin);
+        if (!values->columns)
+            memcpy(out, from, 4 * number * sizeof *out);
+        else
+            for (size_t k = 0; k < 4; k++)
+                for (size_t i = 0; i < number; i++)
+                    out[k * all + i] = from[4 * i + k];
     }
 }
 
@@ -142,11 +157,15 @@ POTR_EXPORT int potr_bundles_values(
     if (out->log_scales && sections > SCALE)
         for (size_t axis = 0; axis < 3; axis++)
             beyond |= look_up(w->scales[axis], lanes, steps, splats, out->scale_table, out->scale_levels,
-                out->log_scales + 3 * first + axis, 3);
+                out->columns ? out->log_scales + axis * all + first : out->log_scales + 3 * first + axis,
+                out->columns ? 1 : 3);
     if (out->quaternions && rotating)
-        rotations(w, out->sf_rotation, lanes, steps, splats, out->quaternions + 4 * first);
+        rotations(w, out, lanes, steps, splats, first, all);
     if (out->dc && sections > DC)
         colours_of_dc(w, out, steps, splats, out->dc + first, all);
+    /* Most are 0. They are cleared here, where they are in a cache when the others follow. */
+    for (int32_t plane = 0; out->ac && plane < 3 * out->coefficients; plane++)
+        memset(out->ac + (size_t)plane * all + first, 0, splats * sizeof *out->ac);
     if (out->ac)
         for (size_t band = 0; band < 3; band++)
             colours_of_items(w, band, out->sf_ac, steps, out->ac + first, all);

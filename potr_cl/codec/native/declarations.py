@@ -51,7 +51,10 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_nearest": (None, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER]),
     "potr_canonical": (None, [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _POINTER, _POINTER, _POINTER]),
     "potr_unit_quaternions": (None, [_POINTER, _SIZE, _POINTER]),
-    "potr_ycocg_columns": (None, [_POINTER, _SIZE, _SIZE, _SIZE, _POINTER]),
+    "potr_colour_levels": (
+        _NUMBER,
+        [_POINTER, *[_SIZE] * 4, _POINTER, _SIZE, _POINTER, _POINTER, _SIZE, _SIZE, _POINTER],
+    ),
     "potr_nonzero_levels": (_NUMBER, [_POINTER, _SIZE, _SIZE, ctypes.c_double, ctypes.c_double, _POINTER]),
     "potr_unpredicted": (None, [_POINTER, _SIZE, _SIZE, _SIZE, *[_POINTER] * 4]),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),

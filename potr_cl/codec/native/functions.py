@@ -58,9 +58,11 @@ class Functions:
         self.quantising = Quantising(self._c)
         self.octree = OctreeFunctions(self._c)
 
-    def bundled_file(self, splats: int, sections: Mapping[int, SectionWords], steps: ColourSteps | None) -> BundledFile:
+    def bundled_file(
+        self, splats: int, sections: Mapping[int, SectionWords], steps: ColourSteps | None, vectors: bool = True
+    ) -> BundledFile:
         """Sections of coder 4, as :class:`potr_cl.codec.native.bundles.BundledFile` takes them."""
-        return BundledFile(self._c, splats, sections, steps)
+        return BundledFile(self._c, splats, sections, steps, vectors)
 
     def bundle_encoder(self, *integers: Any) -> BundleEncoder:
         """Integers to code, as :class:`potr_cl.codec.native.bundles_encode.BundleEncoder` takes them."""

@@ -16,6 +16,8 @@ from potr_cl.errors import UsageError
 VARIABLE = "POTR_CL_NATIVE"
 #: Another library than the one that was built with the package, such as one with a sanitizer.
 LIBRARY_VARIABLE = "POTR_CL_NATIVE_LIBRARY"
+#: "0": without what only some processors have, as on all others.
+VECTORS_VARIABLE = "POTR_CL_NATIVE_VECTORS"
 
 
 def native() -> Functions | None:
@@ -37,6 +39,11 @@ def native() -> Functions | None:
             f"{VARIABLE} is 1, but the compiled library is missing: unset it, or install potr_cl with a C compiler"
         )
     return functions
+
+
+def vectors() -> bool:
+    """Whether the library may use vectors of 512 bits, where the processor has them."""
+    return os.environ.get(VECTORS_VARIABLE) != "0"
 
 
 def _built() -> str | None:

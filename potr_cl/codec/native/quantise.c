@@ -100,20 +100,53 @@ static INLINE void to_ycocg(const float *rgb, size_t step, size_t some, double (
     }
 }
 
-/* SH coefficients of n splats, (n, count, 3) R, G, B, to columns (count, 3, stride) in Y, Co, Cg. */
-POTR_EXPORT void potr_ycocg_columns(
-    const float *restrict sh, size_t n, size_t count, size_t stride, float *restrict columns)
+/* Levels of three channels of `some` splats that `order` picks, which lie `splat_step` apart in sh, to columns that are
+ * `stride` apart. Returns whether all fit. */
+static INLINE int three_levels(
+    const float *restrict sh, size_t splat_step, size_t channel_step, const int64_t *restrict order, size_t some,
+    const double *restrict factors, size_t stride, int16_t *restrict columns)
 {
-    for (size_t start = 0; start < n; start += SH_BLOCK) {
-        const size_t some = n - start < SH_BLOCK ? n - start : SH_BLOCK;
-        for (size_t m = 0; m < count; m++) {
-            double channels[3][SH_BLOCK];
-            to_ycocg(sh + 3 * (start * count + m), 3 * count, some, channels);
-            for (size_t c = 0; c < 3; c++)
-                for (size_t i = 0; i < some; i++)
-                    columns[(3 * m + c) * stride + start + i] = (float)channels[c][i];
+    float rgb[3 * SH_BLOCK];
+    double channels[3][SH_BLOCK];
+    int sound = 1;
+    for (size_t i = 0; i < some; i++)
+        for (size_t c = 0; c < 3; c++)
+            rgb[3 * i + c] = sh[(size_t)order[i] * splat_step + c * channel_step];
+    to_ycocg(rgb, 3, some, channels);
+    for (size_t c = 0; c < 3; c++)
+        for (size_t i = 0; i < some; i++) {
+            const double level = channels[c][i] * factors[i] + 0.5; /* the whole number below it, that is */
+            const int fits = (level >= -32767.0) & (level < 32768.0);
+            const double safe = fits ? level : 0.0;
+            const int32_t whole = (int32_t)safe;
+            sound &= fits;
+            columns[c * stride + i] = (int16_t)(whole - (safe < whole));
         }
+    return sound;
+}
+
+/* Levels of the SH coefficients of n splats, which `order` picks among some: columns (count, 3, stride) in Y, Co, Cg, of
+ * which those from `start` on are set.
+ *
+ * Coefficient m of channel c of splat i is sh[i * splat_step + m * three_step + c * channel_step]. dc, ac: (n,) scale
+ * factors. Returns whether all levels fit; if not, what was set means nothing. */
+POTR_EXPORT int potr_colour_levels(
+    const float *restrict sh, size_t splat_step, size_t three_step, size_t channel_step, size_t count,
+    const int64_t *restrict order, size_t n, const double *restrict dc, const double *restrict ac, size_t start,
+    size_t stride, int16_t *restrict columns)
+{
+    const size_t blocks = (n + SH_BLOCK - 1) / SH_BLOCK;
+    int sound = 1;
+    for (size_t step = 0; step < blocks * count; step++) {
+        /* Caches hold a column of coefficients, or the rows of a few splats: one is done before the next begins. */
+        const size_t block = splat_step == 1 ? step % blocks : step / count;
+        const size_t m = splat_step == 1 ? step / blocks : step % count;
+        const size_t first = block * SH_BLOCK, some = n - first < SH_BLOCK ? n - first : SH_BLOCK;
+        sound &= three_levels(
+            sh + m * three_step, splat_step, channel_step, order + first, some, (m ? ac : dc) + first, stride,
+            columns + 3 * m * stride + start + first);
     }
+    return sound;
 }
 
 /* Which of the coefficients, in Y, Co, Cg, have a level other than 0: columns (count, 3, n) of 0 and 1. Returns whether

@@ -67,19 +67,41 @@ class Quantising:
             address(turned, np.float32, 3 * number, True),
         )
 
-    def ycocg_columns(self, sh: F32, columns: F32) -> None:
-        """Coefficients (n, count, 3) in R, G, B to ``columns`` (count, 3, stride) in Y, Co, Cg; the rest is left."""
-        number, count, _ = sh.shape
-        stride = columns.shape[2]
-        if stride < number:
+    def colour_levels(
+        self, sh: F32, planar: bool, order: I64, dc: F64, ac: F64, start: int, levels: NDArray[np.int16]
+    ) -> bool:
+        """Levels of the SH coefficients of some splats in Y, Co, Cg.
+
+        Args:
+            sh: (count, 3, N) in R, G, B if ``planar``, else (N, count, 3); C order.
+            order: (n,) numbers of the splats.
+            dc, ac: (n,) scale factors.
+            levels: (count, 3, stride), of which ``start`` to ``start + n`` are set.
+
+        Returns:
+            Whether all fit; if not, what was set means nothing.
+        """
+        number = len(order)
+        count, splats = (sh.shape[0], sh.shape[2]) if planar else (sh.shape[1], sh.shape[0])
+        stride = levels.shape[2]
+        if number and not 0 <= int(order.min()) <= int(order.max()) < splats:
+            raise TypeError("the native path was given splats that are not there")
+        if not 0 <= start <= stride - number:
             raise TypeError("the native path was given columns that are too short")
-        self._c["potr_ycocg_columns"](
-            address(sh, np.float32, 3 * number * count),
-            number,
+        steps = (1, 3 * splats, splats) if planar else (3 * count, 3, 1)
+        fit: int = self._c["potr_colour_levels"](
+            address(sh, np.float32, 3 * splats * count),
+            *steps,
             count,
+            address(order, np.int64, number),
+            number,
+            address(dc, np.float64, number),
+            address(ac, np.float64, number),
+            start,
             stride,
-            address(columns, np.float32, 3 * stride * count, True),
+            address(levels, np.int16, 3 * stride * count, True),
         )
+        return bool(fit)
 
     def unit_quaternions(self, quaternions: F32) -> F32:
         """(n, 4) float32 quaternions of unit length, of (n, 4); those of length 0 become the identity."""

@@ -5,8 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.octree.morton import spread
 from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, U64, OctreeStreams
+from potr_cl.model.morton import spread
 
 #: Splats worked on at a time where each stands for itself: the temporaries of a block stay in the cache.
 _BLOCK = 1 << 15

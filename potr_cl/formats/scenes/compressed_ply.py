@@ -16,6 +16,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DataError
 from potr_cl.formats.declaration import SceneFormat
+from potr_cl.formats.scenes.compressed_ply_chunks import in_chunks
 from potr_cl.formats.scenes.compressed_ply_values import (
     CHUNK,
     PackedGeometry,
@@ -27,7 +28,7 @@ from potr_cl.formats.scenes.compressed_ply_values import (
 )
 from potr_cl.formats.scenes.gsply_arrays import EXTRA, library, to_scene
 from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
-from potr_cl.formats.scenes.scene_files import arranged, cleaned, opened, tell_of_low_pass
+from potr_cl.formats.scenes.scene_files import cleaned, opened, tell_of_low_pass, unit_quaternions
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import SH_COEFFICIENTS, FloatArray, Scene
 
@@ -79,7 +80,7 @@ def save(path: str | os.PathLike[str], scene: Scene) -> None:
         PotrError: the system failed to write.
     """
     tell_of_low_pass(path, scene)
-    scene = arranged(scene)
+    scene = unit_quaternions(scene.subset(in_chunks(scene.means)))
     packed, colours = packed_geometry(scene), packed_colours(scene.sh[:, 0])
     with replacing(path) as file:
         for piece in pieces(packed, colours, packed_sh(scene.sh[:, 1:]), scene.antialiased):

@@ -27,6 +27,8 @@ _LARGEST_LOGIT = np.float32(10)
 #: Shifts and bits of three values in a word.
 _POSITION = ((21, 11), (11, 10), (0, 11))
 _COLOUR = ((24, 8), (16, 8), (8, 8))
+#: Of the centres' coordinates.
+POSITION_BITS = tuple(bits for _, bits in _POSITION)
 
 Words = NDArray[np.uint32]
 U8 = NDArray[np.uint8]

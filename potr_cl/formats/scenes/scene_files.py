@@ -13,7 +13,6 @@ from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
 import numpy as np
-from numpy.typing import NDArray
 
 from potr_cl.codec import octree
 from potr_cl.codec.logarithm import natural_logarithm
@@ -213,17 +212,9 @@ def tell_of_low_pass(path: str | os.PathLike[str], scene: Scene) -> None:
 
 
 def arranged(scene: Scene) -> Scene:
-    """A scene as coarse formats want it: unit quaternions, opacities that bytes can tell, neighbours together.
-
-    A compressed PLY has one set of bounds for 256 splats in sequence: in a trainer's order they span the scene.
-    """
-    return unit_quaternions(scene.subset(arrangement(scene)))
-
-
-def arrangement(scene: Scene) -> NDArray[np.int64]:
-    """(N,) the numbers of a scene's splats in an order that has neighbours together."""
+    """A scene as coarse formats want it: unit quaternions, opacities that bytes can tell, neighbours together."""
     side = max(float(axis.max()) - float(axis.min()) for axis in scene.means.T)
-    return octree.leaf_order(scene.means, max(side * 2.0**-20, 1e-30))
+    return unit_quaternions(scene.subset(octree.leaf_order(scene.means, max(side * 2.0**-20, 1e-30))))
 
 
 def unit_quaternions(scene: Scene) -> Scene:

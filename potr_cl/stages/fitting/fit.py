@@ -265,8 +265,9 @@ class _Fit:
         slowing = options.last ** (1 / max(options.steps - 1, 1))
         kept = done = since = 0
         order = batches(fit_to, options.batch, options.seed)
-        for round_number in range(1, options.rounds + 1):
-            end = options.steps * round_number // options.rounds
+        rounds = min(options.rounds, options.steps)
+        for round_number in range(1, rounds + 1):
+            end = options.steps * round_number // rounds
             unit = _unit(errors[-1])
             while done < end and not asked:
                 self._step(next(order), unit, pace * slowing**done)

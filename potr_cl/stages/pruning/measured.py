@@ -3,31 +3,70 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
+from typing import TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.pruning.part import RemovalPart
 from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.shared_removal import SharedRemoval
 from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.visible_parts import PartedRemoval, parts_worth_it
 from potr_cl.stages.stage import State, Workbench
+from potr_cl.workers.dealing import shares
+from potr_cl.workers.parts import Parts
+
+#: What measures: one device, perhaps part by part, or several together.
+Removal: TypeAlias = RemovalSweep | SharedRemoval | PartedRemoval
 
 
 @contextmanager
-def measurement(state: State, bench: Workbench, options: SweepOptions) -> Iterator[RemovalSweep]:
+def measurement(state: State, bench: Workbench, options: SweepOptions) -> Iterator[Removal]:
     """A removal sweep over the views of a state, its splats numbered as in the state's scene.
 
     Raises:
         DeviceError: the scene or a view does not fit the device.
     """
-    with (
-        Rasterizer(bench.opened, bench.drawable(state.scene), background=bench.background) as rasterizer,
-        RemovalSweep(
-            rasterizer, state.views, options, lambda done, count: bench.progress("prepare views", done / count)
-        ) as removal,
-    ):
-        yield removal
+
+    def progress(done: int, count: int) -> None:
+        bench.progress("prepare views", done / count)
+
+    device, pool, views = bench.opened, bench.pool, state.views
+    # A sample of the tiles is drawn from all of them in turn, so one device does it.
+    share = None if pool is None or options.sample < 1 else shares(pool, len(views))
+    with ExitStack() as stack:
+        if pool is None or share is None or not share.others:
+            parts = parts_worth_it(state.scene, views, options)
+            if parts is not None:
+                whole = bench.drawable(state.scene)
+                yield stack.enter_context(
+                    PartedRemoval(device, state.scene, whole, views, parts, options, bench.background, progress)
+                )
+                return
+            rasterizer = stack.enter_context(
+                Rasterizer(device, bench.drawable(state.scene), background=bench.background)
+            )
+            yield stack.enter_context(RemovalSweep(rasterizer, views, options, progress))
+            return
+        scene = stack.enter_context(pool.shared(state.scene))
+        given = [(scene, views, options, bench.background, numbers) for numbers in share.others]
+        others = stack.enter_context(Parts(pool, RemovalPart, given, options.memory))
+        own, stride = None, len(state.scene)
+        if share.own:
+            rasterizer = stack.enter_context(
+                Rasterizer(device, bench.drawable(state.scene), background=bench.background)
+            )
+            own = stack.enter_context(RemovalSweep(rasterizer, views, options, progress, share.own))
+            stride = rasterizer.stride
+        others.ready()
+        steers = all(others.ask(place, "can_steer") for place in range(len(others)))
+        steers = steers and (device.family == "gpu" if own is None else own.steering is not None)
+        yield stack.enter_context(
+            SharedRemoval(device, len(state.scene), stride, views, own, others, pool.sparse, steers)
+        )
 
 
 class Measured:
@@ -38,7 +77,7 @@ class Measured:
         left: (n,) the sweep's numbers of the splats that are left, ascending.
     """
 
-    def __init__(self, removal: RemovalSweep, left: NDArray[np.int64]) -> None:
+    def __init__(self, removal: Removal, left: NDArray[np.int64]) -> None:
         self._removal = removal
         self._places = np.full(removal.splats, -1, np.int64)
         self._places[left] = np.arange(len(left))

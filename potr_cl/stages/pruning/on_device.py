@@ -15,9 +15,9 @@ from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.structs import bytes_before, struct_dtype
 from potr_cl.raster.macros import totals_limits
-from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.measured import Removal
 from potr_cl.stages.pruning.schedule import Iteration, Pruned, PruningOptions, ascending, prune
-from potr_cl.stages.pruning.steering import Steering
+from potr_cl.stages.pruning.steering import Steered
 
 _SOURCE = "prune/choose_gpu.cl"
 #: A score has so many digits, each of so many values; a work-group has a work-item for each value.
@@ -27,7 +27,7 @@ _REMOVED, _STATE = struct_dtype(_SOURCE, "Removed"), struct_dtype(_SOURCE, "Stat
 
 
 def prune_scene(
-    removal: RemovalSweep,
+    removal: Removal,
     options: PruningOptions,
     progress: Callable[[int, int], None] | None = None,
     after_iteration: Callable[[int], None] | None = None,
@@ -53,7 +53,7 @@ class _Controller(Owner):
         DeviceError: the device has no room for the state.
     """
 
-    def __init__(self, removal: Steering, options: PruningOptions) -> None:
+    def __init__(self, removal: Steered, options: PruningOptions) -> None:
         self._removal, self._options = removal, options
         self._device = device = removal.device
         self._splats = removal.splats

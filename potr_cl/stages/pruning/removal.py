@@ -49,9 +49,12 @@ class RemovalSweep(Owner):
         cameras: the views that count.
         options: speed/accuracy trade-offs.
         progress: called with the views prepared and their number.
+        numbers: of the views that are measured here, ascending, where others are measured elsewhere and all totals are
+            added up (:mod:`potr_cl.stages.pruning.shared_removal`); None: all.
 
     Attributes:
         splats: N.
+        fixed_point: the totals' units, those of all views.
         cached_views: views whose lists fit the memory budget; the others are made again for every measurement.
         steering: the interface for a controller that runs on the device; None if the host has to decide, because of the
             kernel family, the options, or views that do not fit the budget.
@@ -67,28 +70,30 @@ class RemovalSweep(Owner):
         cameras: Sequence[Camera],
         options: SweepOptions | None = None,
         progress: Callable[[int, int], None] | None = None,
+        numbers: Sequence[int] | None = None,
     ) -> None:
         if not cameras:
             raise UsageError("removal effects need at least one view")
         options = options or SweepOptions()
+        self._numbers = range(len(cameras)) if numbers is None else numbers
         self._rasterizer = rasterizer
         self._device = device = rasterizer.device
-        self._fixed_point = FixedPoint.of_views(cameras)
+        self.fixed_point = FixedPoint.of_views(cameras)
         self._original_sh: cl.Buffer | None = None
         self.splats = rasterizer.splats
         with ExitStack() as owned:
             self._memory = memory = owned.enter_context(Memory(device))
             self._totals = memory.upload(zero_totals(rasterizer.stride), "the removal effects")
-            launcher = launcher_for(rasterizer, options, self._fixed_point)
+            launcher = launcher_for(rasterizer, options, self.fixed_point)
             budget = default_memory(device) if options.memory is None else options.memory
             self._prepared = prepared = owned.enter_context(
-                PreparedViews(rasterizer, cameras, budget, launcher.most_views, progress)
+                PreparedViews(rasterizer, [cameras[k] for k in self._numbers], budget, launcher.most_views, progress)
             )
             # Sets that share the memory of their projections have to be swept one after the other.
             queues = Queues(device, 1 if prepared.geometry_is_shared else launcher.most_queues)
             self._survivors = owned.enter_context(Survivors(device, self.splats, rasterizer.stride, queues.wait))
             tiles = memory.allocate(4 * prepared.tiles, "the tiles to sweep")
-            schedule = TileSchedule(options, prepared.cached_view_tiles)
+            schedule = TileSchedule(options, [(self._numbers[k], tiles) for k, tiles in prepared.cached_view_tiles])
             self._cached = owned.enter_context(
                 CachedSweep(prepared, launcher, queues, self._survivors, schedule, tiles, self._totals)
             )
@@ -103,7 +108,7 @@ class RemovalSweep(Owner):
                 self._survivors,
                 options.tolerance,
                 self._totals,
-                self._fixed_point.units,
+                self.fixed_point.units,
                 self.splats,
             )
 
@@ -123,12 +128,16 @@ class RemovalSweep(Owner):
         ΔMSE is the change of the mean squared error over all views, pixels and channels against the uncompressed
         scene's renders if that splat alone went; I the mean over views and pixels of T α.
         """
+        return self.fixed_point.values(self.measure_totals())
+
+    def measure_totals(self) -> NDArray[np.int64]:
+        """The same as (N, 2) int64 in units of the fixed point: the sums over the views that are measured here."""
         first_time = self._cached.measurements == 0
         self._cached.measure()
         totals = self._device.download(self._totals, (self.splats, 2), np.int64)
         if self._prepared.uncached:
             totals += self._uncached.measure(self.splats, first_time, self._original_sh)
-        return self._fixed_point.values(totals)
+        return totals
 
     def remove(self, splats: Indices) -> None:
         """Take splats out of all lists; note how much each tile loses."""
@@ -166,9 +175,21 @@ class RemovalSweep(Owner):
         Raises:
             UsageError: nothing has been measured yet.
         """
+        self.sweep_changed()
+        yield from self.known_importances()
+
+    def sweep_changed(self) -> None:
+        """Measure whatever anything was removed from since it was last measured.
+
+        Raises:
+            UsageError: nothing has been measured yet.
+        """
         if not self._cached.measurements:
             raise UsageError("importances are known after a measurement")
         self._cached.sweep_changed()
+
+    def known_importances(self) -> Iterator[tuple[int, Indices, F64]]:
+        """:meth:`view_importances` of the views that are measured here, right after :meth:`sweep_changed`."""
         cached = {views.numbers: views for views in self._prepared.cached}
         for numbers in sorted([*cached, *self._prepared.uncached], key=lambda numbers: numbers.start):
             if numbers in cached:
@@ -184,7 +205,7 @@ class RemovalSweep(Owner):
             weights = np.maximum(sums[:, 1], 0)  # negative: touches no pixel
             total = np.bincount(intersections, weights=weights, minlength=self.splats)[: self.splats]
             splats = np.flatnonzero((total > 0) & alive)
-            yield number, splats, total[splats] / view.pixels
+            yield self._numbers[number], splats, total[splats] / view.pixels
 
     def intersections_left(self) -> int:
         """Tile intersections in the lists of the cached views that no sweep has dropped yet."""

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from typing import Protocol
+
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
@@ -11,9 +13,41 @@ from potr_cl.stages.pruning.cached_sweep import CachedSweep
 from potr_cl.stages.pruning.survivors import Survivors
 
 
+class Steered(Protocol):
+    """What :mod:`potr_cl.stages.pruning.on_device` needs.
+
+    Attributes:
+        device: where the totals and the marks are.
+        totals: (N, 2) int64 in the device's memory.
+        marks: (N,) uint8 in the device's memory, :class:`~potr_cl.stages.pruning.survivors.SplatState`. The controller
+            marks splats as JUST_REMOVED and calls :meth:`remove_marked`; when it marks the next ones, it changes the
+            earlier marks to REMOVED.
+        units: ΔMSE and I of 1 in the totals.
+        splats: N.
+    """
+
+    device: Device
+    totals: cl.Buffer
+    marks: cl.Buffer
+    units: tuple[float, float]
+    splats: int
+
+    @property
+    def alive(self) -> NDArray[np.bool_]:
+        """(N,) which splats are left."""
+        ...
+
+    def measure_on_device(self) -> None:
+        """Bring the totals up to date."""
+
+    def remove_marked(self) -> None:
+        """Take the splats out that are marked JUST_REMOVED."""
+
+
 class Steering:
-    """What :mod:`potr_cl.stages.pruning.on_device` needs. The device lists the tiles that the next measurement sweeps;
-    the host learns only how many they are.
+    """A :class:`Steered` sweep of views that one device does.
+
+    The device lists the tiles that the next measurement sweeps; the host learns only how many they are.
 
     Args:
         device: where everything is.
@@ -25,10 +59,7 @@ class Steering:
         splats: N.
 
     Attributes:
-        device, totals, units, splats: as given; totals are (N, 2) int64 in the device's memory.
-        marks: (N,) uint8 in the device's memory, :class:`~potr_cl.stages.pruning.survivors.SplatState`. The controller
-            marks splats as JUST_REMOVED and calls :meth:`remove_marked`; when it marks the next ones, it changes the
-            earlier marks to REMOVED.
+        device, totals, units, splats, marks: see :class:`Steered`.
     """
 
     def __init__(
@@ -47,17 +78,22 @@ class Steering:
 
     @property
     def alive(self) -> NDArray[np.bool_]:
-        """(N,) which splats are left."""
         return self._survivors.alive
 
+    def mark(self, splats: NDArray[np.int64]) -> None:
+        """Mark splats that a controller elsewhere has chosen; :meth:`remove_marked` follows."""
+        self._survivors.mark(splats)
+
+    def just_marked(self) -> NDArray[np.int64]:
+        """The splats that are marked JUST_REMOVED, ascending."""
+        return self._survivors.just_marked()
+
     def measure_on_device(self) -> None:
-        """Bring :attr:`totals` up to date."""
         if not self._cached.device_has_listed:  # nothing is marked, so this only lists the stale tiles
             self._survivors.settle()
             self.remove_marked()
         self._cached.measure()
 
     def remove_marked(self) -> None:
-        """Take the splats out that are marked JUST_REMOVED."""
         self._cached.have_listed(self._tolerance)
         self._survivors.marked_by_device()

@@ -69,6 +69,17 @@ class Survivors(Owner):
         self._states[splats] = SplatState.REMOVED
         self._host_is_ahead = True
 
+    def mark(self, splats: Indices) -> None:
+        """Mark splats on the device as JUST_REMOVED, as a controller there does; :meth:`marked_by_device` follows."""
+        self.settle()
+        self._states[splats] = SplatState.JUST_REMOVED
+        self._write(self._states)
+
+    def just_marked(self) -> Indices:
+        """The splats that are JUST_REMOVED on the device, ascending."""
+        states = self._device.download(self.buffer, (self._splats,), np.uint8)
+        return np.flatnonzero(states == SplatState.JUST_REMOVED)
+
     def marked_by_device(self) -> None:
         """Note that the device has changed states from ALIVE to JUST_REMOVED, and that the host does not know which."""
         self._device_is_ahead = True

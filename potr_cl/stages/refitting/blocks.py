@@ -39,6 +39,11 @@ class SplatBlocks(Owner):
         self._memory = Memory(device)
         self.buffer = self._memory.allocate(4 * self._triangle * layout.stride, "the splats' normal equations")
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of :attr:`buffer`."""
+        return 4 * self._triangle * self._coefficients.layout.stride
+
     def zero(self) -> None:
         """Have all blocks 0."""
         self._coefficients.zero(self.buffer)
@@ -65,9 +70,19 @@ class SplatBlocks(Owner):
         rows, columns = np.triu_indices(layout.sh_count)
         diagonals = np.empty((layout.splats, layout.sh_count), np.float32)
         for m, place in enumerate(np.flatnonzero(rows == columns)):
-            start = 4 * layout.stride * int(place)
-            diagonals[:, m] = self._coefficients.device.download(self.buffer, (layout.splats,), np.float32, start)
+            diagonals[:, m] = self._element(int(place))
         return diagonals
+
+    def constants(self) -> FloatArray:
+        """(N,) float32, what stands on the blocks' diagonals for the constant coefficient."""
+        return self._element(0)
+
+    def _element(self, place: int) -> FloatArray:
+        layout = self._coefficients.layout
+        column: FloatArray = self._coefficients.device.download(
+            self.buffer, (layout.splats,), np.float32, 4 * layout.stride * place
+        )
+        return column
 
     def precondition(self, residual: cl.Buffer, ridge: Ridge, result: cl.Buffer) -> None:
         """result = (block + ridge)⁻¹ residual on each splat's active coefficients, 0 on the others."""

@@ -2,15 +2,13 @@
 
 from __future__ import annotations
 
-from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.library import native
-from potr_cl.codec.quantize import to_ycocg
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.kernel import Kernel
@@ -21,8 +19,8 @@ _SOURCE = "refit/coefficients.cl"
 _DOT_ITEMS = 16384
 #: Work-items of a work-group.
 _GROUP = 64
-#: Splats whose coefficients the host turns from rows into columns at a time: a CPU's cache holds them.
-_TURNED = 4096
+#: Splats whose coefficients are uploaded at a time.
+_TURNED = 1 << 18
 #: Columns whose flags share a word on the device.
 _FLAGS = 24
 
@@ -105,8 +103,9 @@ class Coefficients(Owner):
 
     def __init__(self, device: Device, layout: Layout) -> None:
         self.device, self.layout = device, layout
-        self._regularise, self._combine, self._dot_parts = (
-            device.shared_kernel(_SOURCE, name, **layout.macros) for name in ("regularise", "combine", "dot_parts")
+        self._regularise, self._combine, self._dot_parts, self._to_ycocg, self._to_rgb = (
+            device.shared_kernel(_SOURCE, name, **layout.macros)
+            for name in ("regularise", "combine", "dot_parts", "to_ycocg", "to_rgb")
         )
         self._memory = Memory(device)
         try:
@@ -175,38 +174,61 @@ class Coefficients(Owner):
         """(N, M, 3) float32, a vector in Y, Co, Cg."""
         return np.ascontiguousarray(self._columns_of(x)[:, :, : self.layout.splats].transpose(2, 0, 1))
 
-    def write_sh(self, x: cl.Buffer, sh: FloatArray, only: NDArray[np.bool_] | None = None) -> None:
+    def write_columns(self, x: cl.Buffer, values: FloatArray) -> None:
+        """Set a vector from its columns, (3 M, N) float32, as :meth:`read_columns` gives them."""
+        columns = np.zeros((self.layout.columns, self.layout.stride), np.float32)
+        columns[:, : self.layout.splats] = values
+        cl.enqueue_copy(self.device.queue, x, columns, is_blocking=True)
+
+    def read_columns(self, x: cl.Buffer) -> FloatArray:
+        """(3 M, N) float32, the columns of a vector as they lie on the device."""
+        columns = self._columns_of(x).reshape(self.layout.columns, self.layout.stride)
+        return np.ascontiguousarray(columns[:, : self.layout.splats])
+
+    def write_sh(self, x: cl.Buffer, sh: FloatArray) -> None:
         """Set a vector.
 
         Args:
             x: the vector.
             sh: (N, M, 3) R, G, B.
-            only: (N, M, 3) in Y, Co, Cg: the others become 0; None: none does.
         """
-        layout, functions = self.layout, native()
-        columns = np.zeros((layout.columns, layout.stride), np.float32)
-        if functions is not None and sh.flags.c_contiguous and sh.dtype == np.float32:
-            functions.quantising.ycocg_columns(sh, columns.reshape(layout.sh_count, 3, -1))
+        layout, device = self.layout, self.device
+        self.zero(x)
+        planar = sh.transpose(1, 2, 0)
+        if planar.flags.c_contiguous and planar.dtype == np.float32:  # as a re-fit or a decoder leaves them
+            cl.enqueue_copy(device.queue, x, planar, is_blocking=True, **self._as_columns(planar))
         else:
-            for some in self._slices():
-                rows = sh[some].astype(np.float64)
-                for c, channel in enumerate(to_ycocg(rows.reshape(-1, 3))):
-                    columns[c::3, some] = channel.reshape(-1, layout.sh_count).T
-        if only is not None:
-            for column in range(layout.columns):
-                columns[column, : layout.splats] *= only[:, column // 3, column % 3]
-        cl.enqueue_copy(self.device.queue, x, columns, is_blocking=True)
+            turn = device.shared_kernel("raster/columns.cl", "columns")
+            for first in range(0, layout.splats, _TURNED):
+                rows = sh[first : first + _TURNED].reshape(-1, layout.columns)
+                with Memory(device) as memory:
+                    some = memory.upload(rows.astype(np.float32, copy=False), "the SH coefficients")
+                    turn.bind(rows=some, first=first, width=layout.columns, stride=layout.stride, result=x)
+                    turn.launch((len(rows),))
+        self._to_ycocg.bind(columns=x, stride=layout.stride)
+        layout.over_splats(self._to_ycocg)
 
     def read_sh(self, x: cl.Buffer) -> FloatArray:
         """(N, M, 3) float32, a vector in R, G, B; each coefficient contiguous in memory."""
-        sh = np.empty((self.layout.sh_count, 3, self.layout.splats), np.float32)
-        for (y, co, cg), (red, green, blue) in zip(self._columns_of(x)[:, :, : self.layout.splats], sh, strict=True):
-            # In this order nothing overflows that did not in R, G, B.
-            rest = y - cg
-            np.add(rest, co, out=red)
-            np.add(y, cg, out=green)
-            np.subtract(rest, co, out=blue)
+        layout, device = self.layout, self.device
+        sh = np.empty((layout.sh_count, 3, layout.splats), np.float32)
+        with Memory(device) as memory:
+            rgb = memory.allocate(4 * self._length, "the SH coefficients")
+            self._to_rgb.bind(columns=x, stride=layout.stride, result=rgb)
+            layout.over_splats(self._to_rgb)
+            with device.errors("failed while computing"):
+                cl.enqueue_copy(device.queue, sh, rgb, is_blocking=True, **self._as_columns(sh))
         return sh.transpose(2, 0, 1)
+
+    def _as_columns(self, planar: FloatArray) -> dict[str, Any]:
+        """How (M, 3, N) lie in a vector, as a copy takes it."""
+        return {
+            "buffer_origin": (0, 0, 0),
+            "host_origin": (0, 0, 0),
+            "region": (4 * self.layout.splats, self.layout.columns, 1),
+            "buffer_pitches": (4 * self.layout.stride, 0),
+            "host_pitches": (4 * self.layout.splats, 0),
+        }
 
     def _columns_of(self, x: cl.Buffer) -> FloatArray:
         """(M, 3, stride)."""
@@ -214,11 +236,11 @@ class Coefficients(Owner):
         columns: FloatArray = self.device.download(x, shape, np.float32)
         return columns
 
-    def _slices(self) -> Iterator[slice]:
-        for first in range(0, self.layout.splats, _TURNED):
-            yield slice(first, min(first + _TURNED, self.layout.splats))
-
     # ------------------------------------------------------------------------------------------ which may change
+
+    def keep_active(self, x: cl.Buffer) -> None:
+        """x = 0 where it may not change."""
+        self.add_ridge(x, x, Ridge(0.0, 0.0, 0.0))
 
     def activate_constant(self) -> None:
         """Say that the constant coefficients may change and no others."""

@@ -7,12 +7,16 @@ are, and :meth:`ColourMap.normal` goes by that.
 A product with Aᵀ W A is one sweep over the tiles of every view (cl/refit/refit_cpu.cl, refit_gpu.cl): from the splats'
 colours (cl/refit/view_colours.cl) to the pixels' values, and from those back to sums for each splat, which are gathered
 into coefficients (cl/refit/gather.cl). W weighs pixels so that all views count the same whatever their size.
+
+The sums over views are integers. So it makes no difference to any bit if other devices do some of the views
+(:class:`Helpers`, which shared_map.py is): their sums are added to those of this device's views.
 """
 
 from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from typing import Protocol
 
 import numpy as np
 import pyopencl as cl
@@ -26,6 +30,7 @@ from potr_cl.raster.view_set import TILE, ViewSet
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.fixed_point import gathered_scale
 from potr_cl.stages.refitting.launcher import Launcher
 from potr_cl.stages.refitting.prepared_views import PreparedViews
 from potr_cl.stages.refitting.targets import TargetCache, Targets
@@ -34,6 +39,24 @@ from potr_cl.stages.refitting.targets import TargetCache, Targets
 _CHANGE, _TOTALS = 16, 32
 #: Views that a work-item of ``view_colours`` does one after the other, the coefficients in its registers.
 _COLOURED = 8
+
+
+class Helpers(Protocol):
+    """Do some of the views of a :class:`ColourMap`."""
+
+    def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
+        """Have them begin with :meth:`ColourMap.sum_gradient` of their views."""
+
+    def begin_normal(self, direction: cl.Buffer, unit: float, constant: bool) -> None:
+        """Have them begin with :meth:`ColourMap.sum_normal` of their views."""
+
+    def add(self, sums: cl.Buffer, blocks: cl.Buffer | None) -> dict[int, float]:
+        """Wait for them, and add what they found to the sums on this device.
+
+        Returns:
+            The errors of their views by number, after a gradient.
+        """
+        ...
 
 
 class ColourMap(Owner):
@@ -47,8 +70,11 @@ class ColourMap(Owner):
         cameras: the views that count, all the same whatever their size.
         background: R, G, B behind the splats.
         memory: bytes of device memory that prepared views and targets may take; None: a quarter of what is free.
+        numbers: of the views that are done here, ascending; None: all.
+        helpers: do the others.
 
     Attributes:
+        sums: (3 M, stride) int64 in the device's memory, what the views have added to coefficients; 0 between products.
         total_weight: the sum over all pixels and channels of their weights: a squared error over it is a mean one.
 
     Raises:
@@ -65,9 +91,12 @@ class ColourMap(Owner):
         cameras: Sequence[Camera],
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         memory: int | None = None,
+        numbers: Sequence[int] | None = None,
+        helpers: Helpers | None = None,
     ) -> None:
         if not cameras:
             raise UsageError("a re-fit needs at least one view")
+        self._helpers = helpers
         self._device = device = coefficients.device
         self._layout = layout = coefficients.layout
         self._coefficients = coefficients
@@ -83,9 +112,14 @@ class ColourMap(Owner):
             )
             for constant, weights in ((False, False), (False, True), (True, False))
         }
+        self._from_fixed = device.shared_kernel("refit/gather.cl", "from_fixed", WEIGHTS=0, **layout.macros)
         self.total_weight = 3 * REFERENCE_PIXELS * len(cameras)
+        self._one = gathered_scale(cameras, [_weight(camera) for camera in cameras])
+        fixed_points = self._launcher.fixed_point_scales(cameras)
+        self._numbers = range(len(cameras)) if numbers is None else numbers
+        cameras = [cameras[number] for number in self._numbers]
         self._weights = [_weight(camera) for camera in cameras]
-        self._fixed_points = self._launcher.fixed_point_scales(cameras)
+        self._fixed_points = [fixed_points[number] for number in self._numbers]
         self._memory = Memory(device)
         self._owned: list[Owner] = [self._memory]
         try:
@@ -96,14 +130,19 @@ class ColourMap(Owner):
             self._views = PreparedViews(rasterizer, cameras, self._launcher.most_views, own, memory)
             self._owned.append(self._views)
             launches = self._views.launches
-            most = max(len(numbers) for numbers in launches)
+            most = max((len(numbers) for numbers in launches), default=0)
             self._change = self._memory.allocate(_CHANGE * layout.stride * most, "the colours' change")
             self._totals = self._memory.allocate(_TOTALS * layout.stride * most, "the re-fit's sums")
             coefficients.zero(self._totals)
-            tiles = max(sum(_tiles(cameras[number]) for number in numbers) for numbers in launches)
+            self.sums = self._memory.allocate(8 * layout.columns * layout.stride, "the sums over views")
+            coefficients.zero(self.sums)
+            tiles = max((sum(_tiles(cameras[number]) for number in numbers) for numbers in launches), default=0)
             self._errors = self._memory.allocate(4 * tiles, "the tiles' errors")
-            self._scales = self._memory.allocate(4 * len(cameras), "the views' scales")
-            self._targets = TargetCache(device, cameras, launches, self._views.budget)
+            # By what each view's sums are multiplied on their way to the coefficients.
+            pairs = zip(self._weights, self._fixed_points, strict=True)
+            scales = np.array([self._one * weight / fixed_point for weight, fixed_point in pairs], np.float32)
+            self._scales = self._memory.upload(scales, "the views' scales")
+            self._targets = TargetCache(device, cameras, launches, self._views.budget, self._numbers)
             self._owned.append(self._targets)
         except BaseException:
             self.close()
@@ -141,16 +180,40 @@ class ColourMap(Owner):
         Raises:
             DeviceError: the device failed. What the targets raise.
         """
-        error = 0.0
-        self._upload_scales(1.0)
+        with Memory(self._device) as memory:
+            sums = None if blocks is None else self._block_sums(memory, blocks.nbytes)
+            if self._helpers is not None:
+                self._helpers.begin_gradient(x, blocks is not None, constant)
+            errors = self.sum_gradient(x, targets, sums, constant)
+            if self._helpers is not None:
+                errors |= self._helpers.add(self.sums, sums)
+            self._finish(self.sums, 1.0, result, constant)
+            if blocks is not None:
+                self._finish(sums, 1.0, blocks.buffer)
+                self._device.queue.finish()  # before their memory is given back
+        return math.fsum(errors[number] for number in sorted(errors))
+
+    def sum_gradient(
+        self, x: cl.Buffer, targets: Targets, blocks: cl.Buffer | None, constant: bool = False
+    ) -> dict[int, float]:
+        """The part of :meth:`gradient` that is a sum over this device's views: it is added to :attr:`sums`.
+
+        Args:
+            x, targets, constant: as of :meth:`gradient`.
+            blocks: (M (M + 1) / 2, stride) int64, the same of the splats' own blocks; None: they are not wanted.
+
+        Returns:
+            The squared error by W of each view, by number.
+        """
+        errors: dict[int, float] = {}
         for numbers in self._views.launches:
             with self._views.ready(numbers) as (views, _):
                 self._enqueue_colours(views, x, views.colours, None)
                 pictures = self._targets.pictures(targets, numbers)
                 self._enqueue_sweep(numbers, views, views.colours, pictures, blocks is not None)
-                self._enqueue_gather(numbers, views, result, blocks, constant)
-                error += self._error(numbers, views)
-        return error
+                self._enqueue_gather(numbers, views, blocks, constant)
+                errors |= self._found_errors(numbers, views)
+        return errors
 
     def normal(self, direction: cl.Buffer, at: cl.Buffer, result: cl.Buffer, constant: bool = False) -> None:
         """result += Aᵀ W A direction, nothing if the direction is 0 or not finite.
@@ -168,22 +231,42 @@ class ColourMap(Owner):
         if not 0 < largest < math.inf:
             return
         unit = 1 / largest
-        self._upload_scales(unit)
+        if self._helpers is not None:
+            self._helpers.begin_normal(direction, unit, constant)
+        self.sum_normal(direction, at, unit, constant)
+        if self._helpers is not None:
+            self._helpers.add(self.sums, None)
+        self._finish(self.sums, unit, result, constant)
+
+    def sum_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool = False) -> None:
+        """The part of :meth:`normal` that is a sum over this device's views: it is added to :attr:`sums`.
+
+        Args:
+            direction, at, constant: as of :meth:`normal`.
+            unit: the direction is multiplied by this.
+        """
         for numbers in self._views.launches:
             with self._views.ready(numbers) as (views, anew):
                 if anew:  # which colours are cut is not known any more
                     self._enqueue_colours(views, at, views.colours, None)
                 self._enqueue_colours(views, direction, self._change, unit, constant)
                 self._enqueue_sweep(numbers, views, self._change, None, False)
-                self._enqueue_gather(numbers, views, result, None, constant)
+                self._enqueue_gather(numbers, views, None, constant)
 
     # ------------------------------------------------------------------------------------------ their parts
 
-    def _upload_scales(self, unit: float) -> None:
-        """By what each view's sums are multiplied on their way to the coefficients."""
-        pairs = zip(self._weights, self._fixed_points, strict=True)
-        scales = np.array([weight / (fixed_point * unit) for weight, fixed_point in pairs], np.float32)
-        cl.enqueue_copy(self._device.queue, self._scales, scales, is_blocking=True)
+    def _block_sums(self, memory: Memory, nbytes: int) -> cl.Buffer:
+        """Integers for as many floats as take so many bytes, 0."""
+        sums = memory.allocate(2 * nbytes, "the splats' normal equations")
+        self._coefficients.zero(sums)
+        return sums
+
+    def _finish(self, sums: cl.Buffer, unit: float, result: cl.Buffer, constant: bool = False) -> None:
+        """Enqueue: result += the sums in the unit of what was summed; the sums become 0."""
+        # The constant coefficients' columns come first, and the others' sums are 0 then.
+        count = 3 * self._layout.stride if constant else sums.size // 8
+        self._from_fixed.bind(sums=sums, unit=np.float32(1 / (self._one * unit)), result=result)
+        self._from_fixed.launch((count,))
 
     def _enqueue_colours(
         self, views: ViewSet, x: cl.Buffer, result: cl.Buffer, unit: float | None, constant: bool = False
@@ -219,9 +302,7 @@ class ColourMap(Owner):
             weights,
         )
 
-    def _enqueue_gather(
-        self, numbers: range, views: ViewSet, result: cl.Buffer, blocks: SplatBlocks | None, constant: bool
-    ) -> None:
+    def _enqueue_gather(self, numbers: range, views: ViewSet, blocks: cl.Buffer | None, constant: bool) -> None:
         """Enqueue the way from the views' sums to the coefficients, and to the blocks if the sums have their part."""
         gather = self._gathers[constant, blocks is not None]
         gather.bind(
@@ -233,20 +314,20 @@ class ColourMap(Owner):
             scales=self._scales,
             first_scale=numbers[0],
             free=views.colours,
-            result=result,
-            blocks=result if blocks is None else blocks.buffer,
+            result=self.sums,
+            blocks=self.sums if blocks is None else blocks,
         )
         self._layout.over_splats(gather)
 
-    def _error(self, numbers: range, views: ViewSet) -> float:
-        """The squared error by W that the last sweep found in these views."""
+    def _found_errors(self, numbers: range, views: ViewSet) -> dict[int, float]:
+        """The squared error by W that the last sweep found in each of these views, by its number among all."""
         tiles = self._device.download(self._errors, (views.tiles,), np.float32)
         ends = np.cumsum([view.tiles for view in views.views])
         parts = np.split(tiles, ends[:-1])
-        return sum(
-            self._weights[number] * float(part.sum(dtype=np.float64))
+        return {
+            self._numbers[number]: self._weights[number] * float(part.sum(dtype=np.float64))
             for number, part in zip(numbers, parts, strict=True)
-        )
+        }
 
     def close(self) -> None:
         """Give all device memory back."""

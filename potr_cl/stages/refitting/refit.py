@@ -12,14 +12,18 @@ from __future__ import annotations
 
 import math
 from collections.abc import Callable, Sequence
+from concurrent.futures import Future
 from contextlib import ExitStack
 from dataclasses import dataclass, replace
+from typing import Protocol
 
 import numpy as np
+import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.codec.quantize import nonzero_levels
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
@@ -31,8 +35,11 @@ from potr_cl.stages.refitting.coefficients import Coefficients, Layout, Ridge
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.rounding import ROUNDS, Rounding
-from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection
+from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts
+from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
 from potr_cl.stages.refitting.targets import Targets
+from potr_cl.workers.dealing import shares
+from potr_cl.workers.pool import Pool
 
 #: Steps in which the constant coefficients are solved for once more, after the others have been rounded.
 _CONSTANT_STEPS = 3
@@ -90,14 +97,11 @@ class Refitted:
         sh: (N, M, 3) float32 coefficients, R, G, B.
         errors: mean squared error over views, pixels and channels before, and after.
         steps: conjugate-gradient steps that were taken.
-        worst: mean squared error that a solution may have and still be one: that of its start, or what was left when
-            coefficients had been given up.
     """
 
     sh: FloatArray
     errors: tuple[float, float]
     steps: int
-    worst: float = math.inf
 
 
 def refit_colours(
@@ -109,7 +113,9 @@ def refit_colours(
     active: NDArray[np.bool_] | None = None,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     progress: Callable[[int, int], None] | None = None,
-    fix_ac: Callable[[FloatArray, ColourRefit], FloatArray | ColourGrid] | None = None,
+    fix_ac: Callable[[FloatArray, ColourRefit], FloatArray] | None = None,
+    help_from: HelpFrom | None = None,
+    colour_grid: Callable[[FloatArray], ColourGrid] | None = None,
 ) -> Refitted:
     """Re-fit a scene's colours to pictures of all views together.
 
@@ -124,54 +130,124 @@ def refit_colours(
         progress: called with the steps done and their greatest number.
         fix_ac: chooses the AC coefficients that a file can hold, from the solution (N, M, 3) R, G, B, which it must not
             change, and from what the re-fit knows of them (:meth:`ColourRefit.worth`). The constant ones are then
-            solved for again. If it returns the solution itself, that stays as it is. If it returns a grid, all
-            coefficients but the last constant ones are rounded to it (:mod:`potr_cl.stages.refitting.rounding`).
+            solved for again. If it returns the solution itself, that stays as it is.
+        help_from: workers that do some of the views; the targets are then pictures of a scene.
+        colour_grid: in place of ``fix_ac``, where colours are rounded to steps of their splats, in rounds
+            (:mod:`potr_cl.stages.refitting.rounding`): it gets :meth:`ColourRefit.worth_of_constants`, in a thread of
+            its own, and returns the steps.
 
     Raises:
         UsageError: no camera.
         DeviceError: the scene does not fit the device.
     """
     options = options or RefitOptions()
-    more = 0 if fix_ac is None else _CONSTANT_STEPS
+    more = 0 if fix_ac is None and colour_grid is None else _CONSTANT_STEPS
 
     def report(done: int, steps: int) -> None:
         if progress is not None:
             progress(done, steps + more)
 
-    with ColourRefit(device, scene, cameras, background=background, memory=options.memory) as refit:
-
-        def solve(check: bool) -> Refitted:
-            return refit.solve(scene.sh, targets, options, active, progress=report, check=check)
-
-        if fix_ac is None:
-            return solve(check=True)
-        found = solve(check=False)
-        result, at_start = _with_ac_fixed(found, fix_ac, refit, targets, options)
+    with ColourRefit(
+        device, scene, cameras, background=background, memory=options.memory, help_from=help_from
+    ) as refit:
+        way: _Rounding
+        if colour_grid is not None:
+            way = _OnGrid(refit, targets, options, colour_grid)
+        elif fix_ac is not None:
+            way = _AsTheFileDoes(refit, targets, options, fix_ac)
+        else:
+            return refit.solve(scene.sh, targets, options, active, progress=report)
+        solved = refit.solve_on_device(
+            scene.sh, targets, options, active, progress=report, check=False, after_start=way.begin
+        )
+        result, at_start = way.finish(solved)
         # How good the solution was, the next one has measured at its start: that saves a sweep. Only if it looks bad is
         # it measured by itself, because the rounding may be what was bad. Where many colours were cut at 0 on the way,
         # it is the solution.
-        if not at_start <= found.worst and not refit.error(found.sh, targets) <= found.worst:
-            result, _ = _with_ac_fixed(solve(check=True), fix_ac, refit, targets, options)
+        if not at_start <= solved.worst and not way.error() <= solved.worst:
+            solved = refit.solve_on_device(scene.sh, targets, options, active, progress=report, after_start=way.begin)
+            result, _ = way.finish(solved)
         return result
 
 
-def _with_ac_fixed(
-    found: Refitted,
-    fix_ac: Callable[[FloatArray, ColourRefit], FloatArray | ColourGrid],
-    refit: ColourRefit,
-    targets: Targets,
-    options: RefitOptions,
-) -> tuple[Refitted, float]:
-    """Round a solution's AC coefficients and solve for the constant ones; also the error between the two."""
-    fixed = fix_ac(found.sh, refit)
-    if isinstance(fixed, ColourGrid):
-        return refit.rounded(fixed, found, targets, options)
-    if fixed is found.sh:
-        error = refit.error(fixed, targets) if math.isnan(found.errors[1]) else found.errors[1]
-        return replace(found, errors=(found.errors[0], error)), error
-    again = refit.solve_constant(fixed, targets, replace(options, steps=_CONSTANT_STEPS))
-    again.sh[:, 1:] = fixed[:, 1:]  # they were rounded once more on their way through Y, Co, Cg
-    return Refitted(again.sh, (found.errors[0], again.errors[1]), found.steps + again.steps), again.errors[0]
+class _Rounding(Protocol):
+    """What becomes of a solution's AC coefficients, and of the constant ones then."""
+
+    def begin(self) -> None:
+        """Called when the splats' blocks are known."""
+        ...
+
+    def finish(self, solved: Solved) -> tuple[Refitted, float]:
+        """Round, and solve for the constant coefficients; also the error between the two."""
+        ...
+
+    def error(self) -> float:
+        """Of the solution, before it was rounded."""
+        ...
+
+
+@dataclass
+class _OnGrid:
+    """Rounded on the device, to steps that are found while it solves."""
+
+    refit: ColourRefit
+    targets: Targets
+    options: RefitOptions
+    colour_grid: Callable[[FloatArray], ColourGrid]
+    _grid: Future[ColourGrid] | None = None
+
+    def begin(self) -> None:
+        self._grid = in_background(self.colour_grid, self.refit.worth_of_constants())
+
+    def finish(self, solved: Solved) -> tuple[Refitted, float]:
+        assert self._grid is not None
+        rounded = self.refit.round_to(self._grid.result(), self.targets, self.options)
+        result = Refitted(self.refit.colours(), (solved.errors[0], rounded.errors[1]), solved.steps + rounded.steps)
+        return result, rounded.errors[0]
+
+    def error(self) -> float:
+        return self.refit.error(self.targets)
+
+
+@dataclass
+class _AsTheFileDoes:
+    """Rounded on the host, in whatever way a kind of file has."""
+
+    refit: ColourRefit
+    targets: Targets
+    options: RefitOptions
+    fix_ac: Callable[[FloatArray, ColourRefit], FloatArray]
+    _found: FloatArray | None = None
+
+    def begin(self) -> None:
+        pass
+
+    def finish(self, solved: Solved) -> tuple[Refitted, float]:
+        self._found = self.refit.colours()
+        fixed = self.fix_ac(self._found, self.refit)
+        if fixed is self._found:
+            error = self.error() if math.isnan(solved.errors[1]) else solved.errors[1]
+            return Refitted(fixed, (solved.errors[0], error), solved.steps), error
+        again = self.refit.solve_constant(self.targets, replace(self.options, steps=_CONSTANT_STEPS), fixed)
+        sh = self.refit.colours()
+        sh[:, 1:] = fixed[:, 1:]  # they were rounded once more on their way through Y, Co, Cg
+        return Refitted(sh, (solved.errors[0], again.errors[1]), solved.steps + again.steps), again.errors[0]
+
+    def error(self) -> float:
+        return self.refit.error(self.targets, self._found)
+
+
+@dataclass(frozen=True)
+class HelpFrom:
+    """Workers that do some of the views of a re-fit.
+
+    Attributes:
+        pool: the workers.
+        source: the scene whose pictures are the targets.
+    """
+
+    pool: Pool
+    source: Scene
 
 
 class ColourRefit(Owner):
@@ -183,6 +259,7 @@ class ColourRefit(Owner):
         cameras: the views that count, all the same whatever their size.
         rules, background: of the rasterizer.
         memory: bytes of device memory that prepared views and targets may take; None: a quarter of what is free.
+        help_from: workers that do some of the views.
 
     Attributes:
         coefficients, colour_map: the vectors and the map, for callers that want products rather than solutions.
@@ -200,10 +277,21 @@ class ColourRefit(Owner):
         rules: RasterRules = INRIA,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         memory: int | None = None,
+        help_from: HelpFrom | None = None,
     ) -> None:
         if not cameras:
             raise UsageError("a re-fit needs at least one view")
         with ExitStack() as owned:
+            own, others = None, None
+            if help_from is not None:
+                share = shares(help_from.pool, len(cameras))
+                if share.others:
+                    own = share.own
+                    others = owned.enter_context(
+                        colour_parts(
+                            help_from.pool, share, scene, rules, background, help_from.source, cameras, memory
+                        )
+                    )  # fmt: skip
             # The rasterizer's own colours are never looked at.
             rasterizer = owned.enter_context(Rasterizer(device, replace(scene, sh=scene.sh[:, :1]), rules))
             launcher = launcher_for(device, rules)
@@ -211,9 +299,13 @@ class ColourRefit(Owner):
             self.coefficients = owned.enter_context(Coefficients(device, layout))
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             self._solver = owned.enter_context(ColourSolver(self.coefficients))
+            helpers = None if others is None else owned.enter_context(SharedViews(self.coefficients, others))
             self.colour_map = owned.enter_context(
-                ColourMap(launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory)
+                ColourMap(
+                    launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory, own, helpers
+                )
             )
+            self._unrounded: cl.Buffer | None = None
             self._owned = owned.pop_all()
 
     def solve(
@@ -224,7 +316,6 @@ class ColourRefit(Owner):
         active: NDArray[np.bool_] | None = None,
         hold: bool = False,
         progress: Callable[[int, int], None] | None = None,
-        check: bool = True,
     ) -> Refitted:
         """Re-fit the active coefficients, after choosing among them if the options say so.
 
@@ -235,15 +326,40 @@ class ColourRefit(Owner):
             active: (N, M, 3) in Y, Co, Cg: the coefficients that may change; all by default.
             hold: whether the other coefficients keep their values; if not, they become 0.
             progress: called with the steps done and their greatest number.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        solved = self.solve_on_device(sh, targets, options, active, hold, progress)
+        return Refitted(self.colours(), solved.errors, solved.steps)
+
+    def solve_on_device(
+        self,
+        sh: FloatArray,
+        targets: Targets,
+        options: RefitOptions,
+        active: NDArray[np.bool_] | None = None,
+        hold: bool = False,
+        progress: Callable[[int, int], None] | None = None,
+        check: bool = True,
+        after_start: Callable[[], None] = lambda: None,
+    ) -> Solved:
+        """The same, with the solution left where :meth:`colours`, :meth:`round_to` and :meth:`solve_constant` find it.
+
+        Args:
+            sh, targets, options, active, hold, progress: as :meth:`solve` takes them.
             check: measure the error of the solution, and keep the start if that was better; if not, that error is not a
                 number.
+            after_start: called when :meth:`worth` and its likes are known.
 
         Raises:
             DeviceError: the device failed.
         """
         coefficients, solver = self.coefficients, self._solver
-        coefficients.write_sh(solver.x, sh, None if hold else active)
+        coefficients.write_sh(solver.x, sh)
         coefficients.activate(active)
+        if active is not None and not hold:
+            coefficients.keep_active(solver.x)
         descent = Descent(options.steps, options.gain, Ridge(options.lam, options.chroma_factor, options.prior))
         selection, total = None, options.steps
         if options.drop:
@@ -255,44 +371,50 @@ class ColourRefit(Owner):
             if progress is not None:
                 progress(steps, total)
 
-        solved = solver.solve(self.colour_map, targets, descent, selection, after_step, check=check)
-        worst = max(solved.errors[0], solved.start)
-        return Refitted(coefficients.read_sh(solver.x), solved.errors, solved.steps, worst)
+        return solver.solve(
+            self.colour_map, targets, descent, selection, after_step, check=check, after_start=after_start
+        )
 
-    def solve_constant(self, sh: FloatArray, targets: Targets, options: RefitOptions) -> Refitted:
-        """Re-fit the constant coefficients alone, after :meth:`solve` for nearly the same colours.
+    def solve_constant(self, targets: Targets, options: RefitOptions, sh: FloatArray | None = None) -> Solved:
+        """Re-fit the constant coefficients alone, after a solution for nearly the same colours.
 
         Args:
-            sh: (N, M, 3) R, G, B, the start; AC coefficients stay.
             targets, options: as :meth:`solve` takes them; none are given up.
+            sh: (N, M, 3) R, G, B, the start; None: the solution before, perhaps rounded. AC coefficients stay.
 
         Raises:
             DeviceError: the device failed.
         """
         coefficients, solver = self.coefficients, self._solver
-        coefficients.write_sh(solver.x, sh)
+        if sh is not None:
+            coefficients.write_sh(solver.x, sh)
         coefficients.activate_constant()
         descent = Descent(options.steps, options.gain, Ridge(options.lam, options.chroma_factor, options.prior))
-        solved = solver.solve(self.colour_map, targets, descent, constant=True)
-        return Refitted(coefficients.read_sh(solver.x), solved.errors, solved.steps)
+        return solver.solve(self.colour_map, targets, descent, constant=True)
 
-    def rounded(
-        self, grid: ColourGrid, found: Refitted, targets: Targets, options: RefitOptions
-    ) -> tuple[Refitted, float]:
-        """The last solution as a file can hold it, but for the last constant coefficients.
+    def colours(self) -> FloatArray:
+        """(N, M, 3) float32 R, G, B, the solution."""
+        return self.coefficients.read_sh(self._solver.x)
+
+    def round_to(self, grid: ColourGrid, targets: Targets, options: RefitOptions) -> Solved:
+        """Make of the solution what a file can hold, but for the last constant coefficients.
+
+        :meth:`error` still knows what it was.
 
         Args:
             grid: what the file can hold.
-            found: the last solution, nothing having been solved since.
-            targets, options: that it was solved with.
+            targets, options: that the solution was found with.
 
         Returns:
-            That, and the mean squared error after the first round of rounding.
+            The errors after the first round of rounding, and in the end.
 
         Raises:
             DeviceError: the device failed.
         """
-        solver, steps, errors = self._solver, found.steps, []
+        solver, steps, errors = self._solver, 0, []
+        if self._unrounded is None:
+            self._unrounded = self.coefficients.vector()
+        self.coefficients.copy(self._unrounded, solver.x)
         ridge = Ridge(options.lam, options.chroma_factor, options.prior)
         worth = _WORTH * options.drop * self.colour_map.total_weight
         with Rounding(self.coefficients, grid) as rounding:
@@ -304,17 +426,28 @@ class ColourRefit(Owner):
                 errors.append(gone_on.start)
             rounding.round(solver.x, solver.blocks, last, worth)
             solved = solver.solve(self.colour_map, targets, Descent(last.steps, 0.0, ridge), constant=True)
-        sh = self.coefficients.read_sh(solver.x)
-        return Refitted(sh, (found.errors[0], solved.errors[1]), steps + solved.steps), errors[0]
+        return Solved((errors[0], solved.errors[1]), steps + solved.steps, solved.start)
 
-    def error(self, sh: FloatArray, targets: Targets) -> float:
-        """Mean squared error of the pictures with colours (N, M, 3) R, G, B.
+    def error(self, targets: Targets, sh: FloatArray | None = None) -> float:
+        """Mean squared error of the pictures. The solution is lost.
+
+        Args:
+            targets: the pictures.
+            sh: (N, M, 3) R, G, B, the colours; None: the solution as it was before :meth:`round_to`.
 
         Raises:
             DeviceError: the device failed.
         """
-        self.coefficients.write_sh(self._solver.x, sh)
+        if sh is not None:
+            self.coefficients.write_sh(self._solver.x, sh)
+        else:
+            assert self._unrounded is not None
+            self.coefficients.copy(self._solver.x, self._unrounded)
         return self._solver.error(self.colour_map, targets)
+
+    def worth_of_constants(self) -> FloatArray:
+        """(N,) float32: :meth:`worth` of the constant coefficients."""
+        return self._solver.blocks.constants() / np.float32(self.colour_map.total_weight)
 
     def worth(self) -> FloatArray:
         """(N, M) float32: by how much the mean squared error grows for an error of 1 in a coefficient of one channel.

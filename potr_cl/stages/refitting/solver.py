@@ -73,6 +73,11 @@ class Solved:
     steps: int
     start: float
 
+    @property
+    def worst(self) -> float:
+        """Mean squared error that a solution may have and still be one."""
+        return max(self.errors[0], self.start)
+
 
 @dataclass(frozen=True)
 class _Problem:
@@ -143,6 +148,7 @@ class ColourSolver(Owner):
         after_step: Callable[[int], None] = lambda steps: None,
         constant: bool = False,
         check: bool = True,
+        after_start: Callable[[], None] = lambda: None,
     ) -> Solved:
         """Solve for the active coefficients, after choosing among them if there is to be a choice.
 
@@ -156,6 +162,7 @@ class ColourSolver(Owner):
                 before, of nearly the same colours: they are only what the steps are preconditioned with.
             check: measure the true error of the result, and go back if the start was better. If not, the error after
                 the solution is not a number.
+            after_start: called when the blocks are those of the start.
 
         Raises:
             DeviceError: the device failed.
@@ -166,6 +173,7 @@ class ColourSolver(Owner):
         self._coefficients.copy(self._start, self.x)
         ridge = (selection.descent if selection else descent).ridge
         first = self._linearise(problem, ridge, None if constant else self.blocks)
+        after_start()
         state, steps = first, 0
         if selection is not None:
             state, steps = self._choose(problem, first, selection, descent.ridge, after_step)

@@ -100,19 +100,28 @@ class TargetCache(Owner):
         cameras: the views.
         launches: the numbers of the views that are asked for together.
         budget: that the pictures which are kept are taken from.
+        numbers: of these cameras among the views that targets know.
 
     Raises:
         DeviceMemoryError: the device has no room for those of one launch.
     """
 
-    def __init__(self, device: Device, cameras: Sequence[Camera], launches: Sequence[range], budget: Budget) -> None:
+    def __init__(
+        self,
+        device: Device,
+        cameras: Sequence[Camera],
+        launches: Sequence[range],
+        budget: Budget,
+        numbers: Sequence[int],
+    ) -> None:
+        self._numbers = numbers
         self._nbytes = {
             numbers: 12 * sum(cameras[number].width * cameras[number].height for number in numbers)
             for numbers in launches
         }
         self._budget = budget
         self._memory = Memory(device)
-        self._others = self._memory.allocate(max(self._nbytes.values()), "the target images")
+        self._others = self._memory.allocate(max(self._nbytes.values(), default=0), "the target images")
         self._kept: dict[range, cl.Buffer] = {}
         self._kept_of: Targets | None = None
 
@@ -128,17 +137,20 @@ class TargetCache(Owner):
             return self._kept[numbers]
         nbytes = self._nbytes[numbers]
         if nbytes > self._budget.room:
-            targets.into(numbers, self._others)
+            targets.into(self._among_all(numbers), self._others)
             return self._others
         buffer = self._memory.allocate(nbytes, "the target images")
         self._budget.room -= buffer.size
         self._kept[numbers] = buffer
         try:
-            targets.into(numbers, buffer)
+            targets.into(self._among_all(numbers), buffer)
         except BaseException:
             self._drop(numbers)
             raise
         return buffer
+
+    def _among_all(self, numbers: range) -> list[int]:
+        return [self._numbers[number] for number in numbers]
 
     def _drop(self, numbers: range) -> None:
         buffer = self._kept.pop(numbers)

@@ -1,0 +1,8 @@
+/* totals += more, where others have measured more views: one 64-bit integer a work-item. */
+
+kernel void add_totals(global long *totals, global const long *more, ulong count)
+{
+    const size_t i = get_global_id(0);
+    if (i < count)
+        totals[i] += more[i];
+}

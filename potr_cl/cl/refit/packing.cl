@@ -1,0 +1,82 @@
+/* Coefficients that may change, splat by splat in one row, as they travel between devices; and back into columns. One
+   splat a work-item.
+
+   Macros: SH_COUNT; LANES (1). */
+
+#include "refit/coefficients.clh"
+
+inline int may_change(global const uint *active, ulong stride, size_t splat, int column)
+{
+    return active[(column / 24) * stride + splat] >> (column % 24) & 1;
+}
+
+kernel void pack_floats(
+    global const float *columns,
+    global const uint *active,
+    ulong stride,
+    ulong splats,
+    global const ulong *places,
+    global float *packed)
+{
+    const size_t splat = get_global_id(0);
+    if (splat >= splats)
+        return;
+    size_t place = places[splat];
+    for (int column = 0; column < 3 * SH_COUNT; ++column)
+        if (may_change(active, stride, splat, column))
+            packed[place++] = columns[column * stride + splat];
+}
+
+/* The others become 0. */
+kernel void unpack_floats(
+    global float *columns,
+    global const uint *active,
+    ulong stride,
+    ulong splats,
+    global const ulong *places,
+    global const float *packed)
+{
+    const size_t splat = get_global_id(0);
+    if (splat >= splats)
+        return;
+    size_t place = places[splat];
+    for (int column = 0; column < 3 * SH_COUNT; ++column)
+        columns[column * stride + splat] = may_change(active, stride, splat, column) ? packed[place++] : 0.0f;
+}
+
+/* The sums become 0. */
+kernel void pack_sums(
+    global long *columns,
+    global const uint *active,
+    ulong stride,
+    ulong splats,
+    global const ulong *places,
+    global long *packed)
+{
+    const size_t splat = get_global_id(0);
+    if (splat >= splats)
+        return;
+    size_t place = places[splat];
+    for (int column = 0; column < 3 * SH_COUNT; ++column) {
+        if (may_change(active, stride, splat, column))
+            packed[place++] = columns[column * stride + splat];
+        columns[column * stride + splat] = 0;
+    }
+}
+
+kernel void add_sums(
+    global long *columns,
+    global const uint *active,
+    ulong stride,
+    ulong splats,
+    global const ulong *places,
+    global const long *packed)
+{
+    const size_t splat = get_global_id(0);
+    if (splat >= splats)
+        return;
+    size_t place = places[splat];
+    for (int column = 0; column < 3 * SH_COUNT; ++column)
+        if (may_change(active, stride, splat, column))
+            columns[column * stride + splat] += packed[place++];
+}

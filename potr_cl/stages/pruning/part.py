@@ -1,0 +1,133 @@
+"""A part of the views of a removal measurement, on a worker: :class:`RemovalPart`."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.opencl.device import Device
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.pruning.changes import pack_changes
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.workers.pool import Part
+
+Indices = NDArray[np.int64]
+
+
+class RemovalPart(Part):
+    """Some of the views; see :class:`potr_cl.stages.pruning.removal.RemovalSweep`.
+
+    Args:
+        device: to compute on.
+        memory: bytes of its memory that the views may take; None: the default.
+        scene: the uncompressed scene.
+        cameras: all views.
+        options: speed/accuracy trade-offs.
+        background: R, G, B behind the scene.
+        numbers: of the views of this part, ascending.
+
+    Raises:
+        DeviceError: the scene or a view does not fit the device.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        memory: int | None,
+        scene: Scene,
+        cameras: Sequence[Camera],
+        options: SweepOptions,
+        background: tuple[float, float, float],
+        numbers: Sequence[int],
+    ) -> None:
+        options = SweepOptions(**{**vars(options), "memory": memory})
+        with ExitStack() as owned:
+            rasterizer = owned.enter_context(Rasterizer(device, scene, background=background))
+            self._sweep = owned.enter_context(RemovalSweep(rasterizer, cameras, options, numbers=numbers))
+            self._owned = owned.pop_all()
+        self._device = device
+        self._sent: NDArray[np.int64] | None = None
+        self._told: tuple[int, Iterator[tuple[int, Indices, NDArray[np.float64]]]] | None = None
+
+    @property
+    def steers(self) -> bool:
+        """Whether the device can list stale tiles itself."""
+        return self._sweep.steering is not None
+
+    def can_steer(self) -> bool:
+        """:attr:`steers`, as a command."""
+        return self.steers
+
+    def measure(self) -> NDArray[np.int64]:
+        """(N, 2) int64, the totals of these views in units of the fixed point of all."""
+        steering = self._sweep.steering
+        if steering is None:
+            return self._sweep.measure_totals()
+        steering.measure_on_device()
+        totals: NDArray[np.int64] = self._device.download(steering.totals, (self._sweep.splats, 2), np.int64)
+        return totals
+
+    def measure_changes(self) -> bytes:
+        """What has changed in the totals of the splats that are left since the last call; all, at the first.
+
+        See :func:`potr_cl.stages.pruning.changes.pack_changes`.
+        """
+        totals = self.measure()
+        if self._sent is None:
+            self._sent = np.zeros_like(totals)
+        changed = np.flatnonzero((totals != self._sent).any(axis=1) & self._sweep.alive)
+        packed = pack_changes(changed, totals[changed] - self._sent[changed])
+        self._sent = totals
+        return packed
+
+    def remove(self, splats: Indices) -> None:
+        """Take splats out for good."""
+        steering = self._sweep.steering
+        if steering is None:
+            self._sweep.remove(splats)
+        else:
+            steering.mark(splats)
+            steering.remove_marked()
+
+    def replace_sh(self, sh: FloatArray) -> None:
+        """Go on with other colours."""
+        self._sweep.replace_sh(sh)
+
+    def sweep_everything(self) -> None:
+        """Have the next measurement sweep every tile."""
+        self._sweep.sweep_everything()
+
+    def sweep_changed(self) -> None:
+        """Measure whatever anything was removed from since it was last measured."""
+        self._told = None
+        self._sweep.sweep_changed()
+
+    def importances(self, place: int) -> tuple[int, NDArray[np.uint32], NDArray[np.float64]] | None:
+        """What is known of one view after :meth:`sweep_changed`.
+
+        Args:
+            place: of the view in this part; fastest one after the other.
+
+        Returns:
+            The view's number among all, the splats that it sees, ascending, and the mean of T α of each over its
+            pixels; None behind the last view.
+        """
+        if self._told is None or self._told[0] != place:
+            known = self._sweep.known_importances()
+            for _ in range(place):
+                next(known, None)
+        else:
+            known = self._told[1]
+        found = next(known, None)
+        self._told = (place + 1, known)
+        return None if found is None else (found[0], found[1].astype(np.uint32), found[2])
+
+    def close(self) -> None:
+        """Give all device memory back."""
+        self._owned.close()

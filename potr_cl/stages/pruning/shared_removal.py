@@ -1,0 +1,193 @@
+"""Removal effects whose views are measured by several: :class:`SharedRemoval` adds up what they find.
+
+All totals are integers, in units that follow from all views (:class:`potr_cl.stages.pruning.fixed_point.FixedPoint`).
+So it makes no difference to any bit who measures which view. What is decided is decided in one place, from the sums: by
+:mod:`potr_cl.stages.pruning.schedule`, or on the master's device by :mod:`potr_cl.stages.pruning.on_device`.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.stages.pruning.changes import unpack_changes
+from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
+from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
+from potr_cl.stages.pruning.steering import Steered, Steering
+from potr_cl.stages.pruning.survivors import Survivors
+from potr_cl.workers.parts import Parts, Pending
+
+#: Splats a work-group of the kernel that adds totals.
+_GROUP = 64
+
+
+class SharedRemoval(Owner):
+    """What :class:`potr_cl.stages.pruning.removal.RemovalSweep` does, with the help of others.
+
+    Args:
+        device: the master's.
+        splats: N. stride: N padded.
+        cameras: all views.
+        own: measures the master's share of the views; None if it has none.
+        others: parts, each a :class:`potr_cl.stages.pruning.part.RemovalPart`, that measure the rest.
+        sparse: whether they send what has changed, and not all totals.
+        steers: whether the choice of splats is the master's device's, as with the views on one GPU.
+
+    Attributes:
+        splats, steering: as of a :class:`~potr_cl.stages.pruning.removal.RemovalSweep`.
+
+    Raises:
+        DeviceError: the device has no room.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        splats: int,
+        stride: int,
+        cameras: Sequence[Camera],
+        own: RemovalSweep | None,
+        others: Parts,
+        sparse: bool,
+        steers: bool,
+    ) -> None:
+        self.splats = splats
+        self._own, self._others, self._sparse = own, others, sparse
+        self._fixed_point = FixedPoint.of_views(cameras)
+        #: What the others have found; of removed splats anything.
+        self._found = np.zeros((splats, 2), np.int64)
+        self._alive = np.ones(splats, bool)
+        self.steering: Steered | None = None
+        with ExitStack() as owned:
+            if steers:
+                self.steering = owned.enter_context(_SharedSteering(self, device, stride))
+            self._owned = owned.pop_all()
+
+    @property
+    def alive(self) -> NDArray[np.bool_]:
+        """(N,) which splats are left."""
+        return self._alive if self.steering is None else self.steering.alive
+
+    def measure(self) -> tuple[F64, F64]:
+        """ΔMSE_k and I_k of all N splats, float64; the values of removed splats mean nothing."""
+        pending = self.begin_measuring()
+        own = None if self._own is None else self._own.measure_totals()
+        totals = self.found_by_others(pending)
+        return self._fixed_point.values(totals if own is None else totals + own)
+
+    def remove(self, splats: Indices) -> None:
+        """Take splats out for good."""
+        pending = self._others.begin("remove", splats)
+        self._alive[splats] = False
+        if self._own is not None:
+            self._own.remove(splats)
+        pending.results()
+
+    def replace_sh(self, sh: FloatArray) -> None:
+        """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
+        pending = self._others.begin("replace_sh", sh)
+        if self._own is not None:
+            self._own.replace_sh(sh)
+        pending.results()
+
+    def view_importances(self) -> Iterator[tuple[int, Indices, F64]]:
+        """See :meth:`potr_cl.stages.pruning.removal.RemovalSweep.view_importances`."""
+        pending = self._others.begin("sweep_changed")
+        if self._own is not None:
+            self._own.sweep_changed()
+        pending.results()
+        own = iter(()) if self._own is None else self._own.known_importances()
+        others = (self._importances_of(place) for place in range(len(self._others)))
+        yield from heapq.merge(own, *others, key=lambda found: found[0])
+
+    def _importances_of(self, part: int) -> Iterator[tuple[int, Indices, F64]]:
+        place = 0
+        while (found := self._others.ask(part, "importances", place)) is not None:
+            number, seen, importances = found
+            yield number, seen.astype(np.int64), importances
+            place += 1
+
+    def begin_measuring(self) -> Pending:
+        """Have the others measure."""
+        return self._others.begin("measure_changes" if self._sparse else "measure")
+
+    def found_by_others(self, pending: Pending) -> NDArray[np.int64]:
+        """(N, 2) int64, what they found; valid until the next call."""
+        if self._sparse:
+            for data in pending.results():
+                splats, changes = unpack_changes(data)
+                self._found[splats] += changes
+            return self._found
+        totals: list[NDArray[np.int64]] = pending.results()
+        found = totals[0]
+        for more in totals[1:]:
+            found += more
+        return found
+
+    def close(self) -> None:
+        """Give the master's device memory back; the parts are the caller's."""
+        self._owned.close()
+
+
+class _SharedSteering(Owner):
+    """A :class:`potr_cl.stages.pruning.steering.Steered` whose totals are the sums over all that measure."""
+
+    def __init__(self, shared: SharedRemoval, device: Device, stride: int) -> None:
+        self._shared = shared
+        self.device, self.splats, self.units = device, shared.splats, shared._fixed_point.units
+        own = None if shared._own is None else shared._own.steering
+        assert own is None or isinstance(own, Steering)
+        self._own: Steering | None = own
+        self._memory = Memory(device)
+        self._marks: Survivors | None = None
+        with device.all_or_nothing():
+            self.totals: cl.Buffer = self._memory.upload(zero_totals(stride), "the removal effects")
+            if own is None:
+                self._marks = Survivors(device, self.splats, stride, device.queue.finish)
+                self.marks: cl.Buffer = self._marks.buffer
+            else:
+                self.marks = own.marks
+                self._add = device.kernel("prune/add_totals.cl", "add_totals")
+
+    @property
+    def alive(self) -> NDArray[np.bool_]:
+        states: Any = self._marks or self._own
+        alive: NDArray[np.bool_] = states.alive
+        return alive
+
+    def measure_on_device(self) -> None:
+        pending = self._shared.begin_measuring()
+        if self._own is not None:
+            self._own.measure_on_device()
+        found = self._shared.found_by_others(pending)
+        with self.device.errors("failed while computing"):
+            cl.enqueue_copy(self.device.queue, self.totals, found, is_blocking=True)
+        if self._own is not None:
+            self._add.bind(totals=self.totals, more=self._own.totals, count=2 * self.splats)
+            self._add.launch((-(-2 * self.splats // _GROUP) * _GROUP,), (_GROUP,))
+
+    def remove_marked(self) -> None:
+        marked = (self._marks or self._own).just_marked()  # type: ignore[union-attr]
+        # The others go on with it while the master's device does its own, and whoever tells them more waits for them.
+        self._shared._others.begin("remove", marked)
+        if self._own is not None:
+            self._own.remove_marked()
+        else:
+            assert self._marks is not None
+            self._marks.marked_by_device()
+            self._marks.settle()
+
+    def close(self) -> None:
+        if self._marks is not None:
+            self._marks.close()
+        self._memory.close()

@@ -1,0 +1,222 @@
+"""Removal effects of scenes of which no view sees much: :class:`PartedRemoval`.
+
+Views are dealt out to parts that see much of the same (:mod:`potr_cl.raster.culling`). Each part has a scene of the
+splats that its views may draw, and a :class:`~potr_cl.stages.pruning.removal.RemovalSweep` of its own, which projects
+these and no others. What the parts measure is added up by the splats' numbers. All totals are integers in units that
+follow from all views, so they are the same bits as of all views with all splats.
+"""
+
+from __future__ import annotations
+
+import heapq
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.raster.culling import ViewPart, parts_of_views, work
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA
+from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, gathered, uploaded
+from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
+from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
+from potr_cl.stages.pruning.steering import Steering
+from potr_cl.stages.pruning.survivors import Survivors
+from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
+
+#: Scenes of fewer splats are projected faster than parted.
+LEAST_SPLATS = 1 << 21
+#: Parts must save this much of the splats that views project, for their own copies and for what each part costs.
+_WORTH_IT = 0.5
+
+_SOURCE = "prune/parts.cl"
+_GROUP = 64
+
+
+def parts_worth_it(scene: Scene, cameras: Sequence[Camera], options: SweepOptions) -> list[ViewPart] | None:
+    """The parts of the views; None where the views had better share one scene."""
+    # A sample of the tiles is drawn from all of them in turn.
+    if len(scene) < LEAST_SPLATS or options.sample < 1:
+        return None
+    parts = parts_of_views(scene, cameras, INRIA.near)
+    return parts if work(parts) <= _WORTH_IT * len(scene) * len(cameras) else None
+
+
+@dataclass(frozen=True)
+class _Part:
+    """A part at work.
+
+    Attributes:
+        splats: their numbers in the scene, ascending.
+        sweep: measures its views.
+        numbers: the same in the device's memory, uint32.
+    """
+
+    splats: Indices
+    sweep: RemovalSweep
+    numbers: cl.Buffer
+
+
+class PartedRemoval(Owner):
+    """What :class:`potr_cl.stages.pruning.removal.RemovalSweep` does, part by part.
+
+    Args:
+        device: that computes.
+        scene: the uncompressed scene.
+        whole: the same to be drawn, perhaps on the device already.
+        cameras: all views.
+        parts: of the views; together they have all.
+        options: speed/accuracy trade-offs; the memory is that of all parts together, their scenes included.
+        background: R, G, B behind the scene.
+        progress: called with the views prepared and their number.
+
+    Attributes:
+        splats, steering: as of a :class:`~potr_cl.stages.pruning.removal.RemovalSweep`.
+
+    Raises:
+        DeviceError: a part's scene or a view does not fit the device.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        scene: Scene,
+        whole: Drawable,
+        cameras: Sequence[Camera],
+        parts: Sequence[ViewPart],
+        options: SweepOptions,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        progress: Callable[[int, int], None] | None = None,
+    ) -> None:
+        self.splats = len(scene)
+        self._fixed_point = FixedPoint.of_views(cameras)
+        self._alive = np.ones(self.splats, bool)
+        self._parts: list[_Part] = []
+        self.steering: _PartedSteering | None = None
+        left = default_memory(device) if options.memory is None else options.memory
+        done = 0
+
+        def report(some: int, _: int) -> None:
+            if progress is not None:
+                progress(done + some, len(cameras))
+
+        with ExitStack() as owned:
+            memory = owned.enter_context(Memory(device))
+            for place, part in enumerate(parts):
+                before = device.allocated
+                share = left * work([part]) / max(work(parts[place:]), 1)
+                drawable = owned.enter_context(_part_of(device, scene, whole, part.splats))
+                rasterizer = owned.enter_context(Rasterizer(device, drawable, background=background))
+                room = max(int(share) - (device.allocated - before), 0)
+                sweep = RemovalSweep(rasterizer, cameras, replace(options, memory=room), report, part.numbers)
+                owned.enter_context(sweep)
+                numbers = memory.upload(part.splats.astype(np.uint32), "the numbers of a part's splats")
+                self._parts.append(_Part(part.splats, sweep, numbers))
+                left = max(left - (device.allocated - before), 0)
+                done += len(part.numbers)
+            steerings = [part.sweep.steering for part in self._parts]
+            if all(steering is not None for steering in steerings):
+                self.steering = owned.enter_context(
+                    _PartedSteering(device, self.splats, self._fixed_point, self._parts)
+                )
+            self._owned = owned.pop_all()
+
+    @property
+    def alive(self) -> NDArray[np.bool_]:
+        """(N,) which splats are left."""
+        return self._alive if self.steering is None else self._alive & self.steering.alive
+
+    def measure(self) -> tuple[F64, F64]:
+        """ΔMSE_k and I_k of all N splats, float64; the values of removed splats mean nothing."""
+        totals = np.zeros((self.splats, 2), np.int64)
+        for part in self._parts:
+            totals[part.splats] += part.sweep.measure_totals()
+        return self._fixed_point.values(totals)
+
+    def remove(self, splats: Indices) -> None:
+        """Take splats out for good."""
+        self._alive[splats] = False
+        gone = np.zeros(self.splats, bool)
+        gone[splats] = True
+        for part in self._parts:
+            part.sweep.remove(np.flatnonzero(gone[part.splats]))
+
+    def replace_sh(self, sh: FloatArray) -> None:
+        """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
+        for part in self._parts:
+            part.sweep.replace_sh(sh[part.splats])
+
+    def view_importances(self) -> Iterator[tuple[int, Indices, F64]]:
+        """See :meth:`potr_cl.stages.pruning.removal.RemovalSweep.view_importances`."""
+        for part in self._parts:
+            part.sweep.sweep_changed()
+        yield from heapq.merge(*map(_importances, self._parts), key=lambda found: found[0])
+
+    def close(self) -> None:
+        """Give all device memory back."""
+        self._owned.close()
+
+
+def _importances(part: _Part) -> Iterator[tuple[int, Indices, F64]]:
+    for number, seen, importances in part.sweep.known_importances():
+        yield number, part.splats[seen], importances
+
+
+def _part_of(device: Device, scene: Scene, whole: Drawable, splats: Indices) -> SceneBuffers:
+    """Some splats on the device: from there, if the scene is there already."""
+    if isinstance(whole, SceneBuffers):
+        return gathered(whole, splats)
+    return uploaded(device, scene.subset(splats))
+
+
+class _PartedSteering(Owner):
+    """A :class:`potr_cl.stages.pruning.steering.Steered` whose totals are the sums over all parts."""
+
+    def __init__(self, device: Device, splats: int, fixed_point: FixedPoint, parts: Sequence[_Part]) -> None:
+        self.device, self.splats, self.units = device, splats, fixed_point.units
+        self._parts = parts
+        stride = -(-splats // SPLAT_GROUP) * SPLAT_GROUP
+        self._memory = Memory(device)
+        with device.all_or_nothing():
+            self.totals: cl.Buffer = self._memory.upload(zero_totals(stride), "the removal effects")
+            self._survivors = Survivors(device, splats, stride, device.queue.finish)
+            self._add, self._mark = (device.kernel(_SOURCE, name) for name in ("add_part", "mark_part"))
+        self.marks: cl.Buffer = self._survivors.buffer
+
+    @property
+    def alive(self) -> NDArray[np.bool_]:
+        return self._survivors.alive
+
+    def measure_on_device(self) -> None:
+        cl.enqueue_fill_buffer(self.device.queue, self.totals, np.uint32(0), 0, self.totals.size)
+        for part in self._parts:
+            steering = _steering(part)
+            steering.measure_on_device()
+            count = len(part.splats)
+            self._add.bind(totals=self.totals, part=steering.totals, numbers=part.numbers, count=count)
+            self._add.launch((-(-count // _GROUP) * _GROUP,), (_GROUP,))
+
+    def remove_marked(self) -> None:
+        for part in self._parts:
+            steering, count = _steering(part), len(part.splats)
+            self._mark.bind(states=self.marks, part=steering.marks, numbers=part.numbers, count=count)
+            self._mark.launch((-(-count // _GROUP) * _GROUP,), (_GROUP,))
+            steering.remove_marked()
+        self._survivors.marked_by_device()
+
+    def close(self) -> None:
+        self._survivors.close()
+        self._memory.close()
+
+
+def _steering(part: _Part) -> Steering:
+    steering = part.sweep.steering
+    assert isinstance(steering, Steering)
+    return steering

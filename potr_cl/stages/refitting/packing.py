@@ -1,0 +1,119 @@
+"""Coefficients that may change, as they travel between devices: :class:`Packing`."""
+
+from __future__ import annotations
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from potr_cl.model.scene import FloatArray
+from potr_cl.opencl.memory import Owner, Scratch
+from potr_cl.stages.refitting.coefficients import Coefficients
+
+_SOURCE = "refit/packing.cl"
+#: Work-items of a work-group.
+_GROUP = 64
+
+
+class Packing(Owner):
+    """Packs the active coefficients of a scene's splats in one row, splat by splat, and unpacks such rows.
+
+    Args:
+        coefficients: whose vectors and flags they are.
+
+    Attributes:
+        flags: (2, N) uint32, the flags by which is packed, as :meth:`take_flags` or :meth:`give_flags` left them.
+        count: coefficients that are active.
+
+    Raises:
+        DeviceError: the kernels cannot be built.
+    """
+
+    def __init__(self, coefficients: Coefficients) -> None:
+        self._coefficients, layout = coefficients, coefficients.layout
+        device = coefficients.device
+        self._kernels = {
+            name: device.kernel(_SOURCE, name, LANES=1, SH_COUNT=layout.sh_count)
+            for name in ("pack_floats", "unpack_floats", "pack_sums", "add_sums")
+        }
+        self.flags: NDArray[np.uint32] | None = None
+        self.count = 0
+        self._places = Scratch(device, "the coefficients' places")
+        self._packed = Scratch(device, "the packed coefficients")
+
+    def take_flags(self) -> bool:
+        """Pack by the flags as they are on the device from now on; whether they are others than before."""
+        layout = self._coefficients.layout
+        flags = np.ascontiguousarray(self._coefficients.save_flags()[:, : layout.splats])
+        if self.flags is not None and np.array_equal(flags, self.flags):
+            return False
+        self._know(flags)
+        return True
+
+    def give_flags(self, flags: NDArray[np.uint32]) -> None:
+        """Have these flags, (2, N) uint32, on the device, and pack by them from now on."""
+        words = np.zeros((2, self._coefficients.layout.stride), np.uint32)
+        words[:, : flags.shape[1]] = flags
+        self._coefficients.restore_flags(words)
+        self._know(flags)
+
+    def floats(self, x: cl.Buffer) -> FloatArray:
+        """(count,) float32, a vector's active coefficients."""
+        self._packed.reserve(4 * self.count)
+        self._launch("pack_floats", x)
+        packed: FloatArray = self._coefficients.device.download(self._packed.buffer, (self.count,), np.float32)
+        return packed
+
+    def set_floats(self, x: cl.Buffer, packed: FloatArray) -> None:
+        """Set a vector; coefficients that are not active become 0."""
+        self._upload(packed)
+        self._launch("unpack_floats", x)
+
+    def sums(self, columns: cl.Buffer) -> NDArray[np.int64]:
+        """(count,) int64, sums over views of active coefficients; all sums become 0."""
+        self._packed.reserve(8 * self.count)
+        self._launch("pack_sums", columns)
+        packed: NDArray[np.int64] = self._coefficients.device.download(self._packed.buffer, (self.count,), np.int64)
+        return packed
+
+    def add_sums(self, columns: cl.Buffer, packed: NDArray[np.int64]) -> None:
+        """Add to sums over views."""
+        self._upload(packed)
+        self._launch("add_sums", columns)
+
+    def _know(self, flags: NDArray[np.uint32]) -> None:
+        self.flags = flags
+        counts = np.bitwise_count(flags).sum(axis=0, dtype=np.uint64)
+        ends = np.cumsum(counts, dtype=np.uint64)
+        self.count = int(ends[-1]) if len(ends) else 0
+        self._places.reserve(8 * len(ends))
+        self._copy_to(self._places, ends - counts)
+
+    def _upload(self, packed: NDArray[np.generic]) -> None:
+        if len(packed) != self.count:
+            raise ValueError(f"{len(packed)} packed coefficients, where {self.count} are active")
+        self._packed.reserve(packed.nbytes)
+        self._copy_to(self._packed, packed)
+
+    def _copy_to(self, scratch: Scratch, array: NDArray[np.generic]) -> None:
+        if array.nbytes:
+            device = self._coefficients.device
+            with device.errors("failed while computing"):
+                cl.enqueue_copy(device.queue, scratch.buffer, array, is_blocking=True)
+
+    def _launch(self, name: str, columns: cl.Buffer) -> None:
+        layout, kernel = self._coefficients.layout, self._kernels[name]
+        kernel.bind(
+            columns=columns,
+            active=self._coefficients.active,
+            stride=layout.stride,
+            splats=layout.splats,
+            places=self._places.buffer,
+            packed=self._packed.buffer,
+        )
+        kernel.launch((-(-layout.splats // _GROUP) * _GROUP,), (_GROUP,))
+
+    def close(self) -> None:
+        """Give the device's memory back."""
+        self._places.close()
+        self._packed.close()

@@ -1,0 +1,132 @@
+"""A part of the views of a re-fit, on a worker: :class:`ColourPart`."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import RasterRules
+from potr_cl.stages.refitting.coefficients import Coefficients, Layout
+from potr_cl.stages.refitting.colour_map import ColourMap
+from potr_cl.stages.refitting.launcher import launcher_for
+from potr_cl.stages.refitting.packing import Packing
+from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.workers.pool import Part
+
+
+@dataclass(frozen=True)
+class Gradient:
+    """What the views of a part add to a gradient.
+
+    Attributes:
+        errors: the squared error by W of each view, by number.
+        sums: (active coefficients,) int64.
+        blocks: (M (M + 1) / 2, N) int64; None if they were not asked for.
+    """
+
+    errors: dict[int, float]
+    sums: NDArray[np.int64]
+    blocks: NDArray[np.int64] | None
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes that travel."""
+        blocks = 0 if self.blocks is None else self.blocks.nbytes
+        return 16 * len(self.errors) + self.sums.nbytes + blocks
+
+
+class ColourPart(Part):
+    """Some of the views; see :class:`potr_cl.stages.refitting.colour_map.ColourMap`.
+
+    Args:
+        device: to compute on.
+        memory: bytes of its memory that prepared views and targets may take; None: the default.
+        scene: whose geometry and opacities are used; its colours need no more than their constant coefficients.
+        sh_count: M, coefficients of a channel.
+        rules, background: of the rasterizer.
+        source: the scene whose pictures are the targets.
+        cameras: all views.
+        numbers: of the views of this part, ascending.
+
+    Raises:
+        DeviceError: the scenes or a view do not fit the device.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        memory: int | None,
+        scene: Scene,
+        sh_count: int,
+        rules: RasterRules,
+        background: tuple[float, float, float],
+        source: Scene,
+        cameras: Sequence[Camera],
+        numbers: Sequence[int],
+    ) -> None:
+        self._device = device
+        with ExitStack() as owned:
+            rasterizer = owned.enter_context(Rasterizer(device, scene, rules))
+            of_source = owned.enter_context(Rasterizer(device, source, background=background))
+            launcher = launcher_for(device, rules)
+            layout = Layout(len(scene), rasterizer.stride, sh_count, launcher.lanes)
+            self._coefficients = owned.enter_context(Coefficients(device, layout))
+            self._packing = owned.enter_context(Packing(self._coefficients))
+            self._x, self._direction = self._coefficients.vector(), self._coefficients.vector()
+            self._map = owned.enter_context(
+                ColourMap(launcher, rasterizer, self._coefficients, scene.means, cameras, background, memory, numbers)
+            )
+            self._targets = RenderedTargets(of_source, cameras)
+            self._owned = owned.pop_all()
+
+    def gradient(self, x: FloatArray, flags: NDArray[np.uint32], blocks: bool, constant: bool) -> Gradient:
+        """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.gradient`.
+
+        Args:
+            x: (3 M, N) float32, the columns of the coefficients.
+            flags: (2, N) uint32, which of them are active.
+            blocks: whether the splats' own blocks are wanted.
+            constant: whether only the constant coefficients are active.
+        """
+        layout = self._coefficients.layout
+        self._packing.give_flags(flags)
+        self._coefficients.write_columns(self._x, x)
+        triangle = layout.sh_count * (layout.sh_count + 1) // 2
+        with Memory(self._device) as memory:
+            sums = None
+            if blocks:
+                sums = memory.allocate(8 * triangle * layout.stride, "the splats' normal equations")
+                self._coefficients.zero(sums)
+            errors = self._map.sum_gradient(self._x, self._targets, sums, constant)
+            found = None
+            if sums is not None:
+                found = self._device.download(sums, (triangle, layout.stride), np.int64)[:, : layout.splats]
+        return Gradient(errors, self._packing.sums(self._map.sums), found)
+
+    def normal(self, direction: FloatArray, unit: float, constant: bool) -> NDArray[np.int64]:
+        """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.normal`.
+
+        Args:
+            direction: (active coefficients,) float32.
+            unit: it is multiplied by this.
+            constant: whether only the constant coefficients are active.
+
+        Returns:
+            (active coefficients,) int64.
+        """
+        self._packing.set_floats(self._direction, direction)
+        self._map.sum_normal(self._direction, self._x, unit, constant)
+        return self._packing.sums(self._map.sums)
+
+    def close(self) -> None:
+        """Give all device memory back."""
+        self._owned.close()

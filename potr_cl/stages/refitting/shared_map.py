@@ -1,0 +1,106 @@
+"""Products of a re-fit whose views are done by several: :class:`SharedViews` adds what the others find."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
+from dataclasses import replace
+
+import numpy as np
+import pyopencl as cl
+
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.memory import Owner
+from potr_cl.raster.rules import RasterRules
+from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.packing import Packing
+from potr_cl.stages.refitting.part import ColourPart, Gradient
+from potr_cl.workers.dealing import Shares
+from potr_cl.workers.parts import Parts, Pending
+from potr_cl.workers.pool import Pool
+
+
+class SharedViews(Owner):
+    """A :class:`potr_cl.stages.refitting.colour_map.Helpers`.
+
+    Args:
+        coefficients: the master's, whose vectors are sent.
+        others: parts, each a :class:`potr_cl.stages.refitting.part.ColourPart`.
+
+    Raises:
+        DeviceError: the kernels cannot be built.
+    """
+
+    def __init__(self, coefficients: Coefficients, others: Parts) -> None:
+        self._coefficients, self._others = coefficients, others
+        self._packing = Packing(coefficients)
+        self._pending: Pending | None = None
+
+    def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
+        """Have them begin with a gradient at x."""
+        self._packing.take_flags()
+        columns = self._coefficients.read_columns(x)
+        flags = self._packing.flags
+        self._pending = self._others.begin("gradient", columns, flags, blocks, constant, anew=True)
+
+    def begin_normal(self, direction: cl.Buffer, unit: float, constant: bool) -> None:
+        """Have them begin with a product of the normal matrix."""
+        self._pending = self._others.begin("normal", self._packing.floats(direction), unit, constant, logged=False)
+
+    def add(self, sums: cl.Buffer, blocks: cl.Buffer | None) -> dict[int, float]:
+        """Add what they found to sums on the master's device."""
+        pending, self._pending = self._pending, None
+        assert pending is not None, "nothing was begun"
+        errors: dict[int, float] = {}
+        for found in pending.results():
+            if isinstance(found, Gradient):
+                errors |= found.errors
+                if blocks is not None and found.blocks is not None:
+                    self._add_blocks(blocks, found.blocks)
+                found = found.sums
+            self._packing.add_sums(sums, found)
+        return errors
+
+    def _add_blocks(self, blocks: cl.Buffer, more: np.ndarray) -> None:
+        """Row by row: a second buffer of that size might not fit."""
+        device, layout = self._coefficients.device, self._coefficients.layout
+        for row, values in enumerate(more):
+            start = 8 * row * layout.stride
+            found = device.download(blocks, (layout.splats,), np.int64, start)
+            found += values
+            with device.errors("failed while computing"):
+                cl.enqueue_copy(device.queue, blocks, found, dst_offset=start, is_blocking=True)
+
+    def close(self) -> None:
+        """Give the master's device memory back; the parts are the caller's."""
+        self._packing.close()
+
+
+@contextmanager
+def colour_parts(
+    pool: Pool,
+    shares: Shares,
+    scene: Scene,
+    rules: RasterRules,
+    background: tuple[float, float, float],
+    source: Scene,
+    cameras: Sequence[Camera],
+    memory: int | None,
+) -> Iterator[Parts]:
+    """The parts that do the others' views.
+
+    Args:
+        pool: of their workers.
+        shares: who does which views.
+        scene: whose colours are re-fitted.
+        rules, background: of the rasterizer.
+        source: the scene whose pictures are the targets.
+        cameras: all views.
+        memory: bytes of a device's memory that prepared views and targets may take; None: the default.
+    """
+    constant = replace(scene, sh=np.ascontiguousarray(scene.sh[:, :1]))
+    with pool.shared(constant) as shape, pool.shared(source) as pictured:
+        given = [(shape, scene.sh.shape[1], rules, background, pictured, cameras, numbers) for numbers in shares.others]
+        with Parts(pool, ColourPart, given, memory) as parts:
+            yield parts

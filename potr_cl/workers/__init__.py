@@ -1,0 +1,7 @@
+"""Who computes views, where that is more than one device. Begin with pool.py and parts.py.
+
+- pool.py says what a pool of workers is: each has a device, and can be lost;
+- parts.py has a work's parts, made on the workers, told what changes, and made again elsewhere when a worker is lost;
+- host.py is the pool of several devices of this computer, cluster.py that of a Dask cluster;
+- dealing.py shares views out.
+"""

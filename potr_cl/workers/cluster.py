@@ -1,0 +1,379 @@
+"""A Dask cluster: :class:`ClusterPool`. Every worker of it is a worker here, with a device of its own.
+
+Dask brings the network, placing things on workers, and who is alive. A worker's parts, and what they share, live in an
+actor there (:class:`_Seat`). Dask's own way to share things (``scatter``) keeps only one copy of them in the long run,
+and that goes with its worker. The master only adds up what the workers find.
+"""
+
+from __future__ import annotations
+
+import logging
+import math
+import threading
+import time
+from collections.abc import Callable, Iterator, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+from typing import TYPE_CHECKING, Any
+
+from potr_cl.errors import DeviceError, PotrError, UsageError
+from potr_cl.host.installation import install_command
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DeviceInfo, fitting_devices
+from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, WorkerLost
+
+if TYPE_CHECKING:
+    from dask.distributed import Client
+
+#: Seconds to wait for a scheduler, and for a worker to say which device it has.
+_CONNECT, _HELLO = 10.0, 120.0
+#: Seconds between two looks at whether a worker that has not answered yet is alive, and at whether to go on waiting.
+_ALIVE, _POLL = 3.0, 0.1
+#: Seconds in which the handle of a part arrives once it is made.
+_FETCH = 30.0
+#: Threads that wait for workers.
+_MOST_WAITING = 256
+
+
+class ClusterPool(Pool):
+    """The workers of a Dask cluster.
+
+    Args:
+        cluster: the scheduler's address, or a client of it, which stays the caller's.
+        first: the master's device.
+        patience: see :class:`potr_cl.workers.pool.Pool`.
+
+    Raises:
+        UsageError: Dask is not installed, no scheduler answers there, or it has no worker that can do the work.
+    """
+
+    takes_part = False
+    sparse = True
+
+    def __init__(self, cluster: str | Client, first: Device, patience: float = 60.0) -> None:
+        self.first, self.traffic, self.patience = first, Traffic(), patience
+        self._closing = threading.Event()
+        self._waiting = ThreadPoolExecutor(_MOST_WAITING, thread_name_prefix="potr_cl cluster")
+        self._workers: list[_ClusterWorker] = []
+        self.client, self._is_own = _client_of(cluster)
+        try:
+            self._workers = self._met()
+        except BaseException:
+            self.close()
+            raise
+
+    def workers(self) -> list[Worker]:
+        alive = self._alive()
+        left: list[Worker] = [worker for worker in self._workers if worker.name in alive]
+        if not left:
+            raise WorkerLost("all workers of the cluster are gone: start some, and encode again")
+        return left
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return tuple(worker.name for worker in self._workers)
+
+    @contextmanager
+    def shared(self, thing: Any) -> Iterator[Shared]:
+        """A worker is sent it when it first makes a part of it, and keeps it for the parts that follow."""
+        yield Shared(thing)
+
+    def close(self) -> None:
+        self._closing.set()
+        self._waiting.shutdown(wait=False, cancel_futures=True)
+        for worker in self._workers:
+            worker.leave()
+        if self._is_own:
+            with suppress(Exception):
+                self.client.close(timeout=2)
+
+    # ------------------------------------------------------------------------------------------------ for the workers
+
+    def _alive(self) -> set[str]:
+        """Addresses of the workers that the scheduler knows."""
+        with _as_worker_lost("the scheduler"):
+            return set(self.client.nthreads())
+
+    def wait_for(self, answer: Any, address: str, most: float = math.inf) -> Any:
+        """What a worker answers.
+
+        Args:
+            answer: a future of Dask's.
+            address: of the worker.
+            most: seconds to wait.
+
+        Raises:
+            WorkerLost: it is gone. Whatever the worker raises.
+        """
+        began = looked = time.monotonic()
+        while not self._answered(answer):
+            if time.monotonic() - began > most:
+                raise WorkerLost(f"{address} does not answer")
+            if self._closing.is_set():
+                raise WorkerLost(f"{address} is not waited for any more")
+            if time.monotonic() - looked > _ALIVE:
+                looked = time.monotonic()
+                if address not in self._alive():
+                    raise WorkerLost(f"{address} is gone")
+        try:
+            return answer.result(timeout=_FETCH)
+        except PotrError:
+            raise
+        except MemoryError:
+            raise DeviceError(f"worker {address} ran out of memory") from None
+        except Exception as error:
+            if self._closing.is_set() or address not in self._alive() or _is_of_transport(error):
+                raise WorkerLost(f"{address} is gone ({_first_line(error)})") from None
+            raise DeviceError(f"worker {address} failed ({_first_line(error)})") from error
+
+    def _answered(self, answer: Any) -> bool:
+        """Whether an answer is there, after waiting a little for it."""
+        if answer.done():
+            return True
+        with suppress(Exception):  # whatever it is, it will be raised again
+            if hasattr(answer, "add_done_callback"):
+                # What is on its way already must not be cut short.
+                done = threading.Event()
+                answer.add_done_callback(lambda _: done.set())
+                done.wait(_POLL)
+            else:
+                answer.result(timeout=_POLL)
+        return bool(answer.done())
+
+    def begin(self, work: Callable[[], Any]) -> Future[Any]:
+        """Have something waited for in a thread."""
+        try:
+            return self._waiting.submit(work)
+        except RuntimeError:  # closed
+            raise WorkerLost("the cluster has been left") from None
+
+    def _met(self) -> list[_ClusterWorker]:
+        """All workers, each of which has said which device it takes."""
+        addresses = sorted(self._alive())
+        if not addresses:
+            raise UsageError("the cluster has no worker: start some with `dask worker ADDRESS`, one for each device")
+        # Several workers of one computer take its devices in turn.
+        hosts = [address.rsplit(":", 1)[0] for address in addresses]
+        places = [hosts[:number].count(host) for number, host in enumerate(hosts)]
+        workers = [_ClusterWorker(self, address, place) for address, place in zip(addresses, places, strict=True)]
+        for worker in workers:
+            worker.meet()
+        return workers
+
+
+class _ClusterWorker(Worker):
+    """One of Dask's workers, with a seat for this pool.
+
+    Args:
+        pool: that it is of.
+        name: its address.
+        place: its number among the workers of its computer.
+    """
+
+    def __init__(self, pool: ClusterPool, name: str, place: int) -> None:
+        self.name = name
+        self._pool = pool
+        self._known: list[tuple[int, Any]] = []  # what the seat has been sent
+        self._next = 0
+        self._sending = threading.Lock()
+        options = {"actor": True, "workers": [name], "allow_other_workers": False, "pure": False}
+        with _as_worker_lost(name):
+            self._future = pool.client.submit(_Seat, place, **options)
+        self._seat: Any = None
+
+    def meet(self) -> None:
+        """Wait until it says which device it has.
+
+        Raises:
+            UsageError: it cannot do the work.
+        """
+        try:
+            self._seat = self._pool.wait_for(self._future, self.name, _HELLO)
+            version, name, family = self.ask("hello")
+        except DeviceError as error:
+            raise UsageError(
+                f"worker {self.name} of the cluster cannot do the work ({error}): install potr_cl there as it is here, "
+                "and an OpenCL driver"
+            ) from None
+        _check(self.name, version, name, family, self._pool.first)
+
+    def ask(self, method: str, *args: Any) -> Any:
+        """What a method of the seat returns."""
+        with _as_worker_lost(self.name), self._pool.client.as_current():  # actors look for the client
+            answer = getattr(self._seat, method)(*args)
+        return self._pool.wait_for(answer, self.name)
+
+    def make(self, kind: type[Part], memory: int | None, given: Sequence[Any]) -> Future[Held]:
+        def made() -> Held:
+            with self._sending:
+                things = [_Known(self._sent(each.handle)) if isinstance(each, Shared) else each for each in given]
+                self._next += 1
+                number = self._next
+            self.ask("make", number, kind, memory, things)
+            return _HeldThere(self._pool, self, number)
+
+        return self._pool.begin(made)
+
+    def _sent(self, thing: Any) -> int:
+        """The number by which the seat knows a thing, after sending it if need be."""
+        number = next((number for number, known in self._known if known is thing), None)
+        if number is None:
+            self._next += 1
+            number = self._next
+            # Two: the uncompressed scene, and what is worked on now.
+            kept = self._known[-1:]
+            self.ask("keep", number, thing, [each for each, _ in kept])
+            self._pool.traffic.sent += getattr(thing, "nbytes", 0)
+        else:
+            kept = [each for each in self._known if each[1] is not thing]
+        self._known = [*kept, (number, thing)]
+        return number
+
+    def leave(self) -> None:
+        """Have Dask forget the seat, and with it all that it holds, as soon as it is idle."""
+        with suppress(Exception):
+            self._future.release()
+
+
+class _HeldThere(Held):
+    """A part on one of Dask's workers."""
+
+    def __init__(self, pool: ClusterPool, worker: _ClusterWorker, number: int) -> None:
+        self._pool, self._worker, self._number = pool, worker, number
+
+    def begin(self, command: str, args: Sequence[Any]) -> Future[Any]:
+        return self._pool.begin(lambda: self._worker.ask("run", self._number, command, tuple(args)))
+
+    def close(self) -> None:
+        with suppress(PotrError):
+            self._pool.begin(lambda: self._worker.ask("drop", self._number)).result()
+
+
+@dataclass(frozen=True)
+class _Known:
+    """Stands for something that the seat has been sent."""
+
+    number: int
+
+
+class _Seat:
+    """Lives on a worker, and holds its parts and what they share.
+
+    Args:
+        place: the worker's number among those of its computer.
+    """
+
+    def __init__(self, place: int) -> None:
+        self._place = place
+        self._known: dict[int, Any] = {}
+        self._parts: dict[int, Part] = {}
+
+    def hello(self) -> tuple[str, str, str]:
+        """The version here, the device, and the family of its kernels."""
+        from potr_cl import __version__
+
+        device = _device(self._place)
+        return __version__, str(device.info), device.family
+
+    def keep(self, number: int, thing: Any, others: Sequence[int]) -> None:
+        """Keep a thing for parts, and of those that are known only the ones of these numbers."""
+        self._known = {each: self._known[each] for each in others} | {number: thing}
+
+    def make(self, number: int, kind: type[Part], memory: int | None, given: Sequence[Any]) -> None:
+        """Make a part."""
+        device = _device(self._place)
+        things = [self._known[each.number] if isinstance(each, _Known) else each for each in given]
+        # A failure may leave buffers behind that nobody owns any more.
+        with device.all_or_nothing(), device.errors("failed while encoding"):
+            self._parts[number] = kind(device, memory, *things)
+
+    def run(self, number: int, command: str, args: Sequence[Any]) -> Any:
+        """Give a part a command."""
+        with _device(self._place).errors("failed while encoding"):
+            return getattr(self._parts[number], command)(*args)
+
+    def drop(self, number: int) -> None:
+        """Give a part's memory back."""
+        part = self._parts.pop(number, None)
+        if part is not None:
+            part.close()
+
+    def __del__(self) -> None:
+        # The master has left, perhaps without a word.
+        for number in list(self.__dict__.get("_parts", ())):
+            with suppress(Exception):
+                self.drop(number)
+
+
+_opened: dict[int, Device] = {}
+
+
+def _device(place: int) -> Device:
+    """This worker's device: of the best ones, that of the worker's place among those of its computer."""
+    if place not in _opened:
+        best, *others = fitting_devices()
+        alike: list[DeviceInfo] = [best, *(info for info in others if _kind(info) == _kind(best))]
+        _opened[place] = Device(alike[place % len(alike)])
+    return _opened[place]
+
+
+def _kind(info: DeviceInfo) -> tuple[str, str]:
+    return info.kind, info.platform
+
+
+def _check(address: str, version: str, name: str, family: str, first: Device) -> None:
+    from potr_cl import __version__
+
+    if version != __version__:
+        raise UsageError(
+            f"worker {address} of the cluster has potr_cl {version}, this computer {__version__}: install the same"
+        )
+    if family != first.family:
+        raise UsageError(
+            f"worker {address} of the cluster computes on {name}, this computer on {first.info}, which round "
+            "differently: choose a device of the same kind with --device"
+        )
+
+
+def _client_of(cluster: str | Client) -> tuple[Client, bool]:
+    """A client, and whether it was made here."""
+    try:
+        from dask.distributed import Client
+    except ImportError:
+        raise UsageError(f"a cluster needs Dask: {install_command('cluster')}") from None
+    if isinstance(cluster, Client):
+        return cluster, False
+    if not isinstance(cluster, str):
+        raise UsageError(
+            f"a cluster is the address of a Dask scheduler, or a dask.distributed.Client, not {type(cluster).__name__}"
+        )
+    if not cluster.strip():
+        raise UsageError("--cluster is empty: give the address of a Dask scheduler, such as tcp://10.0.0.1:8786")
+    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what it has to say is said here, in one line
+    try:
+        return Client(cluster, timeout=_CONNECT, set_as_default=False, direct_to_workers=True), True
+    except Exception as error:
+        raise UsageError(
+            f"no Dask scheduler answers at '{cluster}' ({_first_line(error)}): give its address, such as "
+            "tcp://10.0.0.1:8786"
+        ) from None
+
+
+def _is_of_transport(error: Exception) -> bool:
+    return isinstance(error, (OSError, EOFError)) or "lost" in str(error).lower() or "cancel" in repr(error).lower()
+
+
+@contextmanager
+def _as_worker_lost(who: str) -> Iterator[None]:
+    try:
+        yield
+    except PotrError:
+        raise
+    except Exception as error:
+        raise WorkerLost(f"{who} does not answer ({_first_line(error)})") from None
+
+
+def _first_line(error: BaseException) -> str:
+    said = str(error).strip().partition("\n")[0][:200]
+    return said or type(error).__name__

@@ -1,0 +1,95 @@
+"""Several devices of this computer: :class:`HostPool`. Each but the first has a thread of its own.
+
+Drivers leave the interpreter free while they compute, copy or build, so threads are enough.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import AbstractContextManager, nullcontext
+from typing import Any
+
+from potr_cl.errors import UsageError
+from potr_cl.opencl.device import Device
+from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker
+
+
+class HostPool(Pool):
+    """Several devices of this computer.
+
+    Args:
+        devices: opened; the master computes on the first one too.
+
+    Raises:
+        UsageError: there is no device, or they run different kernels, which round differently.
+    """
+
+    takes_part = True
+    sparse = False
+
+    def __init__(self, devices: Sequence[Device]) -> None:
+        if not devices:
+            raise UsageError("no device to share the work out to")
+        for device in devices:
+            if device.family != devices[0].family:
+                raise UsageError(
+                    f"devices {devices[0].info} and {device.info} run different kernels, which round differently: "
+                    "choose devices of one kind"
+                )
+        self.first = devices[0]
+        self.traffic = Traffic()
+        self._workers: list[Worker] = [_Thread(device, number) for number, device in enumerate(devices[1:], 1)]
+
+    def workers(self) -> list[Worker]:
+        return list(self._workers)
+
+    def shared(self, thing: Any) -> AbstractContextManager[Shared]:
+        return nullcontext(Shared(thing))  # threads see what the master sees
+
+    @property
+    def names(self) -> tuple[str, ...]:
+        return (f"0: {self.first.info}", *(worker.name for worker in self._workers))
+
+    def close(self) -> None:
+        for worker in self._workers:
+            assert isinstance(worker, _Thread)
+            worker.close()
+
+
+class _Thread(Worker):
+    """A thread that computes on a device."""
+
+    def __init__(self, device: Device, number: int) -> None:
+        self.name = f"{number}: {device.info}"
+        self._device = device
+        self._thread = ThreadPoolExecutor(1, thread_name_prefix=f"potr_cl device {number}")
+
+    def make(self, kind: type[Part], memory: int | None, given: Sequence[Any]) -> Future[Held]:
+        def made() -> Held:
+            # A failure may leave buffers behind that nobody owns any more.
+            with self._device.all_or_nothing(), self._device.errors("failed while encoding"):
+                things = [each.handle if isinstance(each, Shared) else each for each in given]
+                return _HeldHere(self._thread, self._device, kind(self._device, memory, *things))
+
+        return self._thread.submit(made)
+
+    def close(self) -> None:
+        self._thread.shutdown(wait=True, cancel_futures=True)
+
+
+class _HeldHere(Held):
+    """A part in this process."""
+
+    def __init__(self, thread: ThreadPoolExecutor, device: Device, part: Part) -> None:
+        self._thread, self._device, self._part = thread, device, part
+
+    def begin(self, command: str, args: Sequence[Any]) -> Future[Any]:
+        def done() -> Any:
+            with self._device.errors("failed while encoding"):
+                return getattr(self._part, command)(*args)
+
+        return self._thread.submit(done)
+
+    def close(self) -> None:
+        self._thread.submit(self._part.close).result()

@@ -1,0 +1,251 @@
+"""The parts of a work, each on a worker: :class:`Parts` gives them commands and makes lost ones again elsewhere.
+
+It keeps a log of the commands that change a part. A worker that dies, stalls or runs out of memory loses its parts;
+another one makes them again, and replays the log. As commands give the same results on every worker, nobody else
+notices.
+"""
+
+from __future__ import annotations
+
+import logging
+import time
+from collections.abc import Callable, Sequence
+from concurrent.futures import FIRST_COMPLETED, Future, wait
+from contextlib import suppress
+from typing import Any
+
+from potr_cl.errors import DeviceError, PotrError
+from potr_cl.opencl.memory import Owner
+from potr_cl.workers.pool import Held, Part, Pool, Worker, WorkerLost
+
+#: A worker may take so many times as long as the slowest of the others.
+_SLOWER = 10
+
+_log = logging.getLogger("potr_cl")
+
+
+class Parts(Owner):
+    """Parts of one work on the workers of a pool.
+
+    Args:
+        pool: of the workers.
+        kind: of all parts.
+        given: what each part is made with, see :class:`potr_cl.workers.pool.Part`.
+        memory: bytes of a device's memory that may be filled with views; None: the parts' own default.
+
+    The workers begin at once; :meth:`ready` waits for them, and so does the first command.
+    """
+
+    def __init__(self, pool: Pool, kind: type[Part], given: Sequence[Sequence[Any]], memory: int | None = None) -> None:
+        self._pool, self._kind, self._memory = pool, kind, memory
+        self._given = [tuple(each) for each in given]
+        self._log: list[tuple[str, tuple[Any, ...]]] = []
+        self._unfit: set[str] = set()  # workers on which a part of this work has failed
+        self._held: list[Held | None] = [None] * len(self._given)
+        self._by: list[Worker | None] = [None] * len(self._given)
+        self._making: list[Future[Held]] = []
+        self._pending: Pending | None = None
+        try:
+            workers = self._able()
+            for place, each in enumerate(self._given):
+                worker = workers[place % len(workers)]
+                self._by[place] = worker
+                self._making.append(worker.make(kind, memory, each))
+        except BaseException:
+            self.close()
+            raise
+
+    def ready(self) -> None:
+        """Return once all parts are made.
+
+        Raises:
+            DeviceError: no worker can make them.
+        """
+        making, self._making = self._making, []
+        if making:
+            self._collect(making, self._take_made, self._remake)
+
+    def __len__(self) -> int:
+        return len(self._given)
+
+    # ------------------------------------------------------------------------------------------------ commands
+
+    def begin(self, command: str, *args: Any, logged: bool = True, anew: bool = False) -> Pending:
+        """Give all parts a command, and do something else until :meth:`Pending.results`.
+
+        Args:
+            command: the parts' method.
+            args: of the method, the same for all parts.
+            logged: whether it changes the parts.
+            anew: whether nothing that they were told before matters after it.
+        """
+        self._settle()
+        if anew:
+            self._log.clear()
+        self._pending = Pending(self, command, args, logged)
+        return self._pending
+
+    def tell(self, command: str, *args: Any) -> list[Any]:
+        """Give all parts a command that changes them; what they return, in their order."""
+        return self.begin(command, *args).results()
+
+    def ask(self, place: int, command: str, *args: Any) -> Any:
+        """Give one part a command that changes nothing; what it returns."""
+        self._settle()
+        found: list[Any] = [None]
+
+        def take(_place: int, result: Any) -> None:
+            found[0] = result
+
+        future = self._begin(place, command, args)
+        self._collect([future], take, lambda _place: self._again(place, command, args), [place])
+        return found[0]
+
+    def _settle(self) -> None:
+        """Wait for what the parts were told before: the log has commands in their order."""
+        self.ready()
+        if self._pending is not None:
+            self._pending.results()
+
+    def close(self) -> None:
+        """Have the workers forget the parts."""
+        self._pending = None
+        held, self._held = self._held, [None] * len(self._given)
+        for making in self._making:  # an error came between
+            with suppress(PotrError):
+                held.append(making.result())
+        self._making = []
+        for each in held:
+            if each is not None:
+                with suppress(PotrError):
+                    each.close()
+
+    # ------------------------------------------------------------------------------------------------ their parts
+
+    def _begin(self, place: int, command: str, args: Sequence[Any]) -> Future[Any]:
+        held = self._held[place]
+        assert held is not None, "a part is closed"
+        self._pool.traffic.sent += nbytes(args)
+        return held.begin(command, args)
+
+    def _take_made(self, place: int, held: Held) -> None:
+        self._held[place] = held
+
+    def _able(self) -> list[Worker]:
+        """Workers that have neither been lost nor failed with a part of this work."""
+        return [worker for worker in self._pool.workers() if worker.name not in self._unfit]
+
+    def _collect(
+        self,
+        futures: Sequence[Future[Any]],
+        take: Callable[[int, Any], None],
+        again: Callable[[int], Any],
+        places: Sequence[int] | None = None,
+    ) -> None:
+        """Wait for all; where a worker fails, have ``again`` do it on another one."""
+        waiting = dict(zip(futures, places if places is not None else range(len(futures)), strict=True))
+        failed: list[tuple[int, DeviceError]] = []
+        patience, began, last = self._pool.patience, time.monotonic(), 0.0
+        while waiting:
+            # Nobody can tell how long something takes before one has done it.
+            limit = None if patience is None or not last else began + max(patience, _SLOWER * last) - time.monotonic()
+            done, _ = wait(waiting, None if limit is None else max(limit, 0.0), return_when=FIRST_COMPLETED)
+            if not done:
+                failed += [(place, WorkerLost("it does not answer")) for place in waiting.values()]
+                break
+            last = time.monotonic() - began
+            for future in done:
+                place = waiting.pop(future)
+                try:
+                    take(place, future.result())
+                except DeviceError as error:
+                    failed.append((place, error))
+        for place, fault in failed:
+            take(place, self._elsewhere(place, fault, again))
+
+    def _elsewhere(self, place: int, error: DeviceError, again: Callable[[int], Any]) -> Any:
+        """Have another worker do what one could not.
+
+        Raises:
+            DeviceError: the last one's error, if there is no other.
+        """
+        last = error
+        while True:
+            worker = self._by[place]
+            assert worker is not None
+            self._unfit.add(worker.name)
+            try:
+                left = self._able()
+            except WorkerLost:
+                left = []
+            if not left:
+                raise last
+            loads = [sum(by is each for by in self._by) for each in left]
+            other = left[loads.index(min(loads))]
+            _log.warning("worker %s gave up (%s): its views go to %s", worker.name, last, other.name)
+            with suppress(PotrError):
+                held = self._held[place]
+                if held is not None:
+                    held.close()
+            self._held[place], self._by[place] = None, other
+            try:
+                return again(place)
+            except DeviceError as another:
+                last = another
+
+    def _remake(self, place: int) -> Held:
+        """Make a part on the worker that has it now, and have it do all that it has been told."""
+        worker = self._by[place]
+        assert worker is not None
+        held = worker.make(self._kind, self._memory, self._given[place]).result()
+        self._held[place] = held
+        for command, args in self._log:
+            self._begin(place, command, args).result()
+        return held
+
+    def _again(self, place: int, command: str, args: Sequence[Any]) -> Any:
+        self._remake(place)
+        return self._begin(place, command, args).result()
+
+    def _note(self, command: str, args: tuple[Any, ...]) -> None:
+        self._log.append((command, args))
+
+
+class Pending:
+    """A command that all parts have been given."""
+
+    def __init__(self, parts: Parts, command: str, args: tuple[Any, ...], logged: bool) -> None:
+        self._parts, self._command, self._args, self._logged = parts, command, args, logged
+        self._futures = [parts._begin(place, command, args) for place in range(len(parts))]
+        self._found: list[Any] | None = None
+
+    def results(self) -> list[Any]:
+        """What the parts return, in their order.
+
+        Raises:
+            PotrError: a part refused, or no worker can do it.
+        """
+        if self._found is not None:
+            return self._found
+        parts, found = self._parts, [None] * len(self._futures)
+
+        def take(place: int, result: Any) -> None:
+            parts._pool.traffic.received += nbytes(result)
+            found[place] = result
+
+        parts._collect(self._futures, take, lambda place: parts._again(place, self._command, self._args))
+        if self._logged:
+            parts._note(self._command, self._args)
+        self._found = found
+        return found
+
+
+def nbytes(thing: Any) -> int:
+    """Bytes of the arrays in a thing made of arrays, bytes, lists and tuples."""
+    if isinstance(getattr(thing, "nbytes", None), int):
+        return int(thing.nbytes)
+    if isinstance(thing, (bytes, bytearray, memoryview)):
+        return len(thing)
+    if isinstance(thing, (list, tuple)):
+        return sum(nbytes(each) for each in thing)
+    return 8 if isinstance(thing, (int, float)) else 0

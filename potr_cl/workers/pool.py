@@ -1,0 +1,136 @@
+"""A pool of workers, each with a device of its own: :class:`Pool`. What they compute is in :mod:`.parts`.
+
+Whoever asks a pool for work (the *master*) has a device too, the pool's ``first``. It may do a share of the work itself
+(``takes_part``), as with several devices of one computer, or only add up what the workers find, as with a cluster.
+"""
+
+from __future__ import annotations
+
+from abc import ABC, abstractmethod
+from collections.abc import Sequence
+from concurrent.futures import Future
+from contextlib import AbstractContextManager
+from dataclasses import dataclass
+from typing import Any
+
+from potr_cl.errors import DeviceError
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner
+
+
+class WorkerLost(DeviceError):
+    """A worker does not answer any more; others can do its work."""
+
+
+class Part(Owner):
+    """A part of a work, on one worker: its methods are the commands that the master gives.
+
+    It is made on its worker as ``kind(device, memory, *given)``, where memory is the number of bytes of the device's
+    memory that may be filled with views, or None. The same commands in the same order give the same results on any
+    worker, so that a part can be made again elsewhere.
+    """
+
+    @abstractmethod
+    def __init__(self, device: Device, memory: int | None, *given: Any) -> None: ...
+
+
+class Held(ABC):
+    """A part that a worker holds."""
+
+    @abstractmethod
+    def begin(self, command: str, args: Sequence[Any]) -> Future[Any]:
+        """Have the part's method of this name called; what it returns or raises is the future's.
+
+        Commands of one part run one after the other. A worker that is gone raises :class:`WorkerLost`.
+        """
+
+    @abstractmethod
+    def close(self) -> None:
+        """Have the worker forget the part; a worker that is gone is none to wait for."""
+
+
+class Worker(ABC):
+    """One that computes.
+
+    Attributes:
+        name: for messages.
+        speed: views that it does in the time in which others do one.
+    """
+
+    name: str
+    speed: float = 1.0
+
+    @abstractmethod
+    def make(self, kind: type[Part], memory: int | None, given: Sequence[Any]) -> Future[Held]:
+        """Make a part.
+
+        Args:
+            kind: its class, see :class:`Part`.
+            memory: bytes of the device's memory that may be filled with views; None: the part's own default.
+            given: the rest of what it is made with; a :class:`Shared` among it stands for what was shared.
+        """
+
+
+@dataclass(frozen=True)
+class Shared:
+    """Something large that all workers have, given to them once.
+
+    Attributes:
+        handle: by which the pool knows it.
+    """
+
+    handle: Any
+
+
+@dataclass
+class Traffic:
+    """What went between the master and the workers, in bytes: arrays, without what their transport adds."""
+
+    sent: int = 0
+    received: int = 0
+
+
+class Pool(ABC):
+    """Workers that share a work.
+
+    Attributes:
+        first: the master's own device.
+        takes_part: whether the master does a share of the work on it.
+        sparse: whether workers send what has changed, and not all of it: worth its time where bytes travel slowly.
+        traffic: so far.
+        patience: seconds, or ten times as long as the others took if that is longer, after which a worker that alone
+            has not answered counts as lost; None: workers are waited for.
+    """
+
+    first: Device
+    takes_part: bool
+    sparse: bool
+    traffic: Traffic
+    patience: float | None = None
+
+    @abstractmethod
+    def workers(self) -> list[Worker]:
+        """Those that have not been lost; without the master.
+
+        Raises:
+            WorkerLost: none is left.
+        """
+
+    @abstractmethod
+    def shared(self, thing: Any) -> AbstractContextManager[Shared]:
+        """Give something to all workers once, for parts that are made as long as the context lasts."""
+
+    @abstractmethod
+    def close(self) -> None:
+        """Leave the workers; none of them goes on working for this pool."""
+
+    def __enter__(self) -> Pool:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
+
+    @property
+    @abstractmethod
+    def names(self) -> tuple[str, ...]:
+        """What all that compute views are called, those that have been lost too."""

@@ -1,0 +1,129 @@
+"""Whole encodes with a fit: the same file where it is left out, and searches for a size or a quality with it."""
+
+from __future__ import annotations
+
+import math
+
+import pytest
+
+from potr_cl.model.camera import resized, train_views
+from potr_cl.model.virtual_cameras import place_cameras
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.search import encode_to_target
+from potr_cl.pipeline.target import Target
+from potr_cl.quality.evaluator import EvaluationViews, Evaluator
+from potr_cl.stages.fit import LeftOut
+from potr_cl.stages.fitting.fit import Fitted
+
+#: Half of the splats, so that there is something to make up for.
+HALF = EncodeOptions(q=0.3).changed(prune={"keep": 0.5, "iterations": 8}, fit={"steps": 30, "rounds": 3})
+
+
+@pytest.fixture(scope="module")
+def device():
+    device = Device()
+    yield device
+    assert device.allocated == 0, "an encode did not give all its memory back"
+
+
+def views_of(kind, cameras, scene):
+    if kind == "virtual":
+        return [resized(camera, 60, 60) for camera in place_cameras(scene, 12)]
+    return train_views(cameras)[: int(kind)]
+
+
+@pytest.mark.parametrize("kind", ["8", "2", "1", "virtual"])
+def test_a_fit_that_is_left_out_says_why_and_changes_nothing(device, plush_excerpt, plush_excerpt_cameras, kind):
+    """As that of an excerpt is, whose splats are few and worth much."""
+    views = views_of(kind, plush_excerpt_cameras, plush_excerpt)
+    plain = EncodeOptions(q=0.3, cameras_anyway=True).changed(prune={"iterations": 8})
+    without = encode(plush_excerpt, views, plain, device=device)
+    with_it = encode(plush_excerpt, views, plain.changed(fit={"steps": 10, "rounds": 2}), device=device)
+    assert isinstance(with_it.fitted, LeftOut)
+    assert ("two training views" if kind == "1" else "did not make up") in str(with_it.fitted)
+    assert with_it.data == without.data
+    assert with_it.parameters == without.parameters
+
+
+def psnr(device, scene, encoded, cameras):
+    with Evaluator(device, scene, EvaluationViews.of(cameras), (0.0, 0.0, 0.0)) as judge:
+        return judge.psnr(encoded.scene)
+
+
+def test_a_fit_pays(device, plush_excerpt, plush_excerpt_cameras):
+    """On test views, which neither of them has seen."""
+    options = HALF.changed(prune={"keep": 0.3}, fit={"steps": 60})
+    fitted, plain = (
+        encode(plush_excerpt, plush_excerpt_cameras, each, device=device)
+        for each in (options, options.changed(fit=False))
+    )
+    assert isinstance(fitted.fitted, Fitted)
+    assert fitted.nbytes < 1.02 * plain.nbytes
+    better, before = (psnr(device, plush_excerpt, each, plush_excerpt_cameras) for each in (fitted, plain))
+    assert better > before + 0.5
+
+
+def test_what_makes_up_for_splats_rounds_finer(device, plush_excerpt, plush_excerpt_cameras):
+    options = EncodeOptions(q=0.3).changed(
+        prune={"delta_mse_max": 1e-7}, fit={"steps": 80, "further": 0.2, "cycles": 1}
+    )
+    encoded = encode(plush_excerpt, plush_excerpt_cameras, options, device=device)
+    assert encoded.fitted.spared > 0
+    plain = options.changed(fit=False).parameters
+    assert plain.sf_sh < encoded.parameters.sf_sh < 1.5 * plain.sf_sh
+    assert plain.drop > encoded.parameters.drop
+    assert encoded.parameters.delta_mse_max == plain.delta_mse_max
+    assert options.changed(q=1).parameters == options.changed(q=1, fit=False).parameters
+
+
+def test_what_only_fits_rounds_as_q_says(device, plush_excerpt, plush_excerpt_cameras):
+    encoded = encode(plush_excerpt, plush_excerpt_cameras, HALF, device=device)
+    assert encoded.fitted.spared == 0
+    assert encoded.parameters == HALF.changed(fit=False).parameters
+
+
+@pytest.mark.parametrize("target", [Target(max_bytes=13_000), Target(min_psnr=46)], ids=str)
+def test_a_search_fits(device, plush_excerpt, plush_excerpt_cameras, target):
+    found = encode_to_target(plush_excerpt, plush_excerpt_cameras, target, HALF, device=device)
+    assert isinstance(found.encoded.fitted, Fitted)
+    low, high = target.window
+    assert low <= found.value <= high
+    again = encode(plush_excerpt, plush_excerpt_cameras, found.options, device=device)
+    assert again.data == found.encoded.data
+    if target.max_bytes is None:
+        reached = psnr(device, plush_excerpt, again, plush_excerpt_cameras)
+        assert reached >= target.min_psnr
+    else:
+        assert round(math.exp(found.value)) == again.nbytes <= target.max_bytes
+
+
+def test_a_search_whose_fit_is_left_out_finds_what_it_finds_without(device, plush_excerpt, plush_excerpt_cameras):
+    plain = EncodeOptions().changed(prune={"iterations": 8})
+    options = plain.changed(fit={"steps": 10, "rounds": 2})
+    target = Target(max_bytes=20_000)
+    found, wanted = (
+        encode_to_target(plush_excerpt, plush_excerpt_cameras, target, each, device=device) for each in (options, plain)
+    )
+    assert isinstance(found.encoded.fitted, LeftOut)
+    assert found.encoded.data == wanted.encoded.data
+    assert encode(plush_excerpt, plush_excerpt_cameras, found.options, device=device).data == found.encoded.data
+
+
+def test_a_search_fits_no_more_after_an_interrupt(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
+    """Its first fit is the scout's."""
+    monkeypatch.setattr("potr_cl.stages.fit.first_interrupt_asks", _Interrupted)
+    found = encode_to_target(plush_excerpt, plush_excerpt_cameras, Target(max_bytes=13_000), HALF, device=device)
+    assert found.encoded.fitted is None
+    assert 0.98 * 13_000 <= found.encoded.nbytes <= 13_000
+
+
+class _Interrupted:
+    """Stands for an interrupt at the beginning."""
+
+    def __enter__(self):
+        return True
+
+    def __exit__(self, *_):
+        return None

@@ -1,0 +1,90 @@
+"""What a fit takes of the device's memory: what is forecast, and that a budget is kept."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.model.camera import resized, train_views
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.forecast import forecast
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.fitting.fit import FitOptions, fit_scene
+from potr_cl.stages.fitting.memory import fit_bytes
+from potr_cl.stages.refitting.targets import RenderedTargets
+from tests.devices import FAMILIES
+
+
+class CountingDevice(Device):
+    """A device that knows the most that was ever allocated on it."""
+
+    most = 0
+
+    def allocate(self, nbytes, what):
+        buffer = super().allocate(nbytes, what)
+        self.most = max(self.most, self.allocated)
+        return buffer
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def device(request):
+    device = CountingDevice(family=request.param)
+    yield device
+    assert device.allocated == 0
+
+
+@pytest.fixture(scope="module")
+def many_splats(plush_excerpt):
+    """30,000 splats, so that what they take is more than what anything else does."""
+    numbers = np.arange(30_000) % len(plush_excerpt)
+    scene = plush_excerpt.subset(numbers)
+    moved = scene.means + np.random.default_rng(0).normal(0, 0.05, scene.means.shape).astype(np.float32)
+    return dataclasses.replace(scene, means=moved)
+
+
+@pytest.fixture(scope="module")
+def views(plush_excerpt_cameras):
+    return [resized(camera, 120, 90) for camera in train_views(plush_excerpt_cameras)]
+
+
+def peak(device, source, scene, views, memory):
+    """Bytes of the device that a fit of a few steps took at its peak."""
+    device.most = 0
+    options = FitOptions(steps=4, rounds=1, memory=memory)
+    with Rasterizer(device, source) as rasterizer:
+        fit_scene(device, scene, views, RenderedTargets(rasterizer, views), options)
+    return device.most
+
+
+def test_the_peak_is_what_is_said(device, many_splats, views):
+    scene = many_splats.subset(np.arange(20_000))
+    with Rasterizer(device, scene) as rasterizer:
+        before = device.allocated
+        with rasterizer.prepare_set(views[:1]):
+            view = device.allocated - before
+    together = 4 if device.family == "gpu" else 1
+    said = fit_bytes(20_000, 30_000, 48, together, len(views), view, 120 * 90, 1e9)
+    assert 0.85 * said < peak(device, many_splats, scene, views, 10**9) < 1.15 * said
+
+
+def test_a_budget_of_memory_is_kept(device, many_splats, views):
+    """What is kept of views is no more than the budget."""
+    larger = [resized(view, 480, 360) for view in views]
+    picture = 12 * 480 * 360
+    least = peak(device, many_splats, many_splats, larger, 0)
+    for kept in (1, 4):
+        assert peak(device, many_splats, many_splats, larger, kept * picture + 100) <= least + kept * picture + 100
+    # What nothing limits takes more.
+    assert peak(device, many_splats, many_splats, larger, 10**9) > least + 4 * picture + 100
+
+
+def test_the_forecast_knows_of_the_fit(device, many_splats, views):
+    def memory(**changes):
+        return forecast(many_splats, views, EncodeOptions().changed(**changes), device).memory
+
+    without, with_it = memory(), memory(fit={"steps": 1000})
+    assert with_it - without > 30_000 * 59 * 4 * 3
+    assert memory(fit={"steps": 1000}, memory=0) < with_it

@@ -1,0 +1,155 @@
+"""Removal effects part by part: the same bits as with all splats for all views."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster import culling
+from potr_cl.raster.culling import parts_of_views
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA
+from potr_cl.raster.scene_buffers import gathered, uploaded
+from potr_cl.reference.captures import looking
+from potr_cl.reference.scenes import random_scene
+from potr_cl.stages.pruning import visible_parts
+from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.schedule import PruningOptions
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.visible_parts import PartedRemoval
+from tests.devices import KERNELS, open_device
+
+
+@pytest.fixture(scope="module", params=KERNELS)
+def device(request):
+    device = open_device(request.param)
+    yield device
+    assert device.allocated == 0, "a sweep did not give all its memory back"
+
+
+@pytest.fixture(autouse=True)
+def _small_groups(monkeypatch):
+    monkeypatch.setattr(culling, "_GROUP", 32)
+
+
+def street(houses: int = 5, splats: int = 300) -> tuple[Scene, list[Camera]]:
+    """Heaps in a row, each with views of its own, and one along the street."""
+    rng = np.random.default_rng(8)
+    scene = random_scene(houses * splats, 1, seed=8)
+    at = np.repeat(np.arange(houses) * 12.0, splats)
+    means = rng.normal(size=(len(scene), 3)) * 0.5
+    means[:, 0] += at
+    rng.shuffle(means)
+    log_scales = rng.normal(-2.2, 0.4, (len(scene), 3))
+    scene = dataclasses.replace(scene, means=means.astype(np.float32), log_scales=log_scales.astype(np.float32))
+    cameras = []
+    for house in range(houses):
+        there = np.array([house * 12.0, 0, 0])
+        for turn in (0.4, 2.2, 4.5):
+            here = there + 3 * np.array([np.cos(turn), np.sin(turn), 0.3])
+            cameras.append(looking(here, there, name=f"{house}_{turn}", wide=0.4))
+    cameras.append(looking(np.array([-6.0, 0, 0.2]), np.array([50.0, 0, 0]), name="along", wide=0.4))
+    cameras = [cameras[k] for k in rng.permutation(len(cameras))]
+    return scene, [dataclasses.replace(c, width=80, height=60, fx=c.fx / 7, fy=c.fy / 7, cx=40, cy=30) for c in cameras]
+
+
+def parted(device, scene, cameras, options, whole=None) -> PartedRemoval:
+    parts = parts_of_views(scene, cameras, INRIA.near)
+    assert 3 <= len(parts) < len(cameras)
+    return PartedRemoval(device, scene, whole or scene, cameras, parts, options)
+
+
+@pytest.mark.parametrize("memory", [None, 300_000, 0], ids=["all fits", "some fits", "nothing fits"])
+@pytest.mark.parametrize("tolerance", [0.0, 0.05])
+def test_the_same_bits(device, memory, tolerance):
+    """While splats go and colours change. Which views are kept is another matter: so none may be skipped there."""
+    scene, cameras = street()
+    options = SweepOptions(tolerance if memory is None else 0.0, memory=memory)
+    rng = np.random.default_rng(1)
+    with (
+        Rasterizer(device, scene) as rasterizer,
+        RemovalSweep(rasterizer, cameras, options) as wanted,
+        parted(device, scene, cameras, options) as got,
+    ):
+        for step in range(4):
+            effects, found = wanted.measure(), got.measure()
+            left = np.flatnonzero(wanted.alive)
+            assert np.array_equal(left, np.flatnonzero(got.alive))
+            assert np.array_equal(effects[0][left], found[0][left])
+            assert np.array_equal(effects[1][left], found[1][left])
+            assert np.count_nonzero(found[1]) > 100
+            gone = rng.choice(left, len(left) // 8, replace=False)
+            wanted.remove(gone)
+            got.remove(gone)
+            if step == 1:
+                sh = scene.sh + rng.normal(0, 0.05, scene.sh.shape).astype(np.float32)
+                wanted.replace_sh(sh)
+                got.replace_sh(sh)
+        for a, b in zip(wanted.view_importances(), got.view_importances(), strict=True):
+            assert a[0] == b[0]
+            assert np.array_equal(a[1], b[1])
+            assert np.array_equal(a[2], b[2])
+
+
+def test_the_same_choice(device):
+    """By the host, or by the device's own controller where there is one."""
+    scene, cameras = street()
+    options, schedule = SweepOptions(0.01), PruningOptions(1e-5, 12)
+    with (
+        Rasterizer(device, scene) as rasterizer,
+        RemovalSweep(rasterizer, cameras, options) as wanted,
+        parted(device, scene, cameras, options) as got,
+    ):
+        assert (got.steering is None) == (wanted.steering is None)
+        a, b = (prune_scene(removal, schedule) for removal in (wanted, got))
+    assert np.array_equal(a.order, b.order)
+    assert a.kept == b.kept < len(scene)
+    assert np.array_equal(a.iteration_of, b.iteration_of)
+
+
+def test_gathered_on_the_device(device):
+    scene, cameras = street(2)
+    splats = np.arange(1, len(scene), 3)
+    with (
+        uploaded(device, scene) as whole,
+        gathered(whole, splats) as part,
+        Rasterizer(device, part) as one,
+        Rasterizer(device, scene.subset(splats)) as other,
+    ):
+        for camera in cameras:
+            assert np.array_equal(one.render(camera)[0], other.render(camera)[0])
+
+
+def test_from_a_scene_on_the_device(device):
+    scene, cameras = street()
+    with uploaded(device, scene) as whole, parted(device, scene, cameras, SweepOptions(0.0), whole) as got:
+        found = got.measure()
+    with Rasterizer(device, scene) as rasterizer, RemovalSweep(rasterizer, cameras, SweepOptions(0.0)) as wanted:
+        effects = wanted.measure()
+    assert np.array_equal(effects[0], found[0])
+
+
+def test_a_whole_encode_has_the_same_bytes(device, monkeypatch):
+    scene, cameras = street(5, 900)
+    options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 6}, refit={"steps": 2})
+    options = dataclasses.replace(options, cameras_anyway=True)
+    whole = encode(scene, cameras, options, device=device)
+    made = []
+
+    def noting(*given):
+        made.append(parts(*given))
+        return made[-1]
+
+    parts = visible_parts.parts_of_views
+    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(visible_parts, "parts_of_views", noting)
+    in_parts = encode(scene, cameras, options, device=device)
+    assert len(made[0]) > 2
+    assert whole.data == in_parts.data
