@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import numpy as np
 import pytest
@@ -120,7 +121,7 @@ def test_levels_of_colours(largest, layout, both):
     for classes in ((some, some[::-1].copy()), (np.zeros(number, np.int8), some)):
         for order in (rng.permutation(number), np.arange(number - 7)):
             chosen = tuple(each[: len(order)] for each in classes)
-            a, b = both(lambda: colour_levels(sh[: len(order)], order, parameters, chosen, map))
+            a, b = both(partial(colour_levels, sh[: len(order)], order, parameters, chosen, map))
             assert_same_bits(a, b)
             assert a.dtype == (np.int16 if largest * 64 < 2**15 else np.int32 if largest < 1e6 else np.int64)
 
