@@ -5,7 +5,7 @@ Several threads that make values of a file's integers share one, and whoever com
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from threading import Lock
 from typing import Generic, TypeVar
@@ -15,6 +15,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec.byte_planes import IntegerStream
 from potr_cl.codec.container import Header
+from potr_cl.codec.native.library import native
 from potr_cl.codec.steps.rule import ColourSteps, factors
 
 F32 = NDArray[np.float32]
@@ -23,6 +24,8 @@ T = TypeVar("T")
 
 #: Splats whose classes are computed at a time.
 _BLOCK = 1 << 15
+#: The native path takes levels below.
+_MOST_MEDIUM = 1 << 29
 
 
 class Once(Generic[T]):
@@ -76,6 +79,10 @@ class ColourFactors:
         if steps is None:
             return ColourFactors(np.zeros(splats, np.int8), factors(header.sf_dc), factors(header.sf_ac))
         by_axis, opacity = scales(), opacities()
+        functions = native()
+        if functions is not None and (joined := _medium([*by_axis, opacity])) is not None:
+            dc, ac = functions.step_classes(steps, joined[:3], joined[3])
+            return ColourFactors(dc, factors(header.sf_dc, dc), factors(header.sf_ac, ac))
         dc, ac = np.empty(splats, np.int8), np.empty(splats, np.int8)
         for start in range(0, splats, _BLOCK):
             stop = min(start + _BLOCK, splats)
@@ -87,3 +94,11 @@ class ColourFactors:
         """Those of some splats."""
         dc, ac = (each[rows] if len(each) > 1 else each for each in (self.dc, self.ac))
         return ColourFactors(self.classes[rows], dc, ac)
+
+
+def _medium(streams: Sequence[IntegerStream]) -> NDArray[np.int32] | None:
+    """(streams, N) levels as the native path takes them; None if they are too large."""
+    joined = [stream.joined for stream in streams]
+    if any(levels.dtype.itemsize > 1 and int(levels.max(initial=0)) >= _MOST_MEDIUM for levels in joined):
+        return None
+    return np.stack(joined, dtype=np.int32, casting="unsafe")

@@ -30,6 +30,8 @@ I8 = NDArray[np.int8]
 
 #: Splats worked on at a time: few enough that temporaries stay in a cache, many enough that threads seldom wait.
 _BLOCK = 1 << 15
+#: Splats whose DC is predicted at a time, a multiple of a prediction's run.
+_PREDICTED = 1 << 16
 #: Levels whose values the native path looks up: small tables for levels of one byte, larger ones for others.
 _SMALL_TABLE, _LARGE_TABLE = 1 << 8, 1 << 16
 
@@ -157,12 +159,14 @@ class Dequantizer:
         dc, ac = np.zeros((2, levels.stop - levels.start), np.int8)
         if steps is not None:
             dc, ac = steps.classes(scales, levels.opacities, levels.start)
-        residuals = np.stack([channel.astype(np.int64) for channel in levels.dc])
-        _to_rgb(list(from_residuals(residuals, dc)), factors(header.sf_dc, dc), own.sh[0])
+        for start in range(0, len(dc), _PREDICTED):
+            some = slice(start, start + _PREDICTED)
+            residuals = np.stack([channel[some] for channel in levels.dc], dtype=np.int64)
+            _to_rgb(list(from_residuals(residuals, dc[some])), factors(header.sf_dc, dc[some]), own.sh[0, :, some])
         divisors = factors(header.sf_ac, ac)
         for items in levels.ac:
             rgb = np.empty(items.channels.shape, np.float32)
-            _to_rgb(list(items.channels.astype(np.int64)), divisors[items.splats], rgb)
+            _to_rgb(_wider(list(items.channels)), divisors[items.splats], rgb)
             own.sh[items.coefficients, :, items.splats] = rgb.T
 
     def _blocks(self, streams: Sequence[IntegerStream]) -> Iterator[tuple[slice, list[NDArray[np.integer]]]]:

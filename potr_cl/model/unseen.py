@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
+from potr_cl.model.splat_groups import SplatGroups
 
 #: The renderer's near plane, world units: a splat whose centre is nearer is not drawn.
 _NEAR = 0.2
@@ -36,15 +37,28 @@ def unseen_splats(scene: Scene, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
     unseen = np.ones(len(scene), bool)
     # Views far from each other first: what one does not see the next one may.
     order = np.argsort((np.arange(len(cameras)) * (math.sqrt(5) - 1) / 2) % 1, kind="stable")
+    groups = SplatGroups.of(scene) if len(scene) > _BLOCK and len(cameras) else None
+    shown = [] if groups is None else [groups.visible(camera, _NEAR) for camera in cameras]
     for start in range(0, len(scene), _BLOCK):
-        left = np.arange(start, min(start + _BLOCK, len(scene)))
+        stop = min(start + _BLOCK, len(scene))
+        left = np.arange(start, stop) if groups is None else groups.order[start:stop]
+        among = None if groups is None else np.searchsorted(groups.starts, np.arange(start, stop), "right") - 1
         means = scene.means[left].astype(np.float64)
         with np.errstate(over="ignore"):
             reach = _REACH * np.exp(np.minimum(scene.log_scales[left].max(axis=1), 80).astype(np.float64))
         for view in order:
-            shown = _shows(cameras[view], means, reach)
-            unseen[left[shown]] = False
-            left, means, reach = left[~shown], means[~shown], reach[~shown]
+            if among is None:
+                seen = _shows(cameras[view], means, reach)
+            else:
+                # Most views show nothing of a neighbourhood of a large scene.
+                near = np.flatnonzero(shown[view][among])
+                if not len(near):
+                    continue
+                seen = np.zeros(len(left), bool)
+                seen[near] = _shows(cameras[view], means[near], reach[near])
+            unseen[left[seen]] = False
+            left, means, reach = left[~seen], means[~seen], reach[~seen]
+            among = None if among is None else among[~seen]
             if not len(left):
                 break
     return unseen

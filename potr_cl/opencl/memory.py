@@ -114,3 +114,53 @@ class Scratch(Owner):
             self._device.free(self.buffer)
             self.buffer = None
         self.nbytes = 0
+
+
+class Staging(Owner):
+    """Memory of the host through which much goes to and from a device, again and again.
+
+    Drivers copy from and to it without a detour, and its pages are there from the second time on.
+
+    Args:
+        device: that it is for.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+        self._bytes: np.ndarray[Any, Any] | None = None
+
+    def array(self, shape: tuple[int, ...], dtype: Any) -> np.ndarray[Any, Any]:
+        """An array in it; what it gave before is overwritten through it."""
+        nbytes = int(np.prod(shape, dtype=np.int64)) * np.dtype(dtype).itemsize
+        if self._bytes is None or self._bytes.nbytes < nbytes:
+            self._bytes = None
+            self._bytes = self._taken(max(nbytes, 16))
+        found: np.ndarray[Any, Any] = self._bytes[:nbytes].view(dtype).reshape(shape)
+        return found
+
+    def _taken(self, nbytes: int) -> np.ndarray[Any, Any]:
+        device = self._device
+        if device.info.kind == "cpu" or device.info.integrated:
+            return np.empty(nbytes, np.uint8)
+        try:
+            flags = cl.mem_flags.READ_WRITE | cl.mem_flags.ALLOC_HOST_PTR
+            buffer = cl.Buffer(device.context, flags, nbytes)
+            access = cl.map_flags.READ | cl.map_flags.WRITE
+            # The array keeps the buffer for as long as anybody has it.
+            mapped: np.ndarray[Any, Any]
+            mapped, _ = cl.enqueue_map_buffer(device.queue, buffer, access, 0, (nbytes,), np.uint8)
+        except (cl.Error, MemoryError):  # a driver allows only so much of it
+            return np.empty(nbytes, np.uint8)
+        return mapped
+
+    def download(self, buffer: cl.Buffer, shape: tuple[int, ...], dtype: Any, start: int = 0) -> np.ndarray[Any, Any]:
+        """As :meth:`potr_cl.opencl.device.Device.download`, into this memory."""
+        array = self.array(shape, dtype)
+        if array.nbytes:
+            with self._device.errors("failed while computing"):
+                cl.enqueue_copy(self._device.queue, array, buffer, src_offset=start, is_blocking=True)
+        return array
+
+    def close(self) -> None:
+        """Keep it no longer; arrays in it live on."""
+        self._bytes = None

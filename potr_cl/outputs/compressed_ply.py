@@ -85,10 +85,17 @@ class CompressedPly(Output):
         whole, sh = sh, sh[:, :kept]
         if request.blocks is not None and kept == whole.shape[1]:
             sh = rounded_in_turn(sh, request.blocks(), _quantise, request.threads)
-        levels = compressed_ply_values.packed_sh(sh[:, 1:])
+        levels = np.empty((len(sh), kept - 1, 3), np.uint8)
         fixed = np.zeros_like(whole)
-        fixed[:, 0] = sh[:, 0]
-        fixed[:, 1:kept] = compressed_ply_values.unpacked_sh(levels)
+
+        def fill(start: int) -> None:
+            rows = slice(start, start + _BLOCK)
+            levels[rows] = compressed_ply_values.packed_sh(sh[rows, 1:])
+            fixed[rows, 0] = sh[rows, 0]
+            fixed[rows, 1:kept] = compressed_ply_values.unpacked_sh(levels[rows])
+
+        with thread_pool(request.threads) as pool:
+            list(pool.map(fill, range(0, len(sh), _BLOCK)))
         return replace(rounded, ac=levels), fixed
 
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:

@@ -17,7 +17,7 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
 
 #: Added to a block's diagonal, as a part of its mean: what no view tells apart is not moved far.
-_DAMPING = 1e-2
+DAMPING = 1e-2
 #: Splats worked on at a time: the temporaries stay small.
 _BLOCK = 1 << 12
 
@@ -71,7 +71,7 @@ def _factors(packed: FloatArray, count: int) -> FloatArray:
     size = np.add.reduce(diagonal) / np.float32(count)
     unseen = size <= 1e-30
     for own in diagonal:
-        own += np.float32(_DAMPING) * size
+        own += np.float32(DAMPING) * size
         own[unseen] = 1
     part = np.empty((count, packed.shape[1]), np.float32)
     for m in range(count - 1):

@@ -164,14 +164,16 @@ class Spz(Output):
                 _ac_levels(sh[:, 1:]), worth[:, 1:] * _bits_of_error(_AC_STEP, request), request.threads
             )
         else:
-            fixed = self._fixed_in_turn(sh, worth, request.blocks(), request)
-            return replace(rounded, ac=_levels_of_values(fixed[:, 1:]), worth=worth), fixed
+            fixed, levels = self._fixed_in_turn(sh, worth, request.blocks(), request)
+            return replace(rounded, ac=levels, worth=worth), fixed
         fixed = sh.copy()
         fixed[:, 1:] = _values_of_levels(levels)
         return replace(rounded, ac=levels, worth=worth), fixed
 
-    def _fixed_in_turn(self, sh: FloatArray, worth: FloatArray, blocks: FloatArray, request: Request) -> FloatArray:
-        """Coefficients on levels, each chosen after the ones behind it, so that it makes up for them."""
+    def _fixed_in_turn(
+        self, sh: FloatArray, worth: FloatArray, blocks: FloatArray, request: Request
+    ) -> tuple[FloatArray, U8]:
+        """Coefficients on levels, each chosen so that it makes up for the ones behind it; and the levels."""
         a_level = _bits_of_error(_AC_STEP, request)
         some = slice(None, None, max(len(sh) // _SAMPLE, 1))
         table = LevelTable(_ac_levels(sh[some, 1:]), worth[some, 1:] * a_level)
@@ -180,7 +182,16 @@ class Spz(Output):
             classes = weight_classes(worth[splats, coefficient] * a_level)
             return _values_of_levels(table(_ac_levels(wanted), classes))
 
-        return rounded_in_turn(sh, blocks, quantise, request.threads)
+        fixed = rounded_in_turn(sh, blocks, quantise, request.threads)
+        levels = np.empty((len(sh), sh.shape[1] - 1, 3), np.uint8)
+
+        def fill(start: int) -> None:
+            some = slice(start, start + _BLOCK)
+            levels[some] = _levels_of_values(fixed[some, 1:])
+
+        with thread_pool(request.threads) as pool:
+            list(pool.map(fill, range(0, len(sh), _BLOCK)))
+        return fixed, levels
 
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
         """Levels of the constant coefficients, then the bytes."""

@@ -32,6 +32,7 @@ from potr_cl.stages.fitting.fit import Fitted
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.pruning.unseen import Unseen
+from potr_cl.stages.refit import Refit
 from potr_cl.stages.refitting.photographs import PhotographChoice
 from potr_cl.stages.refitting.refit import Refitted
 from potr_cl.stages.stage import Interlude, Progress, Stage, State, Workbench
@@ -309,6 +310,7 @@ class Run:
             tell=self._watch.tell,
             output=options.output,
             kept=self._kept,
+            photographs=next((each.ground_truth for each in options.stages if isinstance(each, Refit)), None),
         )
         if not stage.asked_for:
             return state

@@ -75,7 +75,7 @@ class Rasterizer(Owner):
                 self._scene, self._owns = scene, False
             else:
                 self._scene, self._owns = uploaded(device, scene), True
-            self._sh = self._scene.sh
+            self._replaced: cl.Buffer | None = None  # other SH coefficients than the scene's
             self._other_sh = Memory(device)
             self._launcher = launcher_for(device, rules)
             self._filter_macros = _filter_macros(self._scene)
@@ -274,7 +274,7 @@ class Rasterizer(Owner):
     @property
     def sh(self) -> cl.Buffer:
         """The SH coefficients that splats have now, as :class:`~potr_cl.raster.scene_buffers.SceneBuffers` has them."""
-        return self._sh
+        return self._scene.sh if self._replaced is None else self._replaced
 
     def replace_sh(self, sh: FloatArray) -> cl.Buffer | None:
         """Give the scene other SH coefficients, (N, M, 3) float32 of the same degree.
@@ -285,8 +285,8 @@ class Rasterizer(Owner):
             The buffer of the former coefficients, which is the caller's to free; None if they are those of a scene that
             lay on the device already, and stay there.
         """
-        former = self._sh
-        self._sh = self._scene.other_sh(self._other_sh, sh)
+        former = self.sh
+        self._replaced = self._scene.other_sh(self._other_sh, sh)
         if former is not self._scene.sh:
             return self._other_sh.release(former)
         return self._scene.release_sh() if self._owns else None
@@ -311,7 +311,7 @@ class Rasterizer(Owner):
     ) -> None:
         self._projection.bind(
             **self._scene.geometry,
-            sh=self._sh if sh is None else sh,
+            sh=self.sh if sh is None else sh,
             views=views.table,
             shapes=views.shapes if shapes is None else shapes,
             colours=views.colours if colours is None else colours,
@@ -355,6 +355,14 @@ class Rasterizer(Owner):
             raise
         self._frame = views
         return views
+
+    def rest(self) -> None:
+        """Give the scratch memory back until it is needed again; of frames and pictures nothing is left."""
+        if self._frame is not None:
+            self._frame.close()
+            self._frame = None
+        for scratch in (self._bounds, self._counts, self._keys, self._image, self._transmittance):
+            scratch.close()
 
     def close(self) -> None:
         if self._frame is not None:

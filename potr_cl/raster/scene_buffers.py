@@ -59,6 +59,15 @@ class SceneBuffers(Owner):
         self.sh_count = sh_count
         self.antialiased, self.low_pass = antialiased, low_pass
         self._memory = Memory(device)
+        self.wake()
+
+    def wake(self) -> None:
+        """Take the memory again that :meth:`rest` has given back; the splats have to be written anew.
+
+        Raises:
+            DeviceError: the scene does not fit the device.
+        """
+        sh_count = self.sh_count
         try:
             self.means = self._columns(3, 0, "the centres")
             self.scales = self._columns(3, 0, "the scales")
@@ -192,6 +201,46 @@ class SceneBuffers(Owner):
                 )
             self.device.queue.finish()
 
+    def gather(self, scene: SceneBuffers, splats: NDArray[np.int64]) -> None:
+        """Take all parameters from another scene on the same device.
+
+        Args:
+            scene: of the same SH degree.
+            splats: (N,) the numbers there of these splats.
+
+        Raises:
+            DeviceError: there is no room for the numbers, or the device failed.
+        """
+        device = self.device
+        gather = device.shared_kernel("raster/gather_columns.cl", "gather_columns")
+        columns = {"means": 3, "scales": 3, "quaternions": 4, "log2_opacities": 1, "sh": 3 * self.sh_count}
+        with Memory(device) as memory:
+            numbers = memory.upload(splats.astype(np.uint32), "the numbers of some splats")
+            for name, count in columns.items():
+                gather.bind(
+                    columns=getattr(scene, name),
+                    stride=scene.stride,
+                    numbers=numbers,
+                    count=self.splats,
+                    result_stride=self.stride,
+                    result=getattr(self, name),
+                )
+                gather.launch((self.stride, count), (SPLAT_GROUP, 1))
+            with device.errors("cannot take a part of a scene"):
+                device.queue.finish()
+
+    def write(self, scene: Scene) -> None:
+        """Set all parameters to those of a scene of the host, of the same SH degree.
+
+        Raises:
+            DeviceError: there is no room for them beside the scene.
+        """
+        self.write_rows(self.means, scene.means, "the centres")
+        self.write_rows(self.scales, activated_scales(scene.log_scales), "the scales")
+        self.write_rows(self.quaternions, unit_quaternions(scene.quaternions), "the rotations")
+        self.write_rows(self.log2_opacities, log2_opacities(scene.opacity_logits)[:, None], "the opacities")
+        self.write_sh(self.sh, scene.sh)
+
     def write_sh(self, parameter: cl.Buffer, sh: FloatArray) -> None:
         """Set SH coefficients, (N, M, 3) float32 of any strides.
 
@@ -225,6 +274,15 @@ class SceneBuffers(Owner):
         cl.enqueue_fill_buffer(self.device.queue, buffer, np.float32(value), 0, 4 * number * self.stride)
         return buffer
 
+    def rest(self) -> None:
+        """Give the memory back until :meth:`wake`."""
+        self.close()
+
+    @property
+    def rests(self) -> bool:
+        """Whether there is no memory now."""
+        return not self._memory.nbytes
+
     def close(self) -> None:
         self._memory.close()
 
@@ -243,25 +301,9 @@ def gathered(scene: SceneBuffers, splats: NDArray[np.int64]) -> SceneBuffers:
     Raises:
         DeviceError: they do not fit the device beside the scene.
     """
-    device = scene.device
-    part = SceneBuffers(device, len(splats), scene.sh_count, scene.antialiased, scene.low_pass)
+    part = SceneBuffers(scene.device, len(splats), scene.sh_count, scene.antialiased, scene.low_pass)
     try:
-        gather = device.shared_kernel("raster/gather_columns.cl", "gather_columns")
-        columns = {"means": 3, "scales": 3, "quaternions": 4, "log2_opacities": 1, "sh": 3 * scene.sh_count}
-        with Memory(device) as memory:
-            numbers = memory.upload(splats.astype(np.uint32), "the numbers of some splats")
-            for name, count in columns.items():
-                gather.bind(
-                    columns=getattr(scene, name),
-                    stride=scene.stride,
-                    numbers=numbers,
-                    count=len(splats),
-                    result_stride=part.stride,
-                    result=getattr(part, name),
-                )
-                gather.launch((part.stride, count), (SPLAT_GROUP, 1))
-            with device.errors("cannot take a part of a scene"):
-                device.queue.finish()
+        part.gather(scene, splats)
     except BaseException:
         part.close()
         raise
@@ -276,11 +318,7 @@ def uploaded(device: Device, scene: Scene) -> SceneBuffers:
     """
     buffers = SceneBuffers(device, len(scene), scene.sh.shape[1], scene.antialiased, scene.low_pass)
     try:
-        buffers.write_rows(buffers.means, scene.means, "the centres")
-        buffers.write_rows(buffers.scales, activated_scales(scene.log_scales), "the scales")
-        buffers.write_rows(buffers.quaternions, unit_quaternions(scene.quaternions), "the rotations")
-        buffers.write_rows(buffers.log2_opacities, log2_opacities(scene.opacity_logits)[:, None], "the opacities")
-        buffers.write_sh(buffers.sh, scene.sh)
+        buffers.write(scene)
     except BaseException:
         buffers.close()
         raise

@@ -17,11 +17,13 @@ from potr_cl.host.signals import first_interrupt_asks
 from potr_cl.model.views_between import views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family
+from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.fit import FitOptions, FitProgress, Fitted, SupportsBool, fit_scene, held_out_error
 from potr_cl.stages.prune import Prune
-from potr_cl.stages.refitting.targets import RenderedTargets, Targets
+from potr_cl.stages.refitting.photographs import hold_out
+from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
 #: Times the threshold of pruning up to which a fit makes up for splats, about (docs/benchmarks/fit.md): for this
@@ -31,7 +33,7 @@ FURTHER, _AT_THRESHOLD, _MOST_FURTHER = 3.5, 10**-9.3, 20.0
 #: By how much of its way to 1 the q is higher whose steps give about the PSNR that q has without a fit.
 FINER = 0.18
 #: Steps that "auto" stands for.
-STEPS: dict[Family, int] = {"cpu": 500, "gpu": 1200}
+STEPS: dict[Family, int] = {"cpu": 1000, "gpu": 1200}
 #: Views between for each given one that a fit looks at: they keep it from fitting the given ones too closely.
 BETWEEN: dict[Family, float] = {"cpu": 1.0, "gpu": 3.0}
 #: Part of the steps in each cycle but the last.
@@ -54,18 +56,22 @@ class LeftOut:
     Attributes:
         why: as people are told it.
         ended_early: whether someone has asked it to end.
+        photographs: what a fit did that had photographs as its targets; None if there was none.
     """
 
     why: str
     ended_early: bool = False
+    photographs: Fitted | None = None
 
     @property
     def facts(self) -> dict[str, Any]:
         """All by name."""
-        return {"left_out": self.why}
+        photographs = None if self.photographs is None else self.photographs.facts
+        return {"left_out": self.why, "ended_early": self.ended_early, "photographs": photographs}
 
     def __str__(self) -> str:
-        return f"the fit was left out: {self.why}"
+        more = "" if self.photographs is None else f"; to photographs {self.photographs}"
+        return f"the fit was left out: {self.why}{more}"
 
 
 def _steps(text: str) -> int | Literal["auto"]:
@@ -94,6 +100,7 @@ class Fit(Stage):
         iterations: of the pruning in each of them.
         between: views between that the fit looks at, for each given view, unless there are more already. "auto": as
             many as pay on the device.
+        to_photographs: part of the rates with which the fit goes on to photographs, where the re-fit has some.
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -120,6 +127,7 @@ class Fit(Stage):
     cycles: int = option(2)
     iterations: int = option(16)
     between: float | Literal["auto"] = option("auto")
+    to_photographs: float = option(0.3)
     batch: int = option(FitOptions.batch)
     rounds: int = option(FitOptions.rounds)
     patience: int = option(FitOptions.patience)
@@ -186,7 +194,8 @@ class Fit(Stage):
             rasterizer = stack.enter_context(Rasterizer(bench.opened, source, background=bench.background))
             asked = stack.enter_context(first_interrupt_asks())
             found = self._cycles(self._looking_between(state, bench), bench, rasterizer, asked)
-        return dataclasses.replace(found, views=state.views, added=state.added)
+            found = dataclasses.replace(found, views=state.views, added=state.added)
+            return found if asked or bench.photographs is None else self._to_photographs(found, bench, asked)
 
     def _looking_between(self, state: State, bench: Workbench) -> State:
         """The state with the views that the fit looks at."""
@@ -239,6 +248,28 @@ class Fit(Stage):
         first = max(int(_FIRST * steps), 1)
         return [*[first] * (cycles - 1), max(steps - first * (cycles - 1), 1)]
 
+    def _to_photographs(self, state: State, bench: Workbench, asked: SupportsBool) -> State:
+        """Go on with photographs as the targets, as long as others that are held out are matched better."""
+        assert bench.photographs is not None
+        given = state.views[: len(state.views) - state.added]
+        photographs = GroundTruth(bench.photographs, given, bench.background)
+        fit_to, judging = hold_out(photographs.of(given))
+        views = [*fit_to, *judging]
+        options = self._options(bench.opened.family, bench.memory)
+        rates = {each.name: self.to_photographs * getattr(self.rates, each.name) for each in dataclasses.fields(Rates)}
+        fitted = fit_scene(
+            bench.opened, state.scene, views, GroundTruthTargets(bench.opened, photographs, views),
+            dataclasses.replace(options, rates=self._sparse(Rates(**rates), state)), 0, bench.background, None,
+            bench.tell, asked, range(len(fit_to), len(views)),
+        )  # fmt: skip
+        told: Fitted | LeftOut = dataclasses.replace(state.learnt[self.name], photographs=fitted)
+        scene = fitted.scene if fitted.kept else state.scene
+        return dataclasses.replace(state, scene=scene, geometry=None).having_learnt(self.name, told)
+
+    def _sparse(self, rates: Rates, state: State) -> Rates:
+        """The rates, without those that would change coefficients which compaction has chosen."""
+        return dataclasses.replace(rates, ac=0.0) if "compact" in state.learnt else rates
+
     def _pruned(self, state: State, limit: float, bench: Workbench) -> State:
         """The state without the splats that a fit will make up for."""
         parameters = dataclasses.replace(bench.parameters, delta_mse_max=limit)
@@ -256,8 +287,7 @@ class Fit(Stage):
         asked: SupportsBool,
     ) -> Fitted:
         options = dataclasses.replace(self._options(bench.opened.family, bench.memory), steps=steps)
-        if "compact" in state.learnt:
-            options = dataclasses.replace(options, rates=dataclasses.replace(options.rates, ac=0.0))
+        options = dataclasses.replace(options, rates=self._sparse(options.rates, state))
         return fit_scene(
             bench.opened, state.scene, state.views, targets, options, state.added, bench.background, progress,
             bench.tell, asked,

@@ -9,8 +9,9 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray
+from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
@@ -90,8 +91,8 @@ class Refit(Stage):
         None,
         Flag(
             "--photos",
-            "photographs, named after the views: re-fit to them instead, for truth rather than fidelity, if some that "
-            "are held out are matched better so",
+            "photographs, named after the views: re-fit (and with --fit, fit) to them instead, for truth rather than "
+            "fidelity, if some that are held out are matched better so",
             "DIR",
             Path,
             default="the uncompressed scene's pictures",
@@ -123,15 +124,17 @@ class Refit(Stage):
         """
         bench.progress("refit", 0.0)
         parameters = bench.parameters
-        geometry = state.geometry
-        if geometry is None or geometry.asked != parameters:
-            geometry = bench.output.geometry(state.scene, bench.request(state))
-        rounded = geometry
-        decoded = geometry.decoded(state.scene.sh)
         compacted = "compact" in state.learnt
         active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
         options = RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory)
+        on_grid = bench.output.on_grid(bench.request(state))
         fits = 1 if self.ground_truth is None else 2
+
+        def on_geometry() -> tuple[Rounded, Scene]:
+            geometry = state.geometry
+            if geometry is None or geometry.asked != parameters:
+                geometry = bench.output.geometry(state.scene, bench.request(state))
+            return geometry, geometry.decoded(state.scene.sh)
 
         def fitted(views: Sequence[Camera], targets: Targets, number: int) -> tuple[Refitted, Rounded]:
             geometry = rounded
@@ -150,7 +153,6 @@ class Refit(Stage):
                 geometry, grid = bench.output.colour_grid(rounded, effects, bench.request(state))
                 return grid
 
-            on_grid = bench.output.on_grid(bench.request(state))
             found = refit_colours(
                 bench.opened, decoded, views, targets, options, active, bench.background, progress,
                 fix_ac=None if on_grid or not bench.output.fixes_ac else fix_ac,
@@ -166,7 +168,16 @@ class Refit(Stage):
             stack.callback(bench.progress, "refit", 1.0)
             source = bench.drawable(state.source)
             rasterizer = stack.enter_context(Rasterizer(bench.opened, source, background=bench.background))
-            refitted, geometry = fitted(state.views, RenderedTargets(rasterizer, state.views), 0)
+            renders = stack.enter_context(RenderedTargets(rasterizer, state.views))
+            if on_grid:
+                # The host rounds the geometry by itself, so the device may begin with the pictures.
+                waiting = in_background(on_geometry)
+                if not bench.pool:
+                    renders.render_ahead()
+                rounded, decoded = waiting.result()
+            else:
+                rounded, decoded = on_geometry()
+            refitted, geometry = fitted(state.views, renders, 0)
             choice = None
             if self.ground_truth is not None:
                 given = state.views[: len(state.views) - state.added]

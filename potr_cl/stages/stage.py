@@ -12,6 +12,7 @@ import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field
+from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
 
 import numpy as np
@@ -112,6 +113,7 @@ class Workbench:
         output: the kind of file that is made in the end.
         progress: called to say how far the work is.
         tell: called with a line about the work that progress has no place for.
+        photographs: folder of the given views' photographs, where truth is wanted rather than fidelity.
         kept: the uncompressed scene, where it stays on the device from one stage to the next.
         pool: workers that views are shared out to; None: the device does all of them.
     """
@@ -127,6 +129,7 @@ class Workbench:
     tell: Callable[[str], None] = lambda line: None
     output: Output = field(default_factory=Potr)
     kept: KeptScene | None = None
+    photographs: Path | None = None
     pool: Pool | None = None
 
     def drawable(self, scene: Scene) -> Drawable:

@@ -245,6 +245,9 @@ class _HeldThere(Held):
     def begin(self, command: str, args: Sequence[Any]) -> Future[Any]:
         return self._pool.begin(lambda: self._worker.ask("run", self._number, command, tuple(args)))
 
+    def abandon(self) -> None:
+        """The seat goes with the pool."""
+
     def close(self) -> None:
         with suppress(PotrError):
             self._pool.begin(lambda: self._worker.ask("drop", self._number)).result()

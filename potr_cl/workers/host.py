@@ -39,10 +39,15 @@ class HostPool(Pool):
                 )
         self.first = devices[0]
         self.traffic = Traffic()
-        self._workers: list[Worker] = [_Thread(device, number) for number, device in enumerate(devices[1:], 1)]
+        self._workers = [_Thread(device, number) for number, device in enumerate(devices[1:], 1)]
+        # The first device may have room where another one has not.
+        self._reserve = _Thread(devices[0], 0)
 
     def workers(self) -> list[Worker]:
         return list(self._workers)
+
+    def reserve(self) -> list[Worker]:
+        return [self._reserve]
 
     def shared(self, thing: Any) -> AbstractContextManager[Shared]:
         return nullcontext(Shared(thing))  # threads see what the master sees
@@ -52,8 +57,7 @@ class HostPool(Pool):
         return (f"0: {self.first.info}", *(worker.name for worker in self._workers))
 
     def close(self) -> None:
-        for worker in self._workers:
-            assert isinstance(worker, _Thread)
+        for worker in [*self._workers, self._reserve]:
             worker.close()
 
 

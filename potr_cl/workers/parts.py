@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
+from types import TracebackType
 from typing import Any
 
 from potr_cl.errors import DeviceError, PotrError
@@ -95,6 +96,7 @@ class Parts(Owner):
         found: list[Any] = [None]
 
         def take(_place: int, result: Any) -> None:
+            self._pool.traffic.received += nbytes(result)
             found[0] = result
 
         future = self._begin(place, command, args)
@@ -107,18 +109,27 @@ class Parts(Owner):
         if self._pending is not None:
             self._pending.results()
 
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self._end(abandoned=kind is not None and not issubclass(kind, Exception))
+
     def close(self) -> None:
         """Have the workers forget the parts."""
+        self._end(abandoned=False)
+
+    def _end(self, abandoned: bool) -> None:
         self._pending = None
         held, self._held = self._held, [None] * len(self._given)
         for making in self._making:  # an error came between
             with suppress(PotrError):
-                held.append(making.result())
+                if not abandoned:
+                    held.append(making.result())
         self._making = []
         for each in held:
             if each is not None:
                 with suppress(PotrError):
-                    each.close()
+                    each.abandon() if abandoned else each.close()
 
     # ------------------------------------------------------------------------------------------------ their parts
 
@@ -132,8 +143,12 @@ class Parts(Owner):
         self._held[place] = held
 
     def _able(self) -> list[Worker]:
-        """Workers that have neither been lost nor failed with a part of this work."""
-        return [worker for worker in self._pool.workers() if worker.name not in self._unfit]
+        """Workers that have neither been lost nor failed with a part of this work; without any, the reserve."""
+        for workers in (self._pool.workers, self._pool.reserve):
+            able = [worker for worker in workers() if worker.name not in self._unfit]
+            if able:
+                return able
+        return []
 
     def _collect(
         self,

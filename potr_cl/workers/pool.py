@@ -48,6 +48,10 @@ class Held(ABC):
     def close(self) -> None:
         """Have the worker forget the part; a worker that is gone is none to wait for."""
 
+    def abandon(self) -> None:
+        """The same after Ctrl-C, when nobody waits for what the worker is doing just now."""
+        self.close()
+
 
 class Worker(ABC):
     """One that computes.
@@ -115,6 +119,10 @@ class Pool(ABC):
         Raises:
             WorkerLost: none is left.
         """
+
+    def reserve(self) -> list[Worker]:
+        """Who does the work of lost workers when none is left."""
+        return []
 
     @abstractmethod
     def shared(self, thing: Any) -> AbstractContextManager[Shared]:

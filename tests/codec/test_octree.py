@@ -152,3 +152,18 @@ def test_a_multiplicity_that_lies_takes_no_memory():
     hostile = dataclasses.replace(streams, multiplicities=np.array([2**63], np.uint64))
     with pytest.raises(DataError, match="the header says 5"):
         octree.parse(hostile, 5)
+
+
+@pytest.mark.parametrize("different", [1, 2, 50, 5000, 10**6])
+def test_splats_of_one_cell_keep_their_order(different):
+    """Whatever the sort does with equal keys: in the file they follow each other as in the scene."""
+    rng = np.random.default_rng(different)
+    places = rng.uniform(-1, 1, (different, 3)).astype(np.float32)
+    rows = rng.integers(0, different, 20_000)
+    streams, order = octree.build(places[rows], 0.01)
+    means = octree.parse(streams, len(rows))
+    assert np.array_equal(np.sort(order), np.arange(len(rows)))
+    same_leaf = (means[1:] == means[:-1]).all(axis=1)
+    same_place = (rows[order][1:] == rows[order][:-1]) & same_leaf
+    assert (np.diff(order)[same_place] > 0).all()
+    assert same_place.any()

@@ -7,6 +7,7 @@ import dataclasses
 import numpy as np
 import pytest
 
+from potr_cl.model import splat_groups, unseen
 from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
 from potr_cl.reference.scenes import plain_splats, random_splats, ring_of_cameras, straight_camera
 
@@ -56,3 +57,13 @@ def test_shares_of_area():
     scene = plain_splats(np.zeros((3, 3)), [[1.0, 1.0, 0.1], [2.0, 1.0, 0.1], [1.0, 0.1, 0.1]], [0.0, 0.0, 30.0])
     areas = opacity_weighted_areas(scene)
     np.testing.assert_allclose(areas / areas[0], [1, 2, 0.2], rtol=1e-5)
+
+
+def test_groups_of_neighbours_change_nothing(monkeypatch, plush_excerpt, plush_excerpt_cameras):
+    """Large scenes are looked at group by group: the same splats are found."""
+    cameras = [dataclasses.replace(c, fx=40 * c.fx, fy=40 * c.fy) for c in plush_excerpt_cameras[:4]]
+    wanted = unseen_splats(plush_excerpt, cameras)
+    assert 0 < wanted.sum() < len(plush_excerpt)
+    monkeypatch.setattr(unseen, "_BLOCK", 100)
+    monkeypatch.setattr(splat_groups, "_GROUP", 16)
+    assert np.array_equal(unseen_splats(plush_excerpt, cameras), wanted)

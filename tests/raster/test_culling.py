@@ -7,10 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from potr_cl.model import splat_groups
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.raster import culling
-from potr_cl.raster.culling import SplatGroups, parts_of_views, work
+from potr_cl.model.splat_groups import SplatGroups
+from potr_cl.raster.culling import parts_of_views, work
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import GSPLAT, INRIA, RasterRules
 from potr_cl.reference.captures import looking
@@ -104,7 +105,7 @@ def test_every_splat_is_in_one_group():
 
 def test_parts_have_all_views_and_what_they_see(monkeypatch):
     scene = clusters(6)
-    monkeypatch.setattr(culling, "_GROUP", 64)
+    monkeypatch.setattr(splat_groups, "_GROUP", 64)
     cameras = wide_and_narrow(scene, 40, 7, (0.05, 0.1))
     groups = SplatGroups.of(scene)
     parts = parts_of_views(scene, cameras, INRIA.near)

@@ -7,11 +7,11 @@ import dataclasses
 import numpy as np
 import pytest
 
+from potr_cl.model import splat_groups
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster import culling
 from potr_cl.raster.culling import parts_of_views
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
@@ -36,7 +36,7 @@ def device(request):
 
 @pytest.fixture(autouse=True)
 def _small_groups(monkeypatch):
-    monkeypatch.setattr(culling, "_GROUP", 32)
+    monkeypatch.setattr(splat_groups, "_GROUP", 32)
 
 
 def street(houses: int = 5, splats: int = 300) -> tuple[Scene, list[Camera]]:

@@ -6,6 +6,7 @@ import dataclasses
 import io
 import time
 from collections.abc import Callable, Iterator
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -264,6 +265,37 @@ def test_a_dropped_file_is_shown_and_hostile_names_are_text(viewer, page, data):
     assert page.title() != "1"
     viewer.put("B", exhibit)
     until(lambda: viewer.session.exhibit("B") is exhibit)
+
+
+#: Notes when the page hands a word of its camera to the worker that sends it.
+SPY = """window.told = []; const post = Worker.prototype.postMessage;
+Worker.prototype.postMessage = function (data, ...rest) {
+  if (data && data.message && data.message.type === "ViewerCameraMessage") window.told.push(performance.now());
+  return post.call(this, data, ...rest);
+};"""
+
+
+def test_the_camera_is_told_as_often_as_screens_show_pictures(viewer, browser):
+    context = browser.new_context(viewport={"width": WIDTH, "height": HEIGHT})
+    tab = context.new_page()
+    tab.add_init_script(SPY)
+    try:
+        tab.goto(viewer.url)
+        until(lambda: tab.locator(".potr-figures b").count() > 0)
+        tab.mouse.move(200, 330)
+        tab.mouse.down()
+        gaps: list[float] = []
+        end = time.monotonic() + 60
+        while not (gaps and min(gaps) < 1000 / 60) and time.monotonic() < end:
+            for step in range(40):
+                tab.mouse.move(200 + 2 * step, 330 + step % 7)
+            told = tab.evaluate("window.told")
+            gaps = [later - before for before, later in pairwise(told)]
+        tab.mouse.up()
+        assert min(gaps) < 1000 / 60, "viser's page tells no sooner than after 20 ms"
+    finally:
+        context.close()
+        until(lambda: len(viewer.painter.visitors) < 2)
 
 
 def test_on_a_phone_nothing_hides_the_divider(viewer, browser):

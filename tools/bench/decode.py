@@ -8,7 +8,8 @@ pruning by the presets best and fast. Parts (default: all but roads and device):
 speed    decodes in this process, in turn by NumPy and by the native path, with one thread and with one a processor;
          wall time and processor time
 memory   host memory that a decode takes at most, beside what it makes; a process each
-command  `decode FILE -o scene.ply` as a fresh process; the decoded scene is written as PLY too
+command  `decode FILE -o scene.ply` as a fresh process; the decoded scene is written as PLY too. Python finds its
+         modules compiled, as `pip install` leaves them
 versions the same splats in files of version 2 and of version 3: bytes, how fast they are coded and decoded, in turn
 roads    the tokens of the context coder alone: by NumPy, by the native path, and by OpenCL kernels of both families on
          the devices given, with what a fresh process pays for a context and for loading the kernels
@@ -236,9 +237,7 @@ def command(results: Results, files: Iterable[Path], args: argparse.Namespace) -
     )
     for path in files:
         with tempfile.TemporaryDirectory() as folder:
-            output = Path(folder, "scene.ply")
-
-            works = {way: partial(_whole_command, path, way, output) for way in PATHS}
+            works = {way: partial(_whole_command, path, way, Path(folder)) for way in PATHS}
             in_turn(works, 1)
             times = in_turn(works, args.runs)
         wall, used = ({way: statistics.median(times[way][k]) for way in PATHS} for k in (0, 1))
@@ -248,8 +247,10 @@ def command(results: Results, files: Iterable[Path], args: argparse.Namespace) -
         )  # fmt: skip
 
 
-def _whole_command(path: Path, way: str, output: Path) -> None:
-    environment = {**os.environ, VARIABLE: PATHS[way], "PYTHONPATH": str(ROOT)}
+def _whole_command(path: Path, way: str, folder: Path) -> None:
+    compiled = {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(folder / "compiled")}
+    environment = {**os.environ, **compiled, VARIABLE: PATHS[way], "PYTHONPATH": str(ROOT)}
+    output = folder / "scene.ply"
     whole = [sys.executable, "-m", "potr_cl", "decode", str(path), "-o", str(output)]
     subprocess.run(whole, check=True, capture_output=True, env=environment)
     output.unlink()

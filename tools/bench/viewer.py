@@ -8,7 +8,7 @@ whatever it takes, then as users have it, at the size that keeps the pictures co
 for each scene, both scenes are shown under the divider too.
 
 A picture is made when the camera has moved, so there cannot be more of them than ``--said``, the times a second that
-the tab says where its camera is. viser's page says it at most 50 times a second.
+the tab says where its camera is. The page in a browser says it at most 66 times a second.
 """
 
 from __future__ import annotations

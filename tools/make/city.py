@@ -179,7 +179,8 @@ def _entry(number: int, camera: Camera) -> dict[str, Any]:
     }
 
 
-def _building(source: str) -> Building:
+def building_of(source: str) -> Building:
+    """That of a folder with point_cloud.ply and cameras.json, or of "scene.ply,cameras.json"."""
     file, _, cameras = source.partition(",")
     scene = Path(file)
     if not cameras:
@@ -198,7 +199,7 @@ def main() -> None:
     parser.add_argument("--size", default="1600x1064", metavar="WxH")
     args = parser.parse_args()
     width, height = map(int, args.size.split("x"))
-    city = City([_building(source) for source in args.scenes], int(args.splats))
+    city = City([building_of(source) for source in args.scenes], int(args.splats))
     cameras = [
         *city.views(args.views, width, height, "train", args.across),
         *city.views(args.test_views, width, height, "test", args.across),

@@ -672,8 +672,8 @@ def note(worst: dict[str, Worst], found: Measures, name: str) -> None:
 # ------------------------------------------------------------------------------------------ the run
 
 
-def run_device(device: Device, examples: int) -> dict[str, Any]:
-    """All cases, then ``examples`` attempts at each measure."""
+def run_device(device: Device, examples: int, only: str = "") -> dict[str, Any]:
+    """All cases, then ``examples`` attempts at each measure whose name begins with ``only``."""
     worst: dict[str, Worst] = {}
 
     def view(case: Case) -> Measures:
@@ -692,7 +692,10 @@ def run_device(device: Device, examples: int) -> dict[str, Any]:
     )
     for run, cases in lists:
         for case in cases:
-            note(worst, run(case), case.name)
+            found = run(case)
+            if not any(measure.startswith(only) for measure in found):
+                break  # the list is of other kernels
+            note(worst, {measure: pair for measure, pair in found.items() if measure.startswith(only)}, case.name)
     searches: dict[str, tuple[Callable[[Any], Measures], st.SearchStrategy[Any]]] = {
         measure: (view, small_scenes()) for measure in WHAT
     }
@@ -700,12 +703,15 @@ def run_device(device: Device, examples: int) -> dict[str, Any]:
     searches["re-fit: optimum"] = searches["re-fit: loss"] = problem, refit_problems()
     failures = {}
     for measure, (run, strategy) in searches.items():
+        if not measure.startswith(only):
+            continue
         if examples:
             search(measure, strategy, run, worst, examples)
         if measure in worst and not worst[measure].ratio <= limit(measure):
             smallest = smallest_failure(measure, strategy, run, 10 * examples) if examples else None
             failures[measure] = smallest or worst[measure].ratio_at
-    return {"worst": {name: dataclasses.asdict(w) for name, w in worst.items()}, "failures": failures}
+    kept = {name: dataclasses.asdict(w) for name, w in worst.items() if name.startswith(only)}
+    return {"worst": kept, "failures": failures}
 
 
 def families(info: DeviceInfo) -> tuple[str, ...]:
@@ -713,12 +719,12 @@ def families(info: DeviceInfo) -> tuple[str, ...]:
     return ("cpu", "gpu") if info.family == "cpu" else ("gpu",)
 
 
-def in_process(info: DeviceInfo, family: str, examples: int) -> dict[str, Any]:
+def in_process(info: DeviceInfo, family: str, examples: int, only: str = "") -> dict[str, Any]:
     """The run in a process of its own, so that a runtime that crashes is one line of the table."""
     with tempfile.TemporaryDirectory() as folder:
         path = Path(folder) / "result.json"
         command = [sys.executable, "-m", "tools.stress.run", "--device", str(info.index), "--family", family]
-        command += ["--examples", str(examples), "--json", str(path)]
+        command += ["--examples", str(examples), "--only", only, "--json", str(path)]
         done = subprocess.run(command, capture_output=True, text=True, check=False)
         if done.returncode:
             message = done.stderr.strip().splitlines()
@@ -748,13 +754,14 @@ def print_report(results: list[dict[str, Any]]) -> None:
             f"| {by_ratio['ratio']:.2g} | {shortened(by_ratio['ratio_at'])} | {sum(w['checked'] for w in rows)} |"
         )
     print("\nWorst error (worst ratio) by device:\n")
-    print("| device | kernels | " + " | ".join(WHAT) + " |")
-    print("|---" * (len(WHAT) + 2) + "|")
+    measured = [measure for measure in WHAT if any(measure in r["worst"] for r in sound)]
+    print("| device | kernels | " + " | ".join(measured) + " |")
+    print("|---" * (len(measured) + 2) + "|")
     for r in results:
         if "failed" in r:
-            print(f"| {r['device']} | {r['family']} | failed: {r['failed']}" + " |" * len(WHAT))
+            print(f"| {r['device']} | {r['family']} | failed: {r['failed']}" + " |" * len(measured))
             continue
-        found = [r["worst"].get(measure) for measure in WHAT]
+        found = [r["worst"].get(measure) for measure in measured]
         cells = (f"{w['error']:.0e} ({w['ratio']:.1g})" if w else "" for w in found)
         print(f"| {r['device']} | {r['family']} | " + " | ".join(cells) + " |")
     failures = [(r, *failure) for r in sound for failure in r["failures"].items()]
@@ -772,6 +779,7 @@ def main() -> None:
     parser.add_argument("--device", type=int, help="index of one device; default: every one there is")
     parser.add_argument("--family", choices=("cpu", "gpu"), help="one family of kernels; default: all that run")
     parser.add_argument("--examples", type=int, default=100, help="attempts of the search at every measure")
+    parser.add_argument("--only", default="", metavar="PREFIX", help="measures whose names begin so, such as fit")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--from", dest="kept", type=Path, nargs="+", help="results of earlier runs, instead of a run")
     args = parser.parse_args()
@@ -785,9 +793,9 @@ def main() -> None:
             if args.family not in (None, family):
                 continue
             if args.device is None:
-                result = in_process(info, family, args.examples)
+                result = in_process(info, family, args.examples, args.only)
             else:
-                result = run_device(Device(info, family=family), args.examples)  # type: ignore[arg-type]
+                result = run_device(Device(info, family=family), args.examples, args.only)  # type: ignore[arg-type]
             results.append({**circumstances(info), "device": str(info), "family": family, **result})
             print(f"{info}, {family} kernels: done", file=sys.stderr, flush=True)
             if args.json is not None:

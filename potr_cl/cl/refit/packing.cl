@@ -80,3 +80,11 @@ kernel void add_sums(
         if (may_change(active, stride, splat, column))
             columns[column * stride + splat] += packed[place++];
 }
+
+/* Sums from a place on += more: one number a work-item. */
+kernel void add_rows(global long *sums, ulong start, global const long *more, ulong count)
+{
+    const size_t i = get_global_id(0);
+    if (i < count)
+        sums[start + i] += more[i];
+}

@@ -26,6 +26,7 @@ from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.errors import DataError
 
 I16 = NDArray[np.int16]
+I32 = NDArray[np.int32]
 I64 = NDArray[np.int64]
 Integers = NDArray[np.signedinteger]
 
@@ -197,34 +198,32 @@ class _Run:
                 self._terms[stream.name] = np.full(splats, stream.sizes[0], np.int16)
             return [np.zeros(splats, np.int16) for _ in streams_of(*key)]
         words = section.of(self._first, self._last)
-        return [self._stream(key, words, fitted, self._bundles.dense, self._terms) for fitted in section.streams] + (
-            self._finished(words, section)
-        )
+        return [
+            self._stream(key, words, fitted, self._bundles.dense, self._sums(fitted, self._terms))
+            for fitted in section.streams
+        ] + self._finished(words, section)
 
     def _finished(self, words: Words, section: Section) -> list[Integers]:
         if not words.all_taken:
             raise DataError(f"section '{section.what}' does not end where its last token does")
         return []
 
-    def _stream(
-        self,
-        key: Key,
-        words: Words,
-        fitted: Fitted,
-        layout: Layout,
-        terms: dict[str, I16],
-        which: NDArray[np.integer] | None = None,
-    ) -> I64:
-        """Integers of a stream, mapped to unsigned; their sizes become a term."""
-        base = np.full(int(layout.counts.sum()), fitted.constant, np.int64)
-        for name, weight in zip(fitted.stream.terms, fitted.terms.tolist(), strict=True):
-            if weight:
-                base += np.multiply(terms[name], weight, dtype=np.int64)
-        if which is not None:
-            base += fitted.biases[which]
+    def _stream(self, key: Key, words: Words, fitted: Fitted, layout: Layout, base: I32) -> Integers:
+        """Integers of a stream, mapped to unsigned; their sizes become a term. ``base``: (items,) weighted sums."""
         tokens, integers = decode_stream(layout, base, fitted, self._chain(key), words)
-        terms[fitted.stream.name] = fitted.stream.sizes.astype(np.int16).take(tokens)
+        self._terms[fitted.stream.name] = fitted.stream.sizes.astype(np.int16).take(tokens)
         return integers
+
+    def _sums(self, fitted: Fitted, terms: dict[str, I16]) -> I32:
+        """(n,) of each splat: weighted sums of those terms of a stream that there are, and its constant.
+
+        They are below 2^31: sizes are below 2^10, sums of sizes below 2^14, weights 2^15.
+        """
+        sums = np.full(self._bundles.splats, fitted.constant, np.int32)
+        for name, weight in zip(fitted.stream.terms, fitted.terms.tolist(), strict=True):
+            if weight and name in terms:
+                sums += np.multiply(terms[name], weight, dtype=np.int32)
+        return sums
 
     def _find_steps(self) -> None:
         """What the steps of splats' colours tell of them."""
@@ -246,26 +245,47 @@ class _Run:
         first, end = band(key[1])
         words = section.of(self._first, self._last)
         mask, pattern, *values = section.streams
-        masks = self._stream(key, words, mask, self._bundles.dense, terms)
-        bits = np.unpackbits(masks.astype(np.uint8)[:, None], axis=1, bitorder="little")[:, : end - first]
-        splat, which = (where.astype(np.int32) for where in np.nonzero(bits))
-        at_items = {name: terms[name][splat] for name in (*(f"sum {c}" for c in range(3)), "mask", "step")}
+        masks = self._stream(key, words, mask, self._bundles.dense, self._sums(mask, terms))
+        splat, which = _items(masks.astype(np.uint8), end - first)
+        of_splats = {name: terms[name] for name in (*(f"sum {c}" for c in range(3)), "mask", "step")}
+
+        def base(fitted: Fitted, at: NDArray[np.integer] | slice, of_items: dict[str, I16]) -> I32:
+            """Of some items: what their splats tell, then what they do themselves."""
+            sums: I32 = self._sums(fitted, of_splats).take(splat[at])
+            sums += fitted.biases.astype(np.int32).take(which[at])
+            for name, weight in zip(fitted.stream.terms, fitted.terms.tolist(), strict=True):
+                if weight and name in of_items:
+                    sums += np.multiply(of_items[name][at], weight, dtype=np.int32)
+            return sums
+
         layout = self._bundles.items(splat)
-        patterns = self._stream(key, words, pattern, layout, at_items, which)
+        patterns = self._stream(key, words, pattern, layout, base(pattern, slice(None), {})).astype(np.uint8)
+        del layout
         wide = np.result_type(*(integer_type(fitted.alphabet) for fitted in values))
         channels = np.zeros((3, len(splat)), wide)
-        sizes = [np.zeros(len(splat), np.int16) for _ in range(3)]
+        of_items = {"pattern": terms["pattern"]}
         for c, fitted in enumerate(values):
-            (there,) = np.nonzero(patterns >> c & 1)
-            at_values = {name: at_items[name][there] for name in at_items}
-            at_values.update({f"value {b}": sizes[b][there] for b in range(c)})
-            integers = self._stream(key, words, fitted, self._bundles.items(splat[there]), at_values, which[there])
-            sizes[c][there] = at_values[f"value {c}"]
+            there = np.flatnonzero((patterns >> np.uint8(c) & np.uint8(1)).view(bool))
+            integers = self._stream(
+                key, words, fitted, self._bundles.items(splat[there]), base(fitted, there, of_items)
+            )
+            of_items[f"value {c}"] = np.zeros(len(splat), np.int16)
+            of_items[f"value {c}"][there] = terms[f"value {c}"]
             channels[c, there] = _signed(integers + 1)
         self._finished(words, section)
         for c in range(3):
-            terms[f"sum {c}"] += np.bincount(splat, weights=sizes[c], minlength=splats).astype(np.int16)
-        self.levels.ac.append(Items(splat, (which + first).astype(np.uint8), channels))
+            sizes = of_items[f"value {c}"]
+            terms[f"sum {c}"] += np.bincount(splat, weights=sizes, minlength=splats).astype(np.int16)
+        self.levels.ac.append(Items(splat, which + np.uint8(first), channels))
+
+
+def _items(masks: NDArray[np.uint8], width: int) -> tuple[NDArray[np.int32], NDArray[np.uint8]]:
+    """The bits of some masks of so many: the place of each one's mask, and which bit it is."""
+    bits = np.ascontiguousarray(np.unpackbits(masks[:, None], axis=1, bitorder="little")[:, :width]).view(bool)
+    places = np.flatnonzero(bits).astype(np.int32)
+    splat = places // np.int32(width)
+    places -= splat * np.int32(width)
+    return splat, places.astype(np.uint8)
 
 
 def _levels_of(reader: Reader, file: BundledFile, bundle: int, wanted: Wanted, work: NDArray[np.uint8]) -> Levels:

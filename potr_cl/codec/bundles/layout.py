@@ -88,9 +88,9 @@ class Layout:
         idle.ravel()[self.places] = False
         return idle
 
-    def laid(self, values: NDArray[Any]) -> NDArray[Any]:
-        """(items,) to (rows, columns), 0 where there is no item."""
-        rows = np.zeros(self.shape, values.dtype)
+    def laid(self, values: NDArray[Any], dtype: type[np.generic] | None = None) -> NDArray[Any]:
+        """(items,) to (rows, columns), of another type if one is given; 0 where there is no item."""
+        rows = np.zeros(self.shape, dtype or values.dtype)
         rows.ravel()[self.places] = values
         return rows
 

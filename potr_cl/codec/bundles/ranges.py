@@ -46,16 +46,17 @@ class Words:
         shape = (len(counts), LANES)
         self._low, self._full = np.empty(shape, bool).ravel(), np.empty(shape, np.int64).ravel()
         self._ranks, self._taken = np.empty(shape, np.int64), np.empty(shape, np.int64)
+        self._found = np.empty(shape, np.int64).ravel()
 
     def renormalise(self, states: I64) -> None:
         """Give a word to every state (bundles · LANES,) that needs one; :meth:`check` tells if there were enough."""
         low = np.less(states, LOWEST, out=self._low)
         # Lane after lane of a bundle: the first that needs a word has rank 1.
-        ranks = low.reshape(-1, LANES).cumsum(axis=1, out=self._ranks)
+        ranks = np.add.accumulate(low.reshape(-1, LANES), axis=1, out=self._ranks)
         np.add(ranks, self._next[:, None], out=self._taken)
         self._next += ranks[:, -1]
         full = np.left_shift(states, 16, out=self._full)
-        full |= self._words.take(self._taken.ravel(), mode="clip")
+        full |= self._words.take(self._taken.ravel(), None, self._found, "clip")
         np.copyto(states, full, where=low)
 
     def check(self) -> None:
@@ -73,7 +74,7 @@ class Words:
 
 
 def decode_stream(
-    layout: Layout, base: I64, fitted: Fitted, states: I64, words: Words
+    layout: Layout, base: NDArray[np.integer], fitted: Fitted, states: I64, words: Words
 ) -> tuple[U8, NDArray[np.signedinteger]]:
     """Decode a stream.
 
@@ -100,7 +101,7 @@ def decode_stream(
     partly = set(np.flatnonzero(idle.any(axis=1)).tolist())
     # Little is done in a step, so that what numpy takes to be called is most of the time: no call too many.
     multiply, add, subtract, shift, mask = np.multiply, np.add, np.subtract, np.right_shift, np.bitwise_and
-    for t, (expected, slot) in enumerate(zip(layout.laid(base), slots, strict=True)):
+    for t, (expected, slot) in enumerate(zip(layout.laid(base, np.int64), slots, strict=True)):
         multiply(recent, weight, a)
         add(a, expected, a)
         shift(a, CONTEXT_SHIFT, a)

@@ -8,6 +8,8 @@ its twin in Python:
 ``context.c``         :mod:`potr_cl.codec.context`: tokens of lanes, and what they stand for
 ``encode.c``          :mod:`potr_cl.codec.context`, :mod:`potr_cl.codec.rans`: an encoder's contexts and range coding
 ``bundles.c``         :mod:`potr_cl.codec.bundles`: a bundle's integers
+``steps.c``           :mod:`potr_cl.codec.steps.rule`: classes of the steps of colours
+``bundles_tokens.c``   :mod:`potr_cl.codec.bundles.ranges`: tokens of the streams of a bundle
 ``bundles_values.c``  :mod:`potr_cl.codec.bundled_scene`: their values, while they are in a cache
 ``bundles_encode.c``  :mod:`potr_cl.codec.bundles.encoder`: what contexts are fitted to, and range coding
 ``bundles_fit.c``     :mod:`potr_cl.codec.bundles.fitting`: contexts from counts

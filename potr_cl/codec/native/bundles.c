@@ -7,6 +7,7 @@
 #include <string.h>
 
 #include "bundles_tokens.h"
+#include "steps.h"
 
 /* A stream of some items: from w->expected, where the sums of terms, constant and bias stand in rows, to w->tokens, to
  * `sizes`, which has room for as many rows, and, where tokens have bits beside them, to w->extra. Returns 0, or 1 if
@@ -109,54 +110,19 @@ static int dense_section(
     return r->read == r->available ? FINE : TOO_MANY_WORDS;
 }
 
-/* About 16 · log2(4 · level), linear between powers of two; 0 for level 0. Levels are below 2^30. */
-static INLINE int32_t logarithm(int32_t level)
-{
-    const uint32_t quarters = level > 0 ? 4 * (uint32_t)level : 1;
-    int exponent = 0;
-    for (uint32_t rest = quarters >> 1; rest; rest >>= 1)
-        exponent++;
-    return 16 * exponent + (int32_t)(((uint64_t)(quarters - (1u << exponent)) * 16) >> exponent);
-}
-
-static INLINE uint8_t class_of(int64_t weight, int32_t power, int32_t offset)
-{
-    const int64_t class = (weight * power + offset) >> 6;
-    return (uint8_t)((class < -CLASSES ? -CLASSES : class > CLASSES - 1 ? CLASSES - 1 : class) + CLASSES);
-}
-
-/* Classes of the steps of splats' colours (docs/format.md, "Steps of colours"). */
+/* Classes of the steps of splats' colours. */
 static void find_steps(const colour_steps *steps, uint64_t begin, size_t splats, work *w)
 {
     if (!steps->groups) {
         memset(w->dc_classes, CLASSES, sizeof w->dc_classes);
         memset(w->ac_classes, CLASSES, sizeof w->ac_classes);
     } else {
-        const int64_t first = (int64_t)steps->first_knot << steps->knot_shift;
-        const int64_t most = first + ((int64_t)1 << (4 + steps->knot_shift)) - 1;
         const size_t rows = steps_of(splats);
-        for (size_t splat = 0, place = 0, lane = 0, step = 0; splat < splats; splat++) {
-            const int32_t x = w->scales[0][place], y = w->scales[1][place], z = w->scales[2][place];
-            const int32_t a = x < ENOUGH ? w->logarithms[x] : logarithm(x);
-            const int32_t b = y < ENOUGH ? w->logarithms[y] : logarithm(y);
-            const int32_t c = z < ENOUGH ? w->logarithms[z] : logarithm(z);
-            const int32_t low = a < b ? a : b, high = a < b ? b : a;
-            const int32_t largest = high > c ? high : c, smallest = low < c ? low : c;
-            const int32_t between = a + b + c - largest - smallest;
-            int64_t level = w->opacity[place] < most ? w->opacity[place] : most;
-            level = level > first ? level - first : 0;
-            const int64_t knot = level >> steps->knot_shift, part = level - (knot << steps->knot_shift);
-            int64_t weight = (steps->scales[0] * largest + steps->scales[1] * between + steps->scales[2] * smallest) >> 8;
-            weight += steps->knots[knot];
-            weight += (part * (steps->knots[knot + 1] - steps->knots[knot])) >> steps->knot_shift;
-            weight += 8 * steps->groups[(begin + splat) >> steps->group_bits];
-            w->dc_classes[place] = class_of(weight, steps->powers[0], steps->offsets[0]);
-            w->ac_classes[place] = class_of(weight, steps->powers[1], steps->offsets[1]);
-            place += LANES;
-            if (++step == rows) {
-                step = 0;
-                place = ++lane;
-            }
+        for (size_t step = 0; step < rows; step++) {
+            const size_t at = step * LANES, count = (splats - step + rows - 1) / rows;
+            const int32_t *const scales[3] = { w->scales[0] + at, w->scales[1] + at, w->scales[2] + at };
+            find_classes(steps, w->logarithms, scales, w->opacity + at, begin + step, rows, count,
+                w->dc_classes + at, w->ac_classes + at);
         }
     }
     for (size_t i = 0; i < BUNDLE; i++)
@@ -374,8 +340,7 @@ POTR_EXPORT void potr_bundles_begin(work *w)
 {
     for (unsigned mask = 0; mask < 128; mask++)
         list_bits(mask, &w->coefficient_bytes[mask]);
-    for (int32_t level = 0; level < ENOUGH; level++)
-        w->logarithms[level] = (int16_t)logarithm(level);
+    list_logarithms(w->logarithms);
 }
 
 /* Where a bundle's integers go. */

@@ -108,6 +108,23 @@ class _Values(ctypes.Structure):
     )
 
 
+def native_steps(steps: ColourSteps, splats: int) -> _Steps:
+    """What C takes of the steps of colours of N splats; the array of their groups must be kept."""
+    # Both are checked where steps are read, and once more: C shifts by them.
+    if not 0 <= steps.group_bits <= 40 or not 0 <= steps.knot_shift <= 40:
+        raise TypeError("the native path was given impossible steps")
+    return _Steps(
+        address(steps.groups, np.int8, -(-splats >> steps.group_bits)),
+        steps.group_bits,
+        steps.knot_shift,
+        steps.first_knot,
+        steps.powers,
+        steps.offsets,
+        steps.scales,
+        steps.opacities,
+    )
+
+
 @dataclass(frozen=True)
 class StreamModel:
     """What C takes of a stream.
@@ -269,21 +286,12 @@ class BundledFile:
             self._file.rotation_states = self._keep(sections[SECTIONS - 1].states.astype(np.uint32), np.uint32, lanes)
 
         if steps is not None:
-            self._take_steps(steps)
+            self._kept.append(steps.groups)
+            self._file.steps = native_steps(steps, splats)
 
-    def _take_steps(self, steps: ColourSteps) -> None:
-        to = self._file.steps
-        # Both are checked where steps are read, and once more: C shifts by them.
-        if not 0 <= steps.group_bits <= 40 or not 0 <= steps.knot_shift <= 40:
-            raise TypeError("the native path was given impossible steps")
-        to.groups = self._keep(np.ascontiguousarray(steps.groups), np.int8, -(-self._splats >> steps.group_bits))
-        to.group_bits, to.knot_shift, to.first_knot = steps.group_bits, steps.knot_shift, steps.first_knot
-        to.powers[:], to.offsets[:] = list(steps.powers), list(steps.offsets)
-        to.scales[:], to.knots[:] = list(steps.scales), list(steps.opacities)
-
-    def _keep(self, array: NDArray[Any], dtype: type[np.generic], number: int) -> int:
+    def _keep(self, array: NDArray[Any], dtype: type[np.generic], number: int, writable: bool = False) -> int:
         self._kept.append(array)
-        return address(array, dtype, number)
+        return address(array, dtype, number, writable)
 
     def _describe(self, to: _Stream, model: StreamModel) -> None:
         contexts, alphabet = model.frequencies.shape
@@ -296,19 +304,13 @@ class BundledFile:
         frequencies = np.ascontiguousarray(model.frequencies, np.uint16)
         sizes = np.zeros(_TOKENS, np.int16)
         sizes[: len(model.sizes)] = model.sizes
-        if self._c["potr_bundles_table"](
-            address(frequencies, np.uint16, frequencies.size),
-            contexts,
-            alphabet,
-            address(sizes, np.int16, _TOKENS),
-            address(slots, np.uint8, len(slots), True),
-            address(intervals, np.uint32, len(intervals), True),
-        ):
+        to.slots = self._keep(slots, np.uint8, len(slots), True)
+        to.intervals = self._keep(intervals, np.uint32, len(intervals), True)
+        to.sizes = self._keep(sizes, np.int16, _TOKENS)
+        rows = address(frequencies, np.uint16, frequencies.size)
+        if self._c["potr_bundles_table"](rows, contexts, alphabet, to.sizes, to.slots, to.intervals):
             raise TypeError("the native path was given frequencies that do not add up")
         to.classes = self._keep(model.classes, np.uint8, 256)
-        to.slots = self._keep(slots, np.uint8, len(slots))
-        to.intervals = self._keep(intervals, np.uint32, len(intervals))
-        to.sizes = self._keep(sizes, np.int16, _TOKENS)
         to.weights[: len(model.terms)] = list(model.terms)
         to.biases[: len(model.biases)] = list(model.biases)
         to.recent, to.constant, to.alphabet = model.recent, model.constant, alphabet

@@ -128,14 +128,28 @@ static void colours_of_items(const work *w, size_t band, const float *divisors, 
     const uint16_t *const places = w->places[band];
     const uint8_t *const coefficients = w->coefficients[band];
     const int32_t *const y = w->channels[band][0], *const co = w->channels[band][1], *const cg = w->channels[band][2];
-    const size_t first = (band + 1) * (band + 1) - 1;
-    for (size_t i = 0; i < w->items[band]; i++) {
-        float *const to = out + 3 * (first + coefficients[i]) * all + places[i] % LANES * steps + places[i] / LANES;
-        const float divisor = divisors[w->ac_classes[places[i]]];
-        const int32_t rest = y[i] - cg[i];
-        to[0] = (float)(rest + co[i]) / divisor;
-        to[all] = (float)(y[i] + cg[i]) / divisor;
-        to[2 * all] = (float)(rest - co[i]) / divisor;
+    const size_t first = (band + 1) * (band + 1) - 1, items = w->items[band];
+    for (size_t begin = 0; begin < items; begin += LANE) {
+        const size_t number = items - begin < LANE ? items - begin : LANE;
+        float divisor[LANE], red[LANE], green[LANE], blue[LANE];
+        uint64_t at[LANE];
+        for (size_t i = 0; i < number; i++) {
+            const size_t place = places[begin + i];
+            divisor[i] = divisors[w->ac_classes[place]];
+            at[i] = 3 * (first + coefficients[begin + i]) * all + place % LANES * steps + place / LANES;
+        }
+        for (size_t i = 0; i < number; i++) {
+            const int32_t rest = y[begin + i] - cg[begin + i];
+            red[i] = (float)(rest + co[begin + i]) / divisor[i];
+            green[i] = (float)(y[begin + i] + cg[begin + i]) / divisor[i];
+            blue[i] = (float)(rest - co[begin + i]) / divisor[i];
+        }
+        for (size_t i = 0; i < number; i++) {
+            float *const to = out + at[i];
+            to[0] = red[i];
+            to[all] = green[i];
+            to[2 * all] = blue[i];
+        }
     }
 }
 

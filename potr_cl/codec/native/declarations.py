@@ -39,6 +39,7 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_bundles_table": (_NUMBER, [_POINTER, _SIZE, _SIZE, *[_POINTER] * 3]),
     "potr_bundles_vectors": (_NUMBER, []),
     "potr_bundles_work": (_SIZE, []),
+    "potr_steps_classes": (None, [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _POINTER]),
     "potr_bundles_begin": (None, [_POINTER]),
     "potr_bundles_levels": (_NUMBER, [_POINTER, _WORD, _NUMBER, _NUMBER, *[_POINTER] * 3]),
     "potr_bundles_values": (_NUMBER, [_POINTER, _WORD, _NUMBER, _NUMBER, *[_POINTER] * 3]),

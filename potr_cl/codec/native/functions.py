@@ -14,7 +14,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.native.arrays import KINDS, address, addresses, kind_of
-from potr_cl.codec.native.bundles import BundledFile, SectionWords
+from potr_cl.codec.native.bundles import BundledFile, SectionWords, native_steps
 from potr_cl.codec.native.bundles_encode import BundleEncoder
 from potr_cl.codec.native.declarations import declared
 from potr_cl.codec.native.octree import OctreeFunctions
@@ -334,6 +334,29 @@ class Functions:
             address(levels, np.int64, channels * number, True),
         )
         return levels
+
+    def step_classes(self, steps: ColourSteps, scales: I32, opacities: I32) -> tuple[I8, I8]:
+        """(N,) classes of the steps of DC, and of AC.
+
+        Args:
+            steps: of colours.
+            scales: (3, N) levels, 0 to 2^29 - 1.
+            opacities: (N,) levels, 0 to 2^29 - 1.
+        """
+        n = len(opacities)
+        for levels in (scales, opacities):
+            if int(levels.min(initial=0)) < 0 or int(levels.max(initial=0)) >= _MEDIUM:
+                raise TypeError("the native path was given levels that are negative or too large")
+        dc, ac = np.empty((2, n), np.int8)
+        self._c["potr_steps_classes"](
+            ctypes.byref(native_steps(steps, n)),
+            address(scales, np.int32, 3 * n),
+            address(opacities, np.int32, n),
+            n,
+            address(dc, np.int8, n, True),
+            address(ac, np.int8, n, True),
+        )
+        return dc, ac
 
     def look_up(self, levels: NDArray[Any], table: F32, out: F32, column: int) -> int:
         """Values of unsigned levels from a table into a column of ``out`` (n, columns).

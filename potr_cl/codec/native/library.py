@@ -33,7 +33,7 @@ def native() -> Functions | None:
         )
     if asked == "0":
         return None
-    functions = _loaded(os.environ.get(LIBRARY_VARIABLE) or _built())
+    functions = _loaded(os.environ.get(LIBRARY_VARIABLE) or _found())
     if functions is None and asked == "1":
         raise UsageError(
             f"{VARIABLE} is 1, but the compiled library is missing: unset it, or install potr_cl with a C compiler"
@@ -46,8 +46,17 @@ def vectors() -> bool:
     return os.environ.get(VECTORS_VARIABLE) != "0"
 
 
+_paths: list[str] = []
+
+
+def _found() -> str | None:
+    """The library beside this file, which is looked for until it is there: decoders ask some fifty times a file."""
+    if not _paths and (path := _built()) is not None:
+        _paths.append(path)
+    return _paths[0] if _paths else None
+
+
 def _built() -> str | None:
-    """The library beside this file."""
     for suffix in importlib.machinery.EXTENSION_SUFFIXES:
         path = Path(__file__).with_name(f"_library{suffix}")
         if path.is_file():

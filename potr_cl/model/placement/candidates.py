@@ -130,5 +130,6 @@ def views_from(
     # In the image's inscribed circle; a little beyond it, in the corners, counts no less than it costs.
     inside = ahead >= 1 / math.hypot(1, tangent)
     worth = np.where(inside, shown[:, None], 0).T.astype(np.float32)
-    bins = (towards.astype(np.float32) @ _BIN_DIRECTIONS.T).argmax(axis=1).astype(np.uint8)
+    # Without BLAS, whose threads would wait for each other where several threads ask.
+    bins = np.einsum("kj,bj->kb", towards.astype(np.float32), _BIN_DIRECTIONS).argmax(axis=1).astype(np.uint8)
     return aims, worth, bins

@@ -97,6 +97,7 @@ class Fitted:
         ended_early: whether someone has asked it to end.
         spared: how many splats were removed before it for it to make up for.
         without: the error of these views before those were removed; None where none were.
+        photographs: what a further fit did that had photographs as its targets; None if there was none.
     """
 
     scene: Scene
@@ -107,6 +108,7 @@ class Fitted:
     ended_early: bool = False
     spared: int = 0
     without: float | None = None
+    photographs: Fitted | None = None
 
     @property
     def error(self) -> float:
@@ -122,7 +124,8 @@ class Fitted:
     def facts(self) -> dict[str, Any]:
         """All but the scene, by name."""
         names = ("steps", "kept", "held_out", "ended_early", "spared", "without")
-        return {name: getattr(self, name) for name in names} | {"errors": list(self.errors)}
+        facts = {name: getattr(self, name) for name in names} | {"errors": list(self.errors)}
+        return facts | {"photographs": None if self.photographs is None else self.photographs.facts}
 
     def __str__(self) -> str:
         before, after = self.psnr
@@ -133,6 +136,8 @@ class Fitted:
         said = f"{steps}: PSNR {before:.2f} dB before, {after:.2f} dB after, {views}"
         if self.spared and self.without is not None:
             said += f"; {_decibels(self.without):.2f} dB with {self.spared:,} splats more, without it"
+        if self.photographs is not None:
+            said += f"; to photographs {self.photographs}"
         return said
 
 
@@ -157,6 +162,7 @@ def fit_scene(
     progress: FitProgress | None = None,
     tell: Callable[[str], None] | None = None,
     asked: SupportsBool = False,
+    held_out: Sequence[int] | None = None,
 ) -> Fitted:
     """Fit all parameters of a scene to pictures of some views.
 
@@ -171,14 +177,18 @@ def fit_scene(
         progress: called after each step.
         tell: called with a line for each round.
         asked: whether to end before the next step, with the best of the whole rounds; looked at after each.
+        held_out: numbers of the views to judge by; None: some of the given ones.
 
     Raises:
         UsageError: there are fewer than two given views, so that none can be held out.
         DeviceError: the scene does not fit the device.
     """
     options = options or FitOptions()
-    fit_to, held_out = share_out(len(cameras) - added, added)
-    if not held_out:
+    if held_out is None:
+        fit_to, held_out = share_out(len(cameras) - added, added)
+    else:
+        fit_to = [number for number in range(len(cameras)) if number not in set(held_out)]
+    if not held_out or not fit_to:
         raise UsageError("a fit needs two training views or more: one of them is held out and tells whether it helps")
     free = device.info.memory - device.allocated
     with (

@@ -14,7 +14,7 @@ from potr_cl.stages.pruning.part import RemovalPart
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.shared_removal import SharedRemoval
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.pruning.visible_parts import PartedRemoval, parts_worth_it
+from potr_cl.stages.pruning.visible_parts import PartedRemoval, parts_worth_it, whole_on_device
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.workers.dealing import shares
 from potr_cl.workers.parts import Parts
@@ -41,7 +41,7 @@ def measurement(state: State, bench: Workbench, options: SweepOptions) -> Iterat
         if pool is None or share is None or not share.others:
             parts = parts_worth_it(state.scene, views, options)
             if parts is not None:
-                whole = bench.drawable(state.scene)
+                whole = stack.enter_context(whole_on_device(device, bench.drawable(state.scene)))
                 yield stack.enter_context(
                     PartedRemoval(device, state.scene, whole, views, parts, options, bench.background, progress)
                 )

@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Staging
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.changes import pack_changes
 from potr_cl.stages.pruning.removal import RemovalSweep
@@ -50,8 +51,8 @@ class RemovalPart(Part):
         with ExitStack() as owned:
             rasterizer = owned.enter_context(Rasterizer(device, scene, background=background))
             self._sweep = owned.enter_context(RemovalSweep(rasterizer, cameras, options, numbers=numbers))
+            self._staging = owned.enter_context(Staging(device))
             self._owned = owned.pop_all()
-        self._device = device
         self._sent: NDArray[np.int64] | None = None
         self._told: tuple[int, Iterator[tuple[int, Indices, NDArray[np.float64]]]] | None = None
 
@@ -65,12 +66,12 @@ class RemovalPart(Part):
         return self.steers
 
     def measure(self) -> NDArray[np.int64]:
-        """(N, 2) int64, the totals of these views in units of the fixed point of all."""
+        """(N, 2) int64, the totals of these views in units of the fixed point of all; valid until the next call."""
         steering = self._sweep.steering
         if steering is None:
             return self._sweep.measure_totals()
         steering.measure_on_device()
-        totals: NDArray[np.int64] = self._device.download(steering.totals, (self._sweep.splats, 2), np.int64)
+        totals: NDArray[np.int64] = self._staging.download(steering.totals, (self._sweep.splats, 2), np.int64)
         return totals
 
     def measure_changes(self) -> bytes:
@@ -78,7 +79,7 @@ class RemovalPart(Part):
 
         See :func:`potr_cl.stages.pruning.changes.pack_changes`.
         """
-        totals = self.measure()
+        totals = self.measure().copy()
         if self._sent is None:
             self._sent = np.zeros_like(totals)
         changed = np.flatnonzero((totals != self._sent).any(axis=1) & self._sweep.alive)

@@ -118,6 +118,11 @@ class RemovalSweep(Owner):
         return (self._cached.tiles_swept + self._uncached.tiles_swept) / self._prepared.tiles
 
     @property
+    def projects(self) -> bool:
+        """Whether measurements project splats again; if not, the scene's parameters are not looked at any more."""
+        return bool(self._prepared.uncached) or self._prepared.geometry_is_shared
+
+    @property
     def alive(self) -> NDArray[np.bool_]:
         """(N,) which splats are left."""
         return self._survivors.alive

@@ -10,13 +10,14 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
@@ -24,7 +25,7 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.culling import ViewPart, parts_of_views, work
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
-from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, gathered, uploaded
+from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, uploaded
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
 from potr_cl.stages.pruning.steering import Steering
@@ -35,6 +36,10 @@ from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
 LEAST_SPLATS = 1 << 21
 #: Parts must save this much of the splats that views project, for their own copies and for what each part costs.
 _WORTH_IT = 0.5
+#: The parts' scenes stay on the device if they take no more than this part of the memory.
+_SCENES = 1 / 2
+#: The whole scene is on the device too where that has so many times as much memory.
+_WHOLE = 3
 
 _SOURCE = "prune/parts.cl"
 _GROUP = 64
@@ -49,17 +54,35 @@ def parts_worth_it(scene: Scene, cameras: Sequence[Camera], options: SweepOption
     return parts if work(parts) <= _WORTH_IT * len(scene) * len(cameras) else None
 
 
+@contextmanager
+def whole_on_device(device: Device, scene: Drawable) -> Iterator[Drawable]:
+    """The same scene where parts are filled from it quickest: on a GPU with memory of its own, if it fits."""
+    if isinstance(scene, SceneBuffers) or device.info.kind == "cpu" or device.info.integrated:
+        yield scene
+        return
+    found: Drawable = scene
+    with ExitStack() as stack:
+        if _WHOLE * scene.nbytes <= device.info.memory - device.allocated:
+            with suppress(DeviceMemoryError):
+                found = stack.enter_context(uploaded(device, scene))
+        yield found
+
+
 @dataclass(frozen=True)
 class _Part:
     """A part at work.
 
     Attributes:
         splats: their numbers in the scene, ascending.
-        sweep: measures its views.
-        numbers: the same in the device's memory, uint32.
+        scene: these splats on the device; they may rest.
+        rasterizer: of that scene.
+        sweep: measures the part's views.
+        numbers: the same as ``splats`` in the device's memory, uint32.
     """
 
     splats: Indices
+    scene: SceneBuffers
+    rasterizer: Rasterizer
     sweep: RemovalSweep
     numbers: cl.Buffer
 
@@ -96,11 +119,16 @@ class PartedRemoval(Owner):
         progress: Callable[[int, int], None] | None = None,
     ) -> None:
         self.splats = len(scene)
+        self._device, self._scene, self._whole = device, scene, whole
         self._fixed_point = FixedPoint.of_views(cameras)
         self._alive = np.ones(self.splats, bool)
         self._parts: list[_Part] = []
         self.steering: _PartedSteering | None = None
         left = default_memory(device) if options.memory is None else options.memory
+        sizes = [len(part.splats) * scene.nbytes // max(len(scene), 1) for part in parts]
+        #: Whether the parts' scenes are on the device only where they are needed.
+        self._rest = sum(sizes) > _SCENES * left
+        left = max(left - (max(sizes) if self._rest else sum(sizes)), 0)
         done = 0
 
         def report(some: int, _: int) -> None:
@@ -108,25 +136,45 @@ class PartedRemoval(Owner):
                 progress(done + some, len(cameras))
 
         with ExitStack() as owned:
-            memory = owned.enter_context(Memory(device))
+            self._memory = owned.enter_context(Memory(device))
             for place, part in enumerate(parts):
                 before = device.allocated
-                share = left * work([part]) / max(work(parts[place:]), 1)
-                drawable = owned.enter_context(_part_of(device, scene, whole, part.splats))
-                rasterizer = owned.enter_context(Rasterizer(device, drawable, background=background))
-                room = max(int(share) - (device.allocated - before), 0)
+                room = int(left * work([part]) / max(work(parts[place:]), 1))
+                own = SceneBuffers(device, len(part.splats), scene.sh.shape[1], scene.antialiased, scene.low_pass)
+                owned.enter_context(own)
+                nbytes = own.nbytes
+                self._fill(own, part.splats)
+                rasterizer = owned.enter_context(Rasterizer(device, own, background=background))
                 sweep = RemovalSweep(rasterizer, cameras, replace(options, memory=room), report, part.numbers)
                 owned.enter_context(sweep)
-                numbers = memory.upload(part.splats.astype(np.uint32), "the numbers of a part's splats")
-                self._parts.append(_Part(part.splats, sweep, numbers))
-                left = max(left - (device.allocated - before), 0)
+                numbers = self._memory.upload(part.splats.astype(np.uint32), "the numbers of a part's splats")
+                self._parts.append(_Part(part.splats, own, rasterizer, sweep, numbers))
+                self._lay_down(self._parts[-1])
+                left = max(left - (device.allocated - before - (0 if own.rests else nbytes)), 0)
                 done += len(part.numbers)
-            steerings = [part.sweep.steering for part in self._parts]
-            if all(steering is not None for steering in steerings):
-                self.steering = owned.enter_context(
-                    _PartedSteering(device, self.splats, self._fixed_point, self._parts)
-                )
+            if all(part.sweep.steering is not None for part in self._parts):
+                self.steering = owned.enter_context(_PartedSteering(self, device))
             self._owned = owned.pop_all()
+
+    @contextmanager
+    def awake(self, part: _Part) -> Iterator[None]:
+        """Make sure that a part's scene is on the device inside the block, if its measurement looks at it."""
+        if part.sweep.projects and part.scene.rests:
+            part.scene.wake()
+            self._fill(part.scene, part.splats)
+        yield
+        self._lay_down(part)
+
+    def _fill(self, part: SceneBuffers, splats: Indices) -> None:
+        if isinstance(self._whole, SceneBuffers):
+            part.gather(self._whole, splats)
+        else:
+            part.write(self._scene.subset(splats))
+
+    def _lay_down(self, part: _Part) -> None:
+        if self._rest:
+            part.rasterizer.rest()
+            part.scene.rest()
 
     @property
     def alive(self) -> NDArray[np.bool_]:
@@ -137,7 +185,8 @@ class PartedRemoval(Owner):
         """ΔMSE_k and I_k of all N splats, float64; the values of removed splats mean nothing."""
         totals = np.zeros((self.splats, 2), np.int64)
         for part in self._parts:
-            totals[part.splats] += part.sweep.measure_totals()
+            with self.awake(part):
+                totals[part.splats] += part.sweep.measure_totals()
         return self._fixed_point.values(totals)
 
     def remove(self, splats: Indices) -> None:
@@ -150,43 +199,47 @@ class PartedRemoval(Owner):
 
     def replace_sh(self, sh: FloatArray) -> None:
         """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
+        # The scenes' own colours are those of the targets: from now on both are needed.
+        self._rest = False
         for part in self._parts:
+            if part.scene.rests:
+                part.scene.wake()
+                self._fill(part.scene, part.splats)
             part.sweep.replace_sh(sh[part.splats])
 
     def view_importances(self) -> Iterator[tuple[int, Indices, F64]]:
         """See :meth:`potr_cl.stages.pruning.removal.RemovalSweep.view_importances`."""
         for part in self._parts:
-            part.sweep.sweep_changed()
-        yield from heapq.merge(*map(_importances, self._parts), key=lambda found: found[0])
+            with self.awake(part):
+                part.sweep.sweep_changed()
+        yield from heapq.merge(*map(self._importances, self._parts), key=lambda found: found[0])
+
+    def _importances(self, part: _Part) -> Iterator[tuple[int, Indices, F64]]:
+        known = part.sweep.known_importances()
+        while True:
+            with self.awake(part):
+                found = next(known, None)
+            if found is None:
+                return
+            number, seen, importances = found
+            yield number, part.splats[seen], importances
 
     def close(self) -> None:
         """Give all device memory back."""
         self._owned.close()
 
 
-def _importances(part: _Part) -> Iterator[tuple[int, Indices, F64]]:
-    for number, seen, importances in part.sweep.known_importances():
-        yield number, part.splats[seen], importances
-
-
-def _part_of(device: Device, scene: Scene, whole: Drawable, splats: Indices) -> SceneBuffers:
-    """Some splats on the device: from there, if the scene is there already."""
-    if isinstance(whole, SceneBuffers):
-        return gathered(whole, splats)
-    return uploaded(device, scene.subset(splats))
-
-
 class _PartedSteering(Owner):
     """A :class:`potr_cl.stages.pruning.steering.Steered` whose totals are the sums over all parts."""
 
-    def __init__(self, device: Device, splats: int, fixed_point: FixedPoint, parts: Sequence[_Part]) -> None:
-        self.device, self.splats, self.units = device, splats, fixed_point.units
-        self._parts = parts
-        stride = -(-splats // SPLAT_GROUP) * SPLAT_GROUP
+    def __init__(self, removal: PartedRemoval, device: Device) -> None:
+        self.device, self.splats, self.units = device, removal.splats, removal._fixed_point.units
+        self._removal, self._parts = removal, removal._parts
+        stride = -(-self.splats // SPLAT_GROUP) * SPLAT_GROUP
         self._memory = Memory(device)
         with device.all_or_nothing():
             self.totals: cl.Buffer = self._memory.upload(zero_totals(stride), "the removal effects")
-            self._survivors = Survivors(device, splats, stride, device.queue.finish)
+            self._survivors = Survivors(device, self.splats, stride, device.queue.finish)
             self._add, self._mark = (device.kernel(_SOURCE, name) for name in ("add_part", "mark_part"))
         self.marks: cl.Buffer = self._survivors.buffer
 
@@ -198,7 +251,8 @@ class _PartedSteering(Owner):
         cl.enqueue_fill_buffer(self.device.queue, self.totals, np.uint32(0), 0, self.totals.size)
         for part in self._parts:
             steering = _steering(part)
-            steering.measure_on_device()
+            with self._removal.awake(part):
+                steering.measure_on_device()
             count = len(part.splats)
             self._add.bind(totals=self.totals, part=steering.totals, numbers=part.numbers, count=count)
             self._add.launch((-(-count // _GROUP) * _GROUP,), (_GROUP,))

@@ -175,15 +175,10 @@ class Coefficients(Owner):
         return np.ascontiguousarray(self._columns_of(x)[:, :, : self.layout.splats].transpose(2, 0, 1))
 
     def write_columns(self, x: cl.Buffer, values: FloatArray) -> None:
-        """Set a vector from its columns, (3 M, N) float32, as :meth:`read_columns` gives them."""
-        columns = np.zeros((self.layout.columns, self.layout.stride), np.float32)
-        columns[:, : self.layout.splats] = values
-        cl.enqueue_copy(self.device.queue, x, columns, is_blocking=True)
-
-    def read_columns(self, x: cl.Buffer) -> FloatArray:
-        """(3 M, N) float32, the columns of a vector as they lie on the device."""
-        columns = self._columns_of(x).reshape(self.layout.columns, self.layout.stride)
-        return np.ascontiguousarray(columns[:, : self.layout.splats])
+        """Set a vector from its columns, (3 M, N) float32."""
+        for column, row in enumerate(values):
+            start = 4 * column * self.layout.stride
+            cl.enqueue_copy(self.device.queue, x, np.ascontiguousarray(row), dst_offset=start, is_blocking=True)
 
     def write_sh(self, x: cl.Buffer, sh: FloatArray) -> None:
         """Set a vector.

@@ -7,7 +7,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.model.scene import FloatArray
-from potr_cl.opencl.memory import Owner, Scratch
+from potr_cl.opencl.memory import Owner, Scratch, Staging
 from potr_cl.stages.refitting.coefficients import Coefficients
 
 _SOURCE = "refit/packing.cl"
@@ -34,8 +34,9 @@ class Packing(Owner):
         device = coefficients.device
         self._kernels = {
             name: device.kernel(_SOURCE, name, LANES=1, SH_COUNT=layout.sh_count)
-            for name in ("pack_floats", "unpack_floats", "pack_sums", "add_sums")
+            for name in ("pack_floats", "unpack_floats", "pack_sums", "add_sums", "add_rows")
         }
+        self._staging = Staging(device)
         self.flags: NDArray[np.uint32] | None = None
         self.count = 0
         self._places = Scratch(device, "the coefficients' places")
@@ -58,10 +59,10 @@ class Packing(Owner):
         self._know(flags)
 
     def floats(self, x: cl.Buffer) -> FloatArray:
-        """(count,) float32, a vector's active coefficients."""
+        """(count,) float32, a vector's active coefficients; valid until something else is packed."""
         self._packed.reserve(4 * self.count)
         self._launch("pack_floats", x)
-        packed: FloatArray = self._coefficients.device.download(self._packed.buffer, (self.count,), np.float32)
+        packed: FloatArray = self._staging.download(self._packed.buffer, (self.count,), np.float32)
         return packed
 
     def set_floats(self, x: cl.Buffer, packed: FloatArray) -> None:
@@ -70,16 +71,27 @@ class Packing(Owner):
         self._launch("unpack_floats", x)
 
     def sums(self, columns: cl.Buffer) -> NDArray[np.int64]:
-        """(count,) int64, sums over views of active coefficients; all sums become 0."""
+        """(count,) int64, sums over views of active coefficients; valid until something else is packed.
+
+        All sums become 0.
+        """
         self._packed.reserve(8 * self.count)
         self._launch("pack_sums", columns)
-        packed: NDArray[np.int64] = self._coefficients.device.download(self._packed.buffer, (self.count,), np.int64)
+        packed: NDArray[np.int64] = self._staging.download(self._packed.buffer, (self.count,), np.int64)
         return packed
 
     def add_sums(self, columns: cl.Buffer, packed: NDArray[np.int64]) -> None:
         """Add to sums over views."""
         self._upload(packed)
         self._launch("add_sums", columns)
+
+    def add_rows(self, sums: cl.Buffer, row: int, more: NDArray[np.int64]) -> None:
+        """Add whole rows, (rows, stride) int64, to sums from a row on."""
+        self._packed.reserve(more.nbytes)
+        self._copy_to(self._packed, more)
+        kernel = self._kernels["add_rows"]
+        kernel.bind(sums=sums, start=row * more.shape[1], more=self._packed.buffer, count=more.size)
+        kernel.launch((-(-more.size // _GROUP) * _GROUP,), (_GROUP,))
 
     def _know(self, flags: NDArray[np.uint32]) -> None:
         self.flags = flags
@@ -117,3 +129,4 @@ class Packing(Owner):
         """Give the device's memory back."""
         self._places.close()
         self._packed.close()
+        self._staging.close()

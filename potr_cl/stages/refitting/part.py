@@ -7,12 +7,13 @@ from contextlib import ExitStack
 from dataclasses import dataclass
 
 import numpy as np
+import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Memory
+from potr_cl.opencl.memory import Memory, Staging
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients, Layout
@@ -30,18 +31,15 @@ class Gradient:
     Attributes:
         errors: the squared error by W of each view, by number.
         sums: (active coefficients,) int64.
-        blocks: (M (M + 1) / 2, N) int64; None if they were not asked for.
     """
 
     errors: dict[int, float]
     sums: NDArray[np.int64]
-    blocks: NDArray[np.int64] | None
 
     @property
     def nbytes(self) -> int:
         """Bytes that travel."""
-        blocks = 0 if self.blocks is None else self.blocks.nbytes
-        return 16 * len(self.errors) + self.sums.nbytes + blocks
+        return 16 * len(self.errors) + self.sums.nbytes
 
 
 class ColourPart(Part):
@@ -86,31 +84,44 @@ class ColourPart(Part):
                 ColourMap(launcher, rasterizer, self._coefficients, scene.means, cameras, background, memory, numbers)
             )
             self._targets = RenderedTargets(of_source, cameras)
+            self._staging = owned.enter_context(Staging(device))
+            self._blocks = owned.enter_context(Memory(device))
+            self._block_sums: cl.Buffer | None = None
             self._owned = owned.pop_all()
 
     def gradient(self, x: FloatArray, flags: NDArray[np.uint32], blocks: bool, constant: bool) -> Gradient:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.gradient`.
 
         Args:
-            x: (3 M, N) float32, the columns of the coefficients.
+            x: (3 M, N or more) float32, the columns of the coefficients.
             flags: (2, N) uint32, which of them are active.
-            blocks: whether the splats' own blocks are wanted.
+            blocks: whether the splats' own blocks are wanted, see :meth:`block_rows`.
             constant: whether only the constant coefficients are active.
         """
+        self._forget_blocks()
         layout = self._coefficients.layout
         self._packing.give_flags(flags)
         self._coefficients.write_columns(self._x, x)
-        triangle = layout.sh_count * (layout.sh_count + 1) // 2
-        with Memory(self._device) as memory:
-            sums = None
-            if blocks:
-                sums = memory.allocate(8 * triangle * layout.stride, "the splats' normal equations")
-                self._coefficients.zero(sums)
-            errors = self._map.sum_gradient(self._x, self._targets, sums, constant)
-            found = None
-            if sums is not None:
-                found = self._device.download(sums, (triangle, layout.stride), np.int64)[:, : layout.splats]
-        return Gradient(errors, self._packing.sums(self._map.sums), found)
+        if blocks:
+            triangle = layout.sh_count * (layout.sh_count + 1) // 2
+            self._block_sums = self._blocks.allocate(8 * triangle * layout.stride, "the splats' normal equations")
+            self._coefficients.zero(self._block_sums)
+        errors = self._map.sum_gradient(self._x, self._targets, self._block_sums, constant)
+        return Gradient(errors, self._packing.sums(self._map.sums))
+
+    def block_rows(self, first: int, rows: int) -> NDArray[np.int64]:
+        """Some rows of the sums of the splats' own blocks after a gradient; valid until the next call.
+
+        Returns:
+            (rows, stride) int64, of packed upper triangles.
+        """
+        assert self._block_sums is not None, "the gradient was without blocks"
+        stride = self._coefficients.layout.stride
+        return self._staging.download(self._block_sums, (rows, stride), np.int64, 8 * first * stride)
+
+    def _forget_blocks(self) -> None:
+        self._blocks.close()
+        self._block_sums = None
 
     def normal(self, direction: FloatArray, unit: float, constant: bool) -> NDArray[np.int64]:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.normal`.
@@ -123,6 +134,7 @@ class ColourPart(Part):
         Returns:
             (active coefficients,) int64.
         """
+        self._forget_blocks()
         self._packing.set_floats(self._direction, direction)
         self._map.sum_normal(self._direction, self._x, unit, constant)
         return self._packing.sums(self._map.sums)

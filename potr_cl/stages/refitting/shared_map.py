@@ -11,7 +11,7 @@ import pyopencl as cl
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.opencl.memory import Owner
+from potr_cl.opencl.memory import Owner, Staging
 from potr_cl.raster.rules import RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.packing import Packing
@@ -19,6 +19,9 @@ from potr_cl.stages.refitting.part import ColourPart, Gradient
 from potr_cl.workers.dealing import Shares
 from potr_cl.workers.parts import Parts, Pending
 from potr_cl.workers.pool import Pool
+
+#: Bytes of the splats' own blocks that are added at a time.
+_AT_ONCE = 1 << 26
 
 
 class SharedViews(Owner):
@@ -35,12 +38,14 @@ class SharedViews(Owner):
     def __init__(self, coefficients: Coefficients, others: Parts) -> None:
         self._coefficients, self._others = coefficients, others
         self._packing = Packing(coefficients)
+        self._columns = Staging(coefficients.device)
         self._pending: Pending | None = None
 
     def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
         """Have them begin with a gradient at x."""
         self._packing.take_flags()
-        columns = self._coefficients.read_columns(x)
+        layout = self._coefficients.layout
+        columns = self._columns.download(x, (layout.columns, layout.stride), np.float32)[:, : layout.splats]
         flags = self._packing.flags
         self._pending = self._others.begin("gradient", columns, flags, blocks, constant, anew=True)
 
@@ -56,25 +61,31 @@ class SharedViews(Owner):
         for found in pending.results():
             if isinstance(found, Gradient):
                 errors |= found.errors
-                if blocks is not None and found.blocks is not None:
-                    self._add_blocks(blocks, found.blocks)
                 found = found.sums
             self._packing.add_sums(sums, found)
+        if blocks is not None:
+            for place in range(len(self._others)):
+                self._add_blocks(blocks, place)
         return errors
 
-    def _add_blocks(self, blocks: cl.Buffer, more: np.ndarray) -> None:
-        """Row by row: a second buffer of that size might not fit."""
-        device, layout = self._coefficients.device, self._coefficients.layout
-        for row, values in enumerate(more):
-            start = 8 * row * layout.stride
-            found = device.download(blocks, (layout.splats,), np.int64, start)
-            found += values
-            with device.errors("failed while computing"):
-                cl.enqueue_copy(device.queue, blocks, found, dst_offset=start, is_blocking=True)
+    def _add_blocks(self, blocks: cl.Buffer, place: int) -> None:
+        """Some rows at a time: all of them take more memory than anything else."""
+        layout = self._coefficients.layout
+        all_rows = layout.sh_count * (layout.sh_count + 1) // 2
+        rows = max(_AT_ONCE // (8 * layout.stride), 1)
+        for first in range(0, all_rows, rows):
+            count = min(rows, all_rows - first)
+            more = self._others.ask(place, "block_rows", first, count)
+            if more.shape[1] != layout.stride:  # another device pads otherwise
+                padded = np.zeros((count, layout.stride), np.int64)
+                padded[:, : layout.splats] = more[:, : layout.splats]
+                more = padded
+            self._packing.add_rows(blocks, first, more)
 
     def close(self) -> None:
         """Give the master's device memory back; the parts are the caller's."""
         self._packing.close()
+        self._columns.close()
 
 
 @contextmanager

@@ -8,8 +8,11 @@ import numpy as np
 import pytest
 from scipy.spatial import cKDTree
 
+from potr_cl.codec import octree
 from potr_cl.errors import DataError
 from potr_cl.formats import load_scene, scene_writer
+from potr_cl.formats.scenes.compressed_ply_chunks import in_chunks
+from potr_cl.formats.scenes.compressed_ply_values import CHUNK
 from potr_cl.reference.scenes import random_scene
 
 pytest.importorskip("gsply", reason="the extra convert is not installed")
@@ -25,6 +28,21 @@ def test_bounds_of_a_compressed_ply_hold_neighbours(tmp_path):
     distances, index = cKDTree(means).query(load_scene(path).means)
     assert len(np.unique(index)) == len(means)
     assert distances.mean() < 0.2 / 1023
+
+
+def test_chunks_are_more_compact_than_runs_of_a_curve():
+    rng = np.random.default_rng(0)
+    means = np.concatenate([rng.normal(at, 0.3, (5000, 3)) for at in rng.uniform(-5, 5, (9, 3))]).astype(np.float32)
+    means[::7, 1] = 0.25  # many alike
+
+    def area(order):
+        chunks = [means[order[start : start + CHUNK]] for start in range(0, len(means), CHUNK)]
+        return sum(len(each) * (np.ptp(each, axis=0) ** 2).sum() for each in chunks)
+
+    order = in_chunks(means, threads=1)
+    assert np.array_equal(np.sort(order), np.arange(len(means)))
+    assert np.array_equal(order, in_chunks(means, threads=3))
+    assert area(order) < 0.7 * area(octree.leaf_order(means, 1e-6))
 
 
 @pytest.mark.parametrize(

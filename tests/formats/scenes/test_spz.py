@@ -112,6 +112,23 @@ def test_a_scene_has_the_same_bytes_whenever_it_is_written(tmp_path, monkeypatch
         assert len(gzip.decompress(first)) == 16 + splats * (16 + 3 + 24)
 
 
+def test_properties_are_deflated_as_they_pack_best(tmp_path, data):
+    scene = load_scene(data / "plush_excerpt.ply")
+    spz.save(tmp_path / "a.spz", scene)
+    content = gzip.decompress((tmp_path / "a.spz").read_bytes())
+    assert (tmp_path / "a.spz").stat().st_size < len(gzip.compress(content, 6))
+
+
+def test_frames_do_not_depend_on_the_processors(tmp_path, data, monkeypatch):
+    scene = load_scene(data / "plush_excerpt.ply")
+    written = set()
+    for count in (1, 3, 16):
+        monkeypatch.setattr("os.cpu_count", lambda count=count: count)
+        spz.save(tmp_path / "a.spz", scene, 4)
+        written.add((tmp_path / "a.spz").read_bytes())
+    assert len(written) == 1
+
+
 def test_nothing_is_written_but_beside_the_file(tmp_path, monkeypatch):
     """What is killed while it writes leaves no folder elsewhere: there is none."""
     (tmp_path / "temporary").mkdir()

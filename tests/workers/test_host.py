@@ -1,0 +1,166 @@
+"""Several devices of this computer give the bytes that one gives."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+import potr_cl
+from potr_cl.errors import DeviceError, DeviceMemoryError, UsageError
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import choose_device, choose_devices
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.workers.host import HostPool
+from potr_cl.workers.opening import open_workers
+from tests.devices import FAMILIES, open_device
+
+#: Splats go, colours are made sparse and re-fitted on the way, coefficients are given up, and AC is rounded.
+OPTIONS = EncodeOptions.for_preset(
+    "best",
+    q=0.3,
+    prune={"keep": 0.4, "iterations": 8},
+    refit={"at": (0.4,), "steps": 3, "drop": 1e-7},
+    compact=True,
+    between={"views": 0},
+)
+
+
+def few(cameras, size=80):
+    """Five training views and a test view, small."""
+    chosen = [c for c in cameras if c.split == "train"][:5] + [c for c in cameras if c.split == "test"][:1]
+    factor = size / chosen[0].width
+    return [
+        dataclasses.replace(
+            c, width=round(c.width * factor), height=round(c.height * factor), fx=c.fx * factor, fy=c.fy * factor,
+            cx=c.cx * factor, cy=c.cy * factor,
+        )
+        for c in chosen
+    ]  # fmt: skip
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def family(request):
+    return request.param
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        OPTIONS,
+        OPTIONS.changed(memory=0),  # nothing is kept of any view
+        OPTIONS.changed(prune={"keep": None}),  # a GPU decides itself
+    ],
+)
+def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options):
+    cameras = few(plush_excerpt_cameras)
+    alone = open_device(family)
+    expected = encode(plush_excerpt, cameras, options, device=alone)
+    assert expected.shared is None
+    for count in (2, 3):
+        devices = [open_device(family) for _ in range(count)]
+        with HostPool(devices) as pool:
+            found = encode(plush_excerpt, cameras, options, device=devices[0], pool=pool)
+        assert found.data == expected.data
+        assert found.shared is not None
+        assert len(found.shared.workers) == count
+        assert found.shared.sent > 0
+        assert found.shared.received > 0
+        assert [device.allocated for device in devices] == [0] * count
+
+
+def test_more_devices_than_views(plush_excerpt, plush_excerpt_cameras, family):
+    cameras = few(plush_excerpt_cameras)[:2]
+    expected = encode(plush_excerpt, cameras, OPTIONS, device=open_device(family)).data
+    devices = [open_device(family) for _ in range(4)]
+    with HostPool(devices) as pool:
+        assert encode(plush_excerpt, cameras, OPTIONS, device=devices[0], pool=pool).data == expected
+
+
+def test_pruning_alone_removes_the_same_splats(plush_excerpt, plush_excerpt_cameras, family):
+    """All that is known of the course, not only what is left: the order, and the sums of each iteration."""
+    cameras = few(plush_excerpt_cameras)
+    options = EncodeOptions.for_preset("best", q=0.2, refit=False, compact=False, prune={"iterations": 6})
+    expected = encode(plush_excerpt, cameras, options, device=open_device(family)).pruned
+    devices = [open_device(family) for _ in range(2)]
+    with HostPool(devices) as pool:
+        found = encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).pruned
+    assert expected is not None
+    assert found is not None
+    assert np.array_equal(found.order, expected.order)
+    assert found.history == expected.history
+    assert len(expected.history) > 1
+
+
+def small(device: Device, memory: int) -> Device:
+    """The same device with less memory."""
+    return Device(dataclasses.replace(device.info, memory=memory), family=device.family)
+
+
+def test_a_device_with_too_little_memory_leaves_its_views_to_others(plush_excerpt, plush_excerpt_cameras, caplog):
+    cameras = few(plush_excerpt_cameras)
+    first = Device(choose_device())
+    expected = encode(plush_excerpt, cameras, OPTIONS, device=first).data
+    devices = [first, small(first, 100_000)]
+    with HostPool(devices) as pool:
+        assert encode(plush_excerpt, cameras, OPTIONS, device=first, pool=pool).data == expected
+    assert "its views go to 0:" in caplog.text
+    assert [device.allocated for device in devices] == [0, 0]
+
+
+def test_no_device_has_enough_memory(plush_excerpt, plush_excerpt_cameras):
+    devices = [small(Device(choose_device()), 100_000) for _ in range(2)]
+    with HostPool(devices) as pool, pytest.raises(DeviceMemoryError):
+        encode(plush_excerpt, few(plush_excerpt_cameras), OPTIONS, device=devices[0], pool=pool)
+    assert [device.allocated for device in devices] == [0, 0]
+
+
+def test_devices_of_two_kinds_are_refused(plush_excerpt):
+    with pytest.raises(UsageError, match="run different kernels"):
+        HostPool([open_device("cpu"), open_device("gpu")])
+
+
+def test_devices_by_name():
+    best = choose_device()
+    alike = choose_devices("all")
+    assert alike[0] == best
+    assert {(info.kind, info.platform) for info in alike} == {(best.kind, best.platform)}
+    assert choose_devices(str(best.index)) == [best]
+    with pytest.raises(DeviceError, match="twice"):
+        choose_devices(f"{best.index},{best.index}")
+    with pytest.raises(DeviceError, match="no OpenCL device fits '99'"):
+        choose_devices(f"{best.index},99")
+    for named in ("all", f"{best.index}, {best.index + 1}"):
+        with pytest.raises(DeviceError, match="only encode shares"):
+            choose_device(named)
+
+
+def test_the_environment_may_name_several(monkeypatch, plush_excerpt, plush_excerpt_cameras):
+    monkeypatch.setenv("POTR_CL_DEVICE", "all")
+    with open_workers() as workers:
+        assert workers.device.info == choose_devices("all")[0]
+    assert potr_cl.encode(plush_excerpt, few(plush_excerpt_cameras), OPTIONS).nbytes > 0
+
+
+def test_python_takes_several_devices(plush_excerpt, plush_excerpt_cameras):
+    cameras = few(plush_excerpt_cameras)
+    device = Device()
+    expected = potr_cl.encode(plush_excerpt, cameras, OPTIONS, device=device).data
+    assert potr_cl.encode(plush_excerpt, cameras, OPTIONS, device=[device, Device()]).data == expected
+    assert potr_cl.encode(plush_excerpt, cameras, OPTIONS, device=[device.info]).data == expected
+    with pytest.raises(UsageError, match="named twice"):
+        potr_cl.encode(plush_excerpt, cameras, OPTIONS, device=[device.info, device.info])
+    with pytest.raises(UsageError, match="list of devices is empty"):
+        potr_cl.encode(plush_excerpt, cameras, OPTIONS, device=[])
+
+
+def test_a_search_shares_views_out_too(plush_excerpt, plush_excerpt_cameras):
+    cameras = few(plush_excerpt_cameras)
+    options = EncodeOptions.for_preset("best", prune={"iterations": 4}, refit={"steps": 2})
+    device = Device()
+    alone = potr_cl.encode(plush_excerpt, cameras, options, device=device, max_size=16_000)
+    together = potr_cl.encode(plush_excerpt, cameras, options, device=[device, Device()], max_size=16_000)
+    assert together.data == alone.data
+    assert together.shared is not None

@@ -1,0 +1,142 @@
+"""Parts that are lost on the way are made again elsewhere, and nobody sees it in the results."""
+
+from __future__ import annotations
+
+from concurrent.futures import Future, ThreadPoolExecutor
+from contextlib import contextmanager
+
+import pytest
+
+from potr_cl.errors import DeviceMemoryError, UsageError
+from potr_cl.workers.parts import Parts
+from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, WorkerLost
+
+
+class Sum(Part):
+    """Adds up what it is told."""
+
+    def __init__(self, device, memory, start, step):
+        self.total = start
+        self.step = step
+
+    def add(self, number):
+        self.total += number * self.step
+        return self.total
+
+    def look(self):
+        return self.total
+
+    def refuse(self):
+        raise UsageError("no")
+
+    def close(self):
+        pass
+
+
+class FakeWorker(Worker):
+    """Loses its parts at its n-th command, by an error or by silence."""
+
+    def __init__(self, name, lost_at=None, error=None, silent=False):
+        self.name, self.lost_at, self.error, self.silent = name, lost_at, error, silent
+        self.commands = 0
+        self.threads = ThreadPoolExecutor(1)
+
+    def make(self, kind, memory, given):
+        def made():
+            things = [each.handle if isinstance(each, Shared) else each for each in given]
+            return FakeHeld(self, kind(None, memory, *things))
+
+        return self.threads.submit(made)
+
+
+class FakeHeld(Held):
+    def __init__(self, worker, part):
+        self.worker, self.part = worker, part
+
+    def begin(self, command, args):
+        worker = self.worker
+        worker.commands += 1
+        if worker.lost_at is not None and worker.commands >= worker.lost_at:
+            if worker.silent:
+                return Future()
+            failed: Future = Future()
+            failed.set_exception(worker.error or WorkerLost(f"{worker.name} is gone"))
+            return failed
+        return worker.threads.submit(lambda: getattr(self.part, command)(*args))
+
+    def close(self):
+        self.part.close()
+
+
+class FakePool(Pool):
+    takes_part = False
+    sparse = False
+    names = ()
+
+    def __init__(self, *workers, patience=None):
+        self._workers = list(workers)
+        self.traffic = Traffic()
+        self.patience = patience
+
+    def workers(self):
+        return self._workers
+
+    @contextmanager
+    def shared(self, thing):
+        yield Shared(thing)
+
+    def close(self):
+        pass
+
+
+def course(pool):
+    """What parts say on the way, the third step being a mere question."""
+    with pool.shared(10) as start, Parts(pool, Sum, [(start, 1), (start, 2), (start, 3)]) as parts:
+        said = [parts.tell("add", 5), parts.tell("add", 7)]
+        said.append([parts.ask(place, "look") for place in range(3)])
+        said.append(parts.begin("look", logged=False).results())
+        return [*said, parts.tell("add", 1)]
+
+
+EXPECTED = [[15, 20, 25], [22, 34, 46], [22, 34, 46], [22, 34, 46], [23, 36, 49]]
+
+
+def test_parts_do_what_they_are_told():
+    assert course(FakePool(FakeWorker("a"), FakeWorker("b"))) == EXPECTED
+
+
+@pytest.mark.parametrize("lost_at", range(1, 7))
+@pytest.mark.parametrize("error", [None, DeviceMemoryError("too little memory")])
+def test_lost_parts_are_made_again(lost_at, error, caplog):
+    assert course(FakePool(FakeWorker("a", lost_at, error), FakeWorker("b"))) == EXPECTED
+    assert "worker a gave up" in caplog.text
+
+
+def test_several_are_lost_one_after_the_other():
+    assert course(FakePool(FakeWorker("a", 3), FakeWorker("b", 9), FakeWorker("c"))) == EXPECTED
+
+
+def test_all_are_lost():
+    with pytest.raises(WorkerLost, match="b is gone"):
+        course(FakePool(FakeWorker("a", 2), FakeWorker("b", 6)))
+
+
+def test_a_silent_worker_is_given_up():
+    assert course(FakePool(FakeWorker("a", 4, silent=True), FakeWorker("b"), patience=0.3)) == EXPECTED
+
+
+def test_a_refusal_is_no_loss():
+    with Parts(FakePool(FakeWorker("a"), FakeWorker("b")), Sum, [(0, 1), (0, 1)]) as parts:
+        with pytest.raises(UsageError, match="no"):
+            parts.tell("refuse")
+        assert parts.tell("add", 2) == [2, 2]
+
+
+def test_a_log_that_begins_anew_is_not_replayed_whole():
+    first, second = FakeWorker("a", 12), FakeWorker("b")
+    with Parts(FakePool(first, second), Sum, [(0, 1)]) as parts:
+        for number in range(10):
+            parts.tell("add", number)
+        parts.begin("look", anew=True).results()
+        assert parts.tell("look") == [0]  # made again, and told only the two last commands
+    assert second.commands == 2
