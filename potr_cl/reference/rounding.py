@@ -9,7 +9,14 @@ Array = NDArray[np.float64]
 
 
 def rounded_in_turn(
-    block: Array, x: Array, free: NDArray[np.bool_], step: float, to_zero: float, to_less: float, damping: float = 1e-2, floor: float = 1e-3
+    block: Array,
+    x: Array,
+    free: NDArray[np.bool_],
+    step: float,
+    to_zero: float,
+    to_less: float,
+    damping: float = 1e-2,
+    floor: float = 1e-3,
 ) -> tuple[Array, float]:
     """AC coefficients of one channel of one splat as multiples of a step, the last one first.
 

@@ -112,6 +112,15 @@ def test_what_no_view_sees_goes_to_its_nearest_level(device):
     assert np.count_nonzero(got.after[20:, 1:]) > 300
 
 
+def test_splats_that_hardly_show_stay_where_they_are(device):
+    """Their blocks are little more than what fixed points are wrong by, and need not be positive."""
+    scene, grid = visible_scene(300, 3), grid_of(300, 0.02)
+    scene.opacity_logits[:] = np.linspace(-5.5, -3, 300)
+    with Case(device, scene, visible_scene(30, 2, 7), ring_of_cameras(2, size=16)) as case:
+        got = Rounded(case, grid, Round(others=TURNS - 1, constant=-1, steps=0), 0.0)
+    assert np.abs(got.after - got.before).max() < 20 * grid.others.max()
+
+
 def fitted(case: Case, grid: ColourGrid | None, fix_ac=None) -> np.ndarray:
     """(N, M, 3) Y, Co, Cg, what a re-fit leaves."""
     colour_grid = None if grid is None else lambda effects: grid
