@@ -39,10 +39,14 @@ class Results:
     Args:
         device: what was measured on; None for the processor alone.
         path: where to keep the results as JSON, after every row; None prints only.
+        about: where, when and by what they were measured, if not here and now: as :func:`circumstances` gives it.
     """
 
-    def __init__(self, device: DeviceInfo | None, path: Path | None = None) -> None:
-        self._circumstances = circumstances(device)
+    def __init__(
+        self, device: DeviceInfo | None, path: Path | None = None, about: dict[str, Any] | None = None
+    ) -> None:
+        known = about or circumstances(device)
+        self._circumstances = {name: known[name] for name in ("machine", "date", "command", "commit")}
         self._path = path
         self._tables: dict[str, Table] = {}
         print("{machine}, {date}, commit {commit}".format(**self._circumstances))
@@ -73,11 +77,13 @@ class Column:
         unit: of its numbers; stands in the head too.
         format: how a number is written, as in ".2f"; for several numbers in a cell a text with a field for each, as in
             "{:.2f} / {:.2f}".
+        default: what a cell shows if it is of the package's default (tools.make.benchmark_results).
     """
 
     name: str
     unit: str = ""
     format: str = ""
+    default: str = ""
 
     @property
     def head(self) -> str:

@@ -1,4 +1,4 @@
-"""A scene's colours as the levels of a file (:func:`colour_levels`), and rounded as its readers will see them."""
+"""A scene's colours as the levels of a file: :func:`colour_levels`."""
 
 from __future__ import annotations
 
@@ -6,7 +6,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
-from potr_cl.codec.blocks.geometry import AnyGeometry
 from potr_cl.codec.native.library import native
 from potr_cl.codec.steps.rule import factors
 from potr_cl.host.threads import Run
@@ -83,38 +82,3 @@ def colour_levels(
         for where, made in wide:
             levels[where] = made
     return levels
-
-
-def ac_factors(geometry: AnyGeometry) -> NDArray[np.float32]:
-    """(N,) scale factors of each splat's AC coefficients, in the order of the scene."""
-    classes = np.empty(len(geometry.order), np.int8)
-    classes[geometry.order] = geometry.colour_classes()[1]
-    return factors(geometry.parameters.sf_sh, classes)
-
-
-def rounded_ac(sh: FloatArray, geometry: AnyGeometry, run: Run = map) -> FloatArray:
-    """The same colours with AC coefficients rounded to the steps of their splats.
-
-    Args:
-        sh: (N, M, 3) R, G, B in the order of the scene.
-        geometry: of the scene, with its steps.
-        run: in place of :func:`map`, to work with several threads.
-
-    Raises:
-        DataError: a coefficient is too large to quantise.
-    """
-    of_splats = ac_factors(geometry)
-    rounded = np.empty((sh.shape[1], 3, len(sh)), np.float32).transpose(2, 0, 1)
-    rounded[:, :1] = sh[:, :1]
-
-    def take(start: int) -> None:
-        rows = slice(start, start + _BLOCK)
-        divisors = of_splats[rows]
-        for m in range(1, sh.shape[1]):
-            channels = quantize.to_ycocg(sh[rows, m].astype(np.float64))
-            y, co, cg = (quantize.quantize_sh(channel, divisors) / divisors for channel in channels)
-            for c, channel in enumerate((y - cg + co, y + cg, y - cg - co)):
-                rounded[rows, m, c] = channel
-
-    list(run(take, range(0, len(sh), _BLOCK)))
-    return rounded

@@ -26,6 +26,7 @@ from potr_cl.formats.declaration import SceneFormat
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.raster.scene_buffers import Drawable
 
 
@@ -164,22 +165,21 @@ class Output(ABC):
         """
         return rounded, sh
 
-    def steps_of_ac(self, request: Request) -> bool:
-        """Whether :meth:`fix_ac` rounds each coefficient by itself, to steps that :meth:`ac_factors` tells."""
+    def on_grid(self, request: Request) -> bool:
+        """Whether colours are rounded to the steps of :meth:`colour_grid`, and :meth:`fix_ac` does nothing."""
         return False
 
-    def ac_factors(self, rounded: Rounded, effects: FloatArray, request: Request) -> tuple[Rounded, FloatArray]:
-        """To what :meth:`fix_ac` rounds, where that follows from the geometry and ``effects`` alone.
+    def colour_grid(self, rounded: Rounded, effects: FloatArray, request: Request) -> tuple[Rounded, ColourGrid]:
+        """The steps of colours, where they follow from the geometry and ``effects`` alone.
 
-        So the re-fit can ask while it solves, and round where the coefficients are. Only for outputs with
-        :meth:`steps_of_ac`.
+        So the re-fit can ask while it solves, and round in rounds. Only for outputs that are :meth:`on_grid`.
 
         Args:
             rounded, request: as of :meth:`fix_ac`.
             effects: (N,) float32, ``worth`` of the constant coefficients.
 
         Returns:
-            What :meth:`file` is given, and (N,) float32, steps a unit of each splat's AC coefficients in Y, Co, Cg.
+            What :meth:`file` is given, and the steps.
         """
         raise NotImplementedError
 

@@ -10,7 +10,6 @@ from typing import ClassVar
 from potr_cl.codec.blocks.encoder import code_blocks
 from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.blocks.geometry import AnyGeometry, GeometryOfBlocks, in_blocks, quantise
-from potr_cl.codec.colours import ac_factors, rounded_ac
 from potr_cl.codec.decoder import decode, open_file, scene_of_file
 from potr_cl.codec.encoder import Coded, code_scene
 from potr_cl.codec.geometry import Geometry
@@ -24,6 +23,7 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.outputs.output import Output, Request, Rounded
 from potr_cl.raster.scene_buffers import Drawable
 
@@ -56,29 +56,15 @@ class Potr(Output):
         with thread_pool(request.threads) as pool:
             return quantise(scene, request.parameters, request.views, pool.map)
 
-    def fix_ac(
-        self, rounded: Rounded, sh: FloatArray, worth: FloatArray | None, request: Request
-    ) -> tuple[Rounded, FloatArray]:
-        """Fit the steps of colours to each splat, and round to them, in the versions of the format that have such.
-
-        DC is solved for once more afterwards: it makes up for what the rounding of the others has changed.
-        """
-        assert isinstance(rounded, (Geometry, GeometryOfBlocks))
-        if worth is None or not VERSIONS[request.parameters.version].colour_steps:
-            return rounded, sh
-        geometry = rounded.with_steps(worth[:, 0])
-        with thread_pool(request.threads) as pool:
-            return geometry, rounded_ac(sh, geometry, pool.map)
-
-    def steps_of_ac(self, request: Request) -> bool:
+    def on_grid(self, request: Request) -> bool:
         """In the versions of the format that have steps of each splat."""
         return VERSIONS[request.parameters.version].colour_steps
 
-    def ac_factors(self, rounded: Rounded, effects: FloatArray, request: Request) -> tuple[Rounded, FloatArray]:
-        """See :meth:`Output.ac_factors`."""
+    def colour_grid(self, rounded: Rounded, effects: FloatArray, request: Request) -> tuple[Rounded, ColourGrid]:
+        """Fit the steps of colours to each splat."""
         assert isinstance(rounded, (Geometry, GeometryOfBlocks))
         geometry = rounded.with_steps(effects)
-        return geometry, ac_factors(geometry)
+        return geometry, ColourGrid.of(geometry)
 
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
         """See :func:`potr_cl.codec.encoder.code_scene`, and :func:`potr_cl.codec.blocks.encoder.code_blocks`."""

@@ -12,6 +12,7 @@ from potr_cl.errors import UsageError
 from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
@@ -126,7 +127,7 @@ class Refit(Stage):
         compacted = "compact" in state.learnt
         active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
         options = RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory)
-        in_steps = bench.output.steps_of_ac(bench.request(state))
+        on_grid = bench.output.on_grid(bench.request(state))
         fits = 1 if self.ground_truth is None else 2
 
         def on_geometry() -> tuple[Rounded, Scene]:
@@ -144,22 +145,22 @@ class Refit(Stage):
             def fix_ac(sh: FloatArray, refit: ColourRefit) -> FloatArray:
                 nonlocal geometry
                 request = replace(bench.request(state), blocks=refit.blocks)
-                geometry, sh = bench.output.fix_ac(rounded, sh, refit.worth(), request)
-                return sh
+                geometry, fixed = bench.output.fix_ac(rounded, sh, refit.worth(), request)
+                return fixed
 
-            def ac_factors(effects: FloatArray) -> FloatArray:
+            def colour_grid(effects: FloatArray) -> ColourGrid:
                 nonlocal geometry
-                geometry, steps = bench.output.ac_factors(rounded, effects, bench.request(state))
-                return steps
+                geometry, grid = bench.output.colour_grid(rounded, effects, bench.request(state))
+                return grid
 
             found = refit_colours(
                 bench.opened, decoded, views, targets, options, active, bench.background, progress,
-                fix_ac=None if in_steps or not bench.output.fixes_ac else fix_ac,
+                fix_ac=None if on_grid or not bench.output.fixes_ac else fix_ac,
                 # Photographs lie where the master reads them.
                 help_from=HelpFrom(bench.pool, state.source)
                 if bench.pool and isinstance(targets, RenderedTargets)
                 else None,
-                ac_factors=ac_factors if in_steps else None,
+                colour_grid=colour_grid if on_grid else None,
             )  # fmt: skip
             return found, geometry
 
@@ -168,7 +169,7 @@ class Refit(Stage):
             source = bench.drawable(state.source)
             rasterizer = stack.enter_context(Rasterizer(bench.opened, source, background=bench.background))
             renders = stack.enter_context(RenderedTargets(rasterizer, state.views))
-            if in_steps:
+            if on_grid:
                 # The host rounds the geometry by itself, so the device may begin with the pictures.
                 waiting = in_background(on_geometry)
                 if not bench.pool:

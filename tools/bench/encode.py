@@ -401,7 +401,7 @@ def code_rows(load: Workload, quick: bool) -> Iterator[Row]:
         data = b"".join(coded.pieces)
         name = f"{coder.name} {coder.level}" if coder.name == "zstd" else coder.name
         if coder.name == "context":
-            name += " (format 2)"
+            name += f" (format {parameters.version})"
         for stage, work in (
             ("code", lambda c=coder, p=parameters: code_scene(load.scene, p, load.train, entropy=c)),
             ("decode", lambda d=data: decode(d)),

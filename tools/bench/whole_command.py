@@ -63,8 +63,8 @@ def command_parts(args: argparse.Namespace, folder: Path) -> dict[str, float]:
     told: list[dict[str, float]] = []
     chosen = ["--device", args.device] if args.device else []
     whole = [
-        "-m", "potr_cl", "encode", str(args.scene), "-o", str(folder / "scene.potr"), "--cameras", str(args.cameras), "--json",
-        "--preset", args.preset, *chosen,
+        "-m", "potr_cl", "encode", str(args.scene), "-o", str(folder / "scene.potr"),
+        "--cameras", str(args.cameras), "--json", "--preset", args.preset, *chosen,
     ]  # fmt: skip
     pieces = {
         "Python alone": ["-c", "pass"],

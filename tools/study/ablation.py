@@ -1,12 +1,13 @@
 """What each part of the codec contributes, one added after the other.
 
     python -m tools.study.ablation measure SCENE … --json OUT.json [--quality Q]
-    python -m tools.study.ablation report OUT.json
+    python -m tools.study.ablation report OUT.json [--json RESULTS.json]
 
 The steps are those of the paper's table "Ablation study": serialisation and quantisation, entropy coding, pruning,
-SH compaction, YCoCg; those before YCoCg quantise R, G and B. The last two are ours: the re-fit, balanced steps and the
-context coder, and then views between the training views, which make the preset best. A second table has the bytes a
-splat of each property, compared with the float32 values of a PLY (normals left out). ``report`` prints Markdown.
+SH compaction, YCoCg; those before YCoCg quantise R, G and B. The others are ours: the re-fit with balanced steps and
+the context coder; what version 3 of the format and the rounding of colours bring (tools.study.colour_steps); and views
+between the training views, which make the preset best. A second table has the bytes a splat of each property, compared
+with the float32 values of a PLY (normals left out). ``report`` prints both, and --json keeps them for docs/benchmarks.
 """
 
 from __future__ import annotations
@@ -14,7 +15,7 @@ from __future__ import annotations
 import argparse
 import dataclasses
 import json
-from collections.abc import Sequence
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -22,12 +23,15 @@ import numpy as np
 from potr_cl.codec import quantize
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.encoder import code_scene
-from potr_cl.model.camera import Camera, train_views
+from potr_cl.model.camera import train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
-from tools.results import circumstances, write_json
+from potr_cl.stages.stage import State
+from tools.results import Column, Results, circumstances, write_json
+from tools.study.colour_steps import WAYS, coded, pruned_state, refit_options
 from tools.study.evaluation import EvaluatedScene
 from tools.workloads import reduced_state, study_parser
 
@@ -54,15 +58,12 @@ def from_channels(scene: Scene) -> Scene:
     return dataclasses.replace(scene, sh=np.stack(channels, axis=-1).astype(np.float32).reshape(scene.sh.shape))
 
 
-def _coded(
-    evaluator: EvaluatedScene, scene: Scene, options: EncodeOptions, rgb: bool, views: Sequence[Camera]
-) -> dict[str, Any]:
-    """Code a scene as R, G, B or as Y, Co, Cg; what the file takes by property, and what it keeps."""
-    coded = code_scene(as_channels(scene) if rgb else scene, options.parameters, views, entropy=options.code.coder)
-    file = PotrFile.from_bytes(b"".join(coded.pieces))
-    sections = file_report(file)["sections"]
+def _figures(evaluator: EvaluatedScene, data: bytes, rgb: bool = False) -> dict[str, Any]:
+    """What a file takes by property, and what it keeps; ``rgb``: of a scene that was coded :func:`as_channels`."""
+    file = PotrFile.from_bytes(data)
+    splats, sections = file.header.splats, file_report(file)["sections"]
     decoded = from_channels(file.scene()) if rgb else file.scene()
-    figures: dict[str, Any] = {"splats": len(scene), "bytes": coded.nbytes, **evaluator(decoded)}
+    figures: dict[str, Any] = {"splats": splats, "bytes": len(data), **evaluator(decoded)}
     columns = ["bytes"]
     # The context coder codes integers that were never bytes.
     if all(section["serialised_bytes"] is not None for section in sections.values()):
@@ -70,27 +71,40 @@ def _coded(
         columns.append("serialised_bytes")
     for column in columns:
         figures[f"{column}_a_splat"] = {
-            name: sum(sections[part][column] for part in parts if part in sections) / len(scene)
+            name: sum(sections[part][column] for part in parts if part in sections) / splats
             for name, (parts, _) in PROPERTIES.items()
         }
     return figures
 
 
+def _plain(evaluator: EvaluatedScene, options: EncodeOptions, state: State, rgb: bool) -> dict[str, Any]:
+    """Code a scene with steps that are the same for all splats, as R, G, B or as Y, Co, Cg."""
+    scene = as_channels(state.scene) if rgb else state.scene
+    coded = code_scene(scene, options.parameters, state.views, entropy=options.code.coder)
+    return _figures(evaluator, b"".join(coded.pieces), rgb)
+
+
 def measure_steps(evaluator: EvaluatedScene, device: Device, q: float) -> list[dict[str, Any]]:
     """All steps on one scene, the first without entropy coding."""
-    options = EncodeOptions.for_preset("paper", q=q)
-    plain = _coded(evaluator, evaluator.source, options, True, train_views(evaluator.cameras))
+    options, views = EncodeOptions.for_preset("paper", q=q), train_views(evaluator.cameras)
+    plain = _plain(evaluator, options, State.of(evaluator.source, views), True)
     serialised = {**plain, "bytes": plain["serialised_bytes"], "bytes_a_splat": plain["serialised_bytes_a_splat"]}
     steps = [{"step": "serialisation and quantisation", **serialised}, {"step": "entropy coding", **plain}]
     for name, changed, rgb in (
         ("pruning", options.changed(compact=False), True),
         ("SH compaction", options.changed(compact={"colour_model": "rgb"}), True),
         ("RGB → YCoCg", options, False),
-        ("re-fit, balanced steps, contexts", EncodeOptions.for_preset("best", q=q, between=False), False),
-        ("views between: preset best", EncodeOptions.for_preset("best", q=q), False),
     ):
-        left = reduced_state(evaluator.source, train_views(evaluator.cameras), changed, device)
-        steps.append({"step": name, **_coded(evaluator, left.scene, changed, rgb, left.views)})
+        left = reduced_state(evaluator.source, views, changed, device)
+        steps.append({"step": name, **_plain(evaluator, changed, left, rgb)})
+    best = EncodeOptions.for_preset("best", q=q)
+    pruned = pruned_state(evaluator.source, views, best.changed(between=False), device)
+    for way in WAYS:
+        name = "re-fit, balanced steps, contexts" if way is WAYS[0] else way.name.removeprefix("+ ")
+        data = coded(pruned, way, best.parameters, q, device, refit_options(best))
+        steps.append({"step": name, **_figures(evaluator, data)})
+    encoded = encode(evaluator.source, views, best, device=device)
+    steps.append({"step": "views between the training views: preset best", **_figures(evaluator, encoded.data)})
     return steps
 
 
@@ -106,38 +120,43 @@ def _measure(args: argparse.Namespace) -> None:
 
 
 def _report(args: argparse.Namespace) -> None:
-    results = json.loads(args.results.read_text())
-    for name, entry in results["scenes"].items():
-        ground_truth = "truth_psnr" in entry["uncompressed"]
-        print(f"### {name}, q = {results['q']:g}, on {results['device']}\n")
-        head, rule = "| | splats | MB | PSNR, SSIM against uncompressed |", "|---|---|---|---|"
-        row = f"| uncompressed | {entry['source_splats']:,} | {entry['source_bytes'] / 1e6:.1f} | |"
-        if ground_truth:
-            plain = entry["uncompressed"]
-            head, rule = head + " PSNR, SSIM against photographs |", rule + "---|"
-            row += f" {plain['truth_psnr']:.2f} dB, {plain['truth_ssim']:.4f} |"
-        print(head, rule, row, sep="\n")
-        for s in entry["steps"]:
-            row = f"| + {s['step']} | {s['splats']:,} | {s['bytes'] / 1e6:.2f} | {s['psnr']:.2f} dB, {s['ssim']:.4f} |"
-            if ground_truth:
-                row += f" {s['truth_psnr']:.2f} dB, {s['truth_ssim']:.4f} |"
-            print(row)
-        steps = entry["steps"]
-        print("\nBytes a splat:\n")
-        print("| | as PLY | " + " | ".join(f"+ {s['step']}" for s in steps) + " | factor |")
-        print("|---|---|" + "---|" * (len(steps) + 1))
-        for prop, (_, values) in PROPERTIES.items():
-            cells = [s["bytes_a_splat"][prop] for s in steps]
-            factor = f"{4 * values / cells[-1]:.1f}" if cells[-1] else ""
-            print(f"| {prop} | {4 * values} | " + " | ".join(f"{c:.2f}" for c in cells) + f" | {factor} |")
-        totals = [sum(s["bytes_a_splat"].values()) for s in steps]
-        raw = 4 * sum(values for _, values in PROPERTIES.values())
-        print(f"| all | {raw} | " + " | ".join(f"{t:.2f}" for t in totals) + f" | {raw / totals[-1]:.1f} |\n")
+    measured = json.loads(args.results.read_text())
+    results = Results(None, args.json, measured)
+    for name, entry in measured["scenes"].items():
+        table = results.table(
+            name,
+            f"The steps of the paper's ablation, then those to preset best: {name}, q = {measured['q']:g}",
+            Column("step"),
+            Column("splats", format=","),
+            Column("size", "MB", ".3f"),
+            Column("PSNR against uncompressed", "dB", ".2f"),
+            Column("SSIM against uncompressed", format=".4f"),
+            Column("PSNR against photographs", "dB", ".2f"),
+            Column("SSIM against photographs", format=".4f"),
+        )
+        plain, steps = entry["uncompressed"], entry["steps"]
+        truth = (plain.get("truth_psnr"), plain.get("truth_ssim"))
+        table.add("uncompressed", entry["source_splats"], entry["source_bytes"] / 1e6, None, None, *truth)
+        for s in steps:
+            figures = (s["psnr"], s["ssim"], s.get("truth_psnr"), s.get("truth_ssim"))
+            table.add(f"+ {s['step']}", s["splats"], s["bytes"] / 1e6, *figures)
+        parts = results.table(
+            f"bytes_{name}",
+            f"Bytes a splat after each step: {name}, q = {measured['q']:g}",
+            Column("step"),
+            *(Column(prop, format=".2f") for prop in (*PROPERTIES, "all")),
+        )
+        floats = [4.0 * values for _, values in PROPERTIES.values()]
+        parts.add("as PLY", *floats, sum(floats))
+        for s in steps:
+            own = [s["bytes_a_splat"][prop] for prop in PROPERTIES]
+            parts.add(f"+ {s['step']}", *own, sum(own))
 
 
 def main() -> None:
-    parser, measure, _ = study_parser(__doc__, _measure, _report)
+    parser, measure, report = study_parser(__doc__, _measure, _report)
     measure.add_argument("--quality", type=float, default=0.5)
+    report.add_argument("--json", type=Path, help="keep the tables here")
     args = parser.parse_args()
     args.run(args)
 

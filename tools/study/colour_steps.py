@@ -5,7 +5,8 @@
 
 A scene is pruned once for each quality; what is left is re-fitted and coded in each way: with the steps and coder of
 version 2; with the coder of version 3; with steps of colours that fit each splat; with AC coefficients rounded before
-the last solution for DC; and with preset best's constants, which are coarser for AC coefficients and opacities.
+the last solution for DC; with preset best's constants, which are coarser for AC coefficients and opacities; and with
+colours rounded in rounds, as preset best does.
 ``report`` prints Markdown, with the bytes at equal PSNR: those of the first way are interpolated between qualities.
 """
 
@@ -18,15 +19,16 @@ from collections.abc import Sequence
 from typing import Any
 
 import numpy as np
+from numpy.typing import NDArray
 
-from potr_cl.codec.colours import rounded_ac
 from potr_cl.codec.decoder import decode
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.geometry import quantise_geometry
-from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.quantize import HyperParameters, to_ycocg
 from potr_cl.model.camera import Camera, test_views, train_views
-from potr_cl.model.scene import FloatArray
+from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.pipeline.encode import Run, Stopwatch
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
@@ -52,6 +54,7 @@ class Way:
         version: of the file format.
         steps: whether each splat has its own steps of colours.
         rounded: whether AC coefficients are rounded before the last solution for DC.
+        rounds: whether colours are rounded in rounds, between which the others are solved for again.
         former: whether with the constants of version 2.
     """
 
@@ -59,6 +62,7 @@ class Way:
     version: int
     steps: bool = False
     rounded: bool = False
+    rounds: bool = False
     former: bool = True
 
 
@@ -67,7 +71,8 @@ WAYS = (
     Way("+ coder of version 3", 3),
     Way("+ steps that fit each splat", 3, steps=True),
     Way("+ AC coefficients rounded before the last solution for DC", 3, steps=True, rounded=True),
-    Way("+ coarser AC coefficients and opacities (preset best)", 3, steps=True, rounded=True, former=False),
+    Way("+ coarser AC coefficients and opacities", 3, steps=True, rounded=True, former=False),
+    Way("+ colours rounded in rounds (preset best)", 3, steps=True, rounds=True, former=False),
 )
 
 
@@ -79,33 +84,59 @@ def coded(
     parameters = dataclasses.replace(parameters, version=way.version, **constants)
     geometry = quantise_geometry(state.scene, parameters, state.views)
 
-    def fix_ac(sh: FloatArray, refit: ColourRefit) -> FloatArray:
+    def colour_grid(effects: FloatArray) -> ColourGrid:
         nonlocal geometry
         if way.steps:
-            geometry = geometry.with_steps(refit.worth()[:, 0])
-        return rounded_ac(sh, geometry) if way.rounded else sh
+            geometry = geometry.with_steps(effects)
+        return ColourGrid.of(geometry)
+
+    def fix_ac(sh: FloatArray, refit: ColourRefit) -> FloatArray:
+        grid = colour_grid(refit.worth_of_constants())
+        return rounded_ac(sh, grid.others) if way.rounded else sh
 
     decoded = geometry.decoded(state.scene.sh)
     with Rasterizer(device, state.source) as rasterizer:
         targets = RenderedTargets(rasterizer, state.views)
-        fitted = refit_colours(device, decoded, state.views, targets, options, fix_ac=fix_ac)
+        fitted = refit_colours(
+            device, decoded, state.views, targets, options,
+            fix_ac=None if way.rounds else fix_ac, colour_grid=colour_grid if way.rounds else None,
+        )  # fmt: skip
     scene = dataclasses.replace(state.scene, sh=fitted.sh)
     return b"".join(code_scene(scene, parameters, state.views, geometry=geometry).pieces)
+
+
+def rounded_ac(sh: FloatArray, steps: NDArray[np.float32]) -> FloatArray:
+    """Colours (N, M, 3) with AC coefficients of Y, Co, Cg rounded to the nearest multiples of (N,) steps."""
+    y, co, cg = to_ycocg(sh[:, 1:].reshape(-1, 3).astype(np.float64))
+    step = np.repeat(steps.astype(np.float64), sh.shape[1] - 1)
+    y, co, cg = (np.floor(channel / step + 0.5) * step for channel in (y, co, cg))
+    rounded = sh.copy()
+    rounded[:, 1:] = np.stack([y + co - cg, y + cg, y - co - cg], axis=-1).reshape(sh[:, 1:].shape)
+    return rounded
 
 
 def measure(
     state: State, q: float, options: EncodeOptions, device: Device, views: Sequence[Camera]
 ) -> list[dict[str, Any]]:
     """Bytes and PSNR of every way at one quality."""
-    refit = options.stage(Refit)
     figures = []
     chosen = EvaluationViews(list(views), "test", len(views))
     with Evaluator(device, state.source, chosen, (0.0, 0.0, 0.0)) as evaluator:
         for way in WAYS:
-            how = RefitOptions(steps=refit.steps, drop=options.parameters.drop)
-            data = coded(state, way, options.parameters, q, device, how)
+            data = coded(state, way, options.parameters, q, device, refit_options(options))
             figures.append({"way": way.name, "q": q, "bytes": len(data), "psnr": evaluator.psnr(decode(data))})
     return figures
+
+
+def pruned_state(scene: Scene, views: Sequence[Camera], options: EncodeOptions, device: Device) -> State:
+    """What the stages before the re-fit leave."""
+    first = [type(stage) for stage in options.stages if not isinstance(stage, Refit | Code)]
+    return Run(options, Stopwatch(), device).stages(State.of(scene, views), first)
+
+
+def refit_options(options: EncodeOptions) -> RefitOptions:
+    """How an encode with these options re-fits."""
+    return RefitOptions(steps=options.stage(Refit).steps, drop=options.parameters.drop)
 
 
 def _measure(args: argparse.Namespace) -> None:
@@ -116,8 +147,7 @@ def _measure(args: argparse.Namespace) -> None:
         results["scenes"][folder.resolve().name] = figures = []
         for q in args.qualities:
             options = EncodeOptions.for_preset("best", q=q)
-            first = [type(stage) for stage in options.stages if not isinstance(stage, Refit | Code)]
-            state = Run(options, Stopwatch(), device).stages(State.of(scene, train_views(cameras)), first)
+            state = pruned_state(scene, train_views(cameras), options, device)
             figures += measure(state, q, options, device, test_views(cameras)[:: args.every])
             write_json(args.json, results)
 

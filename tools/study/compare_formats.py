@@ -1,18 +1,21 @@
 """What people would use instead: other formats and codecs on the same scenes, against our rate-distortion curve.
 
     python -m tools.study.compare_formats measure SCENE … --json OUT.json [--transform COMMAND] [options]
-    python -m tools.study.compare_formats report OUT.json RATE_DISTORTION.json
+    python -m tools.study.compare_formats report OUT.json RATE_DISTORTION.json [--json RESULTS.json]
 
 ``measure`` writes each scene in each format with splat-transform (npm's @playcanvas/splat-transform), lets the same
 tool decode it to a PLY, and judges that by all test views. A format that does not finish in time is left out.
 The rows of :data:`EARLIER` are added. ``report`` prints Markdown: our size at their PSNR and our PSNR at their size,
-interpolated along the curve that tools.study.rate_distortion measured, linearly in the logarithm of the size.
+interpolated along the curve that tools.study.rate_distortion measured, linearly in the logarithm of the size. With
+--json it keeps the tables of docs/benchmarks for preset best. There OUT.json may be the page's own results,
+docs/benchmarks/results/other_formats.json: other formats do not change as ours does.
 """
 
 from __future__ import annotations
 
 import argparse
 import json
+import re
 import shlex
 import subprocess
 import sys
@@ -24,7 +27,7 @@ from typing import Any
 from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene
 from potr_cl.opencl.device import Device
-from tools.results import circumstances, write_json
+from tools.results import Cell, Column, Results, circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
 from tools.study.rate_distortion import size_at, value_at
 from tools.workloads import study_parser
@@ -121,7 +124,68 @@ def _cells(points: list[dict[str, Any]], row: dict[str, Any], key: str) -> str:
     return f" {smaller} | {ours} |"
 
 
+def measured_formats(path: Path) -> dict[str, list[dict[str, Any]]]:
+    """The formats of each scene: what ``measure`` has left, or the table "sizes" of docs/benchmarks."""
+    content = json.loads(path.read_text())
+    if "scenes" in content:
+        return {name: entry["formats"] for name, entry in content["scenes"].items()}
+    found: dict[str, list[dict[str, Any]]] = {name: [] for name in EARLIER}
+    heads = [column["name"] for column in content["sizes"]["columns"]]
+    for cells in content["sizes"]["rows"]:
+        row = dict(zip(heads, cells, strict=True))
+        suffix = re.match(r"`(\.[a-z.]+)`", row["format"])
+        if suffix is None or suffix[1] == ".sog":  # was measured earlier
+            continue
+        for scene, rows in found.items():
+            size, psnr, lost = (row[f"{scene}: {what}"] for what in ("size", "PSNR", "lost"))
+            rows.append({"format": suffix[1], "bytes": size * 1e6, "psnr": psnr, "psnr_loss": lost, "measured": True})
+    for scene, rows in found.items():
+        for name, (size, lost, psnr) in EARLIER[scene].items():
+            rows.append({"format": name, "bytes": size * 1e6, "psnr": psnr, "psnr_loss": lost, "measured": False})
+    return found
+
+
+def keep_tables(formats: dict[str, list[dict[str, Any]]], curves: dict[str, Any], path: Path) -> None:
+    """The tables of docs/benchmarks: preset best against each format, by interpolation along its curve."""
+    results = Results(None, path, curves)
+    for scene, rows in formats.items():
+        points = curves["scenes"][scene]["series"]["best"]["encodes"]
+        table = results.table(
+            scene,
+            f"Preset best against other formats, by interpolation along its curve: {scene}",
+            Column("format"),
+            Column("size", "MB", ".2f"),
+            Column("PSNR", "dB", ".2f"),
+            Column("best at that PSNR", "MB", ".2f"),
+            Column("times smaller", format=".1f"),
+            Column("best's PSNR at that size", "dB", ".2f"),
+            Column("lost", "dB", ".2f"),
+            Column("best at that loss", "MB", ".2f"),
+            Column("times smaller at that loss", format=".1f"),
+            Column("best's loss at that size", "dB", ".2f"),
+        )
+        for row in rows:
+            cells: list[Cell] = []
+            for key in ("psnr", "psnr_loss"):
+                size = size_at(points, key, row[key])
+                largest = max(points, key=lambda p: int(p["bytes"]))
+                value = value_at(points, key, row["bytes"])
+                least = min(int(p["bytes"]) for p in points)
+                cells += [row[key], *_how_small(row, size, least), largest[key] if value is None else value]
+            table.add(row["format"] + ("" if row["measured"] else " *"), row["bytes"] / 1e6, *cells)
+
+
+def _how_small(row: dict[str, Any], size: float | None, least: int) -> tuple[Cell, Cell]:
+    """MB at which the curve is as good as a format, and how many times smaller that is; in words beyond its end."""
+    if size is not None:
+        return size / 1e6, row["bytes"] / size
+    return f"below {least / 1e6:.2f}", f"more than {row['bytes'] / least:.1f}"
+
+
 def _report(args: argparse.Namespace) -> None:
+    if args.json is not None:
+        keep_tables(measured_formats(args.results), json.loads(args.curves.read_text()), args.json)
+        return
     results = json.loads(args.results.read_text())
     curves = json.loads(args.curves.read_text())["scenes"]
     print(f"{results['tool']}; rows with * were measured earlier with their authors' code.\n")
@@ -148,6 +212,7 @@ def main() -> None:
     measure.add_argument("--formats", nargs="+", choices=FORMATS, default=FORMATS)
     measure.add_argument("--timeout", type=float, default=3600, metavar="S", help="a format; default an hour")
     report.add_argument("curves", type=Path, help="what tools.study.rate_distortion measured")
+    report.add_argument("--json", type=Path, metavar="FILE", help="keep tables for docs/benchmarks")
     args = parser.parse_args()
     args.run(args)
 

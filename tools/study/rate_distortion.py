@@ -5,10 +5,12 @@
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photographs in images. A series is a curve:
 the name it gets and the options of EncodeOptions in which it differs from the defaults, those of a stage with its name,
-as in exact:preset=best,prune.tolerance=0. ``measure`` writes its results after every encode and
-goes on where an existing file stops. ``report`` prints Markdown and draws DIR/rate_distortion_SCENE.png; the points of
-other formats come from tools.study.compare_formats. With --against it prints instead how many bytes more or fewer each
-series takes at the PSNR that the series NAME has at quality Q, by interpolation, and how long its encodes take.
+as in exact:preset=best,prune.tolerance=0. ``measure`` writes its results after every encode and goes on where an
+existing file stops; with --seconds it begins no encode after that many. ``report`` prints Markdown and draws
+DIR/rate_distortion_SCENE.png; the points of other formats come from tools.study.compare_formats. With --json it keeps
+the tables of docs/benchmarks: the curves, the uncompressed scenes, and the seconds of each stage at quality 0.5. With
+--against it prints instead how many bytes more or fewer each series takes at the PSNR that the series NAME has at
+quality Q, by interpolation, and how long its encodes take.
 """
 
 from __future__ import annotations
@@ -17,7 +19,9 @@ import argparse
 import ast
 import dataclasses
 import json
+import math
 import statistics
+import time
 from pathlib import Path
 from typing import Any
 
@@ -29,10 +33,18 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
-from tools.results import circumstances, write_json
+from tools.results import Column, Results, circumstances, write_json
 from tools.study.evaluation import EvaluatedScene
 from tools.workloads import study_parser
 
+#: Columns of the table of stages, and what an encode calls them.
+_STAGES = {
+    "views between": ("views between",),
+    "prepare views": ("prepare views",),
+    "prune": ("prune",),
+    "compact or re-fit": ("compact", "refit"),
+    "octree, quantise and code": ("octree", "quantise and code"),
+}
 QUALITIES = tuple(round(0.1 * step, 1) for step in range(1, 11))
 
 
@@ -90,7 +102,7 @@ def measure_encode(evaluator: EvaluatedScene, options: EncodeOptions, device: De
 
 def _measure(args: argparse.Namespace) -> None:
     series = dict(parse_series(text) for text in args.series)
-    device = Device(args.device)
+    began, device = time.perf_counter(), Device(args.device)
     results: dict[str, Any] = {"scenes": {}}
     if args.json.exists():
         results = json.loads(args.json.read_text())
@@ -102,7 +114,7 @@ def _measure(args: argparse.Namespace) -> None:
                 curve = entry["series"].setdefault(name, {"options": options, "encodes": []})
                 done = {point["q"] for point in curve["encodes"]}
                 for q in args.qualities:
-                    if q in done:
+                    if q in done or time.perf_counter() - began > args.seconds:
                         continue
                     point = measure_encode(evaluator, encode_options({**options, "q": q}), device)
                     curve["encodes"].append(point)
@@ -223,6 +235,70 @@ def print_gaps(scenes: dict[str, Any], against: str, q: float) -> None:
         print(f"| {series} | " + " | ".join(cells) + " |")
 
 
+def keep_tables(measured: dict[str, Any], path: Path) -> None:
+    """The tables of docs/benchmarks: a curve for each scene, "uncompressed", and "stages"."""
+    results = Results(None, path, measured)
+    scenes: dict[str, Any] = measured["scenes"]
+    for name, entry in scenes.items():
+        table = results.table(
+            name,
+            f"Size and quality of {name} by preset and quality, all test views",
+            Column("preset", default="{preset}"),
+            Column("q", default="{quality:g}"),
+            Column("splats", format=","),
+            Column("size", "MB", ".3f"),
+            Column("times smaller", format=".1f"),
+            Column("bytes a splat", format=".2f"),
+            Column("PSNR against uncompressed", "dB", ".2f"),
+            Column("SSIM against uncompressed", format=".4f"),
+            Column("PSNR against photographs", "dB", ".2f"),
+            Column("SSIM against photographs", format=".4f"),
+            Column("lost", "dB", ".2f"),
+        )
+        for series, curve in entry["series"].items():
+            for p in curve["encodes"]:
+                size = (p["bytes"] / 1e6, entry["source_bytes"] / p["bytes"], p["bytes"] / p["splats"])
+                truth = (p.get("truth_psnr"), p.get("truth_ssim"), p.get("psnr_loss"))
+                table.add(series, p["q"], p["splats"], *size, p["psnr"], p["ssim"], *truth)
+    table = results.table(
+        "uncompressed",
+        "The uncompressed scenes against their photographs, all test views",
+        Column("scene"),
+        Column("splats", format=","),
+        Column("PLY bytes", format=","),
+        Column("test views"),
+        Column("PSNR against photographs", "dB", ".2f"),
+        Column("SSIM against photographs", format=".4f"),
+    )
+    for name, entry in scenes.items():
+        plain = entry["uncompressed"]
+        counts = (entry["source_splats"], entry["source_bytes"], entry["test_views"])
+        table.add(name, *counts, plain.get("truth_psnr"), plain.get("truth_ssim"))
+    table = results.table(
+        "stages",
+        "Whole encodes at quality 0.5, stage by stage, in a process that has encoded before",
+        Column("scene"),
+        Column("preset", default="{preset}"),
+        Column("splats kept", format=","),
+        Column("bytes", format=","),
+        Column("times smaller than the PLY", format=".1f"),
+        Column("PSNR against the uncompressed renders", "dB", ".2f"),
+        Column("lost on the photographs", "dB", ".2f"),
+        *(Column(stage, "s", ".2f") for stage in _STAGES),
+        Column("in all", "s", ".2f"),
+    )
+    for name, entry in scenes.items():
+        for series, curve in entry["series"].items():
+            for p in curve["encodes"]:
+                if p["q"] == 0.5:
+                    smaller = entry["source_bytes"] / p["bytes"]
+                    seconds = [sum(p["seconds"].get(part, 0.0) for part in parts) for parts in _STAGES.values()]
+                    table.add(
+                        name, series, p["splats"], p["bytes"], smaller, p["psnr"], p.get("psnr_loss"), *seconds,
+                        sum(p["seconds"].values()),
+                    )  # fmt: skip
+
+
 def _report(args: argparse.Namespace) -> None:
     results = json.loads(args.results.read_text())
     if args.against is not None:
@@ -231,6 +307,9 @@ def _report(args: argparse.Namespace) -> None:
             if args.at not in measured:
                 raise UsageError(f"{args.results}: {name} has no encode of '{args.against}' at quality {args.at:g}")
         print_gaps(results["scenes"], args.against, args.at)
+        return
+    if args.json is not None:
+        keep_tables(results, args.json)
         return
     formats = json.loads(args.formats.read_text())["scenes"] if args.formats is not None else {}
     for name, entry in results["scenes"].items():
@@ -245,9 +324,11 @@ def _report(args: argparse.Namespace) -> None:
 def main() -> None:
     parser, measure, report = study_parser(__doc__, _measure, _report)
     measure.add_argument("--qualities", nargs="+", type=float, default=QUALITIES, metavar="Q")
+    measure.add_argument("--seconds", type=float, default=math.inf, metavar="S")
     measure.add_argument("--series", nargs="+", default=["default"], metavar="NAME[:OPTION=VALUE,…]")
     report.add_argument("--formats", type=Path, help="what tools.study.compare_formats measured")
     report.add_argument("--images", type=Path, metavar="DIR", help="draw the curves too")
+    report.add_argument("--json", type=Path, metavar="FILE", help="keep tables for docs/benchmarks")
     report.add_argument("--against", metavar="NAME")
     report.add_argument("--at", type=float, default=0.5, metavar="Q")
     args = parser.parse_args()

@@ -106,6 +106,40 @@ def test_the_report_on_formats(monkeypatch, tmp_path, capsys):
     assert c.count("more than 8.0 ×") == 2
 
 
+def test_tables_of_curves_and_formats(monkeypatch, folder, tmp_path, capsys):
+    """What docs/benchmarks shows of a measurement, and of formats that were measured before it."""
+    out, kept = tmp_path / "out.json", tmp_path / "kept.json"
+    series = ("--series", "best:preset=best", "fast:preset=fast")
+    call(monkeypatch, rate_distortion, "measure", folder, "--json", out, "--qualities", 0.3, 0.5, *series)
+    call(monkeypatch, rate_distortion, "measure", folder, "--json", out, "--qualities", 0.9, "--seconds", 0, *series)
+    measured = json.loads(out.read_text())
+    points = measured["scenes"]["excerpt"]["series"]["best"]["encodes"]
+    assert [p["q"] for p in points] == [0.3, 0.5], "an encode began after the time was over"
+    call(monkeypatch, rate_distortion, "report", out, "--json", kept)
+    tables = json.loads(kept.read_text())
+    assert [row[:3] for row in tables["excerpt"]["rows"][:2]] == [["best", p["q"], p["splats"]] for p in points]
+    assert [row[:2] for row in tables["stages"]["rows"]] == [["excerpt", "best"], ["excerpt", "fast"]]
+    seconds = tables["stages"]["rows"][0][-6:]
+    assert sum(seconds[:-1]) == pytest.approx(seconds[-1], rel=0.01)
+
+    monkeypatch.setattr(compare_formats, "EARLIER", {"excerpt": {"Other": (0.01, 9.0, 1.0)}})
+    sizes = {
+        "columns": [{"name": n} for n in ("format", "excerpt: size", "excerpt: PSNR", "excerpt: lost")],
+        "rows": [["PLY", 9.0, None, None], ["`.spz` (version 4)", 0.05, points[0]["psnr"], 0.1], ["Other", 1, 1, 1]],
+    }
+    formats, curve = tmp_path / "formats.json", measured["scenes"]["excerpt"]["series"]["best"]["encodes"]
+    for point in curve:
+        point["psnr_loss"] = 50 - point["psnr"]
+    out.write_text(json.dumps(measured))
+    formats.write_text(json.dumps({"sizes": sizes}))
+    call(monkeypatch, compare_formats, "report", formats, out, "--json", kept)
+    spz, other = json.loads(kept.read_text())["excerpt"]["rows"]
+    assert spz[0] == ".spz"
+    assert spz[3:5] == pytest.approx([points[0]["bytes"] / 1e6, 5e4 / points[0]["bytes"]])
+    assert other[0] == "Other *"
+    assert other[3].startswith("below")
+
+
 def test_rgb_streams_keep_r_g_and_b():
     scene = random_scene(50, 2)
     steps = ablation.as_channels(scene)
@@ -120,11 +154,15 @@ def test_ablation(monkeypatch, folder, tmp_path, capsys):
     call(monkeypatch, ablation, "measure", folder, "--json", out)
     steps = json.loads(out.read_text())["scenes"]["excerpt"]["steps"]
     sizes = [step["bytes"] for step in steps]
-    assert len(steps) == 7
-    assert sizes == sorted(sizes, reverse=True), "a part of the codec adds bytes"
+    assert len(steps) == 12
+    assert sizes[:6] == sorted(sizes[:6], reverse=True), "a part of the codec adds bytes"
+    assert sizes[-1] < sizes[5]
     assert steps[0]["psnr"] == steps[1]["psnr"]
     for step in steps[1:]:
         listed = sum(step["bytes_a_splat"].values()) * step["splats"]
         assert 0 < step["bytes"] - listed < 3000, "more than the header is missing"
-    call(monkeypatch, ablation, "report", out)
-    assert "| AC | 180 |" in capsys.readouterr().out
+    call(monkeypatch, ablation, "report", out, "--json", tmp_path / "results.json")
+    assert "| as PLY | 12.00 |" in capsys.readouterr().out
+    results = json.loads((tmp_path / "results.json").read_text())
+    assert [len(results[name]["rows"]) for name in ("excerpt", "bytes_excerpt")] == [13, 13]
+    assert results["excerpt"]["machine"] == json.loads(out.read_text())["machine"]

@@ -55,17 +55,6 @@ kernel void to_rgb(global const float *columns, ulong stride, global float *resu
     }
 }
 
-/* AC coefficients to the nearest multiples of 1 / factor, which each splat has its own of. */
-kernel void round_ac(global float *coefficients, global const float *factors, ulong stride)
-{
-    const size_t index = get_global_id(0);
-    const vfloat factor = VLOAD(index, factors);
-    for (int column = 3; column < 3 * SH_COUNT; ++column) {
-        global float *values = coefficients + column * stride;
-        VSTORE(floor(VLOAD(index, values) * factor + 0.5f) / factor, index, values);
-    }
-}
-
 /* y = a y + b x. */
 kernel void combine(float a, global float *y, float b, global const float *x)
 {

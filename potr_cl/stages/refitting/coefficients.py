@@ -103,9 +103,9 @@ class Coefficients(Owner):
 
     def __init__(self, device: Device, layout: Layout) -> None:
         self.device, self.layout = device, layout
-        self._regularise, self._combine, self._dot_parts, self._to_ycocg, self._to_rgb, self._round_ac = (
+        self._regularise, self._combine, self._dot_parts, self._to_ycocg, self._to_rgb = (
             device.shared_kernel(_SOURCE, name, **layout.macros)
-            for name in ("regularise", "combine", "dot_parts", "to_ycocg", "to_rgb", "round_ac")
+            for name in ("regularise", "combine", "dot_parts", "to_ycocg", "to_rgb")
         )
         self._memory = Memory(device)
         try:
@@ -224,21 +224,6 @@ class Coefficients(Owner):
             "buffer_pitches": (4 * self.layout.stride, 0),
             "host_pitches": (4 * self.layout.splats, 0),
         }
-
-    def round_ac(self, x: cl.Buffer, factors: FloatArray) -> None:
-        """Round a vector's AC coefficients to multiples of a step.
-
-        Args:
-            x: the vector.
-            factors: (N,) float32, steps a unit, of each splat.
-        """
-        layout = self.layout
-        padded = np.ones(layout.stride, np.float32)
-        padded[: layout.splats] = factors
-        with Memory(self.device) as memory:
-            steps = memory.upload(padded, "the steps of colours")
-            self._round_ac.bind(coefficients=x, factors=steps, stride=layout.stride)
-            layout.over_splats(self._round_ac)
 
     def _columns_of(self, x: cl.Buffer) -> FloatArray:
         """(M, 3, stride)."""

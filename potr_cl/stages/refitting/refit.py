@@ -28,11 +28,13 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
+from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients, Layout, Ridge
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
+from potr_cl.stages.refitting.rounding import ROUNDS, Rounding
 from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
 from potr_cl.stages.refitting.targets import Targets
@@ -41,6 +43,9 @@ from potr_cl.workers.pool import Pool
 
 #: Steps in which the constant coefficients are solved for once more, after the others have been rounded.
 _CONSTANT_STEPS = 3
+#: What a coefficient that becomes 0 as it is rounded is worth, as a part of what one is worth that is given up before.
+#: What the others of the splat are counted on to make up for is more than they can.
+_WORTH = 0.4
 
 
 @dataclass(frozen=True)
@@ -110,7 +115,7 @@ def refit_colours(
     progress: Callable[[int, int], None] | None = None,
     fix_ac: Callable[[FloatArray, ColourRefit], FloatArray] | None = None,
     help_from: HelpFrom | None = None,
-    ac_factors: Callable[[FloatArray], FloatArray] | None = None,
+    colour_grid: Callable[[FloatArray], ColourGrid] | None = None,
 ) -> Refitted:
     """Re-fit a scene's colours to pictures of all views together.
 
@@ -127,15 +132,16 @@ def refit_colours(
             change, and from what the re-fit knows of them (:meth:`ColourRefit.worth`). The constant ones are then
             solved for again. If it returns the solution itself, that stays as it is.
         help_from: workers that do some of the views; the targets are then pictures of a scene.
-        ac_factors: in place of ``fix_ac``, where AC coefficients are rounded to multiples of a step of their splat: it
-            gets :meth:`ColourRefit.worth_of_constants`, in a thread of its own, and returns (N,) steps a unit.
+        colour_grid: in place of ``fix_ac``, where colours are rounded to steps of their splats, in rounds
+            (:mod:`potr_cl.stages.refitting.rounding`): it gets :meth:`ColourRefit.worth_of_constants`, in a thread of
+            its own, and returns the steps.
 
     Raises:
         UsageError: no camera.
         DeviceError: the scene does not fit the device.
     """
     options = options or RefitOptions()
-    more = 0 if fix_ac is None and ac_factors is None else _CONSTANT_STEPS
+    more = 0 if fix_ac is None and colour_grid is None else _CONSTANT_STEPS
 
     def report(done: int, steps: int) -> None:
         if progress is not None:
@@ -145,8 +151,8 @@ def refit_colours(
         device, scene, cameras, background=background, memory=options.memory, help_from=help_from
     ) as refit:
         way: _Rounding
-        if ac_factors is not None:
-            way = _InSteps(refit, targets, options, ac_factors)
+        if colour_grid is not None:
+            way = _OnGrid(refit, targets, options, colour_grid)
         elif fix_ac is not None:
             way = _AsTheFileDoes(refit, targets, options, fix_ac)
         else:
@@ -181,24 +187,23 @@ class _Rounding(Protocol):
 
 
 @dataclass
-class _InSteps:
+class _OnGrid:
     """Rounded on the device, to steps that are found while it solves."""
 
     refit: ColourRefit
     targets: Targets
     options: RefitOptions
-    ac_factors: Callable[[FloatArray], FloatArray]
-    _factors: Future[FloatArray] | None = None
+    colour_grid: Callable[[FloatArray], ColourGrid]
+    _grid: Future[ColourGrid] | None = None
 
     def begin(self) -> None:
-        self._factors = in_background(self.ac_factors, self.refit.worth_of_constants())
+        self._grid = in_background(self.colour_grid, self.refit.worth_of_constants())
 
     def finish(self, solved: Solved) -> tuple[Refitted, float]:
-        assert self._factors is not None
-        self.refit.round_ac(self._factors.result())
-        again = self.refit.solve_constant(self.targets, replace(self.options, steps=_CONSTANT_STEPS))
-        result = Refitted(self.refit.colours(), (solved.errors[0], again.errors[1]), solved.steps + again.steps)
-        return result, again.errors[0]
+        assert self._grid is not None
+        rounded = self.refit.round_to(self._grid.result(), self.targets, self.options)
+        result = Refitted(self.refit.colours(), (solved.errors[0], rounded.errors[1]), solved.steps + rounded.steps)
+        return result, rounded.errors[0]
 
     def error(self) -> float:
         return self.refit.error(self.targets)
@@ -339,7 +344,7 @@ class ColourRefit(Owner):
         check: bool = True,
         after_start: Callable[[], None] = lambda: None,
     ) -> Solved:
-        """The same, with the solution left where :meth:`colours`, :meth:`round_ac` and :meth:`solve_constant` find it.
+        """The same, with the solution left where :meth:`colours`, :meth:`round_to` and :meth:`solve_constant` find it.
 
         Args:
             sh, targets, options, active, hold, progress: as :meth:`solve` takes them.
@@ -391,23 +396,44 @@ class ColourRefit(Owner):
         """(N, M, 3) float32 R, G, B, the solution."""
         return self.coefficients.read_sh(self._solver.x)
 
-    def round_ac(self, factors: FloatArray) -> None:
-        """Round the solution's AC coefficients; :meth:`error` still knows what they were.
+    def round_to(self, grid: ColourGrid, targets: Targets, options: RefitOptions) -> Solved:
+        """Make of the solution what a file can hold, but for the last constant coefficients.
+
+        :meth:`error` still knows what it was.
 
         Args:
-            factors: (N,) float32, steps a unit of each splat.
+            grid: what the file can hold.
+            targets, options: that the solution was found with.
+
+        Returns:
+            The errors after the first round of rounding, and in the end.
+
+        Raises:
+            DeviceError: the device failed.
         """
+        solver, steps, errors = self._solver, 0, []
         if self._unrounded is None:
             self._unrounded = self.coefficients.vector()
-        self.coefficients.copy(self._unrounded, self._solver.x)
-        self.coefficients.round_ac(self._solver.x, factors)
+        self.coefficients.copy(self._unrounded, solver.x)
+        ridge = Ridge(options.lam, options.chroma_factor, options.prior)
+        worth = _WORTH * options.drop * self.colour_map.total_weight
+        with Rounding(self.coefficients, grid) as rounding:
+            *first, last = ROUNDS
+            for each in first:
+                rounding.round(solver.x, solver.blocks, each, worth)
+                gone_on = solver.go_on(self.colour_map, targets, Descent(each.steps, 0.0, ridge))
+                steps += gone_on.steps
+                errors.append(gone_on.start)
+            rounding.round(solver.x, solver.blocks, last, worth)
+            solved = solver.solve(self.colour_map, targets, Descent(last.steps, 0.0, ridge), constant=True)
+        return Solved((errors[0], solved.errors[1]), steps + solved.steps, solved.start)
 
     def error(self, targets: Targets, sh: FloatArray | None = None) -> float:
         """Mean squared error of the pictures. The solution is lost.
 
         Args:
             targets: the pictures.
-            sh: (N, M, 3) R, G, B, the colours; None: the solution as it was before :meth:`round_ac`.
+            sh: (N, M, 3) R, G, B, the colours; None: the solution as it was before :meth:`round_to`.
 
         Raises:
             DeviceError: the device failed.

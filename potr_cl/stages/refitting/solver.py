@@ -196,6 +196,21 @@ class ColourSolver(Owner):
         self._coefficients.zero(self._residual)
         return colour_map.gradient(self.x, targets, self._residual) / colour_map.total_weight
 
+    def go_on(self, colour_map: ColourMap, targets: Targets, descent: Descent) -> Solved:
+        """Go on from where x is, some steps that nobody checks, with the blocks of the solution before.
+
+        Returns:
+            What it did; the error after it is not a number.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        problem = _Problem(colour_map, targets, constant=False)
+        state = self._start_here(problem, descent.ridge)
+        steps = self._descend(problem, state, descent, lambda done: None)
+        start = state.error / colour_map.total_weight
+        return Solved((start, math.nan), steps, start)
+
     def _linearise(self, problem: _Problem, ridge: Ridge, blocks: SplatBlocks | None = None) -> _State:
         """Settle which colours are cut, and make the residual: minus half the objective's gradient at x."""
         vectors, residual = self._coefficients, self._residual
