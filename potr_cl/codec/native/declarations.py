@@ -58,6 +58,7 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     ),
     "potr_nonzero_levels": (_NUMBER, [_POINTER, _SIZE, _SIZE, ctypes.c_double, ctypes.c_double, _POINTER]),
     "potr_unpredicted": (None, [_POINTER, _SIZE, _SIZE, _SIZE, *[_POINTER] * 4]),
+    "potr_unit_factors": (None, [_POINTER, _SIZE, _SIZE, _SIZE, _SIZE, _REAL, _POINTER]),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
 }
 #: Those that there are for several kinds of integers, by what their names begin with.
