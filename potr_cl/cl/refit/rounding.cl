@@ -71,7 +71,10 @@ kernel void round_ac(
             vfloat pivot = diagonal;
             for (int i = 0; i < j; ++i)
                 pivot = MAD(-pivots[i] * factor[AT(i, j)], factor[AT(i, j)], pivot);
-            pivots[j] = fmax(pivot, LEAST_PIVOT * diagonal) * free[j];
+            /* Of a block that is positive definite no pivot is below what was added to its diagonal. Of splats that views
+               hardly see, little more than the rounding of the sums is left in the block: such rows make up for
+               nothing. */
+            pivots[j] = pivot > 0.5f * more && pivot > LEAST_PIVOT * diagonal ? pivot * free[j] : (vfloat)(0.0f);
             const vfloat inverse = pivots[j] > 0.0f ? 1.0f / pivots[j] : (vfloat)(0.0f);
             for (int k = j + 1; k < SH_COUNT; ++k) {
                 vfloat sum = length * VLOAD(index, blocks + AT(j, k) * stride);
