@@ -39,8 +39,9 @@ class Rounded:
         with ColourRefit(case.device, case.scene, case.cameras, background=case.background) as refit:
             vectors = refit.coefficients
             x, result = vectors.vector(), vectors.vector()
-            vectors.write_sh(x, case.scene.sh, active)
+            vectors.write_sh(x, case.scene.sh)
             vectors.activate(active)
+            vectors.keep_active(x)
             vectors.zero(result)
             with SplatBlocks(vectors) as blocks, Rounding(vectors, grid) as rounding:
                 blocks.zero()
