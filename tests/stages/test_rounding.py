@@ -5,6 +5,7 @@ from __future__ import annotations
 import dataclasses
 
 import numpy as np
+import pyopencl as cl
 import pytest
 
 from potr_cl.outputs.colour_grid import ColourGrid
@@ -110,6 +111,29 @@ def test_what_no_view_sees_goes_to_its_nearest_level(device):
         got = Rounded(case, grid, Round(others=TURNS - 1, constant=-1, steps=0), 1e9)
     assert np.abs(got.after[20:, 1:] - got.before[20:, 1:]).max() <= grid.others.max() * 0.501
     assert np.count_nonzero(got.after[20:, 1:]) > 300
+
+
+def test_blocks_that_are_rounding_errors_move_nothing_far(device):
+    """Of splats that views hardly see: some quanta of the sums over views, which are no positive definite block."""
+    count, rng = 600, np.random.default_rng(5)
+    scene, grid = visible_scene(count, 3), grid_of(count, 0.02)
+    with (
+        Case(device, scene, visible_scene(30, 2, 7), ring_of_cameras(1, size=40)) as case,
+        ColourRefit(device, scene, case.cameras) as refit,
+        SplatBlocks(refit.coefficients) as blocks,
+        Rounding(refit.coefficients, grid) as rounding,
+    ):
+        vectors = refit.coefficients
+        x, stride = vectors.vector(), vectors.layout.stride
+        vectors.write_sh(x, scene.sh)
+        vectors.activate(None)
+        quanta = rng.integers(-9, 10, (16 * 17 // 2, stride))
+        diagonal = np.cumsum([0, *range(16, 1, -1)])
+        quanta[diagonal] = np.maximum(rng.integers(-3, 20, (16, stride)), 0)
+        cl.enqueue_copy(device.queue, blocks.buffer, (quanta * 2.0**-32).astype(np.float32), is_blocking=True)
+        before = vectors.read(x)
+        rounding.round(x, blocks, Round(others=TURNS - 1, constant=-1, steps=0), 0.0)
+        assert np.abs(vectors.read(x) - before).max() < 66 * grid.others.max()
 
 
 def fitted(case: Case, grid: ColourGrid | None, fix_ac=None) -> np.ndarray:

@@ -11,6 +11,9 @@
 /* The least part of its diagonal that a pivot keeps. */
 #define LEAST_PIVOT 1e-6f
 
+/* A coefficient goes so many steps at most to make up for others. */
+#define FURTHEST 64.0f
+
 /* Of the splats of a round, those that are due: their number in the order of rounds is at most `turn`. */
 inline vint due_lanes(global const int *turns, size_t index, int turn)
 {
@@ -90,6 +93,7 @@ kernel void round_ac(
             vfloat wanted = was;
             for (int k = j + 1; k < SH_COUNT; ++k)
                 wanted = MAD(factor[AT(j, k)], error[k], wanted);
+            wanted = fmin(fmax(wanted, was - FURTHEST * step), was + FURTHEST * step);
             vfloat held = wanted;
             if (j)
                 held = step * cheap_level(wanted / step, pivots[j] * step * step, to_zero, to_less);
