@@ -36,7 +36,9 @@ def grid_of(count: int, step: float = 0.1, seed: int = 0) -> ColourGrid:
 class Rounded:
     """What one round of the device makes of a scene's colours: before and after (N, M, 3), active, blocks."""
 
-    def __init__(self, case: Case, grid: ColourGrid, this: Round, worth: float, active=None) -> None:
+    def __init__(
+        self, case: Case, grid: ColourGrid, this: Round, worth: float, active=None, noise: float = 0.0
+    ) -> None:
         with ColourRefit(case.device, case.scene, case.cameras, background=case.background) as refit:
             vectors = refit.coefficients
             x, result = vectors.vector(), vectors.vector()
@@ -47,6 +49,9 @@ class Rounded:
             with SplatBlocks(vectors) as blocks, Rounding(vectors, grid) as rounding:
                 blocks.zero()
                 refit.colour_map.gradient(x, case.targets, result, blocks)
+                if noise:
+                    found = np.random.default_rng(0).normal(0, noise, blocks.buffer.size // 4).astype(np.float32)
+                    cl.enqueue_copy(case.device.queue, blocks.buffer, found, is_blocking=True)
                 self.before = vectors.read(x).astype(np.float64)
                 rounding.round(x, blocks, this, worth)
                 self.blocks = blocks.read().astype(np.float64)
@@ -113,27 +118,12 @@ def test_what_no_view_sees_goes_to_its_nearest_level(device):
     assert np.count_nonzero(got.after[20:, 1:]) > 300
 
 
-def test_blocks_that_are_rounding_errors_move_nothing_far(device):
-    """Of splats that views hardly see: some quanta of the sums over views, which are no positive definite block."""
-    count, rng = 600, np.random.default_rng(5)
-    scene, grid = visible_scene(count, 3), grid_of(count, 0.02)
-    with (
-        Case(device, scene, visible_scene(30, 2, 7), ring_of_cameras(1, size=40)) as case,
-        ColourRefit(device, scene, case.cameras) as refit,
-        SplatBlocks(refit.coefficients) as blocks,
-        Rounding(refit.coefficients, grid) as rounding,
-    ):
-        vectors = refit.coefficients
-        x, stride = vectors.vector(), vectors.layout.stride
-        vectors.write_sh(x, scene.sh)
-        vectors.activate(None)
-        quanta = rng.integers(-9, 10, (16 * 17 // 2, stride))
-        diagonal = np.cumsum([0, *range(16, 1, -1)])
-        quanta[diagonal] = np.maximum(rng.integers(-3, 20, (16, stride)), 0)
-        cl.enqueue_copy(device.queue, blocks.buffer, (quanta * 2.0**-32).astype(np.float32), is_blocking=True)
-        before = vectors.read(x)
-        rounding.round(x, blocks, Round(others=TURNS - 1, constant=-1, steps=0), 0.0)
-        assert np.abs(vectors.read(x) - before).max() < 66 * grid.others.max()
+def test_splats_that_hardly_show_stay_where_they_are(device):
+    """Their blocks are little more than what fixed points are wrong by, and need not be positive."""
+    scene, grid = visible_scene(200, 3), grid_of(200, 0.02)
+    with Case(device, scene, scene, ring_of_cameras(1, size=20)) as case:
+        got = Rounded(case, grid, Round(others=TURNS - 1, constant=-1, steps=0), 0.0, noise=3e-9)
+    assert np.abs(got.after - got.before).max() < grid.others.max()
 
 
 def fitted(case: Case, grid: ColourGrid | None, fix_ac=None) -> np.ndarray:
