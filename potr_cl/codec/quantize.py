@@ -142,7 +142,7 @@ def _balanced(q: float, given: Mapping[str, float]) -> HyperParameters:
         beta=0.056 / finer,
         gamma=1e-30,
         sf_dc=31 * finer,
-        sf_sh=34 * finer,
+        sf_sh=29 * finer,
         sf_opacity=3.3 * finer,
         sf_rotation=7.6 * finer,
         sf_scale=8.8 * finer,

@@ -27,6 +27,7 @@ from potr_cl.model.placement.choice import pick
 from potr_cl.model.placement.matter import frame_of, matter_of
 from potr_cl.model.placement.sampling import F64
 from potr_cl.model.scene import Scene
+from potr_cl.model.views_between import is_between
 
 F32 = NDArray[np.float32]
 
@@ -144,8 +145,10 @@ def plan(splats: int, count: int | None = None, size: int | None = None) -> Plan
 
 
 def is_virtual(cameras: Sequence[Camera]) -> bool:
-    """Whether they were placed by :func:`place_cameras`, by their names."""
-    return bool(cameras) and all(camera.name.startswith(_PREFIX) for camera in cameras)
+    """Whether they were placed by :func:`place_cameras`, or between such ones, by their names."""
+    if not cameras or not cameras[0].name.startswith(_PREFIX):
+        return False
+    return all(camera.name.startswith(_PREFIX) or is_between(camera) for camera in cameras)
 
 
 def standpoints(cameras: Sequence[Camera], means: F32) -> F64:

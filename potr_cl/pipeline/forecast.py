@@ -23,7 +23,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import Drawable
-from potr_cl.stages.between.amount import most_needed
+from potr_cl.stages.between.amount import most_needed, needed_of_virtual
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.memory import fit_bytes
@@ -115,9 +115,11 @@ def forecast(
     parts = {stage.name: stage for stage in options.stages if stage.asked_for and stage.looks_at(scene)}
     units = UNITS[device.family]
     views, of_a_splat = float(len(cameras)), units.code_splat
-    if isinstance(between := parts.get(Between.name), Between) and len(cameras) > 1 and not is_virtual(cameras):
-        each = between.views  # with auto, nobody knows yet how many the scene needs
-        views *= 1 + (most_needed(len(cameras), device.info.kind == "cpu") if each == "auto" else each)
+    if isinstance(between := parts.get(Between.name), Between) and len(cameras) > 1:
+        each, slow = between.views, device.info.kind == "cpu"
+        if each == "auto":  # nobody knows yet how many the scene needs
+            each = needed_of_virtual(slow) if is_virtual(cameras) else most_needed(len(cameras), slow)
+        views *= 1 + each
     pictures = views * units.prepare
     if isinstance(prune := parts.get(Prune.name), Prune):
         pictures += views * (units.prune + units.iteration * prune.iterations)

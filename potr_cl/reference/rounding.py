@@ -9,7 +9,14 @@ Array = NDArray[np.float64]
 
 
 def rounded_in_turn(
-    block: Array, x: Array, free: NDArray[np.bool_], step: float, to_zero: float, to_less: float, damping: float = 1e-2
+    block: Array,
+    x: Array,
+    free: NDArray[np.bool_],
+    step: float,
+    to_zero: float,
+    to_less: float,
+    damping: float = 1e-2,
+    floor: float = 1e-3,
 ) -> tuple[Array, float]:
     """AC coefficients of one channel of one splat as multiples of a step, the last one first.
 
@@ -20,13 +27,13 @@ def rounded_in_turn(
         x: (M,) the coefficients. free: (M,) those that may change.
         step: of the AC coefficients.
         to_zero, to_less: what it saves to have 0 instead of one step, and one step less of several.
-        damping: added to the diagonal, as a part of its mean.
+        damping, floor: added to the diagonal, as a part of its mean, and besides.
 
     Returns:
         The coefficients, the constant one not rounded; and how near, relatively, a decision was.
     """
     count = len(x)
-    block = block + damping * np.trace(block) / count * np.eye(count)
+    block = block + (damping * np.trace(block) / count + floor) * np.eye(count)
     y, left, margin = x.copy(), free.copy(), np.inf
     for m in range(count - 1, 0, -1):
         if not left[m]:

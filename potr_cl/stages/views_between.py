@@ -12,7 +12,7 @@ from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import SPREAD, views_between
 from potr_cl.model.virtual_cameras import is_virtual
-from potr_cl.stages.between.amount import needed, views_where_few
+from potr_cl.stages.between.amount import needed, needed_of_virtual, views_where_few
 from potr_cl.stages.between.room import room_for
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
@@ -52,7 +52,7 @@ class Added:
 class Between(Stage):
     """Add views between the training views, so that the scene keeps what is seen from there.
 
-    Virtual cameras are spread so that nothing has to be added.
+    Virtual cameras get some on a GPU.
 
     Attributes:
         views: how many to add for each training view; 0.5: one for every second; 0: none; "auto": as many as the scene
@@ -96,16 +96,22 @@ class Between(Stage):
     def run(self, state: State, bench: Workbench) -> State:
         """Add them; ``learnt`` gets an :class:`Added`."""
         given = len(state.views)
-        if is_virtual(state.views) or given < 2 or state.added:
+        if given < 2 or state.added:
+            return state
+        slow = bench.opened.info.kind == "cpu"
+        virtual = is_virtual(state.views)
+        if virtual and self.views == "auto" and not needed_of_virtual(slow):
             return state
         bench.progress("views between", 0.0)
         known = GivenViews(state.source, state.views)
         each, shown_by = self.views, None
-        if each == "auto":
+        if each == "auto" and virtual:
+            each = needed_of_virtual(slow)
+        elif each == "auto":
             each, parts = 0.0, known.views_of_parts()
             if len(parts):
                 shown_by = views_where_few(parts)
-                each = needed(shown_by, given, bench.opened.info.kind == "cpu")
+                each = needed(shown_by, given, slow)
         added = views_between(state.source, state.views, each, self.spread, known=known)
         if self.views == "auto":
             added = _evenly(added, room_for(added, state, bench))

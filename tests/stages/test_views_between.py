@@ -13,7 +13,7 @@ from potr_cl.errors import UsageError
 from potr_cl.formats.images import to_8_bits, write_png
 from potr_cl.model.camera import test_views, train_views
 from potr_cl.model.views_between import is_between, views_between
-from potr_cl.model.virtual_cameras import place_cameras
+from potr_cl.model.virtual_cameras import is_virtual, place_cameras
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
@@ -21,6 +21,7 @@ from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Target
 from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.between.amount import needed_of_virtual
 from potr_cl.stages.pruning.prepared_views import PreparedViews
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.stages.views_between import Between
@@ -138,10 +139,23 @@ def test_the_summary_tells_of_them(device, plush_excerpt, plush_excerpt_cameras)
     assert str(encoded.between) == "8 views between the 9 training views were looked at, too"
 
 
-def test_virtual_cameras_and_single_ones_get_none(device, plush_excerpt, plush_excerpt_cameras):
-    for cameras in (place_cameras(plush_excerpt, 6, 64), train_views(plush_excerpt_cameras)[:1]):
-        alone, asked = (file_of(device, plush_excerpt, cameras, options(views)) for views in (0, 2))
-        assert alone == asked
+def test_single_cameras_get_none(device, plush_excerpt, plush_excerpt_cameras):
+    single = train_views(plush_excerpt_cameras)[:1]
+    alone, asked = (file_of(device, plush_excerpt, single, options(views)) for views in (0, 2))
+    assert alone == asked
+
+
+def test_virtual_cameras_get_some_where_there_is_time(device, plush_excerpt, monkeypatch):
+    """On a GPU by themselves, on a CPU if they are asked for; they go on to be virtual."""
+    state = State.of(plush_excerpt, train_views(place_cameras(plush_excerpt, 8, 64)))
+    bench = Workbench(HyperParameters.from_quality(0.5, "best"), device=device)
+    assert bool(Between().run(state, bench).added) == (device.info.kind != "cpu")
+    monkeypatch.setattr("potr_cl.stages.views_between.needed_of_virtual", lambda slow: needed_of_virtual(slow=False))
+    assert 0 < Between().run(state, bench).added <= 4
+    asked = Between(views=1.0).run(state, bench)
+    assert 4 < asked.added <= 8
+    assert is_virtual(asked.views)
+    assert not is_virtual(asked.views[8:])
 
 
 def test_it_is_left_out_where_nothing_else_looks_at_views(plush_excerpt, plush_excerpt_cameras):

@@ -8,8 +8,9 @@
 
 /* Added to the diagonal of a block, as a part of its mean: what no view tells apart is not moved far. */
 #define DAMPING 1e-2f
-/* The least part of its diagonal that a pivot keeps. */
-#define LEAST_PIVOT 1e-6f
+/* Added besides, in weighted squared error: far below what a coefficient is worth, and far above what the blocks' fixed
+   points are wrong by. Without it, blocks of splats that hardly show are not positive, and values explode. */
+#define FLOOR 1e-3f
 
 /* Of the splats of a round, those that are due: their number in the order of rounds is at most `turn`. */
 inline vint due_lanes(global const int *turns, size_t index, int turn)
@@ -27,10 +28,9 @@ inline vfloat cheap_level(vfloat value, vfloat squared, float to_zero, float to_
     const vfloat size = fabs(nearest), off = fabs(value) - size;
     /* (off + 1)^2 - off^2 */
     const vfloat more = squared * (2.0f * off + 1.0f);
-    /* What no view shows costs nothing, and is left as it is. */
     const vfloat saved = size > 1.5f ? (vfloat)(to_less) : (vfloat)(to_zero);
     const vfloat less = nearest > 0.0f ? nearest - 1.0f : nearest + 1.0f;
-    return size > 0.5f && squared > 0.0f && more < saved ? less : nearest;
+    return size > 0.5f && more < saved ? less : nearest;
 }
 
 /* Rounds the AC coefficients of the splats that are due, from the last to the first: what is still free of the splat's
@@ -59,7 +59,7 @@ kernel void round_ac(
         trace += VLOAD(index, blocks + AT(i, i) * stride);
     for (int c = 0; c < 3; ++c) {
         const float length = c == 1 ? 2.0f : 3.0f;
-        const vfloat more = trace * (DAMPING * length / SH_COUNT);
+        const vfloat more = trace * (DAMPING * length / SH_COUNT) + FLOOR;
         vfloat free[SH_COUNT];
         for (int j = 0; j < SH_COUNT; ++j)
             free[j] = active_lanes(active, stride, index, 3 * j + c);
@@ -71,7 +71,7 @@ kernel void round_ac(
             vfloat pivot = diagonal;
             for (int i = 0; i < j; ++i)
                 pivot = MAD(-pivots[i] * factor[AT(i, j)], factor[AT(i, j)], pivot);
-            pivots[j] = fmax(pivot, LEAST_PIVOT * diagonal) * free[j];
+            pivots[j] = fmax(pivot, more) * free[j];
             const vfloat inverse = pivots[j] > 0.0f ? 1.0f / pivots[j] : (vfloat)(0.0f);
             for (int k = j + 1; k < SH_COUNT; ++k) {
                 vfloat sum = length * VLOAD(index, blocks + AT(j, k) * stride);
@@ -89,7 +89,9 @@ kernel void round_ac(
                 wanted = MAD(factor[AT(j, k)], error[k], wanted);
             vfloat held = wanted;
             if (j)
-                held = step * cheap_level(wanted / step, pivots[j] * step * step, to_zero, to_less);
+                /* What no view shows is left as it is, though it costs nothing. */
+                held = step * cheap_level(
+                    wanted / step, trace > 0.0f ? pivots[j] * step * step : (vfloat)(1e30f), to_zero, to_less);
             const vint changed = due && free[j] > 0.0f && fabs(held) < 1e30f;
             held = changed ? held : was;
             error[j] = was - held;

@@ -12,11 +12,15 @@ _ENOUGH = 32
 _PART = 0.25
 #: Fewer than this for each training view bring too little.
 _LEAST = 0.25
-_MOST = 2.0
+_MOST = 5.0
 #: An added view takes as much time as a training view. So that an encode takes at most 1.6 times as long, added views
 #: are a part of the training views, and some more where an encode does much besides looking at views, as on GPUs.
 _SHARE = 0.45
 _BESIDES, _BESIDES_ON_CPU = 45, 4
+
+#: Views to add for each virtual one: they are as many as a scene needs, but chosen to show what others do not, so that
+#: what someone sees from between them counts too little. A CPU has enough to do with the virtual ones.
+_OF_VIRTUAL, _OF_VIRTUAL_ON_CPU = 0.5, 0.0
 
 
 def needed(shown_by: float, views: int, slow: bool) -> float:
@@ -39,6 +43,15 @@ def views_where_few(views_of_parts: NDArray[np.int64]) -> float:
             (:meth:`potr_cl.model.placement.given_views.GivenViews.views_of_parts`), at least one.
     """
     return float(np.quantile(views_of_parts, _PART))
+
+
+def needed_of_virtual(slow: bool) -> float:
+    """How many to add for each virtual camera.
+
+    Args:
+        slow: whether a CPU has to look at them.
+    """
+    return _OF_VIRTUAL_ON_CPU if slow else _OF_VIRTUAL
 
 
 def most_needed(views: int, slow: bool) -> float:
