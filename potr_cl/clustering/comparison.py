@@ -96,7 +96,7 @@ class Points(Owner):
 
     def sums(self, labels: U32, count: int) -> FloatArray:
         """(count, width) float32, the sum of the rows of each label's points."""
-        order = _sorted(labels, count).astype(np.uint32)
+        order = sorted_by_label(labels, count).astype(np.uint32)
         starts = np.concatenate([[0], np.cumsum(np.bincount(labels, minlength=count))]).astype(np.uint32)
         with Memory(self._device) as memory:
             result = memory.allocate(4 * count * self._width, "the sums of clusters")
@@ -123,7 +123,7 @@ def _blocks(count: int, cell_of: U32 | None, cells: int, size: int) -> tuple[U32
     counts = np.bincount(cell_of, minlength=cells)
     blocks = -(-counts // size)
     firsts = (np.cumsum(blocks) - blocks) * size
-    by_cell = _sorted(cell_of, cells)
+    by_cell = sorted_by_label(cell_of, cells)
     sorted_cells = cell_of[by_cell]
     ranks = np.arange(count) - (np.cumsum(counts) - counts)[sorted_cells]
     order = np.full(int(blocks.sum()) * size, _NO_POINT, np.uint32)
@@ -131,7 +131,7 @@ def _blocks(count: int, cell_of: U32 | None, cells: int, size: int) -> tuple[U32
     return order, np.repeat(np.arange(cells, dtype=np.uint32), blocks)
 
 
-def _sorted(labels: U32, count: int) -> NDArray[np.intp]:
+def sorted_by_label(labels: U32, count: int) -> NDArray[np.intp]:
     """Numbers of points by their labels, below ``count``; those of one label keep their order."""
     # NumPy sorts 16 bits by their digits, ten times as quickly as it compares longer ones.
     return np.argsort(labels.astype(np.uint16) if count <= 1 << 16 else labels, kind="stable")

@@ -21,7 +21,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.clustering.comparison import U32, Lists, Points
+from potr_cl.clustering.comparison import U32, Lists, Points, sorted_by_label
 from potr_cl.clustering.rows import centres_of_sums, errors_at_zero, rows_of_points
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
@@ -186,7 +186,7 @@ class _Finder:
             cell_of, scores = self._at.nearest(cells)
             errors = np.maximum(self._constants + scores, 0)
             errors += errors.mean() * 1e-3 or 1.0  # where all points are alike, too
-            order = np.argsort(cell_of, kind="stable")
+            order = sorted_by_label(cell_of, len(cells))
             self._centres = taken[order[_seeds(errors[order], count)]]
             self._cells = cells
             self._held = None

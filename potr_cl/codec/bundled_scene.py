@@ -36,6 +36,8 @@ if TYPE_CHECKING:
 _SIDE_BY_SIDE = 32
 #: Bundles whose integers a thread joins at a time.
 _HANDED = 4
+#: Splats for each thread, so that one more pays.
+SPLATS_A_THREAD = 3 * BUNDLE
 #: Parts of the positions for each thread, so that none waits long for another.
 _PARTS = 2
 #: Levels whose values are looked up.
@@ -86,11 +88,11 @@ class BundledScene:
             DataError: damaged.
         """
         work, number = SharedWork(), self.reader.bundles.number
-        # More threads than half the bundles would share memory and caches for nothing.
-        helpers = min(threads, max(number // 2, 2)) - (filled is None)
+        # With fewer bundles for each, threads wait for the interpreter, and for memory, longer than they decode.
+        helpers = min(threads, max(self.header.splats // SPLATS_A_THREAD, 2)) - (filled is None)
         first = []
         if centres is not None:
-            first.append(work.add(partial(centres, work.run, _PARTS * threads if helpers else 1)))
+            first.append(work.add(partial(centres, work.run, _PARTS * helpers if helpers else 1)))
         with thread_pool(max(helpers, 1)) as pool:
             try:
                 if helpers and first:  # while this thread opens the sections

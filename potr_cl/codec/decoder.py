@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from potr_cl.codec import container, metadata, octree, sections
 from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.blocks.table import FIXED_BYTES, header_bytes_of, is_of_blocks, read_table
-from potr_cl.codec.bundled_scene import BundledScene
+from potr_cl.codec.bundled_scene import SPLATS_A_THREAD, BundledScene
 from potr_cl.codec.byte_planes import IntegerStream, PlaneStream, unpack_integers
 from potr_cl.codec.colour_factors import ColourFactors, Once
 from potr_cl.codec.container import Header
@@ -230,6 +230,8 @@ class PotrFile:
             (self._contextual(Property.OPACITY), opacities),
         ]
         threads = min(threads or min(os.cpu_count() or 1, _MOST_THREADS), self._threads_in_memory())
+        # With fewer splats for each, threads wait for the interpreter, and for memory, longer than they decode.
+        threads = min(threads, max(self.header.splats // SPLATS_A_THREAD, 2))
         self._run(jobs, lambda run, parts: destination.take_means(self._means(run, parts)), threads)
 
     def sh_count(self, degree: int | None = None) -> int:

@@ -9,17 +9,20 @@ splat's own block of the re-fit's normal equations as the measure.
 
 from __future__ import annotations
 
+import math
+import threading
 from collections.abc import Callable
 
 import numpy as np
 
+from potr_cl.codec.native.library import native
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
 
 #: Added to a block's diagonal, as a part of its mean: what no view tells apart is not moved far.
 DAMPING = 1e-2
 #: Splats worked on at a time: the temporaries stay small.
-_BLOCK = 1 << 12
+_BLOCK = 1 << 13
 
 #: Rounds coefficient m of some splats: called with m, the wanted values (3, n) and which splats they are of, returns
 #: the values (3, n) that the file can hold.
@@ -41,15 +44,19 @@ def rounded_in_turn(sh: FloatArray, packed: FloatArray, quantise: Quantise, thre
     """
     found = np.empty_like(sh)
     count = sh.shape[1]
+    packed = np.ascontiguousarray(packed)
+    own = threading.local()
 
     def turn(start: int) -> None:
         rows = slice(start, start + _BLOCK)
-        factor = _factors(packed[:, rows], count)
-        given = np.ascontiguousarray(sh[rows].transpose(1, 2, 0))
-        moved, part = given.copy(), np.empty_like(given)
+        if not hasattr(own, "room"):
+            own.room = np.empty((3, count, 3, min(_BLOCK, len(sh))), np.float32)
+        given, moved, part = own.room[..., : len(sh[rows])]
+        columns = unit_factors(packed, rows)
+        given[:] = moved[:] = sh[rows].transpose(1, 2, 0)
         for m in range(count - 1, 0, -1):
             held = quantise(m, moved[m], rows)
-            np.multiply(factor[:m, m, None], given[m] - held, out=part[:m])
+            np.multiply(columns[m * (m - 1) // 2 :][:m, None], given[m] - held, out=part[:m])
             moved[:m] += part[:m]
             moved[m] = held
         found[rows] = moved.transpose(2, 0, 1)
@@ -59,25 +66,37 @@ def rounded_in_turn(sh: FloatArray, packed: FloatArray, quantise: Quantise, thre
     return found
 
 
-def _factors(packed: FloatArray, count: int) -> FloatArray:
-    """(M, M, n): above the diagonals, the unit upper triangles U with Uᵀ D U = block.
+def unit_factors(packed: FloatArray, splats: slice) -> FloatArray:
+    """(M (M − 1) / 2, n): above their diagonals, column by column, the unit upper triangles U with Uᵀ D U = block.
 
     So the last coefficient's own part stands apart from all others'. All splats take one step together: that is several
     times as quick as a routine for one small matrix after another.
+
+    Args:
+        packed: (M (M + 1) / 2, N) as of :func:`rounded_in_turn`, in C order.
+        splats: which of them.
     """
-    factor = np.empty((count, count, packed.shape[1]), np.float32)
-    factor[np.triu_indices(count)] = packed
-    diagonal = [factor[m, m] for m in range(count)]
-    size = np.add.reduce(diagonal) / np.float32(count)
-    unseen = size <= 1e-30
-    for own in diagonal:
-        own += np.float32(DAMPING) * size
-        own[unseen] = 1
-    part = np.empty((count, packed.shape[1]), np.float32)
+    count = math.isqrt(2 * len(packed))
+    some = packed[:, splats]
+    columns = np.empty((count * (count - 1) // 2, some.shape[1]), np.float32)
+    functions = native()
+    if functions is not None:
+        functions.quantising.unit_factors(packed, splats.start, DAMPING, columns)
+        return columns
+    factor = np.empty((count, count, some.shape[1]), np.float32)
+    factor[np.triu_indices(count)] = some
+    size = factor[0, 0].copy()
+    for m in range(1, count):
+        size += factor[m, m]
+    size /= np.float32(count)
+    for m in range(count):
+        factor[m, m] += np.float32(DAMPING) * size
+        factor[m, m][size <= np.float32(1e-30)] = 1
+    product = np.empty((count, some.shape[1]), np.float32)
     for m in range(count - 1):
         row = factor[m, m + 1 :] / factor[m, m]
         for k in range(m + 1, count):
-            np.multiply(factor[m, k:], row[k - m - 1], out=part[k:])
-            factor[k, k:] -= part[k:]
-        factor[m, m + 1 :] = row
-    return factor
+            np.multiply(factor[m, k:], row[k - m - 1], out=product[k:])
+            factor[k, k:] -= product[k:]
+            columns[k * (k - 1) // 2 + m] = row[k - m - 1]
+    return columns

@@ -33,6 +33,8 @@ _BITS_AN_ENTRY, _MOST_A_SPLAT = 20, 0.75
 #: What an error is worth at least, as a part of what it were if the constant coefficient could not make up for it:
 #: other views than those of the re-fit may tell them better apart.
 _LEAST_WORTH = 0.02
+#: Splats that a thread works on at a time.
+_BLOCK = 1 << 14
 #: An entry has many splats if it has so many.
 _MANY = 4
 #: What the images hold.
@@ -89,9 +91,7 @@ class Sog(Output):
         assert isinstance(rounded, SogRounded)
         made_up = None
         if worth is not None and request.blocks is not None:
-            made_up = _made_up(request.blocks()[: sh.shape[1]])
-            worth = worth.copy()
-            worth[:, 1:] = np.maximum(worth[:, 1:] - worth[:, :1] * np.square(made_up), _LEAST_WORTH * worth[:, 1:])
+            made_up, worth = _made_up(request.blocks(), worth, request.threads)
         bits = _worth_in_bits(rounded, sh, worth, request)
         if sh.shape[1] == 1:
             return replace(rounded, worth=bits), sh
@@ -102,12 +102,20 @@ class Sog(Output):
         most = min(max(int(len(points) * _MOST_A_SPLAT), 1), PALETTE)
         found = cluster(device, points, weights, most, Rate(_BITS_AN_ENTRY))
         palette = _coded(device, points, weights, found.centres, found.labels)
-        fixed = sh.copy()
+        fixed = np.empty_like(sh)
         back = np.empty_like(order)
         back[order] = np.arange(len(order))
-        fixed[:, 1:] = palette.book.take(palette.entries).take(palette.labels.take(back), axis=0)
-        if made_up is not None:
-            fixed[:, 0] += np.einsum("nm,nmc->nc", made_up, sh[:, 1:] - fixed[:, 1:])
+        entries = palette.book.take(palette.entries)
+
+        def fix(start: int) -> None:
+            some = slice(start, start + _BLOCK)
+            fixed[some, 0] = sh[some, 0]
+            fixed[some, 1:] = entries.take(palette.labels.take(back[some]), axis=0)
+            if made_up is not None:
+                fixed[some, 0] += np.einsum("nm,nmc->nc", made_up[some], sh[some, 1:] - fixed[some, 1:])
+
+        with thread_pool(request.threads) as pool:
+            list(pool.map(fix, range(0, len(sh), _BLOCK)))
         return replace(rounded, worth=bits, palette=palette), fixed
 
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
@@ -146,16 +154,32 @@ class Sog(Output):
         return {name: nbytes for name, nbytes in sums.items() if nbytes}
 
 
-def _made_up(first_rows: FloatArray) -> FloatArray:
-    """(N, M − 1): by how much the constant coefficient takes back an error of 1 in each of the others.
+def _made_up(blocks: FloatArray, worth: FloatArray, threads: int) -> tuple[FloatArray, FloatArray]:
+    """By how much the constant coefficient takes back an error of 1 in each of the others; what such errors cost then.
 
     Seen from one side alone, an error of another coefficient is nearly one of the constant one.
 
     Args:
-        first_rows: (M, N), of the splats' blocks: what the constant coefficient shares with each.
+        blocks: as of :attr:`Request.blocks`; its first rows are what the constant coefficient shares with each.
+        worth: (N, M).
+        threads: to work with.
+
+    Returns:
+        (N, M − 1), and (N, M).
     """
-    constant = first_rows[0]
-    return np.ascontiguousarray((first_rows[1:] / np.where(constant > 0, constant, 1)).T)
+    made_up, left = np.empty((len(worth), worth.shape[1] - 1), np.float32), np.empty_like(worth)
+
+    def find(start: int) -> None:
+        some = slice(start, start + _BLOCK)
+        constant, cost = blocks[0, some], worth[some]
+        made_up[some] = (blocks[1 : worth.shape[1], some] / np.where(constant > 0, constant, 1)).T
+        left[some, 0] = cost[:, 0]
+        others = cost[:, 1:]
+        left[some, 1:] = np.maximum(others - cost[:, :1] * np.square(made_up[some]), _LEAST_WORTH * others)
+
+    with thread_pool(threads) as pool:
+        list(pool.map(find, range(0, len(worth), _BLOCK)))
+    return made_up, left
 
 
 def _worth_in_bits(rounded: SogRounded, sh: FloatArray, worth: FloatArray | None, request: Request) -> FloatArray:

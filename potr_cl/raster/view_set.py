@@ -26,6 +26,8 @@ _MOST_TILES = 0xFFFF
 #: ``View`` of the kernels, and ``SetView``, which has one.
 _CAMERA = struct_dtype("include/splat.clh", "View")
 _SET_VIEW = struct_dtype("include/view_set.clh", "SetView")
+#: Bytes of a view in a set's table.
+TABLE_ENTRY = _SET_VIEW.itemsize
 
 
 class ViewSet(Owner):

@@ -8,11 +8,21 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
+from potr_cl.raster.culling import ViewPart
 from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.schedule import Pruned, PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.pruning.unseen import CHOICES, Unseen, as_of_whole, find_unseen, put_back, set_aside
+from potr_cl.stages.pruning.unseen import (
+    CHOICES,
+    Unseen,
+    as_of_whole,
+    find_unseen,
+    put_back,
+    set_aside,
+    without_directions,
+)
+from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, parts_worth_it
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 
@@ -137,6 +147,12 @@ class Prune(Stage):
             told = told.having_learnt("price", bench.parameters.delta_mse_max)
         if not (kept and splats):
             return self._pruned(told, bench)
+        # A copy of a large scene without them would take as much memory as the scene.
+        options = self._sweep_options(bench.memory)
+        alone = bench.pool is None and not bench.interludes and bench.parameters.delta_mse_max < LARGEST_LIMIT
+        parts = parts_worth_it(state.scene, state.views, options) if alone else None
+        if parts is not None:
+            return without_directions(self._pruned(told, bench, parts, hidden), told.survivors[hidden])
         split = set_aside(told, hidden)
         if not len(split.seen_splats):
             everything = np.arange(splats)
@@ -144,11 +160,17 @@ class Prune(Stage):
         left = self._pruned(split.seen, bench)
         return put_back(split, left).having_learnt(self.name, as_of_whole(split, left.learnt[self.name]))
 
-    def _pruned(self, state: State, bench: Workbench) -> State:
+    def _pruned(
+        self,
+        state: State,
+        bench: Workbench,
+        parts: list[ViewPart] | None = None,
+        spared: NDArray[np.bool_] | None = None,
+    ) -> State:
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene))
         bench.progress("prepare views", 0.0)
-        with measurement(state, bench, self._sweep_options(bench.memory)) as removal:
+        with measurement(state, bench, self._sweep_options(bench.memory), parts, spared) as removal:
             course = _Course(state, removal)
 
             def after_iteration(iteration: int) -> None:

@@ -246,7 +246,9 @@ class _HeldThere(Held):
         return self._pool.begin(lambda: self._worker.ask("run", self._number, command, tuple(args)))
 
     def abandon(self) -> None:
-        """The seat goes with the pool."""
+        # Without waiting: the worker may be gone, or stand still.
+        with suppress(PotrError):
+            self._pool.begin(lambda: self._worker.ask("drop", self._number))
 
     def close(self) -> None:
         with suppress(PotrError):

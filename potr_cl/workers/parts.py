@@ -201,7 +201,7 @@ class Parts(Owner):
             with suppress(PotrError):
                 held = self._held[place]
                 if held is not None:
-                    held.close()
+                    held.abandon()
             self._held[place], self._by[place] = None, other
             try:
                 return again(place)

@@ -49,7 +49,7 @@ class Held(ABC):
         """Have the worker forget the part; a worker that is gone is none to wait for."""
 
     def abandon(self) -> None:
-        """The same after Ctrl-C, when nobody waits for what the worker is doing just now."""
+        """The same where nobody waits: after Ctrl-C, or if the worker does not answer."""
         self.close()
 
 

@@ -35,6 +35,7 @@ COMMAND_LINE_ONLY = {
     "--from": "for standard input",
     "--to": "for standard output and folders of scenes",
     "--ladder": "encode_ladder makes several files, encode one",
+    "--cluster": "a keyword too; tests/workers/test_cluster.py compares them, with a cluster",
     "--no-quality": "nothing is judged unless a report is asked for: compare() judges",
 }
 #: Of each option what is typed, and the same in Python; {name} stands for a path of the test's files. What has the

@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from potr_cl.errors import UsageError
-from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.views_between import is_between, views_between
@@ -143,13 +142,3 @@ def test_parts_of_a_scene_are_shown_by_the_views_that_face_them():
     # Cameras in one place all show the same half.
     here = [dataclasses.replace(ORBIT[0], name=f"{number}") for number in range(5)]
     assert set(GivenViews(BALL, here).views_of_parts()) == {5}
-
-
-def test_the_same_views_whatever_the_threads():
-    here = orbit(12)
-    wanted = views_between(BALL, here, 2)
-    with thread_pool(5) as pool:
-        for one, other in zip(wanted, views_between(BALL, here, 2, run=pool.map), strict=True):
-            assert one.name == other.name
-            assert np.array_equal(one.rotation, other.rotation)
-            assert np.array_equal(one.translation, other.translation)

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import threading
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
@@ -14,6 +15,7 @@ import potr_cl
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import AnyFile, PotrFile, open_file, scene_of_file
 from potr_cl.codec.encoder import code_scene
+from potr_cl.codec.native.library import native
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, UsageError
 from potr_cl.ondevice.decode import decode_to_device
@@ -197,21 +199,35 @@ def test_the_commands_say_the_same_of_a_file_and_of_its_scene(tmp_path, monkeypa
 
 
 def test_parts_that_are_uploaded_while_others_are_decoded(device, monkeypatch):
-    """Several bundles, of which two threads decode some at a time."""
+    """Several bundles, of which two threads decode some at a time; the last one waits for the first upload."""
+    from potr_cl.codec.native.bundles import BundledFile
     from potr_cl.ondevice.dequantiser import DeviceDequantiser
 
+    if native() is None:
+        pytest.skip("the compiled library is not there: python -m tools.make.native, or pip install -e .")
     told: list[tuple[int, int]] = []
-    filled = DeviceDequantiser.filled
+    filled, values = DeviceDequantiser.filled, BundledFile.values
+    uploaded_some = threading.Event()
 
     def noted(self, start, stop):
         told.append((start, stop))
         filled(self, start, stop)
+        uploaded_some.set()
 
+    def last_waits(self, bundle, *others):
+        if bundle == 9 and waits:
+            assert uploaded_some.wait(timeout=60)
+        return values(self, bundle, *others)
+
+    waits: list[bool] = []
+    monkeypatch.setattr(BundledFile, "values", last_waits)
     monkeypatch.setattr(DeviceDequantiser, "filled", noted)
     splats = 9 * 8192 + 77
     file = PotrFile.from_bytes(coded(splats, "best", degree=1))
-    with uploaded(device, file.scene()) as wanted, decode_to_device(file, device, threads=2) as got:
-        assert bits(wanted) == bits(got)
+    with uploaded(device, file.scene()) as wanted:
+        waits.append(True)
+        with decode_to_device(file, device, threads=2) as got:
+            assert bits(wanted) == bits(got)
     assert len(told) > 1
     assert [start for start, _ in told] == [0, *(stop for _, stop in told[:-1])]
     assert told[-1][1] == splats

@@ -136,6 +136,37 @@ def test_from_a_scene_on_the_device(device):
     assert np.array_equal(effects[0], found[0])
 
 
+def test_spared_splats_stay(device):
+    scene, cameras = street()
+    spared = np.random.default_rng(2).random(len(scene)) < 0.3
+    parts = parts_of_views(scene, cameras, INRIA.near)
+    schedule = PruningOptions(1e-2, 8)
+    for memory in (None, 0):
+        options = SweepOptions(0.0, memory=memory)
+        with PartedRemoval(device, scene, scene, cameras, parts, options) as removal:
+            freely = prune_scene(removal, schedule)
+        with PartedRemoval(device, scene, scene, cameras, parts, options, spared=spared) as removal:
+            pruned = prune_scene(removal, schedule)
+        assert np.isin(np.flatnonzero(spared), pruned.survivors).all()
+        assert not np.isin(np.flatnonzero(spared), freely.survivors).all()
+        assert pruned.kept < len(scene) - 100
+
+
+def test_unseen_splats_are_kept_without_a_copy_of_the_scene(device, monkeypatch):
+    """And lose their directions, as those do that are set aside."""
+    scene, cameras = street(6, 400)
+    cameras = [camera for camera in cameras if not camera.name.startswith(("5", "along"))]
+    options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 6}, refit=False)
+    options = dataclasses.replace(options, cameras_anyway=True)
+    aside = encode(scene, cameras, options, device=device)
+    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    spared = encode(scene, cameras, options, device=device)
+    assert aside.unseen is not None
+    assert aside.unseen.splats > 300
+    assert spared.unseen == aside.unseen
+    assert spared.data == aside.data
+
+
 def test_a_whole_encode_has_the_same_bytes(device, monkeypatch):
     scene, cameras = street(5, 900)
     options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 6}, refit={"steps": 2})

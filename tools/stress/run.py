@@ -99,7 +99,7 @@ WHAT = {
     "removal: effect": "of a splat's ΔMSE, relative to the sum of its terms' magnitudes",
     "fit: finite": "a derivative of a picture that is not finite",
     "fit: gradient": "of the pictures' derivatives by a kind of parameters, relative to their length",
-    "fit: J x": "x · Jᵀ J x over |J x|², less 1",
+    "fit: J x": "x · Jᵀ J x over ‖J x‖², less 1",
     "ridge": "weighted colour error above the optimum, relative to the largest coefficient or 1",
     "re-fit: optimum": "colour error in the pictures above the optimum, or above where the solver had to stop",
     "re-fit: loss": "how much more squared error than the start has, relative",

@@ -5,7 +5,8 @@
 #include "refit/view_colours.clh"
 
 /* The splats' colours in each view of a set: of the coefficients themselves (direction == 0), cut at 0, w telling which
-   channels are free (1, 2, 4: above 0); or their change along a direction, 0 where `free` says that the channel is cut.
+   channels are free (1, 2, 4: above 0); or their change along a direction, 0 where `free` says that the channel is cut,
+   and the same w.
    Work-item i of the second dimension does views i, i + get_global_size(1), … */
 kernel void view_colours(
     global const float *coefficients,
@@ -37,6 +38,7 @@ kernel void view_colours(
             red = (kept & 1) != 0 ? red * unit : (vfloat)(0.0f);
             green = (kept & 2) != 0 ? green * unit : (vfloat)(0.0f);
             blue = (kept & 4) != 0 ? blue * unit : (vfloat)(0.0f);
+            channels = CONVERT_VFLOAT(kept);
         } else {
             red = fmin(red + 0.5f, (vfloat)(1e30f));
             green = fmin(green + 0.5f, (vfloat)(1e30f));

@@ -149,9 +149,9 @@ def read_models(raw: bytes, read: int, most_tokens: Sequence[int], what: str) ->
             raise _impossible(what)
         thresholds = raw[read : read + contexts - 1]
         read += contexts - 1
-        low, high = (np.frombuffer(raw, np.uint8, cells, read + k * cells).astype(np.int64) for k in (0, 1))
+        planes = np.frombuffer(raw, np.uint8, 2 * cells, read).astype(np.int64)
         read += 2 * cells
-        frequencies = (low | high << 8).reshape(used, contexts).T
+        frequencies = (planes[:cells] + (planes[cells:] << 8)).reshape(used, contexts).T
         rising = all(a < b for a, b in pairwise(b"\0" + thresholds))
         if not rising or (frequencies.sum(axis=1) != rans.TOTAL).any():
             raise _impossible(what)

@@ -7,7 +7,9 @@
 
 #include "bundles_tokens.h"
 
-#if defined(__x86_64__) && defined(__GNUC__) && (defined(__clang__) ? __clang_major__ >= 10 : __GNUC__ >= 9)
+/* Not on Windows, where compilers put such vectors on a stack that is not aligned for them. */
+#if defined(__x86_64__) && defined(__GNUC__) && !defined(_WIN32) \
+    && (defined(__clang__) ? __clang_major__ >= 10 : __GNUC__ >= 9)
 #define VECTORS 1
 #include <immintrin.h>
 #else
@@ -177,7 +179,7 @@ OF_512 static INLINE __m128i look_up(const stream_model *model, const lookups *o
 {
     const uint32_t token = model->slots[of->slots[lane]];
     tokens[lane] = (uint8_t)token;
-    return _mm_loadu_si32(&model->intervals[of->cells[lane] | token]);
+    return _mm_cvtsi32_si128((int)model->intervals[of->cells[lane] | token]);
 }
 
 /* Those of four lanes. They are put together in registers: a wide load of what was stored piece by piece would wait for

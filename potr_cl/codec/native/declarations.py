@@ -58,6 +58,7 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     ),
     "potr_nonzero_levels": (_NUMBER, [_POINTER, _SIZE, _SIZE, ctypes.c_double, ctypes.c_double, _POINTER]),
     "potr_unpredicted": (None, [_POINTER, _SIZE, _SIZE, _SIZE, *[_POINTER] * 4]),
+    "potr_unit_factors": (None, [_POINTER, _SIZE, _SIZE, _SIZE, _SIZE, _REAL, _POINTER]),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
 }
 #: Those that there are for several kinds of integers, by what their names begin with.
@@ -82,15 +83,22 @@ _OF_KINDS: dict[str, tuple[Any, list[Any], tuple[str, ...]]] = {
 }
 
 
-def declared(library: ctypes.CDLL) -> dict[str, Any]:
+#: Those that take some microseconds, however large a file is. They keep the interpreter: to get it back among threads
+#: that all want it takes longer than they do.
+_SHORT = {"potr_bundles_table", "potr_bundles_work", "potr_bundles_vectors", "potr_octree_cut", "potr_octree_padding"}
+
+
+def declared(path: str) -> dict[str, Any]:
     """The functions of a library by name, told what they take.
 
     Raises:
+        OSError: there is none that can be loaded.
         AttributeError: one is missing.
     """
+    library, keeping = ctypes.CDLL(path), ctypes.PyDLL(path)
     functions: dict[str, Any] = {}
     for name, (result, arguments) in _DECLARATIONS.items():
-        functions[name] = library[name]
+        functions[name] = (keeping if name in _SHORT else library)[name]
         functions[name].restype, functions[name].argtypes = result, arguments
     for start, (result, arguments, kinds) in _OF_KINDS.items():
         for name in (start + kind for kind in kinds):

@@ -43,18 +43,19 @@ class Functions:
     """What the library offers. All of it may be called from several threads at a time, and leaves the interpreter free.
 
     Args:
-        library: to take the functions from.
+        path: of the library.
 
     Attributes:
         quantising: those of the encoder that are about splats, and not about integers.
         octree: those about positions.
 
     Raises:
+        OSError: it cannot be loaded.
         AttributeError: one is missing.
     """
 
-    def __init__(self, library: ctypes.CDLL) -> None:
-        self._c = declared(library)
+    def __init__(self, path: str) -> None:
+        self._c = declared(path)
         self.quantising = Quantising(self._c)
         self.octree = OctreeFunctions(self._c)
 

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import ctypes
 import importlib.machinery
 import os
 import sys
@@ -69,6 +68,6 @@ def _loaded(path: str | None) -> Functions | None:
     if path is None or sys.byteorder != "little":
         return None
     try:
-        return Functions(ctypes.CDLL(path))
+        return Functions(path)
     except (OSError, AttributeError):  # for another machine, or of another version of the package
         return None

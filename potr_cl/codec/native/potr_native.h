@@ -37,7 +37,7 @@
  * chosen when the library is loaded. Only for integers: a wider version could fuse multiplications and additions of
  * floats. */
 #if defined(__x86_64__) && defined(__linux__) && defined(__GLIBC__) && !defined(POTR_SANITIZED) \
-    && (defined(__clang__) ? __clang_major__ >= 14 : defined(__GNUC__))
+    && defined(__GNUC__) && !defined(__clang__) /* which refuses it for functions that a library shows */
 #define POTR_WIDE_INTEGERS __attribute__((target_clones("default", "avx2")))
 #else
 #define POTR_WIDE_INTEGERS

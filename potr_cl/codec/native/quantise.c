@@ -185,3 +185,52 @@ POTR_EXPORT void potr_unit_quaternions(const float *restrict quaternions, size_t
         units[4 * i + 3] = nothing ? 0.0f : (float)(z / length);
     }
 }
+
+/* Splats whose blocks are factored at a time, and the most coefficients of one. */
+#define FACTORED 32
+#define MOST_COEFFICIENTS 16
+
+/* Unit upper triangles U with U^T D U = block for n splats, one step of all at a time. The same bits as
+ * outputs/feedback.py.
+ *
+ * packed: (count (count + 1) / 2, all), the blocks' upper triangles, row by row; of it n columns from `first` on. columns:
+ * (count (count - 1) / 2, n), what stands above the diagonals, column by column. */
+POTR_EXPORT void potr_unit_factors(
+    const float *restrict packed, size_t all, size_t first, size_t n, size_t count, float damping,
+    float *restrict columns)
+{
+    float block[MOST_COEFFICIENTS][MOST_COEFFICIENTS][FACTORED], row[MOST_COEFFICIENTS][FACTORED];
+    for (size_t start = 0; start < n; start += FACTORED) {
+        const size_t some = n - start < FACTORED ? n - start : FACTORED;
+        const float *from = packed + first + start;
+        for (size_t m = 0; m < count; m++)
+            for (size_t k = m; k < count; k++, from += all)
+                for (size_t i = 0; i < FACTORED; i++)
+                    block[m][k][i] = i < some ? from[i] : 0.0f;
+        float size[FACTORED];
+        for (size_t i = 0; i < FACTORED; i++)
+            size[i] = block[0][0][i];
+        for (size_t m = 1; m < count; m++)
+            for (size_t i = 0; i < FACTORED; i++)
+                size[i] = size[i] + block[m][m][i];
+        for (size_t i = 0; i < FACTORED; i++)
+            size[i] = size[i] / (float)count;
+        for (size_t m = 0; m < count; m++)
+            for (size_t i = 0; i < FACTORED; i++) {
+                const float own = block[m][m][i] + damping * size[i];
+                block[m][m][i] = size[i] <= 1e-30f ? 1.0f : own;
+            }
+        for (size_t m = 0; m + 1 < count; m++) {
+            for (size_t k = m + 1; k < count; k++)
+                for (size_t i = 0; i < FACTORED; i++)
+                    row[k][i] = block[m][k][i] / block[m][m][i];
+            for (size_t k = m + 1; k < count; k++)
+                for (size_t j = k; j < count; j++)
+                    for (size_t i = 0; i < FACTORED; i++)
+                        block[k][j][i] = block[k][j][i] - block[m][j][i] * row[k][i];
+            for (size_t k = m + 1; k < count; k++)
+                for (size_t i = 0; i < some; i++)
+                    columns[(k * (k - 1) / 2 + m) * n + start + i] = row[k][i];
+        }
+    }
+}

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any
 
 import numpy as np
@@ -134,3 +135,27 @@ class Quantising:
             address(columns, np.uint8, columns.size, True),
         )
         return columns.view(np.bool_) if sound else None
+
+    def unit_factors(self, packed: F32, first: int, damping: float, columns: F32) -> None:
+        """Unit upper triangles of some splats' blocks (:mod:`potr_cl.outputs.feedback`).
+
+        Args:
+            packed: (M (M + 1) / 2, N), the blocks' upper triangles, row by row.
+            first: of the splats.
+            damping: added to the diagonals, as a part of their mean.
+            columns: (M (M − 1) / 2, n), filled with what stands above the diagonals, column by column.
+        """
+        triangle, number = columns.shape
+        count = (1 + math.isqrt(1 + 8 * triangle)) // 2
+        rows, splats = packed.shape
+        if count > 16 or rows != triangle + count or not 0 <= first <= first + number <= splats:
+            raise TypeError("the native path was given blocks that are not there")
+        self._c["potr_unit_factors"](
+            address(packed, np.float32, rows * splats),
+            splats,
+            first,
+            number,
+            count,
+            damping,
+            address(columns, np.float32, triangle * number, True),
+        )

@@ -46,7 +46,7 @@ _VERSIONS = (2, 3, 4)
 VERSIONS = {
     2: "which all readers that were tried take",
     3: "with finer rotations",
-    4: "smaller and for new readers only",
+    4: "packed by zstd, for new readers only",
 }
 #: Of each stream of version 4. Level 12 takes twice as long for 1 % less.
 _ZSTD_LEVEL = 8

@@ -5,12 +5,10 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Sequence
 from functools import cached_property
-from threading import Lock
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.placement.colour_memory import ColourMemory
 from potr_cl.model.placement.matter import CROWDED, cell_of, frame_of, matter_of, surroundings
@@ -34,18 +32,16 @@ class GivenViews:
     Args:
         scene: that they show.
         cameras: the given views, at least one.
-        run: in place of :func:`map`, to work with several threads.
     """
 
-    def __init__(self, scene: Scene, cameras: Sequence[Camera], run: Run = map) -> None:
+    def __init__(self, scene: Scene, cameras: Sequence[Camera]) -> None:
         every = max(len(scene) // _TAKEN, 1)
         some = scene.subset(np.arange(0, len(scene), every))
-        self._frame = frame_of(some, run)
-        self._asked = Lock()
+        self._frame = frame_of(some)
         matter = matter_of(some, self._frame, _TARGETS, _OCCLUDERS)
         # Each point stands for the surface of the splats that were not taken, too.
         self._matter = dataclasses.replace(matter, areas=matter.areas * np.float32(every))
-        shown, blocked = zip(*run(self._look, cameras), strict=True)
+        shown, blocked = zip(*map(self._look, cameras), strict=True)
         self._shown: F32 = np.stack(shown)
         self._known: F32 = self._shown.max(axis=0)
         # Whoever photographs indoors, stands close to things.
@@ -66,7 +62,7 @@ class GivenViews:
         return counts[counts > 0]
 
     def allow(self, camera: Camera, beside: int) -> bool:
-        """Whether a camera might have been here. Several threads may ask at a time.
+        """Whether a camera might have been here.
 
         That is: not in matter, not where the colours do not remember that they were looked at from there, and not where
         it would show what no given view shows.
@@ -84,8 +80,7 @@ class GivenViews:
         if total > 0 and float((shown * self._known).sum()) < _KNOWN * total:
             return False
         place = (camera.centre - self._frame.centre) / self._frame.unit
-        with self._asked:  # the first that asks has it found
-            memory, least = self._memory
+        memory, least = self._memory
         return not memory.tells or memory.of(place, shown) >= least
 
     def _look(self, camera: Camera) -> tuple[F32, float]:

@@ -9,6 +9,7 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.raster.culling import ViewPart
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.part import RemovalPart
 from potr_cl.stages.pruning.removal import RemovalSweep
@@ -24,8 +25,19 @@ Removal: TypeAlias = RemovalSweep | SharedRemoval | PartedRemoval
 
 
 @contextmanager
-def measurement(state: State, bench: Workbench, options: SweepOptions) -> Iterator[Removal]:
+def measurement(
+    state: State,
+    bench: Workbench,
+    options: SweepOptions,
+    parts: list[ViewPart] | None = None,
+    spared: NDArray[np.bool_] | None = None,
+) -> Iterator[Removal]:
     """A removal sweep over the views of a state, its splats numbered as in the state's scene.
+
+    Args:
+        state, bench, options: of the stage.
+        parts: of the views, where these were found before.
+        spared: as of :class:`~potr_cl.stages.pruning.visible_parts.PartedRemoval`; only with ``parts``.
 
     Raises:
         DeviceError: the scene or a view does not fit the device.
@@ -39,11 +51,12 @@ def measurement(state: State, bench: Workbench, options: SweepOptions) -> Iterat
     share = None if pool is None or options.sample < 1 else shares(pool, len(views))
     with ExitStack() as stack:
         if pool is None or share is None or not share.others:
-            parts = parts_worth_it(state.scene, views, options)
+            if parts is None:
+                parts = parts_worth_it(state.scene, views, options)
             if parts is not None:
                 whole = stack.enter_context(whole_on_device(device, bench.drawable(state.scene)))
                 yield stack.enter_context(
-                    PartedRemoval(device, state.scene, whole, views, parts, options, bench.background, progress)
+                    PartedRemoval(device, state.scene, whole, views, parts, options, bench.background, progress, spared)
                 )
                 return
             rasterizer = stack.enter_context(

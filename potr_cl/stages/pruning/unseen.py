@@ -98,6 +98,19 @@ def put_back(split: Split, pruned: State) -> State:
     return dataclasses.replace(pruned, scene=together, survivors=numbers[order], geometry=None)
 
 
+def without_directions(state: State, unseen: NDArray[np.int64]) -> State:
+    """The state after some splats have lost what of their colours depends on the direction, as :func:`put_back` does.
+
+    Args:
+        state: whose scene is.
+        unseen: their numbers in the source, ascending; those that are not left do not matter.
+    """
+    own = np.isin(state.survivors, unseen, assume_unique=True)
+    sh = state.scene.sh.copy()
+    sh[own, 1:] = 0
+    return state.recoloured(sh)
+
+
 def as_of_whole(split: Split, pruned: Pruned) -> Pruned:
     """What pruning did to the seen splats, as what it did to all: the unseen ones were kept, and nobody misses them."""
     aside = len(split.unseen_splats)

@@ -40,6 +40,8 @@ _WORTH_IT = 0.5
 _SCENES = 1 / 2
 #: The whole scene is on the device too where that has so many times as much memory.
 _WHOLE = 3
+#: The total that spares a splat: a ΔMSE of about 1, by the bounds of :class:`FixedPoint`; and what limits it is beyond.
+_SPARED, LARGEST_LIMIT = 1 << 58, 0.1
 
 _SOURCE = "prune/parts.cl"
 _GROUP = 64
@@ -99,6 +101,7 @@ class PartedRemoval(Owner):
         options: speed/accuracy trade-offs; the memory is that of all parts together, their scenes included.
         background: R, G, B behind the scene.
         progress: called with the views prepared and their number.
+        spared: (N,) splats whose effects are to be beyond :data:`LARGEST_LIMIT`, so that they are never removed.
 
     Attributes:
         splats, steering: as of a :class:`~potr_cl.stages.pruning.removal.RemovalSweep`.
@@ -117,8 +120,13 @@ class PartedRemoval(Owner):
         options: SweepOptions,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         progress: Callable[[int, int], None] | None = None,
+        spared: NDArray[np.bool_] | None = None,
     ) -> None:
         self.splats = len(scene)
+        #: What totals begin with: an effect beyond all limits keeps a splat.
+        self._first_totals = np.zeros((self.splats, 2), np.int64)
+        if spared is not None:
+            self._first_totals[spared, 0] = _SPARED
         self._device, self._scene, self._whole = device, scene, whole
         self._fixed_point = FixedPoint.of_views(cameras)
         self._alive = np.ones(self.splats, bool)
@@ -183,7 +191,7 @@ class PartedRemoval(Owner):
 
     def measure(self) -> tuple[F64, F64]:
         """ΔMSE_k and I_k of all N splats, float64; the values of removed splats mean nothing."""
-        totals = np.zeros((self.splats, 2), np.int64)
+        totals = self._first_totals.copy()
         for part in self._parts:
             with self.awake(part):
                 totals[part.splats] += part.sweep.measure_totals()
@@ -238,7 +246,10 @@ class _PartedSteering(Owner):
         stride = -(-self.splats // SPLAT_GROUP) * SPLAT_GROUP
         self._memory = Memory(device)
         with device.all_or_nothing():
-            self.totals: cl.Buffer = self._memory.upload(zero_totals(stride), "the removal effects")
+            first = zero_totals(stride)
+            first[: self.splats] = removal._first_totals.view(np.uint32)
+            self.totals: cl.Buffer = self._memory.upload(first, "the removal effects")
+            self._first = self._memory.upload(first, "the removal effects to begin with")
             self._survivors = Survivors(device, self.splats, stride, device.queue.finish)
             self._add, self._mark = (device.kernel(_SOURCE, name) for name in ("add_part", "mark_part"))
         self.marks: cl.Buffer = self._survivors.buffer
@@ -248,7 +259,7 @@ class _PartedSteering(Owner):
         return self._survivors.alive
 
     def measure_on_device(self) -> None:
-        cl.enqueue_fill_buffer(self.device.queue, self.totals, np.uint32(0), 0, self.totals.size)
+        cl.enqueue_copy(self.device.queue, self.totals, self._first)
         for part in self._parts:
             steering = _steering(part)
             with self._removal.awake(part):

@@ -16,6 +16,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Sequence
+from dataclasses import dataclass
 from typing import Protocol
 
 import numpy as np
@@ -26,7 +27,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.view_set import TILE, ViewSet
+from potr_cl.raster.view_set import TABLE_ENTRY, TILE, ViewSet
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients
@@ -131,8 +132,15 @@ class ColourMap(Owner):
             self._owned.append(self._views)
             launches = self._views.launches
             most = max((len(numbers) for numbers in launches), default=0)
-            self._change = self._memory.allocate(_CHANGE * layout.stride * most, "the colours' change")
-            self._totals = self._memory.allocate(_TOTALS * layout.stride * most, "the re-fit's sums")
+            together = min(self._launcher.gathered, max(len(launches), 1)) if most == 1 else 1
+            self._groups = [launches[first : first + together] for first in range(0, len(launches), together)]
+            at_once = most * together
+            self._change = self._memory.allocate(_CHANGE * layout.stride * at_once, "the colours' change")
+            self._totals = self._memory.allocate(_TOTALS * layout.stride * at_once, "the re-fit's sums")
+            self._slots = [
+                _Slot(*(_part(of, slot, together) for of in (self._change, self._totals))) for slot in range(together)
+            ]
+            self._tables = self._memory.allocate(TABLE_ENTRY * at_once, "the views")
             coefficients.zero(self._totals)
             self.sums = self._memory.allocate(8 * layout.columns * layout.stride, "the sums over views")
             coefficients.zero(self.sums)
@@ -206,13 +214,18 @@ class ColourMap(Owner):
             The squared error by W of each view, by number.
         """
         errors: dict[int, float] = {}
-        for numbers in self._views.launches:
-            with self._views.ready(numbers) as (views, _):
-                self._enqueue_colours(views, x, views.colours, None)
-                pictures = self._targets.pictures(targets, numbers)
-                self._enqueue_sweep(numbers, views, views.colours, pictures, blocks is not None)
-                self._enqueue_gather(numbers, views, blocks, constant)
-                errors |= self._found_errors(numbers, views)
+        for group in self._groups:
+            for slot, numbers in zip(self._slots, group, strict=False):
+                with self._views.ready(numbers) as (views, _):
+                    self._enqueue_colours(views, x, views.colours, None)
+                    pictures = self._targets.pictures(targets, numbers)
+                    self._enqueue_sweep(numbers, views, views.colours, pictures, blocks is not None, slot)
+                    # Which of them are cut, the gathering asks.
+                    nbytes = _CHANGE * self._layout.stride * len(numbers)
+                    cl.enqueue_copy(self._device.queue, slot.change, views.colours, byte_count=nbytes)
+                    self._enqueue_table(numbers, group, views)
+                    errors |= self._found_errors(numbers, views)
+            self._enqueue_gather(group, blocks, constant)
         return errors
 
     def normal(self, direction: cl.Buffer, at: cl.Buffer, result: cl.Buffer, constant: bool = False) -> None:
@@ -245,13 +258,15 @@ class ColourMap(Owner):
             direction, at, constant: as of :meth:`normal`.
             unit: the direction is multiplied by this.
         """
-        for numbers in self._views.launches:
-            with self._views.ready(numbers) as (views, anew):
-                if anew:  # which colours are cut is not known any more
-                    self._enqueue_colours(views, at, views.colours, None)
-                self._enqueue_colours(views, direction, self._change, unit, constant)
-                self._enqueue_sweep(numbers, views, self._change, None, False)
-                self._enqueue_gather(numbers, views, None, constant)
+        for group in self._groups:
+            for slot, numbers in zip(self._slots, group, strict=False):
+                with self._views.ready(numbers) as (views, anew):
+                    if anew:  # which colours are cut is not known any more
+                        self._enqueue_colours(views, at, views.colours, None)
+                    self._enqueue_colours(views, direction, slot.change, unit, constant)
+                    self._enqueue_sweep(numbers, views, slot.change, None, False, slot)
+                    self._enqueue_table(numbers, group, views)
+            self._enqueue_gather(group, None, constant)
 
     # ------------------------------------------------------------------------------------------ their parts
 
@@ -287,7 +302,13 @@ class ColourMap(Owner):
         self._layout.over_splats(kernel, -(-len(views.views) // _COLOURED))
 
     def _enqueue_sweep(
-        self, numbers: range, views: ViewSet, colours: cl.Buffer, target: cl.Buffer | None, weights: bool
+        self,
+        numbers: range,
+        views: ViewSet,
+        colours: cl.Buffer,
+        target: cl.Buffer | None,
+        weights: bool,
+        slot: _Slot,
     ) -> None:
         """Enqueue the sweep of a launch's views; without a target colours are a change, and black is behind them."""
         self._launcher.sweep(
@@ -298,22 +319,31 @@ class ColourMap(Owner):
             target,
             self._fixed_points[numbers[0]],
             self._errors,
-            self._totals,
+            slot.totals,
             weights,
         )
 
-    def _enqueue_gather(self, numbers: range, views: ViewSet, blocks: cl.Buffer | None, constant: bool) -> None:
-        """Enqueue the way from the views' sums to the coefficients, and to the blocks if the sums have their part."""
+    def _enqueue_table(self, numbers: range, group: Sequence[range], views: ViewSet) -> None:
+        """Enqueue a launch's part of the table of the views that are gathered together."""
+        start = TABLE_ENTRY * (numbers[0] - group[0][0])
+        nbytes = TABLE_ENTRY * len(numbers)
+        cl.enqueue_copy(self._device.queue, self._tables, views.table, byte_count=nbytes, dst_offset=start)
+
+    def _enqueue_gather(self, group: Sequence[range], blocks: cl.Buffer | None, constant: bool) -> None:
+        """Enqueue the way from the sums of some launches' views, which follow each other, to the coefficients.
+
+        And to the blocks, if the sums have their part.
+        """
         gather = self._gathers[constant, blocks is not None]
         gather.bind(
             totals=self._totals,
             means=self._means,
             stride=self._layout.stride,
-            views=views.table,
-            view_count=len(numbers),
+            views=self._tables,
+            view_count=sum(map(len, group)),
             scales=self._scales,
-            first_scale=numbers[0],
-            free=views.colours,
+            first_scale=group[0][0],
+            free=self._change,
             result=self.sums,
             blocks=self.sums if blocks is None else blocks,
         )
@@ -331,8 +361,28 @@ class ColourMap(Owner):
 
     def close(self) -> None:
         """Give all device memory back."""
+        self._slots = []  # parts of buffers, which would keep these
         for owner in reversed(self._owned):
             owner.close()
+
+
+@dataclass(frozen=True)
+class _Slot:
+    """Where a launch that is gathered together with others has its own buffers.
+
+    Attributes:
+        change: (views, stride, 4) float32, what the launch's views composite, or its w.
+        totals: (views, stride, 4) int64.
+    """
+
+    change: cl.Buffer
+    totals: cl.Buffer
+
+
+def _part(buffer: cl.Buffer, number: int, parts: int) -> cl.Buffer:
+    """One of some equal parts of a buffer."""
+    nbytes = buffer.size // parts
+    return buffer if parts == 1 else buffer.get_sub_region(number * nbytes, nbytes)
 
 
 def _weight(camera: Camera) -> float:

@@ -23,6 +23,8 @@ class CpuLauncher:
     """
 
     most_views = 1
+    #: The coefficients' sums, which take much more than a view's, go through the memory once for so many views.
+    gathered = 4
 
     def __init__(self, device: Device, rules: RasterRules) -> None:
         self.lanes = device.vector_width

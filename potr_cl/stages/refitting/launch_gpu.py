@@ -27,6 +27,7 @@ class GpuLauncher:
 
     lanes = 1
     most_views = 32
+    gathered = 1
 
     def __init__(self, device: Device, rules: RasterRules) -> None:
         self._sweeps = [

@@ -28,6 +28,11 @@ class Launcher(Protocol):
         """Views that a launch can do."""
         ...
 
+    @property
+    def gathered(self) -> int:
+        """Launches whose sums are gathered together, where each does one view."""
+        ...
+
     def fixed_point_scales(self, cameras: Sequence[Camera]) -> list[float]:
         """What the sums of each view are multiplied by, see :func:`.fixed_point.fixed_point_scale`.
 

@@ -1,0 +1,222 @@
+"""A Dask cluster gives the bytes that this computer gives alone, whatever becomes of its workers."""
+
+from __future__ import annotations
+
+import contextlib
+import dataclasses
+import os
+import signal
+import subprocess
+import sys
+import time
+from pathlib import Path
+
+import pytest
+
+import potr_cl
+from potr_cl.errors import DeviceError, UsageError
+from potr_cl.formats import load_cameras, load_scene
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.workers.cluster import ClusterPool
+
+distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
+
+ROOT = Path(__file__).parents[2]
+OPTIONS = EncodeOptions.for_preset(
+    "best", q=0.3, prune={"keep": 0.4, "iterations": 6}, refit={"at": (0.4,), "steps": 3, "drop": 1e-7}, compact=True,
+    between={"views": 0},
+)  # fmt: skip
+
+
+@contextlib.contextmanager
+def local_cluster(workers):
+    with distributed.LocalCluster(
+        n_workers=workers, threads_per_worker=1, processes=True, memory_limit=None, dashboard_address=None
+    ) as cluster:
+        yield cluster
+
+
+def process_of(worker):
+    """The number of the process in which a worker of a local cluster runs."""
+    return worker.process.process.pid
+
+
+@pytest.fixture(scope="module")
+def scene(data):
+    return load_scene(data / "plush_excerpt.ply")
+
+
+@pytest.fixture(scope="module")
+def cameras(data):
+    """Five training views, small."""
+    chosen = [c for c in load_cameras(data / "plush_excerpt_cameras.json") if c.split == "train"][:5]
+    factor = 80 / chosen[0].width
+    return [
+        dataclasses.replace(
+            c, width=80, height=round(c.height * factor), fx=c.fx * factor, fy=c.fy * factor, cx=40, cy=c.cy * factor
+        )
+        for c in chosen
+    ]
+
+
+@pytest.fixture(scope="module")
+def device():
+    return Device()
+
+
+@pytest.fixture(scope="module")
+def expected(scene, cameras, device):
+    return encode(scene, cameras, OPTIONS, device=device).data
+
+
+@pytest.mark.parametrize(
+    "workers", [1, pytest.param(2, marks=pytest.mark.slow), pytest.param(3, marks=pytest.mark.slow)]
+)
+def test_the_same_bytes(workers, scene, cameras, device, expected):
+    with local_cluster(workers) as cluster:
+        with ClusterPool(cluster.scheduler_address, device) as pool:
+            found = encode(scene, cameras, OPTIONS, device=device, pool=pool)
+            again = encode(scene, cameras, OPTIONS, device=device, pool=pool)
+        assert found.data == again.data == expected
+        assert found.shared is not None
+        assert again.shared is not None
+        assert len(found.shared.workers) == workers
+        # The scene went there once.
+        assert again.shared.sent < found.shared.sent
+        with distributed.Client(cluster, set_as_default=False) as client:
+            assert potr_cl.encode(scene, cameras, OPTIONS, device=device, cluster=client).data == expected
+            # A caller's client stays the caller's.
+            assert client.submit(sum, [1, 2]).result(timeout=30) == 3
+
+
+def killing(processes, stage, how_many):
+    """Progress that kills processes in the middle of a stage."""
+    left = list(processes[:how_many])
+
+    def progress(what, done):
+        if what == stage and done > 0.3:
+            while left:
+                os.kill(left.pop(), signal.SIGKILL)
+
+    return progress
+
+
+@pytest.mark.slow
+@pytest.mark.parametrize("stage", ["prune", "refit"])
+def test_a_worker_is_killed(stage, scene, cameras, device, expected, caplog):
+    with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device) as pool:
+        processes = [process_of(worker) for worker in cluster.workers.values()]
+        found = encode(scene, cameras, OPTIONS, killing(processes, stage, 1), device, pool=pool)
+    assert found.data == expected
+    assert "its views go to" in caplog.text
+
+
+@pytest.mark.slow
+def test_all_workers_are_killed(scene, cameras, device):
+    with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device) as pool:
+        processes = [process_of(worker) for worker in cluster.workers.values()]
+        with pytest.raises(DeviceError, match=r"gone|does not answer") as error:
+            encode(scene, cameras, OPTIONS, killing(processes, "prune", 2), device, pool=pool)
+    assert "\n" not in str(error.value)
+
+
+@pytest.mark.slow
+def test_a_worker_stands_still(scene, cameras, device, expected):
+    with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device, patience=2.0) as pool:
+        process = process_of(next(iter(cluster.workers.values())))
+        stopped = []
+
+        def progress(what, done):
+            if what == "prune" and done > 0.3 and not stopped:
+                os.kill(process, signal.SIGSTOP)
+                stopped.append(process)
+
+        try:
+            found = encode(scene, cameras, OPTIONS, progress, device, pool=pool)
+        finally:
+            os.kill(process, signal.SIGCONT)
+        assert stopped
+    assert found.data == expected
+
+
+def seats(dask_worker):
+    """On a worker: how many seats there are."""
+    return len(dask_worker.state.actors)
+
+
+def eventually(check, seconds=60):
+    end = time.monotonic() + seconds
+    while not check():
+        assert time.monotonic() < end, "it does not come to pass"
+        time.sleep(0.1)
+
+
+@pytest.mark.slow
+@pytest.mark.skipif(sys.platform == "win32", reason="sends a signal")
+def test_ctrl_c_leaves_no_worker_busy(tmp_path, data, scene, cameras, device, expected):
+    output = tmp_path / "out.potr"
+    with local_cluster(2) as cluster, distributed.Client(cluster, set_as_default=False) as client:
+        command = [
+            sys.executable, "-m", "potr_cl", "encode", data / "plush_excerpt.ply", "-o", output, "--cameras",
+            data / "plush_excerpt_cameras.json", "--cluster", cluster.scheduler_address, "--iterations", "5000",
+            "--keep", "0.001", "--no-quality", "--views-between", "0",
+        ]  # fmt: skip
+        running = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+        try:
+            eventually(lambda: sum(client.run(seats).values()) == 2)
+            time.sleep(1)
+            running.send_signal(signal.SIGINT)
+            _, said = running.communicate(timeout=60)
+        finally:
+            running.kill()
+        assert running.returncode == 130
+        assert "interrupted" in said
+        assert "Traceback" not in said
+        assert not list(tmp_path.iterdir())
+        eventually(lambda: sum(client.run(seats).values()) == 0)
+        # Nothing that was taken for it is still taken, and the workers are free for others.
+        assert set(client.run(taken).values()) == {0}
+        assert potr_cl.encode(scene, cameras, OPTIONS, device=device, cluster=client).data == expected
+
+
+def taken():
+    """On a worker: bytes of its devices that somebody has."""
+    from potr_cl.workers import cluster
+
+    return sum(device.allocated for device in cluster._opened.values())
+
+
+@pytest.mark.parametrize(
+    ("address", "said"),
+    [
+        ("nonsense", "no Dask scheduler answers at 'nonsense'"),
+        ("", "--cluster is empty"),
+        ("tcp://[[:x", "no Dask scheduler answers"),
+        ("tcp://127.0.0.1:0", "no Dask scheduler answers"),
+        (7, "address of a Dask scheduler"),
+    ],
+)
+def test_no_cluster_there(address, said, device, monkeypatch):
+    monkeypatch.setattr("potr_cl.workers.cluster._CONNECT", 0.5)
+    with pytest.raises(UsageError, match=said) as error:
+        ClusterPool(address, device)
+    assert "\n" not in str(error.value)
+
+
+def test_a_cluster_without_workers(device):
+    with local_cluster(0) as cluster, pytest.raises(UsageError, match="has no worker"):
+        ClusterPool(cluster.scheduler_address, device)
+
+
+def test_several_devices_and_a_cluster(scene, cameras, device):
+    with pytest.raises(UsageError, match="several devices and a cluster"):
+        potr_cl.encode(scene, cameras, device=[device, Device()], cluster="tcp://127.0.0.1:1")
+
+
+def test_another_version_is_refused(device, monkeypatch):
+    with local_cluster(1) as cluster:
+        monkeypatch.setattr(potr_cl, "__version__", "0.0.0")
+        with pytest.raises(UsageError, match=r"this computer 0\.0\.0: install the same"):
+            ClusterPool(cluster.scheduler_address, device)
