@@ -53,7 +53,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
 #: What each preset is for, in a line.
 PURPOSE: dict[Preset, str] = {
     "best": "colours re-fitted together, steps of equal worth, the context coder: a small file in little time",
-    "smallest": "as best, with more iterations, re-fits while pruning, and a fit of all parameters: takes several times as long",
+    "smallest": "as best, in more iterations, with re-fits while pruning and a fit of all parameters: takes far longer",
     "fast": "as best, in fewer iterations and steps, with zstd 9: encodes and decodes faster",
     "paper": "what the paper does: colours compacted splat by splat, its steps",
 }

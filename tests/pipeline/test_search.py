@@ -59,7 +59,7 @@ def test_a_size_is_filled_and_not_passed(device, plush_excerpt, cameras, size, p
     assert 0.98 * size <= len(file) <= size
     assert len(file) == found.encoded.nbytes == round(math.exp(found.value))
     assert len(decode(file)) == len(found.encoded.order) == found.encoded.pruned.kept
-    assert len(lines) == len(found.tries)
+    assert sum(not line.startswith("fit: ") for line in lines) == len(found.tries)
     assert sum(step.kind == "encode" for step in found.tries) <= 4
 
 
