@@ -27,7 +27,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
     "smallest": (
         Between(),
         Prune(iterations=64),
-        Fit(),
+        Fit(steps="auto"),
         Compact(on=False),
         Refit(steps=8, at=(0.5, 0.75)),
         Code(),
@@ -53,7 +53,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
 #: What each preset is for, in a line.
 PURPOSE: dict[Preset, str] = {
     "best": "colours re-fitted together, steps of equal worth, the context coder: a small file in little time",
-    "smallest": "as best, in more iterations and with re-fits while pruning: takes twice as long",
+    "smallest": "as best, in more iterations, with re-fits while pruning and a fit of all parameters: takes far longer",
     "fast": "as best, in fewer iterations and steps, with zstd 9: encodes and decodes faster",
     "paper": "what the paper does: colours compacted splat by splat, its steps",
 }

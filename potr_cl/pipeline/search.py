@@ -87,7 +87,7 @@ def encode_to_target(
         scene, cameras, progress, device, antialiased: as :func:`potr_cl.pipeline.encode.encode` takes them.
         target: what to reach.
         options: its q is not looked at; single parameters that are given stay as they are.
-        tell: told a line for every step.
+        tell: told a line for every step, and for every round of a fit.
         pool: as :func:`potr_cl.pipeline.encode.encode` takes it.
 
     Raises:

@@ -33,7 +33,7 @@ FURTHER, _AT_THRESHOLD, _MOST_FURTHER = 3.5, 10**-9.3, 20.0
 #: By how much of its way to 1 the q is higher whose steps give about the PSNR that q has without a fit.
 FINER = 0.18
 #: Steps that "auto" stands for.
-STEPS: dict[Family, int] = {"cpu": 1000, "gpu": 1200}
+STEPS: dict[Family, int] = {"cpu": 800, "gpu": 1000}
 #: Views between for each given one that a fit looks at: they keep it from fitting the given ones too closely.
 BETWEEN: dict[Family, float] = {"cpu": 1.0, "gpu": 3.0}
 #: Part of the steps in each cycle but the last.

@@ -52,12 +52,14 @@ def psnr(device, scene, file, cameras):
 def test_a_size_is_filled_and_not_passed(device, plush_excerpt, cameras, size, preset):
     lines = []
     options = EncodeOptions.for_preset(preset, prune={"iterations": 6})
+    if options.fit.asked_for:
+        options = options.changed(fit={"steps": 20})
     found = encode_to_target(plush_excerpt, cameras, Target(max_bytes=size), options, device=device, tell=lines.append)
     file = b"".join(found.encoded.pieces)
     assert 0.98 * size <= len(file) <= size
     assert len(file) == found.encoded.nbytes == round(math.exp(found.value))
     assert len(decode(file)) == len(found.encoded.order) == found.encoded.pruned.kept
-    assert len(lines) == len(found.tries)
+    assert sum(not line.startswith("fit: ") for line in lines) == len(found.tries)
     assert sum(step.kind == "encode" for step in found.tries) <= 4
 
 
