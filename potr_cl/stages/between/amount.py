@@ -12,7 +12,7 @@ _ENOUGH = 32
 _PART = 0.25
 #: Fewer than this for each training view bring too little.
 _LEAST = 0.25
-_MOST = 5.0
+_MOST, _MOST_ON_CPU = 5.0, 2.0
 #: An added view takes as much time as a training view. So that an encode takes at most 1.6 times as long, added views
 #: are a part of the training views, and some more where an encode does much besides looking at views, as on GPUs.
 _SHARE = 0.45
@@ -56,5 +56,5 @@ def needed_of_virtual(slow: bool) -> float:
 
 def most_needed(views: int, slow: bool) -> float:
     """How many are added for each of so many training views at most."""
-    besides = _BESIDES_ON_CPU if slow else _BESIDES
-    return min(_MOST, _SHARE + besides / views)
+    most, besides = (_MOST_ON_CPU, _BESIDES_ON_CPU) if slow else (_MOST, _BESIDES)
+    return min(most, _SHARE + besides / views)
