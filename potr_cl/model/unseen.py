@@ -22,6 +22,8 @@ _NEAR = 0.2
 _REACH, _PIXELS = 3.5, 2.0
 #: Splats looked at at a time.
 _BLOCK = 1 << 17
+#: In scenes of fewer splats it takes longer to part them into groups than to look at each.
+_GROUPED = 1 << 21
 
 
 def unseen_splats(scene: Scene, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
@@ -37,7 +39,7 @@ def unseen_splats(scene: Scene, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
     unseen = np.ones(len(scene), bool)
     # Views far from each other first: what one does not see the next one may.
     order = np.argsort((np.arange(len(cameras)) * (math.sqrt(5) - 1) / 2) % 1, kind="stable")
-    groups = SplatGroups.of(scene) if len(scene) > _BLOCK and len(cameras) else None
+    groups = SplatGroups.of(scene) if len(scene) >= _GROUPED and len(cameras) else None
     shown = [] if groups is None else [groups.visible(camera, _NEAR) for camera in cameras]
     for start in range(0, len(scene), _BLOCK):
         stop = min(start + _BLOCK, len(scene))

@@ -65,5 +65,6 @@ def test_groups_of_neighbours_change_nothing(monkeypatch, plush_excerpt, plush_e
     wanted = unseen_splats(plush_excerpt, cameras)
     assert 0 < wanted.sum() < len(plush_excerpt)
     monkeypatch.setattr(unseen, "_BLOCK", 100)
+    monkeypatch.setattr(unseen, "_GROUPED", 100)
     monkeypatch.setattr(splat_groups, "_GROUP", 16)
     assert np.array_equal(unseen_splats(plush_excerpt, cameras), wanted)
