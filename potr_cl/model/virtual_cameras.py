@@ -46,8 +46,9 @@ _MOST_ASKED, _WIDEST_ASKED = 4000, 16384
 #: What the names of virtual cameras begin with.
 _PREFIX = "virtual_"
 
-#: More threads than these wait for each other: NumPy's calls are short here, and each needs the interpreter in between.
-_THREADS = 4
+#: More threads than these wait for each other: NumPy's calls are short here, and each needs the interpreter in between
+#: (with 1, 2, 4 and 16 of 16 processors: 2.2, 1.6, 1.7 and 2.1 s).
+_THREADS = 2
 
 #: Splats by which the distance of the scene is measured.
 _SOME = 3000

@@ -9,9 +9,8 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.errors import UsageError
-from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.scene import FloatArray
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
@@ -130,11 +129,10 @@ class Refit(Stage):
         on_grid = bench.output.on_grid(bench.request(state))
         fits = 1 if self.ground_truth is None else 2
 
-        def on_geometry() -> tuple[Rounded, Scene]:
-            geometry = state.geometry
-            if geometry is None or geometry.asked != parameters:
-                geometry = bench.output.geometry(state.scene, bench.request(state))
-            return geometry, geometry.decoded(state.scene.sh)
+        geometry = state.geometry
+        if geometry is None or geometry.asked != parameters:
+            geometry = bench.output.geometry(state.scene, bench.request(state))
+        rounded, decoded = geometry, geometry.decoded(state.scene.sh)
 
         def fitted(views: Sequence[Camera], targets: Targets, number: int) -> tuple[Refitted, Rounded]:
             geometry = rounded
@@ -168,16 +166,7 @@ class Refit(Stage):
             stack.callback(bench.progress, "refit", 1.0)
             source = bench.drawable(state.source)
             rasterizer = stack.enter_context(Rasterizer(bench.opened, source, background=bench.background))
-            renders = stack.enter_context(RenderedTargets(rasterizer, state.views))
-            if on_grid:
-                # The host rounds the geometry by itself, so the device may begin with the pictures.
-                waiting = in_background(on_geometry)
-                if not bench.pool:
-                    renders.render_ahead()
-                rounded, decoded = waiting.result()
-            else:
-                rounded, decoded = on_geometry()
-            refitted, geometry = fitted(state.views, renders, 0)
+            refitted, geometry = fitted(state.views, RenderedTargets(rasterizer, state.views), 0)
             choice = None
             if self.ground_truth is not None:
                 given = state.views[: len(state.views) - state.added]

@@ -10,13 +10,11 @@ import pytest
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.outputs.colour_grid import ColourGrid
-from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
 from potr_cl.reference.refit_cases import Case, Linearised, Pictures
 from potr_cl.reference.scenes import plain_splats, ring_of_cameras, straight_camera, tilted_camera, visible_scene
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, active_coefficients, refit_colours
-from potr_cl.stages.refitting.targets import RenderedTargets
 from tests.devices import KERNELS, open_device
 
 
@@ -329,39 +327,6 @@ def test_colours_come_to_the_device_and_back(device, degree):
             vectors.write_sh(x, sh)
             assert np.abs(vectors.read(x) - to_ycocg(scene.sh)).max() < 1e-6 * np.abs(scene.sh).max()
             assert np.abs(vectors.read_sh(x) - scene.sh).max() < 1e-6 * np.abs(scene.sh).max()
-
-
-@pytest.mark.parametrize(("memory", "rendered"), [(1 << 36, True), (200_000, False)])
-def test_pictures_rendered_ahead_are_those_rendered_when_asked_for(device, monkeypatch, memory, rendered):
-    """Each is given once; afterwards, and where memory is short, they are rendered when they are asked for."""
-    cameras = [of_size(camera, 40 - n, 30) for n, camera in enumerate(ring_of_cameras(5, size=40))]
-    nbytes = sum(12 * camera.width * camera.height for camera in cameras)
-    with Rasterizer(device, visible_scene(60, 2)) as rasterizer, RenderedTargets(rasterizer, cameras) as targets:
-        wanted = [rasterizer.render(camera)[0] for camera in cameras]
-        times, render_into = [], rasterizer.render_into
-
-        def counted(some, target):
-            times.append(some)
-            render_into(some, target)
-
-        monkeypatch.setattr(rasterizer, "render_into", counted)
-        with monkeypatch.context() as patch:
-            info = dataclasses.replace(device.info, kind="gpu", memory=device.allocated + memory)
-            patch.setattr(device, "info", info)
-            targets.render_ahead()
-        assert len(times) == (1 if rendered else 0)
-        buffer = device.allocate(nbytes, "pictures")
-        for numbers in ([3], [1, 2], [0, 4], [0, 1, 2], [4]):
-            targets.into(numbers, buffer)
-            start = 0
-            for number in numbers:
-                shape = wanted[number].shape
-                assert np.array_equal(device.download(buffer, shape, np.float32, start), wanted[number])
-                start += wanted[number].nbytes
-        device.free(buffer)
-        assert len(times) == (3 if rendered else 5)
-        targets.render_ahead()
-        assert len(times) == (3 if rendered else 5), "a CPU has nothing else to do meanwhile"
 
 
 class Counted:

@@ -2,25 +2,17 @@
 
 from __future__ import annotations
 
-import itertools
 from collections.abc import Sequence
-from contextlib import suppress
 from typing import Protocol
 
 import numpy as np
 import pyopencl as cl
 
-from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
-
-#: Pictures are only rendered ahead if the device has so many times the memory for all of them.
-_PLENTY = 4
-#: Views that are rendered ahead together.
-_TOGETHER = 32
 
 
 class Targets(Protocol):
@@ -39,7 +31,7 @@ class Targets(Protocol):
         ...
 
 
-class RenderedTargets(Owner):
+class RenderedTargets:
     """The pictures that another scene gives: the uncompressed one's.
 
     Args:
@@ -50,50 +42,10 @@ class RenderedTargets(Owner):
     def __init__(self, rasterizer: Rasterizer, cameras: Sequence[Camera]) -> None:
         self._rasterizer = rasterizer
         self._cameras = list(cameras)
-        self._memory = Memory(rasterizer.device)
-        self._ahead: dict[int, tuple[cl.Buffer, int]] = {}  # by view, where its picture lies
-
-    def render_ahead(self) -> None:
-        """Render the pictures before anybody asks for them, if there is plenty of device memory for them.
-
-        Each is kept until it was asked for once. So a GPU has something to do while the host is not ready yet.
-
-        Raises:
-            DeviceError: the device failed.
-        """
-        device = self._rasterizer.device
-        free = device.info.memory - device.allocated
-        if device.info.kind == "cpu" or _PLENTY * sum(map(_nbytes, self._cameras)) > free:
-            return
-        with suppress(DeviceMemoryError):
-            for first in range(0, len(self._cameras), _TOGETHER):
-                numbers = range(first, min(first + _TOGETHER, len(self._cameras)))
-                cameras = [self._cameras[number] for number in numbers]
-                starts = [0, *itertools.accumulate(map(_nbytes, cameras))]
-                buffer = self._memory.allocate(starts[-1], "the target images")
-                self._rasterizer.render_into(cameras, buffer)
-                self._ahead.update((number, (buffer, start)) for number, start in zip(numbers, starts, strict=False))
 
     def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
         """See :meth:`Targets.into`."""
-        if not all(number in self._ahead for number in numbers):
-            self._rasterizer.render_into([self._cameras[number] for number in numbers], buffer)
-            return
-        start = 0
-        for number in numbers:
-            picture, place = self._ahead.pop(number)
-            nbytes = _nbytes(self._cameras[number])
-            cl.enqueue_copy(
-                self._rasterizer.device.queue, buffer, picture, byte_count=nbytes, src_offset=place, dst_offset=start
-            )
-            start += nbytes
-            if not any(other is picture for other, _ in self._ahead.values()):
-                self._memory.free(picture)
-
-    def close(self) -> None:
-        """Give back the memory of pictures that nobody has asked for."""
-        self._ahead.clear()
-        self._memory.close()
+        self._rasterizer.render_into([self._cameras[number] for number in numbers], buffer)
 
 
 def _nbytes(camera: Camera) -> int:
