@@ -19,7 +19,10 @@ from potr_cl.api.inputs import (
     on_device,
     scene_of,
 )
+from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.decoder import decode as decode_file
+from potr_cl.codec.decoder import open_file
+from potr_cl.errors import DataError
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene
@@ -117,6 +120,40 @@ def decode(
     if write is not None:
         write(scene)
     return scene
+
+
+def decode_block_by_block(
+    file: str | os.PathLike[str],
+    output: str | os.PathLike[str],
+    trust: bool = False,
+    sh_degree: int | None = None,
+) -> int | None:
+    """Decode a .potr file of blocks into a .ply, with no more of its blocks in memory than are decoded side by side.
+
+    Args:
+        file: its path.
+        output: the file to write.
+        trust, sh_degree: as of :func:`decode`.
+
+    Returns:
+        The number of splats; None if the file is not one of blocks or the output no .ply: nothing was done then.
+
+    Raises:
+        As :func:`decode`.
+    """
+    from potr_cl.formats.registry import suffix_of_name
+    from potr_cl.formats.scenes import ply
+
+    if suffix_of_name(Path(output)) != ".ply":
+        return None
+    opened = open_file(file, trust)
+    if not isinstance(opened, BlockedFile):
+        return None
+    try:
+        ply.save_parts(output, opened.parts(sh_degree=sh_degree), opened.table.splats)
+    except DataError as error:
+        raise DataError(f"'{os.fspath(file)}': {error}") from None
+    return opened.table.splats
 
 
 def decode_to_device(

@@ -6,8 +6,9 @@ import argparse
 import time
 from typing import TYPE_CHECKING
 
+from potr_cl.api.files import decode_block_by_block
 from potr_cl.cli.batch import add_to_option, for_each_scene, jobs
-from potr_cl.cli.guard import read_file
+from potr_cl.cli.guard import StandardOutput, read_file
 from potr_cl.cli.outputs import WrittenScene, place
 from potr_cl.cli.scenes import add_from_option, add_trust_option, as_file, trust, write_scene
 from potr_cl.cli.terminal import say, say_document, say_done
@@ -27,6 +28,12 @@ def _decode(args: argparse.Namespace) -> None:
 def _decode_one(args: argparse.Namespace) -> None:
     started = time.perf_counter()
     with as_file(args.scene) as file:
+        if args.box is None and not isinstance(args.output, StandardOutput):
+            splats = decode_block_by_block(file, args.output, args.trust, args.sh_degree)
+            if splats is not None:
+                seconds = time.perf_counter() - started
+                say_done(f"{args.output}: {splats} splats, decoded and written in {seconds:.2f} s")
+                return
         scene = decode(file, **trust(args), sh_degree=args.sh_degree, box=args.box and Box.of(args.box))
     decoded = time.perf_counter()
     write_scene(args.output, scene, args.to)

@@ -24,6 +24,7 @@ from potr_cl.codec.container import Header
 from potr_cl.codec.context.tokens import largest_integer
 from potr_cl.codec.dequantizer import Dequantizer
 from potr_cl.codec.native.bundles import BEYOND_TABLE, BundledFile, Tables, ValueArrays
+from potr_cl.codec.native.library import native
 from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
 from potr_cl.codec.versions import VERSIONS
@@ -90,6 +91,8 @@ class BundledScene:
         work, number = SharedWork(), self.reader.bundles.number
         # With fewer bundles for each, threads wait for the interpreter, and for memory, longer than they decode.
         helpers = min(threads, max(self.header.splats // SPLATS_A_THREAD, 2)) - (filled is None)
+        if native() is None:  # others would wait for the interpreter, and take memory meanwhile
+            helpers = 0
         first = []
         if centres is not None:
             first.append(work.add(partial(centres, work.run, _PARTS * helpers if helpers else 1)))
@@ -99,7 +102,8 @@ class BundledScene:
                     pool.submit(work.do)
                 job = self._job(arrays)
                 shares = job.shares(number)
-                if job.file is None:  # by NumPy, in one thread: others would wait for the interpreter
+                if job.file is None:
+                    work.do()
                     self._one_by_one(job, shares, filled or _nobody)
                     shares = []
                 futures = [work.add(partial(job, some)) for some in shares]

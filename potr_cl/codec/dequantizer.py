@@ -28,10 +28,9 @@ from potr_cl.codec.versions import FormatVersion
 F32 = NDArray[np.float32]
 I8 = NDArray[np.int8]
 
-#: Splats worked on at a time: few enough that temporaries stay in a cache, many enough that threads seldom wait.
+#: Splats worked on at a time: few enough that temporaries stay in a cache, many enough that threads seldom wait. A
+#: multiple of the runs in which DC is predicted.
 _BLOCK = 1 << 15
-#: Splats whose DC is predicted at a time, a multiple of a prediction's run.
-_PREDICTED = 1 << 16
 #: Levels whose values the native path looks up: small tables for levels of one byte, larger ones for others.
 _SMALL_TABLE, _LARGE_TABLE = 1 << 8, 1 << 16
 
@@ -142,6 +141,10 @@ class Dequantizer:
 
     def of_levels(self, levels: Levels, steps: ColourSteps | None, arrays: ValueArrays) -> None:
         """The values of some splats' levels, by NumPy, into the arrays that there are, of all of the file's splats."""
+        for start in range(0, levels.stop - levels.start, _BLOCK):
+            self._of_block(levels.part(start, start + _BLOCK), steps, arrays)
+
+    def _of_block(self, levels: Levels, steps: ColourSteps | None, arrays: ValueArrays) -> None:
         version, header = self.version, self.header
         own = arrays.part(levels.start, levels.stop)
         scales = levels.scales or []
@@ -159,10 +162,8 @@ class Dequantizer:
         dc, ac = np.zeros((2, levels.stop - levels.start), np.int8)
         if steps is not None:
             dc, ac = steps.classes(scales, levels.opacities, levels.start)
-        for start in range(0, len(dc), _PREDICTED):
-            some = slice(start, start + _PREDICTED)
-            residuals = np.stack([channel[some] for channel in levels.dc], dtype=np.int64)
-            _to_rgb(list(from_residuals(residuals, dc[some])), factors(header.sf_dc, dc[some]), own.sh[0, :, some])
+        residuals = np.stack(levels.dc, dtype=np.int64)
+        _to_rgb(list(from_residuals(residuals, dc)), factors(header.sf_dc, dc), own.sh[0])
         divisors = factors(header.sf_ac, ac)
         for items in levels.ac:
             rgb = np.empty(items.channels.shape, np.float32)

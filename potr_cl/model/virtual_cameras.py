@@ -46,6 +46,9 @@ _MOST_ASKED, _WIDEST_ASKED = 4000, 16384
 #: What the names of virtual cameras begin with.
 _PREFIX = "virtual_"
 
+#: More threads than these wait for each other: NumPy's calls are short here, and each needs the interpreter in between.
+_THREADS = 4
+
 #: Splats by which the distance of the scene is measured.
 _SOME = 3000
 #: How far the standpoints around a virtual view are from it, as a part of its distance from the scene.
@@ -71,7 +74,7 @@ def place_cameras(
         UsageError: ``count`` or ``size`` below 1, or above what can be placed and rendered.
     """
     planned = plan(len(scene), count, size)
-    with thread_pool() as pool:
+    with thread_pool(_THREADS) as pool:
         frame = frame_of(scene, pool.map)
         matter = matter_of(scene, frame)
         candidates = candidates_of(frame, matter, math.tan(math.radians(field / 2)), pool.map)

@@ -5,7 +5,10 @@ from __future__ import annotations
 from collections.abc import Sequence
 from dataclasses import dataclass
 
-from potr_cl.workers.pool import Pool
+from potr_cl.workers.pool import Pool, Worker
+
+#: A worker that is slower than this against another one gets fewer views.
+_MATTERS = 1.25
 
 
 @dataclass(frozen=True)
@@ -26,11 +29,24 @@ def shares(pool: Pool, views: int) -> Shares:
     Raises:
         WorkerLost: no worker is left.
     """
-    speeds = [worker.speed for worker in pool.workers()]
+    workers = pool.workers()
+    speeds = [1.0] * len(workers) if pool.takes_part else speeds_of(workers)
     if not pool.takes_part:
         return Shares([], [each for each in deal(views, speeds) if each])
     own, *others = deal(views, [1.0, *speeds])
     return Shares(own, [each for each in others if each])
+
+
+def speeds_of(workers: Sequence[Worker]) -> list[float]:
+    """How fast workers are in proportion to each other, as far as that is known and matters.
+
+    Small differences say more about what else a computer did just then than about its device.
+    """
+    rates = [worker.rate for worker in workers]
+    known = [rate for rate in rates if rate is not None]
+    if len(known) < len(rates) or not known or max(known) < _MATTERS * min(known):
+        return [1.0] * len(rates)
+    return [rate / max(known) for rate in known]
 
 
 def deal(views: int, speeds: Sequence[float]) -> list[list[int]]:

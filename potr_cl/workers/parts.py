@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
+from functools import partial
 from types import TracebackType
 from typing import Any
 
@@ -33,11 +34,23 @@ class Parts(Owner):
         kind: of all parts.
         given: what each part is made with, see :class:`potr_cl.workers.pool.Part`.
         memory: bytes of a device's memory that may be filled with views; None: the parts' own default.
+        views: how many views each part has: by these, workers' rates are noted in the end.
 
     The workers begin at once; :meth:`ready` waits for them, and so does the first command.
     """
 
-    def __init__(self, pool: Pool, kind: type[Part], given: Sequence[Sequence[Any]], memory: int | None = None) -> None:
+    def __init__(
+        self,
+        pool: Pool,
+        kind: type[Part],
+        given: Sequence[Sequence[Any]],
+        memory: int | None = None,
+        views: Sequence[int] = (),
+    ) -> None:
+        self._views = list(views)
+        self._commands = 0
+        self._longest = 0.0  # seconds that anything has taken
+        self._spent = [0.0] * len(given)
         self._pool, self._kind, self._memory = pool, kind, memory
         self._given = [tuple(each) for each in given]
         self._log: list[tuple[str, tuple[Any, ...]]] = []
@@ -120,6 +133,10 @@ class Parts(Owner):
 
     def _end(self, abandoned: bool) -> None:
         self._pending = None
+        for worker, views, spent in zip(self._by, self._views, self._spent, strict=False):
+            # Of several parts that a worker has, each waits for the others: then nothing is known.
+            if worker is not None and spent > 0 and self._by.count(worker) == 1:
+                worker.rate = views * self._commands / spent
         held, self._held = self._held, [None] * len(self._given)
         for making in self._making:  # an error came between
             with suppress(PotrError):
@@ -160,15 +177,17 @@ class Parts(Owner):
         """Wait for all; where a worker fails, have ``again`` do it on another one."""
         waiting = dict(zip(futures, places if places is not None else range(len(futures)), strict=True))
         failed: list[tuple[int, DeviceError]] = []
-        patience, began, last = self._pool.patience, time.monotonic(), 0.0
+        patience, began = self._pool.patience, time.monotonic()
         while waiting:
             # Nobody can tell how long something takes before one has done it.
-            limit = None if patience is None or not last else began + max(patience, _SLOWER * last) - time.monotonic()
+            limit = None
+            if patience is not None and self._longest > 0:
+                limit = began + max(patience, _SLOWER * self._longest) - time.monotonic()
             done, _ = wait(waiting, None if limit is None else max(limit, 0.0), return_when=FIRST_COMPLETED)
             if not done:
                 failed += [(place, WorkerLost("it does not answer")) for place in waiting.values()]
                 break
-            last = time.monotonic() - began
+            self._longest = max(self._longest, time.monotonic() - began)
             for future in done:
                 place = waiting.pop(future)
                 try:
@@ -222,6 +241,9 @@ class Parts(Owner):
         self._remake(place)
         return self._begin(place, command, args).result()
 
+    def _note_time(self, place: int, began: float, _done: Future[Any]) -> None:
+        self._spent[place] += time.monotonic() - began
+
     def _note(self, command: str, args: tuple[Any, ...]) -> None:
         self._log.append((command, args))
 
@@ -232,6 +254,9 @@ class Pending:
     def __init__(self, parts: Parts, command: str, args: tuple[Any, ...], logged: bool) -> None:
         self._parts, self._command, self._args, self._logged = parts, command, args, logged
         self._futures = [parts._begin(place, command, args) for place in range(len(parts))]
+        began = time.monotonic()
+        for place, future in enumerate(self._futures):
+            future.add_done_callback(partial(parts._note_time, place, began))
         self._found: list[Any] | None = None
 
     def results(self) -> list[Any]:
@@ -248,7 +273,12 @@ class Pending:
             parts._pool.traffic.received += nbytes(result)
             found[place] = result
 
-        parts._collect(self._futures, take, lambda place: parts._again(place, self._command, self._args))
+        try:
+            parts._collect(self._futures, take, lambda place: parts._again(place, self._command, self._args))
+        except BaseException:
+            parts._pending = None  # it is over
+            raise
+        parts._commands += 1
         if self._logged:
             parts._note(self._command, self._args)
         self._found = found

@@ -58,11 +58,11 @@ class Worker(ABC):
 
     Attributes:
         name: for messages.
-        speed: views that it does in the time in which others do one.
+        rate: views that it did in a second in the last work that it had a part of, each command counting; None before.
     """
 
     name: str
-    speed: float = 1.0
+    rate: float | None = None
 
     @abstractmethod
     def make(self, kind: type[Part], memory: int | None, given: Sequence[Any]) -> Future[Held]:

@@ -313,10 +313,9 @@ def test_plush_is_looked_at_from_where_it_was_photographed(plush):
 
 
 def test_the_same_places_whatever_the_threads(monkeypatch):
-    """One processor, many, and none but the caller's own thread."""
     wanted = place_cameras(BALL, 12, 64)
-    for processors in (1, 7):
-        monkeypatch.setattr("os.cpu_count", lambda n=processors: n)
+    for threads in (1, 7):
+        monkeypatch.setattr("potr_cl.model.virtual_cameras._THREADS", threads)
         for one, other in zip(wanted, place_cameras(BALL, 12, 64), strict=True):
             assert np.array_equal(one.rotation, other.rotation)
             assert np.array_equal(one.translation, other.translation)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
 
 import pytest
 
 from potr_cl.errors import DeviceMemoryError, UsageError
+from potr_cl.workers.dealing import shares
 from potr_cl.workers.parts import Parts
 from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, WorkerLost
 
@@ -130,6 +132,24 @@ def test_a_refusal_is_no_loss():
         with pytest.raises(UsageError, match="no"):
             parts.tell("refuse")
         assert parts.tell("add", 2) == [2, 2]
+
+
+def test_slow_workers_get_fewer_views():
+    """From the second work on: how fast they are shows in the first one."""
+
+    class Sleepy(Sum):
+        def add(self, number):
+            time.sleep(0.02 * self.step)
+            return super().add(number)
+
+    pool = FakePool(FakeWorker("a"), FakeWorker("b"))
+    assert [len(each) for each in shares(pool, 30).others] == [15, 15]
+    with Parts(pool, Sleepy, [(0, 1), (0, 4)], views=[15, 15]) as parts:
+        for number in range(5):
+            parts.tell("add", number)
+    fast, slow = (len(each) for each in shares(pool, 30).others)
+    assert fast + slow == 30
+    assert 2 * slow < fast
 
 
 def test_a_log_that_begins_anew_is_not_replayed_whole():

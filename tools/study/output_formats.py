@@ -249,6 +249,8 @@ def _report(args: argparse.Namespace) -> None:
                 if kind.partition(":")[0].lstrip(".") != other["format"].lstrip("."):
                     continue
                 points = [p for p in entry["encodes"] if (p["format"], p.get("fit", 0)) == (kind, fit)]
+                if len(points) < 2:
+                    continue
                 cells: list[Any] = [kind, fit or None, other["bytes"] / 1e6]
                 # A curve rises with PSNR and falls with what is lost.
                 for key, sign in (("psnr", 1), ("psnr_loss", -1)):

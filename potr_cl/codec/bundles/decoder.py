@@ -31,6 +31,10 @@ I64 = NDArray[np.int64]
 Integers = NDArray[np.signedinteger]
 
 
+#: Splats whose steps are found at a time: few enough that temporaries are small.
+_AT_A_TIME = 1 << 15
+
+
 @dataclass(frozen=True)
 class Wanted:
     """What to decode. Later parts of a chain need the earlier ones.
@@ -230,7 +234,10 @@ class _Run:
         steps, levels = self._reader.steps, self.levels
         classes = np.zeros(self._bundles.splats, np.int8)
         if steps is not None and levels.scales is not None and levels.opacities is not None:
-            classes, _ = steps.classes(levels.scales, levels.opacities, levels.start)
+            for start in range(0, len(classes), _AT_A_TIME):
+                some = slice(start, start + _AT_A_TIME)
+                scales = [axis[some] for axis in levels.scales]
+                classes[some], _ = steps.classes(scales, levels.opacities[some], levels.start + start)
         self._terms["step"] = step_terms(classes).astype(np.int16)
 
     def _decode_band(self, key: Key) -> None:

@@ -48,6 +48,20 @@ class Levels:
     dc: list[NDArray[Any]] | None = None
     ac: list[Items] = field(default_factory=list)
 
+    def part(self, start: int, stop: int) -> Levels:
+        """Those of some splats, which are counted from this run's first."""
+        stop = min(stop, self.stop - self.start)
+        own = slice(start, stop)
+        part = Levels(self.start + start, self.start + stop, None if self.opacities is None else self.opacities[own])
+        for name in ("scales", "rotations", "dc"):
+            if (arrays := getattr(self, name)) is not None:
+                setattr(part, name, [array[own] for array in arrays])
+        for items in self.ac:
+            first, end = np.searchsorted(items.splats, (start, stop))
+            some = slice(first, end)
+            part.ac.append(Items(items.splats[some] - start, items.coefficients[some], items.channels[:, some]))
+        return part
+
     def coefficient(self, number: int) -> NDArray[Any]:
         """(3, n) Y, Co, Cg of an AC coefficient, zeros included."""
         for items in self.ac:

@@ -125,7 +125,7 @@ def decode_stream(
         if extra is not None and (token := tokens.take(slot)).max() >= DIRECT:
             _take_bits(token, states, words, extra[t])
     words.check()
-    of_items = tokens.take(layout.taken(slots))
+    of_items = layout.taken(tokens.take(slots))
     extras = None if extra is None else layout.taken(extra)
     return of_items, _integers(of_items, extras, integer_type(fitted.alphabet))
 

@@ -10,6 +10,7 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec import octree
 from potr_cl.formats.scenes.compressed_ply_values import CHUNK, POSITION_BITS
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
@@ -21,11 +22,16 @@ _PART = 1 << 15
 def in_chunks(means: FloatArray, threads: int = 0) -> NDArray[np.int64]:
     """(N,) the numbers of splats in an order of which each :data:`CHUNK` in sequence lie near each other.
 
+    Those of a chunk follow Morton's curve.
+
     Args:
         means: (N, 3) float32, finite.
         threads: to work with; the result does not depend on it. 0: one a processor.
     """
-    tree = _Tree(means)
+    # Viewers draw splats of nearly the same depth in the order of the file, so it should be that of other writers.
+    side = max(float(axis.max()) - float(axis.min()) for axis in means.T)
+    order = octree.leaf_order(means, max(side * 2.0**-20, 1e-30))
+    tree = _Tree(means.take(order, axis=0))
     parts, small = [(0, len(means))], []
     while parts:
         start, end = parts.pop()
@@ -36,7 +42,7 @@ def in_chunks(means: FloatArray, threads: int = 0) -> NDArray[np.int64]:
             parts += [(start, middle), (middle, end)]
     with thread_pool(threads) as pool:
         list(pool.map(lambda part: tree.split_to_chunks(*part), small))
-    return tree.numbers.astype(np.int64)
+    return order.take(tree.numbers.astype(np.int64))
 
 
 class _Tree:
@@ -61,7 +67,7 @@ class _Tree:
         return start + half
 
     def split_to_chunks(self, start: int, end: int) -> None:
-        """Split a part until there are chunks, the splats of each by their numbers."""
+        """Split a part until there are chunks, the splats of each in the order that the tree was given."""
         if end - start > CHUNK:
             middle = self.split(start, end)
             self.split_to_chunks(start, middle)

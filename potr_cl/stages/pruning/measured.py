@@ -66,7 +66,9 @@ def measurement(
             return
         scene = stack.enter_context(pool.shared(state.scene))
         given = [(scene, views, options, bench.background, numbers) for numbers in share.others]
-        others = stack.enter_context(Parts(pool, RemovalPart, given, options.memory))
+        others = stack.enter_context(
+            Parts(pool, RemovalPart, given, options.memory, [len(each) for each in share.others])
+        )
         own, stride = None, len(state.scene)
         if share.own:
             rasterizer = stack.enter_context(

@@ -13,7 +13,6 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Staging
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.changes import pack_changes
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.workers.pool import Part
@@ -74,18 +73,21 @@ class RemovalPart(Part):
         totals: NDArray[np.int64] = self._staging.download(steering.totals, (self._sweep.splats, 2), np.int64)
         return totals
 
-    def measure_changes(self) -> bytes:
+    def measure_changes(self) -> tuple[NDArray[np.uint32], NDArray[np.int64]]:
         """What has changed in the totals of the splats that are left since the last call; all, at the first.
 
-        See :func:`potr_cl.stages.pruning.changes.pack_changes`.
+        To pack them tighter takes longer than a network does.
+
+        Returns:
+            (n,) uint32 numbers of splats, and (n, 2) int64 by how much their totals have changed.
         """
         totals = self.measure().copy()
         if self._sent is None:
             self._sent = np.zeros_like(totals)
         changed = np.flatnonzero((totals != self._sent).any(axis=1) & self._sweep.alive)
-        packed = pack_changes(changed, totals[changed] - self._sent[changed])
+        changes = totals[changed] - self._sent[changed]
         self._sent = totals
-        return packed
+        return changed.astype(np.uint32), changes
 
     def remove(self, splats: Indices) -> None:
         """Take splats out for good."""

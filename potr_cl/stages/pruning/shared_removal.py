@@ -20,7 +20,6 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.stages.pruning.changes import unpack_changes
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
 from potr_cl.stages.pruning.steering import Steered, Steering
@@ -124,8 +123,7 @@ class SharedRemoval(Owner):
     def found_by_others(self, pending: Pending) -> NDArray[np.int64]:
         """(N, 2) int64, what they found; valid until the next call."""
         if self._sparse:
-            for data in pending.results():
-                splats, changes = unpack_changes(data)
+            for splats, changes in pending.results():
                 self._found[splats] += changes
             return self._found
         totals: list[NDArray[np.int64]] = pending.results()

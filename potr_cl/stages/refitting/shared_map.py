@@ -113,5 +113,5 @@ def colour_parts(
     constant = replace(scene, sh=np.ascontiguousarray(scene.sh[:, :1]))
     with pool.shared(constant) as shape, pool.shared(source) as pictured:
         given = [(shape, scene.sh.shape[1], rules, background, pictured, cameras, numbers) for numbers in shares.others]
-        with Parts(pool, ColourPart, given, memory) as parts:
+        with Parts(pool, ColourPart, given, memory, [len(each) for each in shares.others]) as parts:
             yield parts
