@@ -11,8 +11,8 @@ import pytest
 from potr_cl import cli
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply
-from potr_cl.opencl.device import Device
 from potr_cl.reference.scenes import random_scene
+from potr_cl.workers.opening import Workers, open_workers
 
 KEEP = ["--no-prune", "--no-compact", "--refit", "off"]
 
@@ -81,13 +81,13 @@ def test_a_mistake_of_the_program_does_not_lose_the_others(
 def test_one_device_is_opened_once(
     folder: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    opened: list[Device] = []
+    opened: list[Workers] = []
 
-    def opening(choice: str | None = None) -> Device:
-        opened.append(Device(choice))
+    def opening(device: str | None, cluster: str | None) -> Workers:
+        opened.append(open_workers(device, cluster))
         return opened[-1]
 
-    monkeypatch.setattr("potr_cl.cli.encode.Device", opening)
+    monkeypatch.setattr("potr_cl.cli.encode.open_workers", opening)
     call = ["encode", "a.ply", "b.ply", "c.ply", "-o", "small", "--preset", "fast", "--virtual-views", "8"]
     assert cli.main(call) == 0
     assert len(opened) == 1

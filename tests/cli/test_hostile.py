@@ -311,7 +311,7 @@ def unreadable(monkeypatch: pytest.MonkeyPatch) -> None:
     def refuse(*_args: object, **_keywords: object) -> None:
         raise DataError("the octree's origin is not finite")
 
-    monkeypatch.setattr("potr_cl.codec.decoder.PotrFile.means", refuse)
+    monkeypatch.setattr("potr_cl.codec.decoder.PotrFile.decode_into", refuse)
 
 
 def test_a_file_that_cannot_be_decoded_replaces_nothing(
@@ -396,13 +396,14 @@ def test_trust_reaches_the_readers(
 ) -> None:
     asked = []
 
-    def ask(path: object, **keywords: object) -> None:
-        asked.append(keywords)
+    def ask(path: object, trust: bool = False, **_keywords: object) -> None:
+        asked.append(trust)
         raise PotrError("enough")
 
-    for reader in ("cli.scenes.load_scene", "cli.files.decode", "api.describing.load_scene", "formats.load_scene"):
+    for reader in ("cli.scenes.load_scene", "api.describing.load_scene", "formats.load_scene"):
         monkeypatch.setattr(f"potr_cl.{reader}", ask)
-    monkeypatch.setattr("potr_cl.codec.decoder.PotrFile.open", ask)
+    for module in ("api.files", "api.describing", "codec.decoder"):
+        monkeypatch.setattr(f"potr_cl.{module}.open_file", ask)
     cameras = str(ROOT / "tests" / "data" / "plush_excerpt_cameras.json")
     scene, out = str(scene_path), str(tmp_path / "out.ply")
     for command in (
@@ -421,7 +422,7 @@ def test_trust_reaches_the_readers(
         asked.clear()
         assert cli.main(command) == 1
         assert cli.main([*command, "--trust"]) == 1
-        assert [keywords.get("trust", False) for keywords in asked] == [False, True], command[0]
+        assert asked == [False, True], command[0]
     capsys.readouterr()
 
 
