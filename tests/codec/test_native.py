@@ -176,6 +176,7 @@ def files_to_change() -> list[bytes]:
     return made + [path.read_bytes() for path in GOLDEN if path.stat().st_size < 6000]
 
 
+@pytest.mark.slow
 def test_changed_files(choose):
     """Bytes changed anywhere behind the magic, checksums made right: read alike or refused for the same reason."""
     rng = random.Random(7)

@@ -312,6 +312,7 @@ def test_plush_is_looked_at_from_where_it_was_photographed(plush):
     assert np.quantile(nearest, 0.9) < 4
 
 
+@pytest.mark.slow
 def test_the_same_places_whatever_the_threads(monkeypatch):
     wanted = place_cameras(BALL, 12, 64)
     for threads in (1, 7):

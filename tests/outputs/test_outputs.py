@@ -154,6 +154,7 @@ def test_a_psnr_is_met(suffix, least, plush_excerpt, plush_excerpt_cameras, devi
     assert least <= psnr(device, plush_excerpt, encoded.scene, plush_excerpt_cameras) < least + 1.5
 
 
+@pytest.mark.slow
 def test_quality_decides_of_size(plush_excerpt, plush_excerpt_cameras, device):
     for output in OTHERS:
         sizes = [encoded_to(output, plush_excerpt, plush_excerpt_cameras, device, q=q).nbytes for q in (0.2, 0.8)]
@@ -189,6 +190,7 @@ def test_antialiased_scenes_stay_so(suffix, plush_excerpt, plush_excerpt_cameras
     assert seen_in_file(encoded, tmp_path).antialiased
 
 
+@pytest.mark.slow
 def test_results_are_saved_in_their_own_format_and_others(plush_excerpt, tmp_path):
     nothing = {"prune": False, "refit": False}
     encoded = potr_cl.encode(plush_excerpt, output=tmp_path / "a.spz", **nothing)

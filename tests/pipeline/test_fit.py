@@ -84,6 +84,7 @@ def test_what_only_fits_rounds_as_q_says(device, plush_excerpt, plush_excerpt_ca
     assert encoded.parameters == HALF.changed(fit=False).parameters
 
 
+@pytest.mark.slow
 @pytest.mark.parametrize("target", [Target(max_bytes=13_000), Target(min_psnr=46)], ids=str)
 def test_a_search_fits(device, plush_excerpt, plush_excerpt_cameras, target):
     found = encode_to_target(plush_excerpt, plush_excerpt_cameras, target, HALF, device=device)
@@ -99,6 +100,7 @@ def test_a_search_fits(device, plush_excerpt, plush_excerpt_cameras, target):
         assert round(math.exp(found.value)) == again.nbytes <= target.max_bytes
 
 
+@pytest.mark.slow
 def test_a_search_whose_fit_is_left_out_finds_what_it_finds_without(device, plush_excerpt, plush_excerpt_cameras):
     plain = EncodeOptions().changed(prune={"iterations": 8})
     options = plain.changed(fit={"steps": 10, "rounds": 2})

@@ -70,6 +70,7 @@ def test_the_peak_is_what_is_said(device, many_splats, views):
     assert 0.85 * said < peak(device, many_splats, scene, views, 10**9) < 1.15 * said
 
 
+@pytest.mark.slow
 def test_a_budget_of_memory_is_kept(device, many_splats, views):
     """What is kept of views is no more than the budget."""
     larger = [resized(view, 480, 360) for view in views]

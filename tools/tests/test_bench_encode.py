@@ -33,6 +33,7 @@ def test_the_front():
     assert [on_front(row, rows) for row in rows] == [True, True, False]
 
 
+@pytest.mark.slow
 def test_kernels_and_their_variants(folder):
     info = choose_device()
     rows = result(info, folder, ["project", "tile lists", "sort", "composite"])["rows"]

@@ -21,6 +21,7 @@ def folder(tmp_path, data):
     return tmp_path
 
 
+@pytest.mark.slow
 def test_the_bench_measures_steps_products_and_errors(folder, monkeypatch):
     path = folder / "fit.json"
     arguments = ["fit", str(folder), "--every", "4", "--steps", "4", "--batches", "2", "--json", str(path)]

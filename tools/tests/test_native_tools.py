@@ -37,6 +37,7 @@ def run(program, *arguments, **environment):
     )  # fmt: skip
 
 
+@pytest.mark.slow
 @needs_compiler
 def test_the_sanitizer_sees_one_byte_beyond(tmp_path):
     library = tmp_path / "sanitized.so"
