@@ -14,7 +14,6 @@ def rounded_in_turn(
     free: NDArray[np.bool_],
     step: float,
     to_zero: float,
-    to_less: float,
     damping: float = 1e-2,
     floor: float = 1e-3,
 ) -> tuple[Array, float]:
@@ -26,7 +25,7 @@ def rounded_in_turn(
         block: (M, M), what squared errors of the channel's coefficients cost together.
         x: (M,) the coefficients. free: (M,) those that may change.
         step: of the AC coefficients.
-        to_zero, to_less: what it saves to have 0 instead of one step, and one step less of several.
+        to_zero: what it saves to have 0 instead of one step.
         damping, floor: added to the diagonal, as a part of its mean, and besides.
 
     Returns:
@@ -46,12 +45,10 @@ def rounded_in_turn(
         cost = block[m, m] - block[m, others] @ np.linalg.solve(block[np.ix_(others, others)], block[others, m])
         level = np.floor(y[m] / step + 0.5)
         margin = min(margin, abs(y[m] / step + 0.5 - np.round(y[m] / step + 0.5)))
-        if level:
-            less = level - np.sign(level)
-            more = cost * ((y[m] - step * less) ** 2 - (y[m] - step * level) ** 2)
-            saved = to_zero if abs(level) == 1 else to_less
-            margin = min(margin, abs(more / saved - 1) if saved else np.inf)
-            level = less if more < saved else level
+        if abs(level) == 1:
+            more = cost * (y[m] ** 2 - (y[m] - step * level) ** 2)
+            margin = min(margin, abs(more / to_zero - 1) if to_zero else np.inf)
+            level = 0.0 if more < to_zero else level
         y[m] = step * level
         left[m] = False
     index, held = np.flatnonzero(left), np.flatnonzero(free & ~left)

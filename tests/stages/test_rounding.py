@@ -85,9 +85,7 @@ def test_levels_are_those_of_the_definition(device, degree, worth):
     for k in np.flatnonzero(due):
         step = float(grid.others[k])
         for c, length in enumerate(LENGTHS):
-            wanted, margin = rounded_in_turn(
-                length * got.blocks[k], got.before[k, :, c], active[k, :, c], step, worth, 0.0
-            )
+            wanted, margin = rounded_in_turn(length * got.blocks[k], got.before[k, :, c], active[k, :, c], step, worth)
             if margin < 1e-3:
                 continue
             clear += 1

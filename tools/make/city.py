@@ -18,7 +18,6 @@ from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path
-from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -29,6 +28,7 @@ from potr_cl.model.camera import Camera, camera_centres, focus, test_views, trai
 from potr_cl.model.scene import Scene
 from potr_cl.reference.captures import looking
 from potr_cl.reference.frames import moved
+from tools.cameras_json import entry
 
 F64 = NDArray[np.float64]
 
@@ -143,7 +143,7 @@ class City:
 def write_city(folder: Path, city: City, cameras: Sequence[Camera]) -> None:
     """Write point_cloud.ply, copy by copy, and cameras.json."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "cameras.json").write_text(json.dumps([_entry(number, view) for number, view in enumerate(cameras)]))
+    (folder / "cameras.json").write_text(json.dumps([entry(number, view) for number, view in enumerate(cameras)]))
     ply.save_parts(folder / "point_cloud.ply", city.parts(), city.splats)
 
 
@@ -162,21 +162,6 @@ def _of_size(camera: Camera, width: int, height: int) -> Camera:
     """The same field from left to right, with square pixels and the principal point in the middle."""
     focal = camera.fx * width / camera.width
     return dataclasses.replace(camera, width=width, height=height, fx=focal, fy=focal, cx=width / 2, cy=height / 2)
-
-
-def _entry(number: int, camera: Camera) -> dict[str, Any]:
-    """As cameras.json of the original implementation has it."""
-    return {
-        "id": number,
-        "img_name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "position": camera.centre.tolist(),
-        "rotation": camera.rotation.T.tolist(),
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "split": camera.split,
-    }
 
 
 def building_of(source: str) -> Building:

@@ -22,6 +22,7 @@ from potr_cl.formats import load_cameras
 from potr_cl.formats.scenes import ply
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import Scene
+from tools.cameras_json import entry
 
 _DATA = Path(__file__).resolve().parents[2] / "tests" / "data"
 _SPLATS = 1500
@@ -40,7 +41,7 @@ def main() -> None:
     _DATA.mkdir(exist_ok=True)
     excerpt = _splats(source / "point_cloud.ply")
     views = _views_of_the_excerpt(load_cameras(source / "cameras.json"), excerpt)
-    _write_json(_DATA / "plush_excerpt_cameras.json", [_entry(number, view) for number, view in enumerate(views)])
+    _write_json(_DATA / "plush_excerpt_cameras.json", [entry(number, view) for number, view in enumerate(views)])
     _write_transforms(views)
     _views_of_the_whole(source)
     print(f"{sum(f.stat().st_size for f in _DATA.rglob('*') if f.is_file())} bytes in {_DATA}")
@@ -85,21 +86,6 @@ def _sees_all(camera: Camera, scene: Scene) -> bool:
         return False
     column, row = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
     return bool(column.min() > 0 and column.max() < camera.width and row.min() > 0 and row.max() < camera.height)
-
-
-def _entry(number: int, camera: Camera) -> dict[str, Any]:
-    """As cameras.json of the original implementation has it."""
-    return {
-        "id": number,
-        "img_name": camera.name,
-        "width": camera.width,
-        "height": camera.height,
-        "position": camera.centre.tolist(),
-        "rotation": camera.rotation.T.tolist(),
-        "fx": camera.fx,
-        "fy": camera.fy,
-        "split": camera.split,
-    }
 
 
 def _write_transforms(cameras: Sequence[Camera]) -> None:

@@ -18,26 +18,23 @@ inline vint due_lanes(global const int *turns, size_t index, int turn)
     return VLOAD(index, turns) <= turn;
 }
 
-/* The nearest whole number of steps; one less where that saves more bits than the error that it adds is worth.
+/* The nearest whole number of steps; 0 instead of one step where that saves more bits than the error that it adds is worth.
 
-   `value` is in steps, `squared` is what a squared error of one step costs, `to_zero` and `to_less` what it saves to
-   have 0 instead of 1, and one step less of several. */
-inline vfloat cheap_level(vfloat value, vfloat squared, float to_zero, float to_less)
+   `value` is in steps, `squared` is what a squared error of one step costs, `to_zero` what it saves to have 0. */
+inline vfloat cheap_level(vfloat value, vfloat squared, float to_zero)
 {
     const vfloat nearest = floor(value + 0.5f);
     const vfloat size = fabs(nearest), off = fabs(value) - size;
     /* (off + 1)^2 - off^2 */
     const vfloat more = squared * (2.0f * off + 1.0f);
-    const vfloat saved = size > 1.5f ? (vfloat)(to_less) : (vfloat)(to_zero);
-    const vfloat less = nearest > 0.0f ? nearest - 1.0f : nearest + 1.0f;
-    return size > 0.5f && more < saved ? less : nearest;
+    return size > 0.5f && size < 1.5f && more < to_zero ? (vfloat)(0.0f) : nearest;
 }
 
 /* Rounds the AC coefficients of the splats that are due, from the last to the first: what is still free of the splat's
    channel, the constant coefficient at the end, goes to where the splat's colours change least by its own block of the
    normal equations. Coefficients that were rounded are not active any more.
 
-   steps: of AC coefficients, one a splat. to_zero, to_less: weighted squared errors, see cheap_level. */
+   steps: of AC coefficients, one a splat. to_zero: a weighted squared error, see cheap_level. */
 kernel void round_ac(
     global float *coefficients,
     global const float *blocks,
@@ -46,8 +43,7 @@ kernel void round_ac(
     global const float *steps,
     ulong stride,
     int turn,
-    float to_zero,
-    float to_less)
+    float to_zero)
 {
     const size_t index = get_global_id(0);
     const vint due = due_lanes(turns, index, turn);
@@ -90,8 +86,8 @@ kernel void round_ac(
             vfloat held = wanted;
             if (j)
                 /* What no view shows is left as it is, though it costs nothing. */
-                held = step * cheap_level(
-                    wanted / step, trace > 0.0f ? pivots[j] * step * step : (vfloat)(1e30f), to_zero, to_less);
+                held =
+                    step * cheap_level(wanted / step, trace > 0.0f ? pivots[j] * step * step : (vfloat)(1e30f), to_zero);
             const vint changed = due && free[j] > 0.0f && fabs(held) < 1e30f;
             held = changed ? held : was;
             error[j] = was - held;

@@ -42,17 +42,8 @@ class PixelSums:
     @property
     def arguments(self) -> dict[str, Any]:
         """The arguments that the kernels of both families have, by name."""
-        views = self.views
-        red, green, blue = self.background
         return {
-            "shapes": views.shapes,
-            "colours": views.colours,
-            "offsets": views.offsets,
-            "intersections": views.intersections,
-            "subtiles": views.subtiles,
-            "red": red,
-            "green": green,
-            "blue": blue,
+            **_of_views(self.views, self.background),
             "target": self.target,
             "first_pixel": self.first_pixel,
             "given": self.given,
@@ -84,21 +75,27 @@ class PixelTangents:
     @property
     def arguments(self) -> dict[str, Any]:
         """The arguments that the kernels of both families have, by name."""
-        views = self.views
-        red, green, blue = self.background
         return {
-            "shapes": views.shapes,
-            "colours": views.colours,
+            **_of_views(self.views, self.background),
             "changes": self.changes,
-            "offsets": views.offsets,
-            "intersections": views.intersections,
-            "subtiles": views.subtiles,
-            "red": red,
-            "green": green,
-            "blue": blue,
             "first_pixel": self.first_pixel,
             "result": self.result,
         }
+
+
+def _of_views(views: ViewSet, background: tuple[float, float, float]) -> dict[str, Any]:
+    """What all these kernels are told of the views."""
+    red, green, blue = background
+    return {
+        "shapes": views.shapes,
+        "colours": views.colours,
+        "offsets": views.offsets,
+        "intersections": views.intersections,
+        "subtiles": views.subtiles,
+        "red": red,
+        "green": green,
+        "blue": blue,
+    }
 
 
 def pixel_macros(rules: RasterRules) -> dict[str, Any]:

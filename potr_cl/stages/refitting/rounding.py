@@ -26,8 +26,6 @@ from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients
 
 _SOURCE = "refit/rounding.cl"
-#: What one step less saves of several, as a part of what it saves to have 0.
-_LESS = 0.0
 #: Splats are due in so many turns: every fourth one in the order of the file in turn 0, the next ones in turn 1, …
 TURNS = 4
 _NEVER = np.iinfo(np.int32).max
@@ -104,7 +102,6 @@ class Rounding(Owner):
             stride=stride,
             turn=this.others,
             to_zero=np.float32(worth),
-            to_less=np.float32(worth * _LESS),
         )
         layout.over_splats(self._round_ac)
         self._round_constant.bind(
