@@ -84,9 +84,9 @@ make.benchmark_pages  the tables and plots of docs/benchmarks, from the results 
 ====================  ==================================================================================================
 
 Shared: :mod:`tools.results` (tables that say what they are of), :mod:`tools.workloads` (scenes, views, repeated work),
-:mod:`tools.viewer_tab` (a browser's tab without the browser),
-:mod:`tools.study.evaluation` (what a candidate loses to its scene), :mod:`tools.study.pruning_baselines` (the orders of
-other pruners), :mod:`tools.stress.cases` (inputs at their worst). Tools import the package and its float64 definitions
-(:mod:`potr_cl.reference`), never the tests; kernels of their own are given to a
+:mod:`tools.viewer_tab` (a browser's tab without the browser), :mod:`tools.study.evaluation` (what a candidate loses to
+its scene), :mod:`tools.study.pruning_baselines` (the orders of other pruners), :mod:`tools.stress.cases` (inputs at
+their worst), :mod:`tools.stress.precise` (what they give in float64). Tools import the package and its float64
+definitions (:mod:`potr_cl.reference`), never the tests; kernels of their own are given to a
 :class:`potr_cl.opencl.device.Device` as variants. Their own tests are in tools/tests.
 """
