@@ -27,6 +27,7 @@ class HostPool(Pool):
 
     takes_part = True
     sparse = False
+    in_process = True
 
     def __init__(self, devices: Sequence[Device]) -> None:
         if not devices:
