@@ -79,9 +79,7 @@ def measurement(
         others.ready()
         steers = all(others.ask(place, "can_steer") for place in range(len(others)))
         steers = steers and (device.family == "gpu" if own is None else own.steering is not None)
-        yield stack.enter_context(
-            SharedRemoval(device, len(state.scene), stride, views, own, others, pool, steers)
-        )
+        yield stack.enter_context(SharedRemoval(device, len(state.scene), stride, views, own, others, pool, steers))
 
 
 class Measured:

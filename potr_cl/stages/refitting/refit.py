@@ -299,7 +299,10 @@ class ColourRefit(Owner):
             self.coefficients = owned.enter_context(Coefficients(device, layout))
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             self._solver = owned.enter_context(ColourSolver(self.coefficients))
-            helpers = None if others is None else owned.enter_context(SharedViews(self.coefficients, others))
+            helpers = None
+            if help_from is not None and others is not None:
+                in_process = help_from.pool.in_process
+                helpers = owned.enter_context(SharedViews(self.coefficients, others, in_process))
             self.colour_map = owned.enter_context(
                 ColourMap(
                     launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory, own, helpers
