@@ -123,6 +123,11 @@ class Pool(ABC):
             WorkerLost: none is left.
         """
 
+    @property
+    def devices(self) -> Sequence[Device]:
+        """Devices of this process that workers have, without the master's."""
+        return ()
+
     def reserve(self) -> list[Worker]:
         """Who does the work of lost workers when none is left."""
         return []

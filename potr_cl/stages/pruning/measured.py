@@ -64,7 +64,7 @@ def measurement(
             )
             yield stack.enter_context(RemovalSweep(rasterizer, views, options, progress))
             return
-        scene = stack.enter_context(pool.shared(state.scene))
+        scene = stack.enter_context(pool.shared(bench.shareable(state.scene)))
         given = [(scene, views, options, bench.background, numbers) for numbers in share.others]
         others = stack.enter_context(
             Parts(pool, RemovalPart, given, options.memory, [len(each) for each in share.others])

@@ -14,6 +14,7 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Scratch, Staging
 from potr_cl.opencl.relay import Lent
+from potr_cl.raster.kept_scene import KeptScene, drawable_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.survivors import Bits
@@ -29,7 +30,7 @@ class RemovalPart(Part):
     Args:
         device: to compute on.
         memory: bytes of its memory that the views may take; None: the default.
-        scene: the uncompressed scene.
+        scene: the uncompressed scene, perhaps kept on devices.
         cameras: all views.
         options: speed/accuracy trade-offs.
         background: R, G, B behind the scene.
@@ -43,7 +44,7 @@ class RemovalPart(Part):
         self,
         device: Device,
         memory: int | None,
-        scene: Scene,
+        scene: Scene | KeptScene,
         cameras: Sequence[Camera],
         options: SweepOptions,
         background: tuple[float, float, float],
@@ -51,7 +52,7 @@ class RemovalPart(Part):
     ) -> None:
         options = SweepOptions(**{**vars(options), "memory": memory})
         with ExitStack() as owned:
-            rasterizer = owned.enter_context(Rasterizer(device, scene, background=background))
+            rasterizer = owned.enter_context(Rasterizer(device, drawable_on(device, scene), background=background))
             self._sweep = owned.enter_context(RemovalSweep(rasterizer, cameras, options, numbers=numbers))
             self._staging = owned.enter_context(Staging(device))
             self._totals = owned.enter_context(Scratch(device, "the removal effects"))

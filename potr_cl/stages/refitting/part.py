@@ -15,6 +15,7 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Staging
 from potr_cl.opencl.relay import Lent
+from potr_cl.raster.kept_scene import KeptScene, drawable_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients, Layout
@@ -54,7 +55,7 @@ class ColourPart(Part):
         scene: whose geometry and opacities are used; its colours need no more than their constant coefficients.
         sh_count: M, coefficients of a channel.
         rules, background: of the rasterizer.
-        source: the scene whose pictures are the targets.
+        source: the scene whose pictures are the targets, perhaps kept on devices.
         cameras: all views.
         numbers: of the views of this part, ascending.
 
@@ -70,14 +71,14 @@ class ColourPart(Part):
         sh_count: int,
         rules: RasterRules,
         background: tuple[float, float, float],
-        source: Scene,
+        source: Scene | KeptScene,
         cameras: Sequence[Camera],
         numbers: Sequence[int],
     ) -> None:
         self._device = device
         with ExitStack() as owned:
             rasterizer = owned.enter_context(Rasterizer(device, scene, rules))
-            of_source = owned.enter_context(Rasterizer(device, source, background=background))
+            of_source = owned.enter_context(Rasterizer(device, drawable_on(device, source), background=background))
             launcher = launcher_for(device, rules)
             layout = Layout(len(scene), rasterizer.stride, sh_count, launcher.lanes)
             self._coefficients = owned.enter_context(Coefficients(device, layout))

@@ -13,6 +13,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.memory import Owner, Staging
 from potr_cl.opencl.relay import Lent
+from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rules import RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.packing import Packing
@@ -111,7 +112,7 @@ def colour_parts(
     scene: Scene,
     rules: RasterRules,
     background: tuple[float, float, float],
-    source: Scene,
+    source: Scene | KeptScene,
     cameras: Sequence[Camera],
     memory: int | None,
 ) -> Iterator[Parts]:
@@ -122,7 +123,7 @@ def colour_parts(
         shares: who does which views.
         scene: whose colours are re-fitted.
         rules, background: of the rasterizer.
-        source: the scene whose pictures are the targets.
+        source: the scene whose pictures are the targets, perhaps kept on devices.
         cameras: all views.
         memory: bytes of a device's memory that prepared views and targets may take; None: the default.
     """
