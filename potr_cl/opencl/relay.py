@@ -7,7 +7,6 @@ makes that several times as fast as a download and an upload of everything.
 
 from __future__ import annotations
 
-from collections import deque
 from typing import Any
 
 import numpy as np
@@ -16,8 +15,8 @@ import pyopencl as cl
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner, Staging
 
-#: Bytes of a slice, and slices that are on their way at a time.
-_SLICE, _SLOTS = 1 << 22, 4
+#: Bytes of a slice, and slices that the host has room for.
+_SLICE, _SLOTS = 1 << 23, 4
 
 
 class Lent:
@@ -57,7 +56,6 @@ class Relay(Owner):
     def __init__(self, device: Device) -> None:
         self._device = device
         self._queue = _queue_beside(device)
-        self._landing = Staging(device)
         self._ways: dict[int, _Way] = {}
 
     def fetch(self, target: cl.Buffer, lent: Lent, start: int = 0, nbytes: int | None = None) -> None:
@@ -81,50 +79,45 @@ class Relay(Owner):
             free = cl.enqueue_marker(device.queue)
             device.queue.flush()
             if lent.device is device:
-                waits = {"wait_for": [free, lent.ready]}
+                waits = [free, lent.ready]
                 cl.enqueue_copy(
-                    self._queue, target, lent.buffer, byte_count=nbytes, src_offset=start, **waits
-                ).wait()  # fmt: skip
+                    self._queue, target, lent.buffer, byte_count=nbytes, src_offset=start, wait_for=waits
+                ).wait()
             else:
                 self._through_host(target, lent, start, nbytes, free)
 
     def _through_host(self, target: cl.Buffer, lent: Lent, start: int, nbytes: int, free: cl.Event) -> None:
         way = self._ways.setdefault(id(lent.device), _Way(lent.device))
-        departing = way.staging.array((_SLOTS, _SLICE), np.uint8)
-        landing = self._landing.array((_SLOTS, _SLICE), np.uint8)
-        starts = range(0, nbytes, _SLICE)
-        down: deque[cl.Event] = deque()
-        up: list[cl.Event | None] = [None] * _SLOTS
+        slots = way.staging.array((_SLOTS, _SLICE), np.uint8)
+        sizes = [min(_SLICE, nbytes - first) for first in range(0, nbytes, _SLICE)]
+        down: list[cl.Event] = []
+        up: list[cl.Event] = []
 
         def depart(number: int) -> None:
-            size = min(_SLICE, nbytes - starts[number])
-            row = departing[number % _SLOTS][:size]
-            waits = {"wait_for": [lent.ready]} if number == 0 else {}
+            if number >= _SLOTS:
+                up[number - _SLOTS].wait()
+            slot, first = slots[number % _SLOTS][: sizes[number]], start + number * _SLICE
+            waits = None if number else [lent.ready]
             down.append(
-                cl.enqueue_copy(
-                    way.queue, row, lent.buffer, src_offset=start + starts[number], is_blocking=False, **waits
-                )
+                cl.enqueue_copy(way.queue, slot, lent.buffer, src_offset=first, is_blocking=False, wait_for=waits)
             )
             way.queue.flush()
 
+        def land(number: int) -> None:
+            down[number].wait()
+            slot, first = slots[number % _SLOTS][: sizes[number]], number * _SLICE
+            waits = None if number else [free]
+            up.append(cl.enqueue_copy(self._queue, target, slot, dst_offset=first, is_blocking=False, wait_for=waits))
+            self._queue.flush()
+
         try:
-            for number in range(min(_SLOTS, len(starts))):
-                depart(number)
-            for number in range(len(starts)):
-                slot, size = number % _SLOTS, min(_SLICE, nbytes - starts[number])
-                down.popleft().wait()
-                before = up[slot]
-                if before is not None:
-                    before.wait()
-                # Each driver copies fast from and to memory that it has made itself.
-                landing[slot][:size] = departing[slot][:size]
-                if number + _SLOTS < len(starts):
-                    depart(number + _SLOTS)
-                waits = {"wait_for": [free]} if number == 0 else {}
-                up[slot] = cl.enqueue_copy(
-                    self._queue, target, landing[slot][:size], dst_offset=starts[number], is_blocking=False, **waits
-                )
-                self._queue.flush()
+            # One slot less is under way than there are: who waits for a slot waits for the copy before the last.
+            ahead = _SLOTS - 1
+            for number in range(len(sizes) + ahead):
+                if number < len(sizes):
+                    depart(number)
+                if number >= ahead:
+                    land(number - ahead)
         finally:
             # What is on its way uses memory that must not be given up.
             way.queue.finish()
@@ -132,7 +125,6 @@ class Relay(Owner):
 
     def close(self) -> None:
         """Give the host's memory back."""
-        self._landing.close()
         for way in self._ways.values():
             way.staging.close()
         self._ways = {}
