@@ -301,6 +301,9 @@ class Run:
         self._pool = pool
         self._before = Traffic() if pool is None else dataclasses.replace(pool.traffic)
         self._options, self._watch, self._given, self._kept = options, watch, device, kept
+        if kept is not None and pool is not None:
+            for other in pool.devices:
+                kept.bring_to(other)
 
     def stages(self, state: State, only: Sequence[type[Stage]] | None = None) -> State:
         """Run the stages, or some of them, in their order.

@@ -48,7 +48,7 @@ class Helpers(Protocol):
     def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
         """Have them begin with :meth:`ColourMap.sum_gradient` of their views."""
 
-    def begin_normal(self, direction: cl.Buffer, unit: float, constant: bool) -> None:
+    def begin_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool) -> None:
         """Have them begin with :meth:`ColourMap.sum_normal` of their views."""
 
     def add(self, sums: cl.Buffer, blocks: cl.Buffer | None) -> dict[int, float]:
@@ -245,7 +245,7 @@ class ColourMap(Owner):
             return
         unit = 1 / largest
         if self._helpers is not None:
-            self._helpers.begin_normal(direction, unit, constant)
+            self._helpers.begin_normal(direction, at, unit, constant)
         self.sum_normal(direction, at, unit, constant)
         if self._helpers is not None:
             self._helpers.add(self.sums, None)

@@ -29,6 +29,7 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
 from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients, Layout, Ridge
@@ -243,11 +244,11 @@ class HelpFrom:
 
     Attributes:
         pool: the workers.
-        source: the scene whose pictures are the targets.
+        source: the scene whose pictures are the targets, perhaps kept on devices.
     """
 
     pool: Pool
-    source: Scene
+    source: Scene | KeptScene
 
 
 class ColourRefit(Owner):
@@ -299,7 +300,10 @@ class ColourRefit(Owner):
             self.coefficients = owned.enter_context(Coefficients(device, layout))
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             self._solver = owned.enter_context(ColourSolver(self.coefficients))
-            helpers = None if others is None else owned.enter_context(SharedViews(self.coefficients, others))
+            helpers = None
+            if help_from is not None and others is not None:
+                in_process = help_from.pool.in_process
+                helpers = owned.enter_context(SharedViews(self.coefficients, others, in_process))
             self.colour_map = owned.enter_context(
                 ColourMap(
                     launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory, own, helpers
