@@ -45,6 +45,8 @@ study.compare_formats      what would people use instead?
 study.output_formats       how small are encodes to the formats that viewers open, and what do others read of them?
 study.virtual_views        how many virtual views, how large, how wide, at what time and memory?
 study.rates                where do the bits go, and what do they buy?
+study.fit_guards           is a file with the fit ever worse than one without: few views, thresholds by hand?
+study.photographs          how much nearer to unseen photographs does a fit to others bring a scene and its file?
 study.gauss_newton         does Gauss-Newton fit a pruned scene in less time than Adam?
 study.antialiasing         what is lost if an antialiased scene is encoded as a classic one?
 study.compaction_curves    what does the compaction do to sparsity and pictures?
