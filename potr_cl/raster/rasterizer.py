@@ -298,7 +298,7 @@ class Rasterizer(Owner):
     def _zeroed_counts(self, views: ViewSet) -> cl.Buffer:
         """Counters for all tiles. They are zero, and the kernels that use them leave them zero."""
         if self._counts.reserve(self._launcher.counter_bytes * views.tiles):
-            cl.enqueue_fill_buffer(self.device.queue, self._counts.buffer, np.uint32(0), 0, self._counts.nbytes)
+            self.device.fill(self._counts.buffer, np.uint32(0), self._counts.nbytes)
         return self._counts.buffer
 
     def _enqueue_project(
