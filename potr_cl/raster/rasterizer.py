@@ -87,6 +87,7 @@ class Rasterizer(Owner):
                 NEAR=float(rules.near),
                 SQUARE_EXTENT=int(rules.square_extent),
                 **self._filter_macros,
+                **self._scene.pick_macros,
             )
         self._bounds = Scratch(device, "the projected splats' bounds")
         self._counts = Scratch(device, "the tile counts")
@@ -311,6 +312,7 @@ class Rasterizer(Owner):
     ) -> None:
         self._projection.bind(
             **self._scene.geometry,
+            **self._scene.picks,
             sh=self.sh if sh is None else sh,
             views=views.table,
             shapes=views.shapes if shapes is None else shapes,

@@ -103,6 +103,16 @@ class SceneBuffers(Owner):
             "log2_opacities": self.log2_opacities,
         }
 
+    @property
+    def pick_macros(self) -> dict[str, int]:
+        """Macros of the projection that follow from which splats of the buffers are this scene's: here all are."""
+        return {}
+
+    @property
+    def picks(self) -> dict[str, Any]:
+        """The projection's arguments that say which they are, by their names."""
+        return {"columns": self.stride, "numbers": self.means, "picked": self.splats}
+
     def write_rows(
         self,
         parameter: cl.Buffer,
