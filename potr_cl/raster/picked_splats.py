@@ -46,7 +46,7 @@ class PickedSplats(SceneBuffers):
 
     @property
     def picks(self) -> dict[str, Any]:
-        return {"columns": self._whole.stride, "numbers": self._numbers, "picked": self.splats}
+        return {"whole_stride": self._whole.stride, "numbers": self._numbers, "picked": self.splats}
 
 
 class Picker(Owner):

@@ -111,7 +111,7 @@ class SceneBuffers(Owner):
     @property
     def picks(self) -> dict[str, Any]:
         """The projection's arguments that say which they are, by their names."""
-        return {"columns": self.stride, "numbers": self.means, "picked": self.splats}
+        return {"whole_stride": self.stride, "numbers": self.means, "picked": self.splats}
 
     def write_rows(
         self,

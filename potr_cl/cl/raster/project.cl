@@ -14,8 +14,8 @@
                       by sqrt(det S / det(S + LOW_PASS I)), S the covariance on screen; 0, the default: it does not;
        LEAST_COMPENSATION_SQUARED  the least value under that root; must be given if ANTIALIASED;
        LOW_PASS, LOW_PASS_SQUARED  square pixels added to a splat's variances on screen, and their square;
-       PICKED         1: of a scene with `columns` splats a parameter, only those that `numbers` names are projected,
-                      `picked` of them, and what is found lies in their order; LANES must be 1. 0, the default: all. */
+       PICKED         1: only the splats that `numbers` names are projected, `picked` of them, of a scene that is
+                      `whole_stride` long; what is found lies in their order; LANES must be 1. 0, the default: all. */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
@@ -63,7 +63,7 @@ kernel void project(
     global const float *log2_opacities,
     global const float *sh,
     uint stride,
-    uint columns,
+    uint whole_stride,
     global const uint *numbers,
     uint picked,
     global const SetView *views,
@@ -77,7 +77,7 @@ kernel void project(
     bounds += (size_t)stride * get_global_id(1);
     const size_t place = get_global_id(0); /* of the results */
 #if PICKED
-    const size_t column = columns; /* a parameter's columns lie so far apart */
+    const size_t column = whole_stride; /* a parameter's columns lie so far apart */
     const size_t index = numbers[min(place, (size_t)picked - 1)];
     vfloat lo = place < picked ? log2_opacities[index] : -INFINITY;
 #else
