@@ -24,9 +24,6 @@ _TURNED = 1 << 18
 #: Columns whose flags share a word on the device.
 _FLAGS = 24
 
-#: Bytes that are filled at a time: no runtime has to count beyond 32 bits.
-_FILLED = 1 << 30
-
 
 @dataclass(frozen=True)
 class Layout:
@@ -131,8 +128,7 @@ class Coefficients(Owner):
 
     def zero(self, x: cl.Buffer) -> None:
         """x = 0."""
-        for start in range(0, x.size, _FILLED):
-            cl.enqueue_fill_buffer(self.device.queue, x, np.float32(0), start, min(_FILLED, x.size - start))
+        self.device.fill(x, np.float32(0))
 
     def copy(self, y: cl.Buffer, x: cl.Buffer) -> None:
         """y = x."""
