@@ -5,14 +5,19 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import Run
+from potr_cl.model.order import ascending
+
 #: Of each coordinate, in a code of 64 bits.
 BITS = 21
 #: Centres whose codes are made at a time.
-_ROWS = 1 << 18
+_ROWS = 1 << 17
 
 
-def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
+def morton_order(means: NDArray[np.float32], run: Run = map) -> NDArray[np.int64]:
     """(N,) the numbers of (N, 3) centres along a Morton curve through the cube that holds nearly all of them.
+
+    Centres of the same code follow each other by number; ``run`` shares the work out.
 
     The cube is the smallest around the second to the last but one hundredth of the centres on each axis, twice as
     large: a far splat must not take all of the curve's levels. What lies outside of it counts as on its faces.
@@ -22,11 +27,15 @@ def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
     middle, side = (low + high) / 2, max(2 * float((high - low).max()), 1e-30)
     corner = middle - side / 2
     codes = np.empty(len(means), np.uint64)
-    for start in range(0, len(means), _ROWS):
+
+    def code(start: int) -> None:
         rows = slice(start, start + _ROWS)
         cells = np.clip((means[rows] - corner) * ((1 << BITS) / side), 0, (1 << BITS) - 1).astype(np.uint64)
         codes[rows] = spread(cells[:, 0]) | spread(cells[:, 1]) << np.uint64(1) | spread(cells[:, 2]) << np.uint64(2)
-    return np.argsort(codes, kind="stable")
+
+    for _ in run(code, range(0, len(means), _ROWS)):
+        pass
+    return ascending(codes)
 
 
 def spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:

@@ -11,12 +11,13 @@ from collections.abc import Callable
 import numpy as np
 import pyopencl as cl
 
+from potr_cl.model.order import ascending
 from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.structs import bytes_before, struct_dtype
 from potr_cl.raster.macros import totals_limits
 from potr_cl.stages.pruning.measured import Removal
-from potr_cl.stages.pruning.schedule import Iteration, Pruned, PruningOptions, ascending, prune
+from potr_cl.stages.pruning.schedule import Iteration, Pruned, PruningOptions, prune
 from potr_cl.stages.pruning.steering import Steered
 
 _SOURCE = "prune/choose_gpu.cl"
