@@ -28,7 +28,7 @@ from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.picked_splats import PickedSplats, Picker
-from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rasterizer import PreparingMemory, Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.raster.view_set import TILE
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
@@ -180,6 +180,7 @@ class ViewByView(Owner):
                 owned.enter_context(Scratch(device, what))
                 for what in ("a view's effects", "a view's splats that are left", "a view's tiles", "their staleness")
             ]
+            self._preparing = owned.enter_context(PreparingMemory(device))
             first = zero_totals(whole.stride)
             if first_totals is not None:
                 first[: self.splats] = first_totals.view(np.uint32)
@@ -264,7 +265,7 @@ class ViewByView(Owner):
         picked = PickedSplats(self._whole, view.numbers, view.splats)
         if self._sh is not None:
             picked.sh = self._sh
-        return Rasterizer(self.device, picked, background=self._background)
+        return Rasterizer(self.device, picked, background=self._background, preparing=self._preparing)
 
     def _prepared(self, view: _View, rasterizer: Rasterizer) -> PreparedSet:
         views = rasterizer.prepare_set([view.camera])
