@@ -1,10 +1,13 @@
-"""A scene that stays on a device while one after another renders it: :class:`KeptScene`."""
+"""A scene that stays on devices while one after another renders it: :class:`KeptScene`."""
 
 from __future__ import annotations
 
+import threading
+from concurrent.futures import Future
 from contextlib import suppress
 
-from potr_cl.errors import DeviceMemoryError
+from potr_cl.errors import DeviceError, DeviceMemoryError
+from potr_cl.host.threads import in_background
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
@@ -24,18 +27,58 @@ class KeptScene(Owner):
 
     def __init__(self, device: Device, scene: Scene) -> None:
         self._device, self._scene = device, scene
-        self._buffers: SceneBuffers | None = None
-        if _PART * scene.nbytes <= device.info.memory:
+        self._buffers = self._uploaded(device)
+        self._elsewhere: dict[Device, Future[SceneBuffers | None]] = {}
+        self._lock = threading.Lock()
+
+    def _uploaded(self, device: Device) -> SceneBuffers | None:
+        if _PART * self._scene.nbytes <= device.info.memory:
             with suppress(DeviceMemoryError):
-                self._buffers = uploaded(device, scene)
+                return uploaded(device, self._scene)
+        return None
+
+    def is_of(self, scene: Scene) -> bool:
+        """Whether it is this scene."""
+        return scene is self._scene
 
     def drawable(self, device: Device, scene: Scene) -> Drawable:
         """What to give to a rasterizer for a scene: what is kept, if it is this scene and on this device."""
-        if self._buffers is not None and scene is self._scene and device is self._device:
+        if self._buffers is not None and self.is_of(scene) and device is self._device:
             return self._buffers
         return scene
 
+    def bring_to(self, device: Device) -> Future[SceneBuffers | None]:
+        """Begin to upload it to another device as well, to be kept there too, and do not wait for it."""
+        with self._lock:
+            if device not in self._elsewhere:
+                # In a thread of its own: what this thread takes may belong to something that fails.
+                self._elsewhere[device] = in_background(self._uploaded, device)
+            return self._elsewhere[device]
+
+    def on(self, device: Device) -> Drawable:
+        """What to give to a rasterizer for the scene, on this device or another one.
+
+        Raises:
+            DeviceError: the other device failed.
+        """
+        buffers = self._buffers if device is self._device else self.bring_to(device).result()
+        return self._scene if buffers is None else buffers
+
     def close(self) -> None:
-        if self._buffers is not None:
-            self._buffers.close()
-        self._buffers = None
+        kept = [self._buffers]
+        for future in self._elsewhere.values():
+            with suppress(DeviceError):
+                kept.append(future.result())
+        for buffers in kept:
+            if buffers is not None:
+                buffers.close()
+        self._buffers, self._elsewhere = None, {}
+
+
+def drawable_on(device: Device, scene: Scene | KeptScene) -> Drawable:
+    """What to give to a rasterizer on a device for a scene, which may be one that is kept on devices.
+
+    Raises:
+        DeviceError: the device failed.
+    """
+    return scene.on(device) if isinstance(scene, KeptScene) else scene

@@ -12,7 +12,7 @@ from potr_cl.host.threads import thread_pool
 from potr_cl.raster.culling import Sights
 from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.schedule import Pruned, PruningOptions
+from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.unseen import (
     CHOICES,
@@ -158,7 +158,9 @@ class Prune(Stage):
         split = set_aside(told, hidden)
         if not len(split.seen_splats):
             everything = np.arange(splats)
-            return told.having_learnt(self.name, Pruned(everything, splats, np.full(splats, -1, np.int32), 0))
+            return told.having_learnt(
+                self.name, Pruned(splats, np.full(splats, -1, np.int32), 0, lambda: Course(everything))
+            )
         if sights is not None:
             sights = sights_worth_it(split.seen.scene, state.views, options)
         left = self._pruned(split.seen, bench, sights)

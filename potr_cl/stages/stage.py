@@ -136,6 +136,11 @@ class Workbench:
         """What to give to a rasterizer for a scene: it may lie on the device already."""
         return scene if self.kept is None else self.kept.drawable(self.opened, scene)
 
+    def shareable(self, scene: Scene) -> Scene | KeptScene:
+        """What to give to the pool's workers for a scene: threads of this process have it kept on their devices."""
+        in_process = self.pool is not None and self.pool.in_process
+        return self.kept if self.kept is not None and in_process and self.kept.is_of(scene) else scene
+
     def request(self, state: State, metadata: bytes = b"", entropy: EntropyCoder | None = None) -> Request:
         """What the output is told besides the scene."""
         return Request(

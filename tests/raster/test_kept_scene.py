@@ -16,6 +16,7 @@ from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.reference.scenes import random_splats, straight_camera
+from potr_cl.workers.host import HostPool
 from tests.devices import FAMILIES, open_device
 
 OPTIONS = EncodeOptions.for_preset("best", prune={"iterations": 8}, compact={"on": True})
@@ -83,3 +84,38 @@ def test_an_encode_uploads_its_scene_once_and_makes_the_same_bytes(
     assert encode(plush_excerpt, plush_excerpt_cameras, OPTIONS, device=device).data == once
     assert sum(scenes) > 1
     assert device.allocated == 0
+
+
+def test_other_devices_keep_it_too(device):
+    scene, camera = random_splats(300, seed=5), straight_camera()
+    other = Device(device.info, family=device.family)
+    with KeptScene(device, scene) as kept:
+        assert kept.on(device) is kept.drawable(device, scene)
+        kept.bring_to(other)
+        there = kept.on(other)
+        assert isinstance(there, SceneBuffers)
+        assert kept.on(other) is there
+        with Rasterizer(other, there) as moved, Rasterizer(device, scene) as wanted:
+            assert np.array_equal(moved.render(camera)[0], wanted.render(camera)[0])
+    assert other.allocated == 0
+    # A device without the room is given the host's.
+    small = Device(replace(device.info, memory=2 * scene.nbytes), family=device.family)
+    with KeptScene(device, scene) as kept:
+        assert kept.on(small) is scene
+        assert small.allocated == 0
+
+
+def test_several_devices_are_given_it_once_each(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
+    scenes = []
+    real = scene_buffers.SceneBuffers.write_sh
+
+    def counted(self, parameter, sh):
+        scenes.append(sh is plush_excerpt.sh)
+        real(self, parameter, sh)
+
+    monkeypatch.setattr(scene_buffers.SceneBuffers, "write_sh", counted)
+    devices = [device, Device(device.info, family=device.family)]
+    with HostPool(devices) as pool:
+        encode(plush_excerpt, plush_excerpt_cameras[:6], OPTIONS, device=device, pool=pool)
+    assert sum(scenes) == 2
+    assert devices[1].allocated == 0

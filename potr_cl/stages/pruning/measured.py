@@ -68,7 +68,7 @@ def measurement(
             )
             yield stack.enter_context(RemovalSweep(rasterizer, views, options, progress))
             return
-        scene = stack.enter_context(pool.shared(state.scene))
+        scene = stack.enter_context(pool.shared(bench.shareable(state.scene)))
         each = [(scene, views, options, bench.background, numbers) for numbers in share.others]
         others = stack.enter_context(
             Parts(pool, RemovalPart, each, options.memory, [len(each) for each in share.others])
@@ -83,9 +83,7 @@ def measurement(
         others.ready()
         steers = all(others.ask(place, "can_steer") for place in range(len(others)))
         steers = steers and (device.family == "gpu" if own is None else own.steering is not None)
-        yield stack.enter_context(
-            SharedRemoval(device, len(state.scene), stride, views, own, others, pool.sparse, steers)
-        )
+        yield stack.enter_context(SharedRemoval(device, len(state.scene), stride, views, own, others, pool, steers))
 
 
 class Measured:

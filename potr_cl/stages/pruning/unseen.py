@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
@@ -11,7 +12,7 @@ from numpy.typing import NDArray
 from potr_cl.host.threads import Run
 from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
-from potr_cl.stages.pruning.schedule import Pruned
+from potr_cl.stages.pruning.schedule import Course, Pruned
 from potr_cl.stages.stage import State
 
 #: What can be done with them.
@@ -121,14 +122,15 @@ def without_directions(state: State, unseen: NDArray[np.int64]) -> State:
 def as_of_whole(split: Split, pruned: Pruned) -> Pruned:
     """What pruning did to the seen splats, as what it did to all: the unseen ones were kept, and nobody misses them."""
     aside = len(split.unseen_splats)
-    removed = len(pruned.order) - pruned.kept
-    iteration_of = np.full(aside + len(pruned.order), -1, np.int32)
+    removed = len(split.seen_splats) - pruned.kept
+    iteration_of = np.full(aside + len(split.seen_splats), -1, np.int32)
     iteration_of[split.seen_splats] = pruned.iteration_of
-    seen = split.seen_splats[pruned.order]
-    return Pruned(
-        np.concatenate([seen[:removed], split.unseen_splats, seen[removed:]]),
-        pruned.kept + aside,
-        iteration_of,
-        pruned.iterations,
-        tuple(dataclasses.replace(each, left=each.left + aside) for each in pruned.history),
-    )
+
+    def course() -> Course:
+        seen = split.seen_splats[pruned.order]
+        return Course(
+            np.concatenate([seen[:removed], split.unseen_splats, seen[removed:]]),
+            tuple(dataclasses.replace(each, left=each.left + aside) for each in pruned.history),
+        )
+
+    return Pruned(pruned.kept + aside, iteration_of, pruned.iterations, lru_cache(maxsize=1)(course))

@@ -383,9 +383,8 @@ class ViewByView(Owner):
                     if self._sh is not None:
                         rasterizer.project(prepared.views, self._whole.sh)
                     device.fill(marks.buffer, np.uint8(SplatState.ALIVE), stride)
-                    kernels.sweep(0, count)  # for the target only
+                    kernels.store_target()
                     prepared.zero_sums()
-                    kernels.target_is_known()
                     if self._sh is not None:
                         rasterizer.project(prepared.views)
                 device.fill(own_totals.buffer, np.uint32(0), 16 * stride)
