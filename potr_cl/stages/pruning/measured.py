@@ -57,7 +57,7 @@ def measurement(
                 whole = stack.enter_context(whole_on_device(device, bench.drawable(state.scene)))
                 given = (options, bench.background, progress)
                 if isinstance(whole, SceneBuffers) and device.family == "gpu" and options.only_by_tolerance:
-                    first = first_totals(len(state.scene), spared)
+                    first = None if spared is None else first_totals(len(state.scene), spared)
                     yield stack.enter_context(ViewByView(device, whole, views, sights, *given, first))
                 else:
                     parts = sights.parts()

@@ -63,7 +63,8 @@ class _Controller(Owner):
         with device.all_or_nothing():
             self._smoothed = memory.allocate(4 * self._splats, "the smoothed effects")
             self._keys = memory.allocate(4 * self._splats, "the splats' scores")
-            self._removed = memory.upload(np.zeros(self._splats, _REMOVED), "the removed splats")
+            self._removed = memory.allocate(_REMOVED.itemsize * self._splats, "the removed splats")
+            device.fill(self._removed, np.uint32(0))
             self._state = memory.allocate(_STATE.itemsize, "the pruning's state")
             macros = totals_limits(device)
             self._rank, self._refine, self._mark = (

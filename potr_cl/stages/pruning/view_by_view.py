@@ -31,7 +31,7 @@ from potr_cl.raster.picked_splats import PickedSplats, Picker
 from potr_cl.raster.rasterizer import PreparingMemory, Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.raster.view_set import TILE
-from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
+from potr_cl.stages.pruning.fixed_point import FixedPoint
 from potr_cl.stages.pruning.launcher import SetKernels, launcher_for
 from potr_cl.stages.pruning.prepared_views import PreparedSet
 from potr_cl.stages.pruning.queues import Queues
@@ -181,11 +181,10 @@ class ViewByView(Owner):
                 for what in ("a view's effects", "a view's splats that are left", "a view's tiles", "their staleness")
             ]
             self._preparing = owned.enter_context(PreparingMemory(device))
-            first = zero_totals(whole.stride)
+            self.totals = memory.allocate(16 * whole.stride, "the removal effects")
+            self._first: cl.Buffer | None = None
             if first_totals is not None:
-                first[: self.splats] = first_totals.view(np.uint32)
-            self._first = memory.upload(first, "the removal effects to begin with")
-            self.totals = memory.allocate(first.nbytes, "the removal effects")
+                self._first = memory.upload(first_totals, "the removal effects to begin with")
             self.marks = memory.upload(np.full(whole.stride, SplatState.ALIVE, np.uint8), "the splats that are left")
             self._prepare_all(sights, progress)
             self._owned = owned.pop_all()
@@ -293,8 +292,11 @@ class ViewByView(Owner):
     def measure_on_device(self) -> None:
         """Bring the totals up to date."""
         self._sweep_listed()
-        with self.device.errors("failed while computing"):
-            cl.enqueue_copy(self.device.queue, self.totals, self._first, byte_count=16 * self._whole.stride)
+        if self._first is None:
+            self.device.fill(self.totals, np.int64(0))
+        else:
+            with self.device.errors("failed while computing"):
+                cl.enqueue_copy(self.device.queue, self.totals, self._first, byte_count=16 * self.splats)
         for kept in self._kept:
             kept.add()
         if self._unkept:
