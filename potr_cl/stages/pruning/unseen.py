@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host import mapped
 from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
 from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.stage import State
@@ -106,7 +107,8 @@ def without_directions(state: State, unseen: NDArray[np.int64]) -> State:
         unseen: their numbers in the source, ascending; those that are not left do not matter.
     """
     own = np.isin(state.survivors, unseen, assume_unique=True)
-    sh = state.scene.sh.copy()
+    copied = mapped.rows(state.scene.sh, None, "SH coefficients")
+    sh = state.scene.sh.copy() if copied is None else copied
     sh[own, 1:] = 0
     return state.recoloured(sh)
 
