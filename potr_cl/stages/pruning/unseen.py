@@ -9,6 +9,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host import mapped
 from potr_cl.host.threads import Run
 from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
@@ -114,7 +115,8 @@ def without_directions(state: State, unseen: NDArray[np.int64]) -> State:
         unseen: their numbers in the source, ascending; those that are not left do not matter.
     """
     own = np.isin(state.survivors, unseen, assume_unique=True)
-    sh = state.scene.sh.copy()
+    copied = mapped.rows(state.scene.sh, None, "SH coefficients")
+    sh = state.scene.sh.copy() if copied is None else copied
     sh[own, 1:] = 0
     return state.recoloured(sh)
 
