@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.raster.culling import Sights
+from potr_cl.raster.kept_scene import lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.pruning.part import RemovalPart
@@ -63,21 +64,19 @@ def measurement(
                     parts = sights.parts()
                     yield stack.enter_context(PartedRemoval(device, state.scene, whole, views, parts, *given, spared))
                 return
-            rasterizer = stack.enter_context(
-                Rasterizer(device, bench.drawable(state.scene), background=bench.background)
-            )
+            drawable = stack.enter_context(lying_on(device, bench.placed(state)))
+            rasterizer = stack.enter_context(Rasterizer(device, drawable, background=bench.background))
             yield stack.enter_context(RemovalSweep(rasterizer, views, options, progress))
             return
-        scene = stack.enter_context(pool.shared(bench.shareable(state.scene)))
+        scene = stack.enter_context(pool.shared(bench.shared(state)))
         each = [(scene, views, options, bench.background, numbers) for numbers in share.others]
         others = stack.enter_context(
             Parts(pool, RemovalPart, each, options.memory, [len(each) for each in share.others])
         )
         own, stride = None, len(state.scene)
         if share.own:
-            rasterizer = stack.enter_context(
-                Rasterizer(device, bench.drawable(state.scene), background=bench.background)
-            )
+            drawable = stack.enter_context(lying_on(device, bench.placed(state)))
+            rasterizer = stack.enter_context(Rasterizer(device, drawable, background=bench.background))
             own = stack.enter_context(RemovalSweep(rasterizer, views, options, progress, share.own))
             stride = rasterizer.stride
         others.ready()

@@ -104,7 +104,7 @@ def put_back(split: Split, pruned: State) -> State:
         opacity_logits=np.concatenate([left.opacity_logits, scene.opacity_logits])[order],
         sh=np.concatenate([left.sh, scene.sh])[order],
     )
-    return dataclasses.replace(pruned, scene=together, survivors=numbers[order], geometry=None)
+    return dataclasses.replace(pruned, scene=together, survivors=numbers[order], geometry=None, cut=None)
 
 
 def without_directions(state: State, unseen: NDArray[np.int64]) -> State:
