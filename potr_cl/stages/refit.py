@@ -103,7 +103,7 @@ class Refit(Stage):
     def __post_init__(self) -> None:
         for part in self.at:
             if not 0 <= part <= 1:
-                raise UsageError(f"refit_at is {part:g}, it must lie between 0 and 1")
+                raise UsageError(f"--refit-at is {part:g}, it must lie between 0 and 1")
         _ = RefitOptions(steps=self.steps), RefitOptions(steps=self.at_steps)
 
     @classmethod
