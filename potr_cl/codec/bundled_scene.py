@@ -6,8 +6,7 @@ Threads share the bundles out. Integers of a bundle become values while they are
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future
-from dataclasses import dataclass, field
+from dataclasses import dataclass
 from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
@@ -23,15 +22,16 @@ from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
 from potr_cl.codec.context.tokens import largest_integer
 from potr_cl.codec.dequantizer import Dequantizer
-from potr_cl.codec.native.bundles import BEYOND_TABLE, BundledFile, Tables, ValueArrays
+from potr_cl.codec.native.bundles import BEYOND_TABLE, BundledFile, Filling
 from potr_cl.codec.native.library import native
+from potr_cl.codec.native.values import Tables, ValueArrays
 from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
 from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import Run, SharedWork, thread_pool
 
 if TYPE_CHECKING:
-    from potr_cl.codec.destination import Activation, Destination
+    from potr_cl.codec.destination import Activation, BundleTaker, Destination
 
 #: Bundles that NumPy decodes side by side.
 _SIDE_BY_SIDE = 32
@@ -39,6 +39,10 @@ _SIDE_BY_SIDE = 32
 _HANDED = 4
 #: Splats for each thread, so that one more pays.
 SPLATS_A_THREAD = 3 * BUNDLE
+#: The same where values are packed, which takes less memory.
+_SPLATS_A_PACKING_THREAD = 3 * BUNDLE // 2
+#: Threads that open sections and walk the octree before there are bundles to decode.
+_OPENING = 3
 #: Parts of the positions for each thread, so that none waits long for another.
 _PARTS = 2
 #: Levels whose values are looked up.
@@ -70,68 +74,71 @@ class BundledScene:
         section = self.header.find(*key)
         return None if section is None else (container.stored_bytes(self.data, section), section.name)
 
-    def fill(
-        self,
-        arrays: ValueArrays,
-        threads: int = 1,
-        centres: Callable[[Run, int], None] | None = None,
-        filled: Callable[[int, int], None] | None = None,
-    ) -> None:
+    def fill(self, arrays: ValueArrays, threads: int = 1, centres: Callable[[Run, int], None] | None = None) -> None:
         """Fill some arrays; sections of others are not looked at.
 
         Args:
             arrays: what to decode.
             threads: to work with, this one included.
             centres: what else to do meanwhile; it is told how to share out work, and into how many parts.
-            filled: told from one splat to another which values are there, by this thread; others decode meanwhile.
 
         Raises:
             DataError: damaged.
         """
+        self._share_out(lambda run: self._filling(arrays, run), threads, SPLATS_A_THREAD, centres)
+
+    def pack(self, destination: BundleTaker, sh_count: int, threads: int, centres: Callable[[Run, int], None]) -> None:
+        """Hand the values of all bundles to a destination, packed, with so many SH coefficients of a channel.
+
+        Args:
+            destination: it gets bundles as they are decoded, from all threads.
+            threads, centres: as of :meth:`fill`.
+
+        Raises:
+            DataError: damaged, and what the destination raises.
+        """
+        destination.expect_bundles()
+        self._share_out(
+            lambda run: self._packing(destination, sh_count, run), threads, _SPLATS_A_PACKING_THREAD, centres
+        )
+
+    def _share_out(
+        self,
+        job_of: Callable[[Run], Job],
+        threads: int,
+        splats_a_thread: int,
+        centres: Callable[[Run, int], None] | None,
+    ) -> None:
+        """Have threads do a job.
+
+        Args:
+            job_of: opens the sections, with a way to share that out, and says what is to be done with bundles.
+            threads: this one included.
+            splats_a_thread: with fewer, another thread does not pay.
+            centres: as of :meth:`fill`.
+        """
         work, number = SharedWork(), self.reader.bundles.number
-        # With fewer bundles for each, threads wait for the interpreter, and for memory, longer than they decode.
-        helpers = min(threads, max(self.header.splats // SPLATS_A_THREAD, 2)) - (filled is None)
+        helpers = min(threads, max(self.header.splats // splats_a_thread, 2)) - 1
         if native() is None:  # others would wait for the interpreter, and take memory meanwhile
             helpers = 0
         first = []
         if centres is not None:
-            first.append(work.add(partial(centres, work.run, _PARTS * helpers if helpers else 1)))
+            first.append(work.add(partial(centres, work.run, _PARTS * (helpers + 1) if helpers else 1)))
         with thread_pool(max(helpers, 1)) as pool:
             try:
-                if helpers and first:  # while this thread opens the sections
-                    pool.submit(work.do)
-                job = self._job(arrays)
-                shares = job.shares(number)
-                if job.file is None:
-                    work.do()
-                    self._one_by_one(job, shares, filled or _nobody)
-                    shares = []
+                if first:  # while this thread opens the sections
+                    for _ in range(min(helpers, _OPENING)):
+                        pool.submit(work.do)
+                job = job_of(work.run if helpers else map)
+                shares = [range(at, min(at + job.at_once, number)) for at in range(0, number, job.at_once)]
                 futures = [work.add(partial(job, some)) for some in shares]
-                for _ in range(helpers if shares else 0):
+                for _ in range(helpers):
                     pool.submit(work.do)
-                if filled is None:
-                    work.do()
-                self._tell(shares, futures, filled or _nobody)
-                for future in first:
+                work.do()
+                for future in [*futures, *first]:
                     future.result()
             finally:
                 work.forget()
-
-    def _one_by_one(self, job: Job, shares: list[range], filled: Callable[[int, int], None]) -> None:
-        for bundles in shares:
-            job(bundles)
-            filled(bundles.start * BUNDLE, min(bundles.stop * BUNDLE, self.header.splats))
-
-    def _tell(self, shares: list[range], futures: list[Future[None]], filled: Callable[[int, int], None]) -> None:
-        """Wait for shares of the bundles, and tell of all that are done at a time."""
-        ready = done = 0
-        while done < len(futures):
-            futures[done].result()
-            while done < len(futures) and futures[done].done() and futures[done].exception() is None:
-                done += 1
-            stop = min(shares[done - 1].stop * BUNDLE, self.header.splats)
-            filled(ready, stop)
-            ready = stop
 
     def hand_to(self, destination: Destination, sh_count: int, threads: int) -> None:
         """Hand all integers but those of the centres to a destination, with so many SH coefficients of a channel.
@@ -184,12 +191,86 @@ class BundledScene:
         alphabets = [fitted.alphabet for fitted in section.streams] if section is not None else [1]
         return min(largest_integer(max(alphabets) - 1), _TABLE - 1)
 
-    def _job(self, arrays: ValueArrays) -> Job:
+    def _filling(self, arrays: ValueArrays, run: Run) -> Job:
         wanted = self._wanted(arrays)
-        file = self.reader.bundled_file(wanted)
-        if file is not None:
-            _ = self.tables  # made once, before threads ask for them
-        return Job(self, arrays, wanted, file)
+        file = self.reader.bundled_file(wanted, run)
+        if file is None:
+            return Job(_SIDE_BY_SIDE, lambda bundles: self.by_numpy(bundles, wanted, arrays))
+        fill = file.values(wanted.sections, wanted.rotations, arrays, self.tables)
+        works = _Works(file)
+
+        def decode(bundles: range) -> None:
+            for bundle in bundles:
+                if self.went_beyond(works.with_one(fill, bundle)):
+                    self.by_numpy(range(bundle, bundle + 1), wanted, arrays)
+
+        return Job(1, decode)
+
+    def _packing(self, destination: BundleTaker, sh_count: int, run: Run) -> Job:
+        wanted = self._wanted_of(sh_count, True)
+        file = self.reader.bundled_file(wanted, run)
+        if file is None:
+            return Job(_SIDE_BY_SIDE, lambda bundles: self._pack_by_numpy(destination, sh_count, wanted, bundles))
+        tables, works = self.tables, _Works(file)
+
+        def decode(bundles: range) -> None:
+            for bundle in bundles:
+                with destination.room() as packed:
+                    fill = file.packed(wanted.sections, wanted.rotations, packed, tables)
+                    beyond = self.went_beyond(works.with_one(fill, bundle))
+                    if not beyond:
+                        destination.take_bundle(bundle * BUNDLE, packed, fill.items)
+                if beyond:
+                    self._pack_by_numpy(destination, sh_count, wanted, range(bundle, bundle + 1))
+
+        return Job(1, decode)
+
+    def went_beyond(self, said: tuple[int, int]) -> bool:
+        """Whether the native path says of a bundle that its levels are beyond its tables.
+
+        Raises:
+            DataError: it says that the bundle is damaged.
+        """
+        if said[0] == BEYOND_TABLE:
+            return True
+        check_said(self.reader, *said)
+        return False
+
+    def _pack_by_numpy(self, destination: BundleTaker, sh_count: int, wanted: Wanted, bundles: range) -> None:
+        start, stop = bundles.start * BUNDLE, min(bundles.stop * BUNDLE, self.header.splats)
+        n = stop - start
+        arrays = ValueArrays(
+            np.empty((n, 3), np.float32),
+            np.empty((n, 4), np.float32),
+            np.empty(n, np.float32),
+            np.empty((sh_count, 3, n), np.float32),
+            begin=start,
+        )
+        self.by_numpy(bundles, wanted, arrays)
+        for bundle in bundles:
+            first = bundle * BUNDLE
+            with destination.room() as packed:
+                items = packed.take(arrays.part(first, min(first + BUNDLE, stop)))
+                destination.take_bundle(first, packed, items)
+
+    def by_numpy(self, bundles: range, wanted: Wanted, arrays: ValueArrays) -> None:
+        """Fill arrays with the values of some bundles, which are decoded side by side.
+
+        Raises:
+            DataError: damaged.
+        """
+        header, activation = self.header, self.activation
+        levels = self.reader.levels(bundles.start, bundles.stop, wanted)
+        Dequantizer(header, VERSIONS[header.version]).of_levels(levels, self.reader.steps, arrays)
+        own = arrays.part(levels.start, levels.stop)
+        if activation is None:
+            return
+        if own.log_scales is not None:
+            own.log_scales[...] = activation.scales(own.log_scales)
+        if own.logits is not None:
+            own.logits[...] = activation.opacities(own.logits)
+        if own.quaternions is not None:
+            own.quaternions[...] = activation.rotations(own.quaternions)
 
     def _wanted(self, arrays: ValueArrays) -> Wanted:
         rotations = arrays.quaternions is not None
@@ -201,10 +282,6 @@ class BundledScene:
         degree = round(sh_count**0.5) - 1
         # To the end of the chain where all is asked for: so its end is checked.
         return Wanted(len(MAIN) if degree == self.header.sh_degree else 3 + degree, rotations)
-
-
-def _nobody(start: int, stop: int) -> None:
-    """Is told which values are there."""
 
 
 @dataclass(frozen=True)
@@ -241,49 +318,33 @@ def _wide(largest: int) -> type[np.generic]:
 
 @dataclass(frozen=True)
 class Job:
-    """What decodes bundles, by any thread."""
+    """What is done with bundles, by any thread.
 
-    scene: BundledScene
-    arrays: ValueArrays
-    wanted: Wanted
-    file: BundledFile | None
-    _works: list[NDArray[np.uint8]] = field(default_factory=list)
+    Attributes:
+        at_once: so many bundles.
+        do: does it with some that follow each other; raises DataError where they are damaged.
+    """
 
-    def shares(self, number: int) -> list[range]:
-        """The bundles of a file, as they are decoded at a time."""
-        at_once = 1 if self.file is not None else _SIDE_BY_SIDE
-        return [range(first, min(first + at_once, number)) for first in range(0, number, at_once)]
+    at_once: int
+    do: Callable[[range], None]
 
     def __call__(self, bundles: range) -> None:
-        """Decode one of the shares.
+        self.do(bundles)
 
-        Raises:
-            DataError: damaged.
-        """
-        if self.file is None:
-            self._by_numpy(bundles)
-            return
-        # What a thread has worked with the next one takes.
-        work = self._works.pop() if self._works else self.file.work()
-        said, section = self.file.values(
-            bundles.start, self.wanted.sections, self.wanted.rotations, work, self.arrays, self.scene.tables
-        )
-        self._works.append(work)
-        if said == BEYOND_TABLE:
-            self._by_numpy(bundles)
-        else:
-            check_said(self.scene.reader, said, section)
 
-    def _by_numpy(self, bundles: range) -> None:
-        header = self.scene.header
-        levels = self.scene.reader.levels(bundles.start, bundles.stop, self.wanted)
-        Dequantizer(header, VERSIONS[header.version]).of_levels(levels, self.scene.reader.steps, self.arrays)
-        activation, own = self.scene.activation, self.arrays.part(levels.start, levels.stop)
-        if activation is None:
-            return
-        if own.log_scales is not None:
-            own.log_scales[...] = activation.scales(own.log_scales)
-        if own.logits is not None:
-            own.logits[...] = activation.opacities(own.logits)
-        if own.quaternions is not None:
-            own.quaternions[...] = activation.rotations(own.quaternions)
+class _Works:
+    """What threads need to decode bundles: what one has worked with the next one takes."""
+
+    def __init__(self, file: BundledFile) -> None:
+        self._file = file
+        self._free: list[NDArray[np.uint8]] = []
+
+    def with_one(self, fill: Filling, bundle: int) -> tuple[int, int]:
+        """What C says of a bundle, and the section at fault."""
+        try:
+            work = self._free.pop()
+        except IndexError:
+            work = self._file.work()
+        said = fill(bundle, work)
+        self._free.append(work)
+        return said

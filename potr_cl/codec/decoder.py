@@ -28,9 +28,9 @@ from potr_cl.codec.context.decoder import Reader, Stream
 from potr_cl.codec.context.lanes import Lanes
 from potr_cl.codec.context.model import Sizes
 from potr_cl.codec.dequantizer import Dequantizer
-from potr_cl.codec.destination import Destination, Fillable, SceneArrays
-from potr_cl.codec.native.bundles import ValueArrays
+from potr_cl.codec.destination import BundleTaker, Destination, Fillable, SceneArrays
 from potr_cl.codec.native.library import native
+from potr_cl.codec.native.values import ValueArrays
 from potr_cl.codec.sections import Coder, Property, Section
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.codec.versions import VERSIONS, FormatVersion
@@ -292,8 +292,11 @@ class PotrFile:
             destination.take_means(self._means(run, parts))
 
         if isinstance(destination, Fillable):
-            replace(scene, activation=destination.activation).fill(
-                destination.values, threads, centres, destination.filled if destination.is_told else None
+            replace(scene, activation=destination.activation).fill(destination.values, threads, centres)
+            return
+        if isinstance(destination, BundleTaker):
+            replace(scene, activation=destination.activation).pack(
+                destination, self.sh_count(sh_degree), threads, centres
             )
             return
         scene.hand_to(destination, self.sh_count(sh_degree), threads)

@@ -18,9 +18,9 @@ from potr_cl.codec.bundles.levels import Levels
 from potr_cl.codec.byte_planes import IntegerStream
 from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
-from potr_cl.codec.native.bundles import ValueArrays
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import native
+from potr_cl.codec.native.values import ValueArrays
 from potr_cl.codec.steps.prediction import from_residuals
 from potr_cl.codec.steps.rule import ColourSteps, factors
 from potr_cl.codec.versions import FormatVersion
