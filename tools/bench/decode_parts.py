@@ -26,10 +26,11 @@ from potr_cl.codec.bundles import sections
 from potr_cl.codec.bundles.decoder import Wanted
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.destination import SceneArrays
-from potr_cl.codec.native.bundles import BundledFile, ValueArrays
+from potr_cl.codec.native.bundles import BundledFile
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import VARIABLE
 from potr_cl.codec.native.octree import OctreeFunctions, Walk
+from potr_cl.codec.native.values import ValueArrays
 from tools.results import Column, Results
 
 #: What a clock is put around: where it is, its name there, what the table calls it.
@@ -40,7 +41,7 @@ _CLOCKS: tuple[tuple[Any, str, str], ...] = (
     (sections, "read_description", "descriptions of contexts"),
     (BundledFile, "__init__", "tables of contexts"),
     (BundledFile, "work", "memory to work with"),
-    (BundledFile, "values", "bundles to values"),
+    (BundledFile, "to_values", "bundles to values"),
     (bundled_scene.BundledScene, "tables", "tables of values"),
     (decoder, "unpack_integers", "multiplicities"),
     (OctreeFunctions, "tree", "octree: levels"),
@@ -52,7 +53,7 @@ _CLOCKS: tuple[tuple[Any, str, str], ...] = (
     (Functions, "look_up", "scales, opacities"),
     (Functions, "rotations", "rotations"),
     (Functions, "colours", "colours"),
-    (Functions, "unpredicted", "prediction of DC"),
+    (Functions, "dc_colours", "DC from its prediction"),
 )
 #: Of bundles: parts of the chain, by the section that they end with.
 _CHAIN = ("opacities", "scales", "steps and DC", "AC of degree 1", "AC of degree 2", "AC of degree 3")
@@ -143,11 +144,11 @@ def _of_bundles(data: bytes, runs: int) -> dict[str, float]:
     def decoded(sections: int, rotations: bool, arrays: ValueArrays) -> Callable[[], None]:
         opened = scene.reader.bundled_file(Wanted(sections, rotations))
         assert opened is not None
-        work = opened.work()
+        work, fill = opened.work(), opened.values(sections, rotations, arrays, tables)
 
         def run() -> None:
             for bundle in bundles:
-                opened.values(bundle, sections, rotations, work, arrays, tables)
+                fill(bundle, work)
 
         return run
 

@@ -6,6 +6,7 @@
 #include <string.h>
 
 #include "bundles.h"
+#include "prediction.h"
 
 /* Where the values of a file's splats go, or those of n = `stride` of them; NULL where they are not asked for. */
 typedef struct {
@@ -95,35 +96,49 @@ static void rotations(
     }
 }
 
-/* DC from what its prediction has left (docs/format.md, "Prediction"). Sums and products wrap round. */
+static INLINE int32_t as_it_is(int32_t level)
+{
+    return level;
+}
+
+DC_OF(dc_runs, int32_t, as_it_is)
+
+/* DC of a bundle's splats. Lanes that are whole are runs of the prediction; where they are shorter, it goes on from lane
+ * to lane. */
 static void colours_of_dc(const work *w, const scene_values *out, size_t steps, size_t splats, float *to, uint64_t all)
 {
-    uint64_t last[4][3], total[3] = { 0, 0, 0 };
-    for (size_t splat = 0, place = 0, lane = 0, step = 0; splat < splats; splat++) {
-        if (splat % LANE == 0) {
-            memset(last, 0, sizeof last);
+    const dc_steps of = { out->step, out->inverse, out->sf_dc };
+    const int32_t *const *const dc = (const int32_t *const[]) { w->dc[0], w->dc[1], w->dc[2] };
+    if (steps == RUN) {
+        const size_t whole = splats / RUN, four = whole / SIDE_BY_SIDE * SIDE_BY_SIDE;
+        for (size_t lane = 0; lane < four; lane += SIDE_BY_SIDE) {
+            float *const red = to + lane * RUN;
+            dc_runs(&of, dc[0] + lane, dc[1] + lane, dc[2] + lane, w->dc_classes + lane, LANES, 1, SIDE_BY_SIDE, RUN, red,
+                red + all, red + 2 * all);
+        }
+        for (size_t lane = four; lane * RUN < splats; lane++) {
+            float *const red = to + lane * RUN;
+            const size_t left = splats - lane * RUN, number = left < RUN ? left : RUN;
+            dc_runs(&of, dc[0] + lane, dc[1] + lane, dc[2] + lane, w->dc_classes + lane, LANES, 1, 1, number, red,
+                red + all, red + 2 * all);
+        }
+        return;
+    }
+    uint64_t total[3] = { 0 }, last[4][3] = { { 0 } };
+    for (size_t splat = 0; splat < splats; splat++) {
+        if (splat % RUN == 0) {
             memset(total, 0, sizeof total);
+            memset(last, 0, sizeof last);
         }
+        const size_t place = splat % steps * LANES + splat / steps;
         const unsigned class = w->dc_classes[place];
-        const uint64_t inverse = out->inverse[class], one = out->step[class];
-        const float divisor = out->sf_dc[class];
-        uint64_t level[3];
-        for (size_t c = 0; c < 3; c++) {
-            const int64_t mean = (int64_t)(total[c] * inverse + (UINT64_C(1) << 33)) >> 34;
-            level[c] = (uint64_t)(int64_t)w->dc[c][place] + (uint64_t)mean;
-            const uint64_t value = level[c] * one;
-            total[c] += value - last[splat & 3][c];
-            last[splat & 3][c] = value;
-        }
-        const uint64_t rest = level[0] - level[2];
-        to[splat] = (float)(int64_t)(rest + level[1]) / divisor;
-        to[splat + all] = (float)(int64_t)(level[0] + level[2]) / divisor;
-        to[splat + 2 * all] = (float)(int64_t)(rest - level[1]) / divisor;
-        place += LANES;
-        if (++step == steps) {
-            step = 0;
-            place = ++lane;
-        }
+        const uint64_t residuals[3] = {
+            (uint64_t)(int64_t)dc[0][place], (uint64_t)(int64_t)dc[1][place], (uint64_t)(int64_t)dc[2][place]
+        };
+        float rgb[3];
+        next_dc(&of, class, residuals, total, last[splat & 3], rgb);
+        for (size_t c = 0; c < 3; c++)
+            to[splat + c * all] = rgb[c] / of.factors[class];
     }
 }
 

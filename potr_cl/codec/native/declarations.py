@@ -57,7 +57,6 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
         [_POINTER, *[_SIZE] * 4, _POINTER, _SIZE, _POINTER, _POINTER, _SIZE, _SIZE, _POINTER],
     ),
     "potr_nonzero_levels": (_NUMBER, [_POINTER, _SIZE, _SIZE, ctypes.c_double, ctypes.c_double, _POINTER]),
-    "potr_unpredicted": (None, [_POINTER, _SIZE, _SIZE, _SIZE, *[_POINTER] * 4]),
     "potr_unit_factors": (None, [_POINTER, _SIZE, _SIZE, _SIZE, _SIZE, _REAL, _POINTER]),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
 }
@@ -74,6 +73,7 @@ _OF_KINDS: dict[str, tuple[Any, list[Any], tuple[str, ...]]] = {
         [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _POINTER, _POINTER],
         ("narrow", "medium", "wide"),
     ),
+    "potr_dc_of_": (None, [_POINTER, _POINTER, _POINTER, _SIZE, *[_POINTER] * 7], ("narrow", "medium", "wide")),
     "potr_look_up_": (_WORD, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER, _SIZE], ("narrow", "medium", "wide")),
     "potr_rotations_of_": (
         None,
