@@ -6,8 +6,9 @@ Threads share the bundles out. Integers of a bundle become values while they are
 from __future__ import annotations
 
 from collections.abc import Callable
+from concurrent.futures import Future, ThreadPoolExecutor
 from dataclasses import dataclass
-from functools import cached_property, partial
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -22,13 +23,13 @@ from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
 from potr_cl.codec.context.tokens import largest_integer
 from potr_cl.codec.dequantizer import Dequantizer
-from potr_cl.codec.native.bundles import BEYOND_TABLE, BundledFile, Filling
+from potr_cl.codec.native.bundles import BEYOND_TABLE
 from potr_cl.codec.native.library import native
-from potr_cl.codec.native.values import Tables, ValueArrays
+from potr_cl.codec.native.values import PackedValues, Tables, ValueArrays
 from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
 from potr_cl.codec.versions import VERSIONS
-from potr_cl.host.threads import Run, SharedWork, thread_pool
+from potr_cl.host.threads import thread_pool
 
 if TYPE_CHECKING:
     from potr_cl.codec.destination import Activation, BundleTaker, Destination
@@ -37,14 +38,10 @@ if TYPE_CHECKING:
 _SIDE_BY_SIDE = 32
 #: Bundles whose integers a thread joins at a time.
 _HANDED = 4
-#: Splats for each thread, so that one more pays.
-SPLATS_A_THREAD = 3 * BUNDLE
-#: The same where values are packed, which takes less memory.
-_SPLATS_A_PACKING_THREAD = 3 * BUNDLE // 2
-#: Threads that open sections and walk the octree before there are bundles to decode.
-_OPENING = 3
-#: Parts of the positions for each thread, so that none waits long for another.
-_PARTS = 2
+#: Bundles for each thread, so that one more pays.
+_BUNDLES_A_THREAD = 2
+#: Bundles for each thread that may be packed, or wait to be taken, at a time.
+_ROOMS_A_THREAD = 2
 #: Levels whose values are looked up.
 _TABLE = 1 << 16
 
@@ -74,71 +71,75 @@ class BundledScene:
         section = self.header.find(*key)
         return None if section is None else (container.stored_bytes(self.data, section), section.name)
 
-    def fill(self, arrays: ValueArrays, threads: int = 1, centres: Callable[[Run, int], None] | None = None) -> None:
+    def fill(self, arrays: ValueArrays, threads: int = 1, beside: Callable[[], None] | None = None) -> None:
         """Fill some arrays; sections of others are not looked at.
 
         Args:
             arrays: what to decode.
             threads: to work with, this one included.
-            centres: what else to do meanwhile; it is told how to share out work, and into how many parts.
+            beside: what else is to be done, by any thread.
 
         Raises:
-            DataError: damaged.
+            DataError: damaged; and what ``beside`` raises.
         """
-        self._share_out(lambda run: self._filling(arrays, run), threads, SPLATS_A_THREAD, centres)
+        wanted, number = self._wanted(arrays), self.reader.bundles.number
+        with _Helpers(number, min(threads, max(number // _BUNDLES_A_THREAD, 2)) - 1, beside) as helpers:
+            file, share = self.reader.bundled_file(wanted), helpers.share
+            if file is None or share is None:
+                self._side_by_side(lambda bundles: self._by_numpy(bundles, wanted, arrays))
+            else:
+                share.open(file, wanted.sections, wanted.rotations, arrays, self.tables)
+                share.do()
+                for bundle in range(number):
+                    if self._went_beyond(share.wait(bundle)):
+                        self._by_numpy(range(bundle, bundle + 1), wanted, arrays)
+            helpers.finish()
 
-    def pack(self, destination: BundleTaker, sh_count: int, threads: int, centres: Callable[[Run, int], None]) -> None:
-        """Hand the values of all bundles to a destination, packed, with so many SH coefficients of a channel.
-
-        Args:
-            destination: it gets bundles as they are decoded, from all threads.
-            threads, centres: as of :meth:`fill`.
-
-        Raises:
-            DataError: damaged, and what the destination raises.
-        """
-        destination.expect_bundles()
-        self._share_out(
-            lambda run: self._packing(destination, sh_count, run), threads, _SPLATS_A_PACKING_THREAD, centres
-        )
-
-    def _share_out(
-        self,
-        job_of: Callable[[Run], Job],
-        threads: int,
-        splats_a_thread: int,
-        centres: Callable[[Run, int], None] | None,
+    def pack(
+        self, destination: BundleTaker, sh_count: int, threads: int, means: Callable[[], NDArray[np.float32]]
     ) -> None:
-        """Have threads do a job.
+        """Hand the values of all bundles to a destination, packed and in their order, and the centres.
+
+        This thread hands them on; others decode.
 
         Args:
-            job_of: opens the sections, with a way to share that out, and says what is to be done with bundles.
-            threads: this one included.
-            splats_a_thread: with fewer, another thread does not pay.
-            centres: as of :meth:`fill`.
+            destination: takes them.
+            sh_count: SH coefficients of a channel that are wanted.
+            threads: to decode with.
+            means: finds the centres; called by one of them.
+
+        Raises:
+            DataError: damaged; what ``means`` and the destination raise.
         """
-        work, number = SharedWork(), self.reader.bundles.number
-        helpers = min(threads, max(self.header.splats // splats_a_thread, 2)) - 1
-        if native() is None:  # others would wait for the interpreter, and take memory meanwhile
-            helpers = 0
-        first = []
-        if centres is not None:
-            first.append(work.add(partial(centres, work.run, _PARTS * (helpers + 1) if helpers else 1)))
-        with thread_pool(max(helpers, 1)) as pool:
-            try:
-                if first:  # while this thread opens the sections
-                    for _ in range(min(helpers, _OPENING)):
-                        pool.submit(work.do)
-                job = job_of(work.run if helpers else map)
-                shares = [range(at, min(at + job.at_once, number)) for at in range(0, number, job.at_once)]
-                futures = [work.add(partial(job, some)) for some in shares]
-                for _ in range(helpers):
-                    pool.submit(work.do)
-                work.do()
-                for future in [*futures, *first]:
-                    future.result()
-            finally:
-                work.forget()
+        wanted, number = self._wanted_of(sh_count, True), self.reader.bundles.number
+        destination.expect_bundles()
+        threads = max(1, min(threads, -(-number // _BUNDLES_A_THREAD)))
+        with _Helpers(number, threads, means) as helpers:
+            file, share = self.reader.bundled_file(wanted), helpers.share
+            if file is None or share is None:
+                self._side_by_side(lambda bundles: self._pack_by_numpy(destination, sh_count, wanted, bundles))
+            else:
+                rooms = [PackedValues() for _ in range(min(number, _ROOMS_A_THREAD * threads))]
+                share.open(file, wanted.sections, wanted.rotations, rooms, self.tables)
+                taken = False
+                for bundle in range(number):
+                    room = bundle % len(rooms)
+                    if self._went_beyond(share.wait(bundle, helpers.look_after)):
+                        self._pack_by_numpy(destination, sh_count, wanted, range(bundle, bundle + 1))
+                    else:
+                        destination.take_bundle(bundle * BUNDLE, rooms[room], share.items(room))
+                    share.allow(bundle + 1 + len(rooms))
+                    if not taken and helpers.beside.done():
+                        destination.take_means(helpers.finish())
+                        taken = True
+                if taken:
+                    return
+            destination.take_means(helpers.finish())
+
+    def _side_by_side(self, do: Callable[[range], None]) -> None:
+        number = self.reader.bundles.number
+        for first in range(0, number, _SIDE_BY_SIDE):
+            do(range(first, min(first + _SIDE_BY_SIDE, number)))
 
     def hand_to(self, destination: Destination, sh_count: int, threads: int) -> None:
         """Hand all integers but those of the centres to a destination, with so many SH coefficients of a channel.
@@ -191,41 +192,7 @@ class BundledScene:
         alphabets = [fitted.alphabet for fitted in section.streams] if section is not None else [1]
         return min(largest_integer(max(alphabets) - 1), _TABLE - 1)
 
-    def _filling(self, arrays: ValueArrays, run: Run) -> Job:
-        wanted = self._wanted(arrays)
-        file = self.reader.bundled_file(wanted, run)
-        if file is None:
-            return Job(_SIDE_BY_SIDE, lambda bundles: self.by_numpy(bundles, wanted, arrays))
-        fill = file.values(wanted.sections, wanted.rotations, arrays, self.tables)
-        works = _Works(file)
-
-        def decode(bundles: range) -> None:
-            for bundle in bundles:
-                if self.went_beyond(works.with_one(fill, bundle)):
-                    self.by_numpy(range(bundle, bundle + 1), wanted, arrays)
-
-        return Job(1, decode)
-
-    def _packing(self, destination: BundleTaker, sh_count: int, run: Run) -> Job:
-        wanted = self._wanted_of(sh_count, True)
-        file = self.reader.bundled_file(wanted, run)
-        if file is None:
-            return Job(_SIDE_BY_SIDE, lambda bundles: self._pack_by_numpy(destination, sh_count, wanted, bundles))
-        tables, works = self.tables, _Works(file)
-
-        def decode(bundles: range) -> None:
-            for bundle in bundles:
-                with destination.room() as packed:
-                    fill = file.packed(wanted.sections, wanted.rotations, packed, tables)
-                    beyond = self.went_beyond(works.with_one(fill, bundle))
-                    if not beyond:
-                        destination.take_bundle(bundle * BUNDLE, packed, fill.items)
-                if beyond:
-                    self._pack_by_numpy(destination, sh_count, wanted, range(bundle, bundle + 1))
-
-        return Job(1, decode)
-
-    def went_beyond(self, said: tuple[int, int]) -> bool:
+    def _went_beyond(self, said: tuple[int, int]) -> bool:
         """Whether the native path says of a bundle that its levels are beyond its tables.
 
         Raises:
@@ -246,14 +213,13 @@ class BundledScene:
             np.empty((sh_count, 3, n), np.float32),
             begin=start,
         )
-        self.by_numpy(bundles, wanted, arrays)
-        for bundle in bundles:
-            first = bundle * BUNDLE
-            with destination.room() as packed:
-                items = packed.take(arrays.part(first, min(first + BUNDLE, stop)))
-                destination.take_bundle(first, packed, items)
+        self._by_numpy(bundles, wanted, arrays)
+        packed = PackedValues()
+        for first in range(start, stop, BUNDLE):
+            items = packed.take(arrays.part(first, min(first + BUNDLE, stop)))
+            destination.take_bundle(first, packed, items)
 
-    def by_numpy(self, bundles: range, wanted: Wanted, arrays: ValueArrays) -> None:
+    def _by_numpy(self, bundles: range, wanted: Wanted, arrays: ValueArrays) -> None:
         """Fill arrays with the values of some bundles, which are decoded side by side.
 
         Raises:
@@ -316,35 +282,70 @@ def _wide(largest: int) -> type[np.generic]:
     return np.int32 if largest < 1 << 29 else np.int64
 
 
-@dataclass(frozen=True)
-class Job:
-    """What is done with bundles, by any thread.
+class _Helpers:
+    """Threads that take part in decoding, and in what is to be done beside it.
+
+    They begin at once, and wait in C until the bundles can be decoded: so they do not keep this thread from the
+    interpreter while it opens the file. By NumPy there are none: they would wait for the interpreter all the time, and
+    take memory meanwhile.
+
+    Args:
+        bundles: of the file.
+        threads: so many.
+        beside: what else is to be done, by one of them, or by this one where there are none.
 
     Attributes:
-        at_once: so many bundles.
-        do: does it with some that follow each other; raises DataError where they are damaged.
+        share: the bundles; None where NumPy is to be taken.
+        beside: what came of what is done beside.
     """
 
-    at_once: int
-    do: Callable[[range], None]
+    def __init__(self, bundles: int, threads: int, beside: Callable[[], Any] | None) -> None:
+        functions = native()
+        self.share = None if functions is None else functions.bundle_share(bundles)
+        self._number = 0 if self.share is None else threads
+        self._do_beside = beside or (lambda: None)
+        self._pool = ThreadPoolExecutor(max(self._number, 1))
+        self._futures: list[Future[None]] = []
+        self.beside: Future[Any] = Future()
 
-    def __call__(self, bundles: range) -> None:
-        self.do(bundles)
-
-
-class _Works:
-    """What threads need to decode bundles: what one has worked with the next one takes."""
-
-    def __init__(self, file: BundledFile) -> None:
-        self._file = file
-        self._free: list[NDArray[np.uint8]] = []
-
-    def with_one(self, fill: Filling, bundle: int) -> tuple[int, int]:
-        """What C says of a bundle, and the section at fault."""
+    def __enter__(self) -> _Helpers:
         try:
-            work = self._free.pop()
-        except IndexError:
-            work = self._file.work()
-        said = fill(bundle, work)
-        self._free.append(work)
-        return said
+            for number in range(self._number):
+                self._futures.append(self._pool.submit(self._do, number == 0))
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.share is not None:
+            self.share.give_up()
+        self._pool.shutdown(cancel_futures=True)
+
+    def _do(self, first: bool) -> None:
+        if first:
+            self._set_beside()
+        if self.share is not None:
+            self.share.do()
+
+    def _set_beside(self) -> None:
+        try:
+            self.beside.set_result(self._do_beside())
+        except BaseException as error:  # the one who asks for the result is told
+            self.beside.set_exception(error)
+
+    def look_after(self) -> None:
+        """Raise what has ended the threads, if none is left."""
+        if all(future.done() for future in self._futures):
+            for future in self._futures:
+                future.result()
+
+    def finish(self) -> Any:
+        """See to it that what was to be done beside is, and give what came of it.
+
+        Raises:
+            What it raises.
+        """
+        if not self._number:
+            self._set_beside()
+        return self.beside.result()

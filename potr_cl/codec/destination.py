@@ -9,7 +9,6 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
-from contextlib import AbstractContextManager
 from typing import Protocol
 
 import numpy as np
@@ -102,19 +101,15 @@ class BundleTaker(ABC):
 
     @abstractmethod
     def expect_bundles(self) -> None:
-        """Bundles will come; called first, by the thread that waits for them all."""
-
-    @abstractmethod
-    def room(self) -> AbstractContextManager[PackedValues]:
-        """Memory for a bundle's values, which nobody else has meanwhile; called by several threads at a time."""
+        """Bundles will come."""
 
     @abstractmethod
     def take_bundle(self, first: int, packed: PackedValues, items: int) -> None:
-        """The values of a bundle, each bundle once and in any order, while their memory is the caller's.
+        """The values of a bundle; all from one thread, that of :meth:`expect_bundles`, and in their order.
 
         Args:
             first: the number of its first splat.
-            packed: the memory, from :meth:`room`.
+            packed: the values; the memory is another bundle's afterwards.
             items: how many it has.
         """
 

@@ -11,7 +11,6 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -123,10 +122,6 @@ class DeviceDequantiser(BundleTaker):
 
     def expect_bundles(self) -> None:
         self._staged = StagedBundles(self._buffers, self._lock)
-
-    def room(self) -> AbstractContextManager[PackedValues]:
-        assert self._staged is not None
-        return self._staged.room()
 
     def take_bundle(self, first: int, packed: PackedValues, items: int) -> None:
         assert self._staged is not None

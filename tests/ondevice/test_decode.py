@@ -10,24 +10,22 @@ from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
 from unittest.mock import patch
-from weakref import WeakKeyDictionary
 
 import numpy as np
 import pytest
 
 import potr_cl
-from potr_cl.codec import encoder
+from potr_cl.codec import bundled_scene, encoder
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import AnyFile, PotrFile, open_file, scene_of_file
 from potr_cl.codec.encoder import code_scene
-from potr_cl.codec.native.bundles import Filling
 from potr_cl.codec.native.library import native
+from potr_cl.codec.native.share import BundleShare
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import Coder, Property
 from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, UsageError
-from potr_cl.ondevice import staged_bundles
 from potr_cl.ondevice.decode import decode_to_device
-from potr_cl.ondevice.dequantiser import DeviceDequantiser
+from potr_cl.ondevice.staged_bundles import StagedBundles
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
@@ -227,45 +225,39 @@ def compiled():
         pytest.skip("the compiled library is not there: python -m tools.make.native, or pip install -e .")
 
 
-def test_bundles_that_are_uploaded_while_others_are_decoded(device, monkeypatch, compiled):
-    """The last one is not decoded before another was uploaded."""
-    take, decode = DeviceDequantiser.take_bundle, Filling.__call__
+@pytest.mark.parametrize(("rooms", "threads"), [(1, 1), (1, 3), (2, 2)])
+def test_memory_that_bundles_take_turns_in(rooms, threads, device, monkeypatch, compiled):
+    """Less of it than there are bundles: those that come late wait until others are on the device."""
+    monkeypatch.setattr(bundled_scene, "_ROOMS_A_THREAD", rooms)
+    file = PotrFile.from_bytes(of_bundles(9 * 8192 + 77, 2))
+    with uploaded(device, file.scene()) as wanted, decode_to_device(file, device, threads=threads) as got:
+        assert bits(wanted) == bits(got)
+
+
+def test_a_device_that_fails_among_bundles_ends_all_threads(device, monkeypatch, compiled):
     taken: list[int] = []
-    uploaded_some = threading.Event()
 
-    def noted(self, first, *others):
-        take(self, first, *others)
+    def fail(self, first, packed, items):
         taken.append(first)
-        uploaded_some.set()
+        if len(taken) == 2:
+            raise DeviceError("gone")
 
-    def last_waits(self, bundle, work):
-        if bundle == 9 and waits:
-            assert uploaded_some.wait(timeout=60)
-        return decode(self, bundle, work)
-
-    waits: list[bool] = []
-    monkeypatch.setattr(Filling, "__call__", last_waits)
-    monkeypatch.setattr(DeviceDequantiser, "take_bundle", noted)
-    splats = 9 * 8192 + 77
-    file = PotrFile.from_bytes(of_bundles(splats, 1))
-    with uploaded(device, file.scene()) as wanted:
-        waits.append(True)
-        with decode_to_device(file, device, threads=2) as got:
-            assert bits(wanted) == bits(got)
-    assert sorted(taken) == list(range(0, splats, 8192))
+    monkeypatch.setattr(bundled_scene, "_ROOMS_A_THREAD", 1)
+    monkeypatch.setattr(StagedBundles, "take", fail)
+    before = device.allocated, threading.active_count()
+    with pytest.raises(DeviceError, match="gone"):
+        decode_to_device(PotrFile.from_bytes(of_bundles(6 * 8192, 1)), device, threads=2)
+    assert taken == [0, 8192]
+    assert (device.allocated, threading.active_count()) == before
 
 
-@pytest.mark.parametrize("most", [1, 2])
-def test_memory_that_bundles_take_turns_in(most, device, monkeypatch):
-    """Less of it than there are bundles, for two files one after the other, which have nothing in common."""
-    monkeypatch.setattr(staged_bundles, "_MOST_ROOMS", most)
-    monkeypatch.setattr(staged_bundles, "_free", WeakKeyDictionary())
-    for splats, degree in ((5 * 8192 + 300, 2), (3 * 8192, 1)):
-        file = PotrFile.from_bytes(of_bundles(splats, degree))
-        with uploaded(device, file.scene()) as wanted:
-            for _ in range(2):
-                with decode_to_device(file, device, threads=4) as got:
-                    assert bits(wanted) == bits(got)
+def test_threads_that_get_no_memory_are_told_of(device, monkeypatch, compiled):
+    def no_memory(self):
+        raise MemoryError
+
+    monkeypatch.setattr(BundleShare, "do", no_memory)
+    with pytest.raises(DataError, match="more memory than the host has"):
+        decode_to_device(PotrFile.from_bytes(of_bundles(3 * 8192, 0)), device, threads=2)
 
 
 @pytest.mark.parametrize("native", ["0", ""])

@@ -24,7 +24,6 @@ from potr_cl.codec.rans import LOWEST, check_end, no_words_left
 from potr_cl.codec.sections import Property
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.errors import DataError
-from potr_cl.host.threads import Run
 
 I16 = NDArray[np.int16]
 I32 = NDArray[np.int32]
@@ -125,20 +124,15 @@ class Reader:
         run.check_end(wanted)
         return run.levels
 
-    def bundled_file(self, wanted: Wanted = EVERYTHING, run: Run = map) -> BundledFile | None:
+    def bundled_file(self, wanted: Wanted = EVERYTHING) -> BundledFile | None:
         """What the native path decodes bundles from; None where NumPy is to be taken.
-
-        Args:
-            wanted: what will be decoded.
-            run: shares out the opening of sections.
 
         Raises:
             DataError: damaged.
         """
         functions = native()
         # By whatever path, they are looked at before anything is decoded.
-        keys = wanted.keys
-        sections = dict(zip(map(ORDER.index, keys), run(self.section, keys), strict=True))
+        sections = {ORDER.index(key): self.section(key) for key in wanted.keys}
         steps = self.steps if wanted.sections > 2 else None
         if functions is None:
             return None

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.native.arrays import address
-from potr_cl.codec.native.values import PackedValues, Tables, ValueArrays, ValuesOfC, to_arrays, to_packed
 from potr_cl.codec.steps.rule import KNOTS, ColourSteps
 
 U8 = NDArray[np.uint8]
@@ -178,6 +177,9 @@ class BundledFile:
             least.
         steps: of colours, for files that have them.
         vectors: whether to look tokens up by vectors, where the processor can.
+
+    Attributes:
+        splats: as given.
     """
 
     def __init__(
@@ -190,8 +192,7 @@ class BundledFile:
     ) -> None:
         self._c = functions
         self._vectors = bool(vectors and functions["potr_bundles_vectors"]())
-        self._splats = splats
-        self._work = functions["potr_bundles_work"]()
+        self.splats = splats
         self._kept: list[NDArray[Any]] = []
         self._file = _File()
         self._file.splats = splats
@@ -245,7 +246,7 @@ class BundledFile:
 
     def work(self) -> U8:
         """What a thread needs to decode bundles, one at a time."""
-        work = np.zeros(self._work + 64, np.uint8)
+        work = np.empty(self._c["potr_bundles_work"]() + 64, np.uint8)
         start = -work.ctypes.data % 64
         aligned = work[start : len(work) - 64 + start]
         self._c["potr_bundles_begin"](address(aligned, np.uint8, len(aligned), True))
@@ -263,7 +264,7 @@ class BundledFile:
         Returns:
             What C says, the section at fault, and the integers, if nothing is.
         """
-        n = self._size(bundle, sections, rotations)
+        n = self.check(bundle, sections, rotations)
         integers = [np.zeros((k, n), np.int32) for k in (1, 3, 3, 3)]
         splats, coefficients = np.empty(_COEFFICIENTS * n, np.uint16), np.empty(_COEFFICIENTS * n, np.uint8)
         channels = np.empty((3, _COEFFICIENTS * n), np.int32)
@@ -291,78 +292,24 @@ class BundledFile:
         )
         return said, section.value, found
 
-    def values(self, sections: int, rotations: bool, arrays: ValueArrays, tables: Tables) -> Filling:
-        """What decodes bundles to the arrays of all splats; threads may share it.
-
-        Args:
-            sections, rotations: as of :meth:`integers`.
-            arrays: where values go.
-            tables: what makes values of levels.
-        """
-        degree = max((number - 2 for number in range(3, sections) if self._file.words[number]), default=0)
-        out = to_arrays(arrays, tables, self._splats, degree)
-        return Filling(self, sections, rotations, out, (arrays, tables))
-
-    def packed(self, sections: int, rotations: bool, packed: PackedValues, tables: Tables) -> Filling:
-        """What decodes bundles to packed values, for one thread; arguments as of :meth:`values`."""
-        if not rotations or sections < 3:
-            raise TypeError("the native path packs whole splats only")
-        return Filling(self, sections, rotations, to_packed(packed, tables), (packed, tables))
-
-    def to_values(self, bundle: int, sections: int, rotations: bool, work: U8, out: ValuesOfC) -> tuple[int, int]:
-        """See :class:`Filling`."""
-        self._size(bundle, sections, rotations)
-        section = ctypes.c_int()
-        said = self._c["potr_bundles_values"](
-            ctypes.byref(self._file),
-            bundle,
-            sections,
-            rotations,
-            address(work, np.uint8, self._work, True),
-            ctypes.byref(out),
-            ctypes.byref(section),
-        )
-        return said, section.value
-
-    def _size(self, bundle: int, sections: int, rotations: bool) -> int:
-        """Splats of a bundle."""
-        if not 0 <= bundle * _BUNDLE < self._splats or not 1 <= sections < SECTIONS or (rotations and sections < 2):
-            raise TypeError("the native path was asked for what is not there")
-        return min(self._splats - bundle * _BUNDLE, _BUNDLE)
-
-
-class Filling:
-    """Decodes bundles to values, as :meth:`BundledFile.values` or :meth:`BundledFile.packed` has made it.
-
-    Args:
-        file: that has the bundles.
-        sections, rotations: what of them.
-        out: as C takes it.
-        kept: what ``out`` points to.
-    """
-
-    def __init__(self, file: BundledFile, sections: int, rotations: bool, out: ValuesOfC, kept: Any) -> None:
-        self._file, self._sections, self._rotations, self._out, self._kept = file, sections, rotations, out, kept
-
-    def __call__(self, bundle: int, work: U8) -> tuple[int, int]:
-        """Decode a bundle.
-
-        Args:
-            bundle: which.
-            work: of :meth:`BundledFile.work`.
-
-        Returns:
-            What C says, and the section at fault. BEYOND_TABLE: values of the bundle are not whole.
-        """
-        out = self._out
-        if out.items:
-            out.begin = bundle * _BUNDLE
-        return self._file.to_values(bundle, self._sections, self._rotations, work, out)
-
     @property
-    def items(self) -> int:
-        """How many items the last bundle has that was packed."""
-        return int(self._out.listed)
+    def as_c(self) -> ctypes.Structure:
+        """What C takes; it lives as long as this object."""
+        return self._file
+
+    def degree(self, sections: int) -> int:
+        """Of the AC coefficients in so many sections of the chain."""
+        return max((number - 2 for number in range(3, sections) if self._file.words[number]), default=0)
+
+    def check(self, bundle: int, sections: int, rotations: bool) -> int:
+        """Splats of a bundle, of which so much can be decoded.
+
+        Raises:
+            TypeError: it cannot.
+        """
+        if not 0 <= bundle * _BUNDLE < self.splats or not 1 <= sections < SECTIONS or (rotations and sections < 2):
+            raise TypeError("the native path was asked for what is not there")
+        return min(self.splats - bundle * _BUNDLE, _BUNDLE)
 
 
 def fits(largest: int) -> bool:

@@ -43,6 +43,8 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_bundles_begin": (None, [_POINTER]),
     "potr_bundles_levels": (_NUMBER, [_POINTER, _WORD, _NUMBER, _NUMBER, *[_POINTER] * 3]),
     "potr_bundles_values": (_NUMBER, [_POINTER, _WORD, _NUMBER, _NUMBER, *[_POINTER] * 3]),
+    "potr_bundles_share": (_NUMBER, [_POINTER, _POINTER, _WORD]),
+    "potr_bundles_wait": (ctypes.c_int32, [_POINTER, _WORD]),
     "potr_bundles_encoding": (_SIZE, []),
     "potr_bundles_survey": (None, [_POINTER, _WORD, _POINTER, _POINTER, _WORD, _POINTER, _POINTER]),
     "potr_bundles_count": (None, [_POINTER, _WORD, *[_POINTER] * 3]),

@@ -19,6 +19,7 @@ from potr_cl.codec.native.bundles_encode import BundleEncoder
 from potr_cl.codec.native.declarations import declared
 from potr_cl.codec.native.octree import OctreeFunctions
 from potr_cl.codec.native.quantising import Quantising
+from potr_cl.codec.native.share import BundleShare
 from potr_cl.codec.steps.rule import CLASSES, ColourSteps
 
 F32 = NDArray[np.float32]
@@ -64,6 +65,10 @@ class Functions:
     ) -> BundledFile:
         """Sections of coder 4, as :class:`potr_cl.codec.native.bundles.BundledFile` takes them."""
         return BundledFile(self._c, splats, sections, steps, vectors)
+
+    def bundle_share(self, bundles: int) -> BundleShare:
+        """So many bundles to decode, as :class:`potr_cl.codec.native.share.BundleShare` takes them."""
+        return BundleShare(self._c, bundles)
 
     def bundle_encoder(self, *integers: Any) -> BundleEncoder:
         """Integers to code, as :class:`potr_cl.codec.native.bundles_encode.BundleEncoder` takes them."""

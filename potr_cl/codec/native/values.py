@@ -60,6 +60,9 @@ class ValueArrays:
 class PackedValues:
     """Memory for the values of a bundle as a device is sent them, in one piece: AC coefficients only that are not 0.
 
+    Args:
+        memory: to be taken; None: new memory.
+
     Attributes:
         memory: (PACKED,) float32: first the values that every splat has, in columns; then the items.
         log_scales, logits: (3, 8192), (8192,), or what stands for them.
@@ -69,8 +72,8 @@ class PackedValues:
             of the splat in the bundle; R, G, B as the bits of float32.
     """
 
-    def __init__(self, memory: F32) -> None:
-        self.memory = memory
+    def __init__(self, memory: F32 | None = None) -> None:
+        self.memory = memory = np.empty(PACKED, np.float32) if memory is None else memory
         dense = memory[: PACKED_COLUMNS * BUNDLE].reshape(PACKED_COLUMNS, BUNDLE)
         self.log_scales, self.quaternions, self.logits, self.dc = dense[:3], dense[3:7], dense[7], dense[8:]
         self.items = memory[dense.size :].view(np.uint32).reshape(-1, 4)
