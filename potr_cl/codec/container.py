@@ -187,6 +187,12 @@ def read_section(data: bytes | memoryview, section: Section) -> NDArray[np.uint8
     return np.frombuffer(raw, np.uint8)
 
 
+def raw_bytes(header: Header, data: bytes | memoryview, prop: Property, index: int = 0) -> NDArray[np.uint8]:
+    """As :func:`read_section`, of the section of a property; empty where the file has none."""
+    section = header.find(prop, index)
+    return np.empty(0, np.uint8) if section is None else read_section(data, section)
+
+
 # ------------------------------------------------------------------------------------------------ container
 
 

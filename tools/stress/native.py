@@ -32,7 +32,7 @@ from unittest.mock import patch
 
 import numpy as np
 
-from potr_cl.codec import bundled_scene, decoder, encoder
+from potr_cl.codec import bundled_scene, encoder, sectioned_scene
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.destination import BundleTaker, SceneArrays
 from potr_cl.codec.native import arrays, bundles, functions, octree, share, values
@@ -118,7 +118,7 @@ def work(seed: int, first: int, stop: int, compare: int, version: int) -> None:
     at = os.open(os.environ["POTR_STRESS_AT"], os.O_WRONLY | os.O_CREAT)
     with (
         ExitStack() as patches,
-        patch.object(decoder, "thread_pool", _at_once),
+        patch.object(sectioned_scene, "thread_pool", _at_once),
         patch.object(bundled_scene, "thread_pool", _at_once),
         patch.object(bundles.BundledFile, "work", _work_again(bundles.BundledFile.work)),
     ):
