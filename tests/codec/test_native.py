@@ -20,6 +20,7 @@ from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.sections import Property
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import Scene
@@ -168,6 +169,22 @@ def resealed(data: bytearray) -> bytes:
         at += size
     struct.pack_into("<I", data, 120 + 24 * count, zlib.crc32(data[: 120 + 24 * count]))
     return bytes(data)
+
+
+def test_threads_name_the_damage_that_one_thread_finds_first(choose):
+    """Several bundles are damaged, in sections that are decoded early and late."""
+    choose("native")
+    good = coded(random_scene(9 * 8192, 1, seed=3))
+    header = PotrFile.from_bytes(good).header
+    data = bytearray(good)
+    for prop, index, part in ((Property.SH, 3, 0.5), (Property.OPACITY, 0, 0.9), (Property.ROTATION, 0, 0.95)):
+        section = header.find(prop, index)
+        at = section.offset + int(section.stored_bytes * part)
+        data[at : at + 8] = bytes(value ^ 0x5A for value in data[at : at + 8])
+    data = resealed(data)
+    said = {outcome(data, threads) for threads in (1, 1, 2, 3, 4, 4, 4, 4)}
+    assert len(said) == 1
+    assert said.pop().startswith("section 'sh 3'")  # half of its words are before the damage
 
 
 def files_to_change() -> list[bytes]:
