@@ -25,7 +25,7 @@ from potr_cl.codec.context.tokens import largest_integer
 from potr_cl.codec.dequantizer import Dequantizer
 from potr_cl.codec.native.bundles import BEYOND_TABLE
 from potr_cl.codec.native.library import native
-from potr_cl.codec.native.values import PackedValues, Tables, ValueArrays
+from potr_cl.codec.native.values import PackedValues, Tables, ValueArrays, packing_rooms
 from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
 from potr_cl.codec.versions import VERSIONS
@@ -133,7 +133,6 @@ class BundledScene:
             if file is None or share is None:
                 scene._side_by_side(lambda bundles: scene._pack_by_numpy(destination, sh_count, wanted, bundles))
             else:
-                rooms = [PackedValues() for _ in range(min(number, _ROOMS_A_THREAD * threads))]
                 share.open(file, wanted.sections, wanted.rotations, rooms, scene.tables)
                 for bundle in range(number):
                     room = bundle % len(rooms)
@@ -148,7 +147,8 @@ class BundledScene:
             if not taken:
                 destination.take_means(helpers.finish())
 
-        self._helped(threads, wanted, means, work)
+        with packing_rooms(0 if native() is None else min(number, _ROOMS_A_THREAD * threads)) as rooms:
+            self._helped(threads, wanted, means, work)
 
     def _helped(
         self,
