@@ -125,7 +125,7 @@ def test_compaction_of_bad_files(tmp_path, scene_path, capsys):
     fails(capsys, ["compact", scene_path, "--cameras", scene_path, "-o", out], 2, "scene.ply")
     for option in ("compact", "refit"):
         late = [f"--{option}-at", "2"]
-        fails(capsys, ["encode", scene_path, "--cameras", cameras, "-o", out, *late], 2, f"{option}_at")
+        fails(capsys, ["encode", scene_path, "--cameras", cameras, "-o", out, *late], 2, f"--{option}-at is 2")
     assert not out.exists()
 
 
