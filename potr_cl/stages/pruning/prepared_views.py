@@ -147,6 +147,7 @@ class PreparedSet(Owner):
         rasterizer: that prepared them.
         numbers: of the views among the cameras.
         views: projection and lists, this object's from now on.
+        memory: to take the rest from, which is closed with this object; None: memory of its own.
 
     Attributes:
         numbers, views: as given.
@@ -159,9 +160,9 @@ class PreparedSet(Owner):
         DeviceMemoryError: the device has no room.
     """
 
-    def __init__(self, rasterizer: Rasterizer, numbers: range, views: ViewSet) -> None:
+    def __init__(self, rasterizer: Rasterizer, numbers: range, views: ViewSet, memory: Memory | None = None) -> None:
         self._device = device = rasterizer.device
-        self._memory = Memory(device)
+        self._memory = memory or Memory(device)
         self.numbers, self.views = numbers, views
         self.first_tile = 0
         try:

@@ -24,7 +24,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.kernel import Kernel
-from potr_cl.opencl.memory import Memory, Owner, Scratch
+from potr_cl.opencl.memory import Arena, Memory, Owner, Scratch
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.picked_splats import PickedSplats, Picker
@@ -180,6 +180,9 @@ class ViewByView(Owner):
                 owned.enter_context(Scratch(device, what))
                 for what in ("a view's effects", "a view's splats that are left", "a view's tiles", "their staleness")
             ]
+            #: Of views that are not kept, one after the other.
+            self._passing = Arena(device, "a view")
+            owned.callback(self._passing.give_back)
             self._preparing = owned.enter_context(PreparingMemory(device))
             self.totals = memory.allocate(16 * whole.stride, "the removal effects")
             self._first: cl.Buffer | None = None
@@ -266,9 +269,9 @@ class ViewByView(Owner):
             picked.sh = self._sh
         return Rasterizer(self.device, picked, background=self._background, preparing=self._preparing)
 
-    def _prepared(self, view: _View, rasterizer: Rasterizer) -> PreparedSet:
-        views = rasterizer.prepare_set([view.camera])
-        return PreparedSet(rasterizer, range(view.number, view.number + 1), views)
+    def _prepared(self, view: _View, rasterizer: Rasterizer, memory: Memory | None = None) -> PreparedSet:
+        views = rasterizer.prepare_set([view.camera], memory)
+        return PreparedSet(rasterizer, range(view.number, view.number + 1), views, memory)
 
     def _add(self, view: _View, totals: cl.Buffer, part: cl.Buffer) -> Kernel:
         kernel = self._kernel("add_part")
@@ -369,7 +372,7 @@ class ViewByView(Owner):
             stride = rasterizer.stride
             own_totals.reserve(16 * stride)
             marks.reserve(stride)
-            prepared = self._prepared(view, rasterizer)
+            prepared = self._prepared(view, rasterizer, self._passing)
             try:
                 count = prepared.views.tiles
                 tiles.reserve(4 * count)
