@@ -467,7 +467,7 @@ def test_an_arena_gives_the_same_memory_again(device: Device, monkeypatch: pytes
         if turn == 2:
             arena.free(buffers[0])
         arena.close()
-    assert all(24_000 <= nbytes < 32_000 for nbytes in taken)
+    assert all(24_000 <= taken[turn] < 32_000 for turn in (0, 1, 3))  # in between there is too little room
     assert 28_000 <= device.allocated - before < 32_000  # it stays
     arena.give_back()
     assert device.allocated == before
