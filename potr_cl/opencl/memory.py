@@ -103,7 +103,7 @@ class Arena(Memory):
     def allocate(self, nbytes: int, what: str) -> cl.Buffer:
         nbytes = -(-max(int(nbytes), 16) // self._grain) * self._grain
         if not self._parts and not self._buffers:
-            self._block.reserve(max(self._wanted, self._grain))
+            self._block.reserve(min(max(self._wanted, self._grain), self._device.info.largest_buffer))
             self._wanted = 0
         self._wanted += nbytes
         if self._used + nbytes > self._block.nbytes:

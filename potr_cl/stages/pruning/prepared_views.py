@@ -148,6 +148,7 @@ class PreparedSet(Owner):
         numbers: of the views among the cameras.
         views: projection and lists, this object's from now on.
         memory: to take the rest from, which is closed with this object; None: memory of its own.
+        target: the pictures before any removal, which stay the caller's; None: memory for them.
 
     Attributes:
         numbers, views: as given.
@@ -160,7 +161,14 @@ class PreparedSet(Owner):
         DeviceMemoryError: the device has no room.
     """
 
-    def __init__(self, rasterizer: Rasterizer, numbers: range, views: ViewSet, memory: Memory | None = None) -> None:
+    def __init__(
+        self,
+        rasterizer: Rasterizer,
+        numbers: range,
+        views: ViewSet,
+        memory: Memory | None = None,
+        target: cl.Buffer | None = None,
+    ) -> None:
         self._device = device = rasterizer.device
         self._memory = memory or Memory(device)
         self.numbers, self.views = numbers, views
@@ -169,7 +177,7 @@ class PreparedSet(Owner):
             lengths = np.concatenate([np.diff(offsets) for offsets in views.read_offsets()])
             self.lengths = self._memory.upload(lengths, "the tile lists")
             self.sums = self._memory.allocate(8 * views.capacity, "the tiles' removal effects")
-            self.target = self._memory.allocate(12 * views.pixels, "the target images")
+            self.target = target or self._memory.allocate(12 * views.pixels, "the target images")
         except BaseException:
             self.close()
             raise
