@@ -1,17 +1,25 @@
-"""A scene that stays on a device while one after another renders it: :class:`KeptScene`."""
+"""A scene that stays on devices while one after another renders it: :class:`KeptScene`."""
 
 from __future__ import annotations
 
-from contextlib import suppress
+import threading
+from collections.abc import Iterator
+from concurrent.futures import Future
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
 
-from potr_cl.errors import DeviceMemoryError
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.errors import DeviceError, DeviceMemoryError
+from potr_cl.host.threads import in_background
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
-from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, uploaded
+from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, gathered, uploaded
 
 #: A scene that takes more than this part of the device's memory is not kept: others may need the room.
-_PART = 16
+_PART = 10
 
 
 class KeptScene(Owner):
@@ -24,18 +32,85 @@ class KeptScene(Owner):
 
     def __init__(self, device: Device, scene: Scene) -> None:
         self._device, self._scene = device, scene
-        self._buffers: SceneBuffers | None = None
-        if _PART * scene.nbytes <= device.info.memory:
+        self._buffers = self._uploaded(device)
+        self._elsewhere: dict[Device, Future[SceneBuffers | None]] = {}
+        self._lock = threading.Lock()
+
+    def _uploaded(self, device: Device) -> SceneBuffers | None:
+        if _PART * self._scene.nbytes <= device.info.memory:
             with suppress(DeviceMemoryError):
-                self._buffers = uploaded(device, scene)
+                return uploaded(device, self._scene)
+        return None
+
+    def is_of(self, scene: Scene) -> bool:
+        """Whether it is this scene."""
+        return scene is self._scene
 
     def drawable(self, device: Device, scene: Scene) -> Drawable:
         """What to give to a rasterizer for a scene: what is kept, if it is this scene and on this device."""
-        if self._buffers is not None and scene is self._scene and device is self._device:
+        if self._buffers is not None and self.is_of(scene) and device is self._device:
             return self._buffers
         return scene
 
+    def bring_to(self, device: Device) -> Future[SceneBuffers | None]:
+        """Begin to upload it to another device as well, to be kept there too, and do not wait for it."""
+        with self._lock:
+            if device not in self._elsewhere:
+                # In a thread of its own: what this thread takes may belong to something that fails.
+                self._elsewhere[device] = in_background(self._uploaded, device)
+            return self._elsewhere[device]
+
+    def on(self, device: Device) -> Drawable:
+        """What to give to a rasterizer for the scene, on this device or another one.
+
+        Raises:
+            DeviceError: the other device failed.
+        """
+        buffers = self._buffers if device is self._device else self.bring_to(device).result()
+        return self._scene if buffers is None else buffers
+
     def close(self) -> None:
-        if self._buffers is not None:
-            self._buffers.close()
-        self._buffers = None
+        kept = [self._buffers]
+        for future in self._elsewhere.values():
+            with suppress(DeviceError):
+                kept.append(future.result())
+        for buffers in kept:
+            if buffers is not None:
+                buffers.close()
+        self._buffers, self._elsewhere = None, {}
+
+
+@dataclass(frozen=True)
+class PartOfKept:
+    """Some splats of a scene that is kept on devices.
+
+    Attributes:
+        kept: the scene.
+        splats: (n,) int64, their numbers there.
+        scene: the same splats on the host.
+    """
+
+    kept: KeptScene
+    splats: NDArray[np.int64]
+    scene: Scene
+
+
+@contextmanager
+def lying_on(device: Device, scene: Scene | KeptScene | PartOfKept) -> Iterator[Drawable]:
+    """What to give to a rasterizer on a device for a scene, as long as the context lasts.
+
+    Raises:
+        DeviceError: the device failed, or has no room for a part of what it keeps.
+    """
+    if isinstance(scene, PartOfKept):
+        whole = scene.kept.on(device)
+        if isinstance(whole, SceneBuffers):
+            # To gather them takes no time; to make ready and upload the splats of the host does.
+            with gathered(whole, scene.splats) as part:
+                yield part
+        else:
+            yield scene.scene
+    elif isinstance(scene, KeptScene):
+        yield scene.on(device)
+    else:
+        yield scene

@@ -20,8 +20,6 @@ SPLAT_GROUP = 256
 
 #: Splats whose parameters are uploaded at a time.
 _UPLOADED = 1 << 18
-#: Bytes that are filled at a time: no runtime has to count beyond 32 bits.
-_FILLED = 1 << 30
 
 
 class SceneBuffers(Owner):
@@ -104,6 +102,16 @@ class SceneBuffers(Owner):
             "quaternions": self.quaternions,
             "log2_opacities": self.log2_opacities,
         }
+
+    @property
+    def pick_macros(self) -> dict[str, int]:
+        """Macros of the projection that follow from which splats of the buffers are this scene's: here all are."""
+        return {}
+
+    @property
+    def picks(self) -> dict[str, Any]:
+        """The projection's arguments that say which they are, by their names."""
+        return {"whole_stride": self.stride, "numbers": self.means, "picked": self.splats}
 
     def write_rows(
         self,
@@ -238,9 +246,15 @@ class SceneBuffers(Owner):
             DeviceError: there is no room for them beside the scene.
         """
         self.write_rows(self.means, scene.means, "the centres")
-        self.write_rows(self.scales, activated_scales(scene.log_scales), "the scales")
-        self.write_rows(self.quaternions, unit_quaternions(scene.quaternions), "the rotations")
-        self.write_rows(self.log2_opacities, log2_opacities(scene.opacity_logits)[:, None], "the opacities")
+        # What is activated is there for some splats at a time: of all it would be as large as their geometry.
+        for start in range(0, self.splats, _UPLOADED):
+            some = slice(start, start + _UPLOADED)
+            for parameter, rows, what in (
+                (self.scales, activated_scales(scene.log_scales[some]), "the scales"),
+                (self.quaternions, unit_quaternions(scene.quaternions[some]), "the rotations"),
+                (self.log2_opacities, log2_opacities(scene.opacity_logits[some])[:, None], "the opacities"),
+            ):
+                self.write_rows(parameter, rows, what, start=start)
         self.write_sh(self.sh, scene.sh)
 
     def write_sh(self, parameter: cl.Buffer, sh: FloatArray) -> None:
@@ -273,9 +287,7 @@ class SceneBuffers(Owner):
 
     def _columns(self, number: int, value: float, what: str, memory: Memory | None = None) -> cl.Buffer:
         buffer = (memory or self._memory).allocate(4 * number * self.stride, what)
-        nbytes = 4 * number * self.stride
-        for start in range(0, nbytes, _FILLED):
-            cl.enqueue_fill_buffer(self.device.queue, buffer, np.float32(value), start, min(_FILLED, nbytes - start))
+        self.device.fill(buffer, np.float32(value))
         return buffer
 
     def rest(self) -> None:

@@ -14,13 +14,23 @@ from typing import Any, Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.signals import first_interrupt_asks
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.views_between import views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
-from potr_cl.stages.fitting.fit import FitOptions, FitProgress, Fitted, SupportsBool, fit_scene, held_out_error
+from potr_cl.stages.fitting.fit import (
+    FitOptions,
+    FitProgress,
+    Fitted,
+    SupportsBool,
+    fit_scene,
+    held_out_error,
+    kept_pictures,
+)
+from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refitting.photographs import hold_out
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
@@ -43,10 +53,14 @@ _FIRST = 0.25
 _WORTH = 1.25
 #: What is left of the cost has to be less than this part of it: a few held-out views are no exact judges.
 _LESS = 0.97
+#: A fit that has made up for no splats has to leave less than this part of the held-out views' error: the re-fit takes
+#: most of what a little one mends off by itself, and splats that have moved have fewer coefficients that are 0.
+_LESS_ALONE = 0.7
 #: Why a fit was left out.
 _TOO_FEW_VIEWS = "it needs two training views or more, because one of them is held out and tells whether it helps"
 _NO_GAIN = "on the views that were held out it did not make up for the splats that were removed before it"
-_INTERRUPTED = "it was interrupted before it had made up for the splats that were removed before it"
+_LITTLE_GAIN = "on the views that were held out it gained little beyond what the re-fit of the colours does"
+_INTERRUPTED = "it was interrupted before it had gained enough"
 
 
 @dataclass(frozen=True)
@@ -193,7 +207,12 @@ class Fit(Stage):
             source = bench.drawable(state.source)
             rasterizer = stack.enter_context(Rasterizer(bench.opened, source, background=bench.background))
             asked = stack.enter_context(first_interrupt_asks())
-            found = self._cycles(self._looking_between(state, bench), bench, rasterizer, asked)
+            seen = self._looking_between(state, bench)
+            rendered = RenderedTargets(rasterizer, seen.views)
+            targets: Targets | TargetPictures = rendered
+            if bench.memory is None:  # else pruning needs all that is allowed, between two fits
+                targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
+            found = self._cycles(seen, bench, targets, asked)
             found = dataclasses.replace(found, views=state.views, added=state.added)
             return found if asked or bench.photographs is None else self._to_photographs(found, bench, asked)
 
@@ -203,12 +222,12 @@ class Fit(Stage):
         each = self.views_on(bench.opened.family)
         if is_virtual(given) or each * len(given) <= state.added:
             return state
-        added = views_between(state.source, given, each)
+        with thread_pool(bench.threads) as pool:
+            added = views_between(state.source, given, each, run=pool.map)
         return dataclasses.replace(state, views=(*given, *added), added=len(added))
 
-    def _cycles(self, state: State, bench: Workbench, rasterizer: Rasterizer, asked: SupportsBool) -> State:
+    def _cycles(self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool) -> State:
         """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least."""
-        targets = RenderedTargets(rasterizer, state.views)
         price: float | None = state.learnt.get("price")
         worth = 0.0 if price is None else _WORTH * price
         without = held_out_error(bench.opened, state.scene, state.views, targets, state.added, bench.background)
@@ -232,13 +251,14 @@ class Fit(Stage):
             fitted = self._fitted(last, bench, targets, steps, progress, asked)
             last, done = dataclasses.replace(last, scene=fitted.scene, geometry=None), done + steps
             cost = fitted.error + worth * len(fitted.scene)
-            if price is None or cost < least:
-                spared = len(state.scene) - len(fitted.scene)
+            spared = len(state.scene) - len(fitted.scene)
+            if cost < least and (spared or fitted.error < _LESS_ALONE * without):
                 best, least, taken = last, cost, dataclasses.replace(fitted, spared=spared, without=without)
             if asked:
                 break
         if taken is None:
-            return state.having_learnt(self.name, LeftOut(_INTERRUPTED if asked else _NO_GAIN, bool(asked)))
+            why = _INTERRUPTED if asked else _NO_GAIN if len(steps_of) > 1 else _LITTLE_GAIN
+            return state.having_learnt(self.name, LeftOut(why, bool(asked)))
         return best.having_learnt(self.name, taken)
 
     def _steps_of_cycles(self, family: Family, removing: bool) -> list[int]:
@@ -281,7 +301,7 @@ class Fit(Stage):
         self,
         state: State,
         bench: Workbench,
-        targets: Targets,
+        targets: Targets | TargetPictures,
         steps: int,
         progress: FitProgress,
         asked: SupportsBool,

@@ -27,6 +27,7 @@ class HostPool(Pool):
 
     takes_part = True
     sparse = False
+    in_process = True
 
     def __init__(self, devices: Sequence[Device]) -> None:
         if not devices:
@@ -39,12 +40,17 @@ class HostPool(Pool):
                 )
         self.first = devices[0]
         self.traffic = Traffic()
+        self._devices = tuple(devices[1:])
         self._workers = [_Thread(device, number) for number, device in enumerate(devices[1:], 1)]
         # The first device may have room where another one has not.
         self._reserve = _Thread(devices[0], 0)
 
     def workers(self) -> list[Worker]:
         return list(self._workers)
+
+    @property
+    def devices(self) -> Sequence[Device]:
+        return self._devices
 
     def reserve(self) -> list[Worker]:
         return [self._reserve]

@@ -101,6 +101,8 @@ class Pool(ABC):
         first: the master's own device.
         takes_part: whether the master does a share of the work on it.
         sparse: whether workers send what has changed, and not all of it: worth its time where bytes travel slowly.
+        in_process: whether workers are threads of this process: what lies on a device can then be lent
+            (:mod:`potr_cl.opencl.relay`), and goes to another device without a stay on the host.
         traffic: so far.
         patience: seconds, or ten times as long as the others took if that is longer, after which a worker that alone
             has not answered counts as lost; None: workers are waited for.
@@ -109,6 +111,7 @@ class Pool(ABC):
     first: Device
     takes_part: bool
     sparse: bool
+    in_process: bool = False
     traffic: Traffic
     patience: float | None = None
 
@@ -119,6 +122,11 @@ class Pool(ABC):
         Raises:
             WorkerLost: none is left.
         """
+
+    @property
+    def devices(self) -> Sequence[Device]:
+        """Devices of this process that workers have, without the master's."""
+        return ()
 
     def reserve(self) -> list[Worker]:
         """Who does the work of lost workers when none is left."""

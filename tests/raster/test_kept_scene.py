@@ -12,10 +12,11 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster import kept_scene, scene_buffers
-from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.reference.scenes import random_splats, straight_camera
+from potr_cl.workers.host import HostPool
 from tests.devices import FAMILIES, open_device
 
 OPTIONS = EncodeOptions.for_preset("best", prune={"iterations": 8}, compact={"on": True})
@@ -83,3 +84,76 @@ def test_an_encode_uploads_its_scene_once_and_makes_the_same_bytes(
     assert encode(plush_excerpt, plush_excerpt_cameras, OPTIONS, device=device).data == once
     assert sum(scenes) > 1
     assert device.allocated == 0
+
+
+def test_other_devices_keep_it_too(device):
+    scene, camera = random_splats(300, seed=5), straight_camera()
+    other = Device(device.info, family=device.family)
+    with KeptScene(device, scene) as kept:
+        assert kept.on(device) is kept.drawable(device, scene)
+        kept.bring_to(other)
+        there = kept.on(other)
+        assert isinstance(there, SceneBuffers)
+        assert kept.on(other) is there
+        with Rasterizer(other, there) as moved, Rasterizer(device, scene) as wanted:
+            assert np.array_equal(moved.render(camera)[0], wanted.render(camera)[0])
+    assert other.allocated == 0
+    # A device without the room is given the host's.
+    small = Device(replace(device.info, memory=2 * scene.nbytes), family=device.family)
+    with KeptScene(device, scene) as kept:
+        assert kept.on(small) is scene
+        assert small.allocated == 0
+
+
+def test_several_devices_are_given_it_once_each(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
+    scenes = []
+    real = scene_buffers.SceneBuffers.write_sh
+
+    def counted(self, parameter, sh):
+        scenes.append(sh is plush_excerpt.sh)
+        real(self, parameter, sh)
+
+    monkeypatch.setattr(scene_buffers.SceneBuffers, "write_sh", counted)
+    devices = [device, Device(device.info, family=device.family)]
+    with HostPool(devices) as pool:
+        encode(plush_excerpt, plush_excerpt_cameras[:6], OPTIONS, device=device, pool=pool)
+    assert sum(scenes) == 2
+    assert devices[1].allocated == 0
+
+
+def test_a_part_of_what_is_kept_is_taken_on_the_device(device):
+    scene, camera = random_splats(700, seed=6), straight_camera()
+    numbers = np.flatnonzero(np.random.default_rng(7).random(700) < 0.4)
+    other = Device(device.info, family=device.family)
+    with KeptScene(device, scene) as kept, Rasterizer(device, scene.subset(numbers)) as wanted:
+        expected = wanted.render(camera)[0]
+        for place in (device, other):
+            with lying_on(place, PartOfKept(kept, numbers, scene.subset(numbers))) as part:
+                assert isinstance(part, SceneBuffers)
+                with Rasterizer(place, part) as rasterizer:
+                    assert np.array_equal(rasterizer.render(camera)[0], expected)
+    assert other.allocated == 0
+
+
+def test_without_what_no_view_sees_the_scene_is_still_uploaded_once(
+    device, plush_excerpt, plush_excerpt_cameras, monkeypatch
+):
+    """Splats behind all cameras are set aside, and the others taken from what is kept."""
+    means = plush_excerpt.means.copy()
+    means[::10] += 1e4
+    scene, cameras = replace(plush_excerpt, means=means), plush_excerpt_cameras[:6]
+    options = OPTIONS.changed(refit=False, compact=False)
+    splats = []
+    real = scene_buffers.SceneBuffers.write_sh
+
+    def counted(self, parameter, sh):
+        splats.append(len(sh))
+        real(self, parameter, sh)
+
+    monkeypatch.setattr(scene_buffers.SceneBuffers, "write_sh", counted)
+    found = encode(scene, cameras, options, device=device)
+    assert found.unseen is not None
+    assert found.unseen.splats > 0
+    assert splats == [len(scene)]
+    monkeypatch.setattr(kept_scene, "_PART", 1 << 40)
+    assert encode(scene, cameras, options, device=device).data == found.data

@@ -15,7 +15,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.refit_cases import Pictures
 from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.fit import Fit, LeftOut
-from potr_cl.stages.fitting.fit import FitOptions, Fitted, fit_scene
+from potr_cl.stages.fitting.fit import FitOptions, Fitted, fit_scene, held_out_error
 from potr_cl.stages.fitting.views import batches, share_out
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refitting.targets import RenderedTargets
@@ -58,6 +58,19 @@ def fitted_to(device, source, scene, cameras, options=STEPS, **more):
 def mean_error(device, source, scene, cameras):
     with Rasterizer(device, source) as one, Rasterizer(device, scene) as other:
         return np.mean([np.mean((one.render(c)[0] - other.render(c)[0]) ** 2) for c in cameras])
+
+
+def test_views_that_judge_find_the_mean_squared_error(device):
+    """Of views of several sizes, each counting the same; also of colours beyond 1."""
+    source = visible_scene(60, 2, seed=3)
+    scene = shaken(source)
+    bright = dataclasses.replace(source, sh=5 * source.sh)
+    cameras = [*ring_of_cameras(3, size=48), *ring_of_cameras(3, size=131)]
+    for targets in (source, bright):
+        with Rasterizer(device, targets) as rasterizer:
+            found = held_out_error(device, scene, cameras, RenderedTargets(rasterizer, cameras))
+        _, held_out = share_out(len(cameras), 0)
+        assert found == pytest.approx(mean_error(device, targets, scene, [cameras[k] for k in held_out]), rel=1e-5)
 
 
 @pytest.mark.parametrize("only", [*((name,) for name in PARAMETERS), PARAMETERS], ids=lambda names: "+".join(names))
@@ -304,9 +317,25 @@ def priced_fit(further, **options):
 
 
 def test_of_a_given_number_of_splats_none_are_removed(family_device, plush_excerpt, small_views):
-    after = Fit(steps=10).run(State.of(plush_excerpt, small_views), bench_of(family_device))
+    before = dataclasses.replace(State.of(plush_excerpt, small_views), scene=shaken(plush_excerpt, only=("sh",)))
+    after = Fit(steps=30).run(before, bench_of(family_device))
     assert len(after.scene) == len(plush_excerpt)
     assert after.learnt["fit"].spared == 0
+
+
+def test_little_is_left_to_the_refit(family_device, plush_excerpt, small_views):
+    """Splats that moved have fewer coefficients that are 0: a fit that gains little makes a larger file."""
+    start = shaken(plush_excerpt, only=("sh",))
+    before = dataclasses.replace(State.of(plush_excerpt, small_views), scene=start)
+    after = Fit(steps=2, between=0).run(before, bench_of(family_device))
+    with Rasterizer(family_device, plush_excerpt) as rasterizer:
+        alone = fit_scene(
+            family_device, start, small_views, RenderedTargets(rasterizer, small_views), FitOptions(steps=2)
+        )
+    assert 0.7 * alone.errors[0] < alone.error < alone.errors[0], "the fit gains, but little"
+    assert isinstance(after.learnt["fit"], LeftOut)
+    assert "gained little" in str(after.learnt["fit"])
+    assert after.scene is before.scene
 
 
 def test_the_threshold_grows_faster_than_what_it_follows():

@@ -85,3 +85,26 @@ def test_none_removed_for_a_while(device, survivors):
         assert on_device(device, survivors) == [ALIVE] * 8
     assert on_device(device, survivors)[2] == REMOVED
     assert survivors.alive.tolist() == [True, True, False, True, True]
+
+
+def test_marks_travel_as_bits(device, survivors):
+    """Another device that is told the bits has the same states as the one whose controller marked the splats."""
+    with Survivors(device, 5, 8, lambda: None) as told:
+        for marks in (
+            [ALIVE, JUST_REMOVED, ALIVE, ALIVE, JUST_REMOVED],
+            [JUST_REMOVED, REMOVED, ALIVE, ALIVE, REMOVED],
+        ):
+            states = np.array([*marks, *[ALIVE] * 3], np.uint8)
+            cl.enqueue_copy(device.queue, survivors.buffer, states, is_blocking=True)
+            survivors.marked_by_device()
+            told.mark(survivors.just_marked())
+            told.marked_by_device()
+            assert on_device(device, told) == states.tolist()
+        assert told.alive.tolist() == survivors.alive.tolist() == [False, False, True, True, False]
+
+
+def test_a_mark_after_a_removal_by_the_host(device, survivors):
+    survivors.remove(np.array([0]))
+    survivors.mark(np.array([0b10], np.uint8))
+    survivors.marked_by_device()
+    assert survivors.alive.tolist() == [False, False, True, True, True]

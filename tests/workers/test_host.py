@@ -13,6 +13,8 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import choose_device, choose_devices
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.stages.pruning.part import RemovalPart
+from potr_cl.stages.refitting.part import ColourPart
 from potr_cl.workers.host import HostPool
 from potr_cl.workers.opening import open_workers
 from tests.devices import FAMILIES, open_device
@@ -106,6 +108,38 @@ def test_a_device_with_too_little_memory_leaves_its_views_to_others(plush_excerp
     devices = [first, small(first, 100_000)]
     with HostPool(devices) as pool:
         assert encode(plush_excerpt, cameras, OPTIONS, device=first, pool=pool).data == expected
+    assert "its views go to 0:" in caplog.text
+    assert [device.allocated for device in devices] == [0, 0]
+
+
+@pytest.mark.parametrize(
+    ("kind", "command", "call"),
+    [
+        (RemovalPart, "lend_totals", 4),
+        (RemovalPart, "remove_marked", 3),
+        (ColourPart, "gradient", 2),
+        (ColourPart, "normal", 1),
+        (ColourPart, "normal", 4),
+    ],
+)
+def test_a_device_that_fails_on_the_way(plush_excerpt, plush_excerpt_cameras, monkeypatch, caplog, kind, command, call):
+    """Its part is made again on the first device, from what is lent, and repeats what it was told."""
+    cameras = few(plush_excerpt_cameras)
+    options = OPTIONS.changed(prune={"keep": None})
+    expected = encode(plush_excerpt, cameras, options, device=open_device("gpu")).data
+    devices = [open_device("gpu") for _ in range(2)]
+    real, calls = getattr(kind, command), []
+
+    def failing(self, *args):
+        calls.append(None)
+        if len(calls) == call:
+            raise DeviceError("the device failed")
+        return real(self, *args)
+
+    monkeypatch.setattr(kind, command, failing)
+    with HostPool(devices) as pool:
+        assert encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).data == expected
+    assert len(calls) > call
     assert "its views go to 0:" in caplog.text
     assert [device.allocated for device in devices] == [0, 0]
 

@@ -7,6 +7,7 @@
 #include <string.h>
 
 #include "bundles_tokens.h"
+#include "bundles_values.h"
 #include "steps.h"
 
 /* A stream of some items: from w->expected, where the sums of terms, constant and bias stand in rows, to w->tokens, to
@@ -46,7 +47,7 @@ static void clear_idle(uint8_t *tokens, size_t splats, size_t whole)
 }
 
 /* Weighted sums of terms in rows. */
-POTR_WIDE_INTEGERS
+POTR_WIDE
 static void add_terms(
     int32_t *restrict sums, int32_t constant, const int32_t *weights, const int16_t *const *terms, size_t number,
     size_t places)
@@ -66,7 +67,7 @@ static void add_terms(
 }
 
 /* The integers of a stream of an item a splat. Nearly all are tokens by themselves. */
-POTR_WIDE_INTEGERS
+POTR_WIDE
 static void keep_dense(const stream_model *model, const work *w, size_t places, int is_signed, int32_t *restrict integers)
 {
     const uint8_t *const tokens = w->tokens;
@@ -335,9 +336,12 @@ POTR_EXPORT size_t potr_bundles_work(void)
     return sizeof(work);
 }
 
-/* Makes it ready, once; it holds zeros. */
+/* Makes it ready, once, of any content. */
 POTR_EXPORT void potr_bundles_begin(work *w)
 {
+    /* Lanes that have no splat compute with what stands there, which must not be too large. */
+    memset(w, 0, offsetof(work, places));
+    memset(w->expected, 0, sizeof w->expected);
     for (unsigned mask = 0; mask < 128; mask++)
         list_bits(mask, &w->coefficient_bytes[mask]);
     list_logarithms(w->logarithms);

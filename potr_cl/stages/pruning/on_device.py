@@ -11,12 +11,14 @@ from collections.abc import Callable
 import numpy as np
 import pyopencl as cl
 
+from potr_cl.host.threads import in_background
+from potr_cl.model.order import ascending
 from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.structs import bytes_before, struct_dtype
 from potr_cl.raster.macros import totals_limits
 from potr_cl.stages.pruning.measured import Removal
-from potr_cl.stages.pruning.schedule import Iteration, Pruned, PruningOptions, ascending, prune
+from potr_cl.stages.pruning.schedule import Course, Indices, Iteration, Pruned, PruningOptions, prune
 from potr_cl.stages.pruning.steering import Steered
 
 _SOURCE = "prune/choose_gpu.cl"
@@ -61,7 +63,8 @@ class _Controller(Owner):
         with device.all_or_nothing():
             self._smoothed = memory.allocate(4 * self._splats, "the smoothed effects")
             self._keys = memory.allocate(4 * self._splats, "the splats' scores")
-            self._removed = memory.upload(np.zeros(self._splats, _REMOVED), "the removed splats")
+            self._removed = memory.allocate(_REMOVED.itemsize * self._splats, "the removed splats")
+            device.fill(self._removed, np.uint32(0))
             self._state = memory.allocate(_STATE.itemsize, "the pruning's state")
             macros = totals_limits(device)
             self._rank, self._refine, self._mark = (
@@ -92,7 +95,7 @@ class _Controller(Owner):
         remaining = options.iterations - iteration
         effect_unit, importance_unit = removal.units
         everywhere = {"splats": self._splats, "totals": removal.totals, "keys": self._keys, "state": self._state}
-        cl.enqueue_fill_buffer(self._device.queue, self._state, np.uint32(0), 0, _STATE.itemsize)
+        self._device.fill(self._state, np.uint32(0), _STATE.itemsize)
         self._rank.bind(
             **everywhere,
             alive=removal.marks,
@@ -134,15 +137,18 @@ class _Controller(Owner):
         removed = device.download(self._removed, (n,), _REMOVED)
         iteration = removed["iteration"].astype(np.int32)
         iteration[alive] = -1
-        gone = np.flatnonzero(~alive)
-        gone = gone[ascending(removed["iteration"][gone].astype(np.uint64) << np.uint64(32) | removed["key"][gone])]
-        if len(gone) == n:  # an empty scene is no scene
-            alive[gone[-1]], iteration[gone[-1]] = True, -1
-            gone = gone[:-1]
-        kept = np.flatnonzero(alive)
-        kept = kept[ascending(smoothed[kept])]
-        order = np.concatenate([gone, kept])
-        return Pruned(order, len(kept), iteration, done, self._history(removed[gone], iteration[gone]))
+        if not alive.any():  # an empty scene is no scene
+            last = _as_they_went(np.arange(n), removed)[-1]
+            alive[last], iteration[last] = True, -1
+        left = np.flatnonzero(alive)
+
+        def course() -> Course:
+            gone = _as_they_went(np.flatnonzero(~alive), removed)
+            kept = left[ascending(smoothed[left])]
+            return Course(np.concatenate([gone, kept]), self._history(removed[gone], iteration[gone]))
+
+        # Others go on with what is left meanwhile.
+        return Pruned(len(left), iteration, done, in_background(course).result)
 
     def _history(self, removed: np.ndarray, iteration: np.ndarray) -> tuple[Iteration, ...]:
         """What is known of each iteration in which splats went, in order."""
@@ -160,3 +166,11 @@ class _Controller(Owner):
 
     def close(self) -> None:
         self._memory.close()
+
+
+def _as_they_went(gone: Indices, removed: np.ndarray) -> Indices:
+    """Removed splats in the order of their removal."""
+    order: Indices = gone[
+        ascending(removed["iteration"][gone].astype(np.uint64) << np.uint64(32) | removed["key"][gone])
+    ]
+    return order

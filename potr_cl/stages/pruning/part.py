@@ -6,14 +6,18 @@ from collections.abc import Iterator, Sequence
 from contextlib import ExitStack
 
 import numpy as np
+import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Staging
+from potr_cl.opencl.memory import Scratch, Staging
+from potr_cl.opencl.relay import Lent
+from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.survivors import Bits
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.workers.pool import Part
 
@@ -26,7 +30,7 @@ class RemovalPart(Part):
     Args:
         device: to compute on.
         memory: bytes of its memory that the views may take; None: the default.
-        scene: the uncompressed scene.
+        scene: the uncompressed scene, perhaps kept on devices.
         cameras: all views.
         options: speed/accuracy trade-offs.
         background: R, G, B behind the scene.
@@ -40,7 +44,7 @@ class RemovalPart(Part):
         self,
         device: Device,
         memory: int | None,
-        scene: Scene,
+        scene: Scene | KeptScene | PartOfKept,
         cameras: Sequence[Camera],
         options: SweepOptions,
         background: tuple[float, float, float],
@@ -48,10 +52,13 @@ class RemovalPart(Part):
     ) -> None:
         options = SweepOptions(**{**vars(options), "memory": memory})
         with ExitStack() as owned:
-            rasterizer = owned.enter_context(Rasterizer(device, scene, background=background))
+            drawable = owned.enter_context(lying_on(device, scene))
+            rasterizer = owned.enter_context(Rasterizer(device, drawable, background=background))
             self._sweep = owned.enter_context(RemovalSweep(rasterizer, cameras, options, numbers=numbers))
             self._staging = owned.enter_context(Staging(device))
+            self._totals = owned.enter_context(Scratch(device, "the removal effects"))
             self._owned = owned.pop_all()
+        self._device = device
         self._sent: NDArray[np.int64] | None = None
         self._told: tuple[int, Iterator[tuple[int, Indices, NDArray[np.float64]]]] | None = None
 
@@ -89,11 +96,27 @@ class RemovalPart(Part):
         self._sent = totals
         return changed.astype(np.uint32), changes
 
+    def lend_totals(self) -> Lent:
+        """The totals of :meth:`measure`, for others of this process to read from the device until the next command."""
+        steering, nbytes = self._sweep.steering, 16 * self._sweep.splats
+        if steering is None:  # some views do not fit this device
+            self._totals.reserve(nbytes)
+            totals = self._sweep.measure_totals()
+            cl.enqueue_copy(self._device.queue, self._totals.buffer, totals, is_blocking=True)
+            return Lent(self._device, self._totals.buffer, nbytes)
+        steering.measure_on_device()
+        return Lent(self._device, steering.totals, nbytes)
+
     def remove(self, splats: Indices) -> None:
         """Take splats out for good."""
+        self._sweep.remove(splats)
+
+    def remove_marked(self, splats: Bits) -> None:
+        """Take splats out for good, as a device has marked them (:meth:`Survivors.just_marked`)."""
         steering = self._sweep.steering
         if steering is None:
-            self._sweep.remove(splats)
+            marked = np.unpackbits(splats, count=self._sweep.splats, bitorder="little")
+            self._sweep.remove(np.flatnonzero(marked))
         else:
             steering.mark(splats)
             steering.remove_marked()

@@ -7,12 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Protocol
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
+from potr_cl.model.order import ascending
 
 #: Candidates that are looked at to guess how far an iteration's budget reaches.
 _SAMPLE = 2048
@@ -85,22 +86,38 @@ class Iteration:
 
 
 @dataclass(frozen=True)
+class Course:
+    """How a pruning run went; see :class:`Pruned`."""
+
+    order: Indices
+    history: tuple[Iteration, ...] = ()
+
+
+@dataclass(frozen=True)
 class Pruned:
     """What a pruning run did.
 
     Attributes:
-        order: (N,) all splats: first the removed ones as they went, then the kept ones by ascending (smoothed) ΔMSE.
-        kept: number of splats at the end of ``order`` that were kept.
+        kept: number of splats that were kept.
         iteration_of: (N,) int32, the iteration (from 0) in which each splat went; -1 for the kept ones.
         iterations: rounds that were run: fewer than asked for when nothing was left to decide.
-        history: of the rounds that removed splats.
+        course: gives the course of the run, which takes long to find of millions of splats, and few ask for.
     """
 
-    order: Indices
     kept: int
     iteration_of: NDArray[np.int32]
     iterations: int
-    history: tuple[Iteration, ...] = ()
+    course: Callable[[], Course]
+
+    @property
+    def order(self) -> Indices:
+        """(N,) all splats: first the removed ones as they went, then the kept ones by ascending (smoothed) ΔMSE."""
+        return self.course().order
+
+    @property
+    def history(self) -> tuple[Iteration, ...]:
+        """What is known of the rounds that removed splats."""
+        return self.course().history
 
     @property
     def survivors(self) -> Indices:
@@ -149,20 +166,6 @@ def mapping(x: F64, a: float) -> F64:
     below = np.flatnonzero(x < 0)
     mapped[below] = (np.sqrt(1 - 2 * a * x[below]) - 1) / a
     return mapped
-
-
-def ascending(score: NDArray[Any]) -> Indices:
-    """Stable argsort: by score, ties by number. The unstable sort is ten times as fast, and ties are few."""
-    order = np.argsort(score)
-    ordered = score[order]
-    same = ordered[1:] == ordered[:-1]
-    if same.any():
-        tied = np.zeros(len(order), bool)
-        tied[1:] = same
-        tied[:-1] |= same
-        members = order[tied]
-        order[tied] = members[np.lexsort((members, score[members]))]
-    return order
 
 
 def choose(delta_mse: F64, importance: F64, alive: Indices, remaining: int, options: PruningOptions) -> Indices:
@@ -263,4 +266,5 @@ def prune(
         if after_iteration is not None:
             after_iteration(iteration)
     kept = alive[ascending(delta_mse[alive])]
-    return Pruned(np.concatenate([*removed, kept]), len(kept), iteration_of, done, tuple(history))
+    course = Course(np.concatenate([*removed, kept]), tuple(history))
+    return Pruned(len(kept), iteration_of, done, lambda: course)

@@ -19,12 +19,14 @@ from numpy.typing import NDArray
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.opencl.memory import Memory, Owner, Scratch
+from potr_cl.opencl.relay import Lent, Relay
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
 from potr_cl.stages.pruning.steering import Steered, Steering
 from potr_cl.stages.pruning.survivors import Survivors
 from potr_cl.workers.parts import Parts, Pending
+from potr_cl.workers.pool import Pool
 
 #: Splats a work-group of the kernel that adds totals.
 _GROUP = 64
@@ -39,7 +41,7 @@ class SharedRemoval(Owner):
         cameras: all views.
         own: measures the master's share of the views; None if it has none.
         others: parts, each a :class:`potr_cl.stages.pruning.part.RemovalPart`, that measure the rest.
-        sparse: whether they send what has changed, and not all totals.
+        pool: of their workers.
         steers: whether the choice of splats is the master's device's, as with the views on one GPU.
 
     Attributes:
@@ -57,11 +59,11 @@ class SharedRemoval(Owner):
         cameras: Sequence[Camera],
         own: RemovalSweep | None,
         others: Parts,
-        sparse: bool,
+        pool: Pool,
         steers: bool,
     ) -> None:
         self.splats = splats
-        self._own, self._others, self._sparse = own, others, sparse
+        self._own, self._others, self._sparse, self._in_process = own, others, pool.sparse, pool.in_process
         self._fixed_point = FixedPoint.of_views(cameras)
         #: What the others have found; of removed splats anything.
         self._found = np.zeros((splats, 2), np.int64)
@@ -148,14 +150,16 @@ class _SharedSteering(Owner):
         self._own: Steering | None = own
         self._memory = Memory(device)
         self._marks: Survivors | None = None
+        self._relay = Relay(device) if shared._in_process else None
         with device.all_or_nothing():
             self.totals: cl.Buffer = self._memory.upload(zero_totals(stride), "the removal effects")
+            self._more = Scratch(device, "the removal effects")
             if own is None:
                 self._marks = Survivors(device, self.splats, stride, device.queue.finish)
                 self.marks: cl.Buffer = self._marks.buffer
             else:
                 self.marks = own.marks
-                self._add = device.kernel("prune/add_totals.cl", "add_totals")
+            self._add = device.kernel("prune/add_totals.cl", "add_totals")
 
     @property
     def alive(self) -> NDArray[np.bool_]:
@@ -164,20 +168,37 @@ class _SharedSteering(Owner):
         return alive
 
     def measure_on_device(self) -> None:
-        pending = self._shared.begin_measuring()
+        shared = self._shared
+        pending = shared.begin_measuring() if self._relay is None else shared._others.begin("lend_totals")
         if self._own is not None:
             self._own.measure_on_device()
-        found = self._shared.found_by_others(pending)
-        with self.device.errors("failed while computing"):
-            cl.enqueue_copy(self.device.queue, self.totals, found, is_blocking=True)
+        if self._relay is None:
+            found = shared.found_by_others(pending)
+            with self.device.errors("failed while computing"):
+                cl.enqueue_copy(self.device.queue, self.totals, found, is_blocking=True)
+        else:
+            self._fetch(pending.results())
         if self._own is not None:
-            self._add.bind(totals=self.totals, more=self._own.totals, count=2 * self.splats)
-            self._add.launch((-(-2 * self.splats // _GROUP) * _GROUP,), (_GROUP,))
+            self._add_to_totals(self._own.totals)
+
+    def _fetch(self, found: Sequence[Lent]) -> None:
+        """Have as totals the sum of what others lend."""
+        assert self._relay is not None
+        first, *others = found
+        self._relay.fetch(self.totals, first)
+        for more in others:
+            self._more.reserve(more.nbytes)
+            self._relay.fetch(self._more.buffer, more)
+            self._add_to_totals(self._more.buffer)
+
+    def _add_to_totals(self, more: cl.Buffer) -> None:
+        self._add.bind(totals=self.totals, more=more, count=2 * self.splats)
+        self._add.launch((-(-2 * self.splats // _GROUP) * _GROUP,), (_GROUP,))
 
     def remove_marked(self) -> None:
         marked = (self._marks or self._own).just_marked()  # type: ignore[union-attr]
         # The others go on with it while the master's device does its own, and whoever tells them more waits for them.
-        self._shared._others.begin("remove", marked)
+        self._shared._others.begin("remove_marked", marked)
         if self._own is not None:
             self._own.remove_marked()
         else:
@@ -188,4 +209,7 @@ class _SharedSteering(Owner):
     def close(self) -> None:
         if self._marks is not None:
             self._marks.close()
+        if self._relay is not None:
+            self._relay.close()
+        self._more.close()
         self._memory.close()

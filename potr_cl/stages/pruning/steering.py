@@ -10,7 +10,7 @@ from numpy.typing import NDArray
 
 from potr_cl.opencl.device import Device
 from potr_cl.stages.pruning.cached_sweep import CachedSweep
-from potr_cl.stages.pruning.survivors import Survivors
+from potr_cl.stages.pruning.survivors import Bits, Survivors
 
 
 class Steered(Protocol):
@@ -80,12 +80,15 @@ class Steering:
     def alive(self) -> NDArray[np.bool_]:
         return self._survivors.alive
 
-    def mark(self, splats: NDArray[np.int64]) -> None:
-        """Mark splats that a controller elsewhere has chosen; :meth:`remove_marked` follows."""
+    def mark(self, splats: Bits) -> None:
+        """Mark splats that a controller elsewhere has chosen, as its :meth:`just_marked` gives them.
+
+        :meth:`remove_marked` follows.
+        """
         self._survivors.mark(splats)
 
-    def just_marked(self) -> NDArray[np.int64]:
-        """The splats that are marked JUST_REMOVED, ascending."""
+    def just_marked(self) -> Bits:
+        """The splats that are marked JUST_REMOVED, see :meth:`Survivors.just_marked`."""
         return self._survivors.just_marked()
 
     def measure_on_device(self) -> None:

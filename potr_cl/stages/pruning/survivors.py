@@ -14,6 +14,10 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 
 Indices = NDArray[np.int64]
+Bits = NDArray[np.uint8]
+
+#: Work-items of a work-group of the kernels that turn marks to bits and back; each has eight splats.
+_GROUP = 64
 
 
 class SplatState(IntEnum):
@@ -69,16 +73,31 @@ class Survivors(Owner):
         self._states[splats] = SplatState.REMOVED
         self._host_is_ahead = True
 
-    def mark(self, splats: Indices) -> None:
-        """Mark splats on the device as JUST_REMOVED, as a controller there does; :meth:`marked_by_device` follows."""
-        self.settle()
-        self._states[splats] = SplatState.JUST_REMOVED
-        self._write(self._states)
+    def mark(self, splats: Bits) -> None:
+        """Mark splats on the device as JUST_REMOVED, as a controller there does; :meth:`marked_by_device` follows.
 
-    def just_marked(self) -> Indices:
-        """The splats that are JUST_REMOVED on the device, ascending."""
-        states = self._device.download(self.buffer, (self._splats,), np.uint8)
-        return np.flatnonzero(states == SplatState.JUST_REMOVED)
+        Args:
+            splats: as :meth:`just_marked` gives them.
+        """
+        if self._host_is_ahead:
+            self.settle()
+        with Memory(self._device) as memory:
+            bits = memory.upload(splats, "the splats that go")
+            self._launch("mark_bits", bits)
+            self._device.queue.finish()  # before the memory is given back
+
+    def just_marked(self) -> Bits:
+        """(N / 8, rounded up) uint8: the splats that are JUST_REMOVED on the device, a bit each, the lowest first."""
+        nbytes = -(-self._splats // 8)
+        with Memory(self._device) as memory:
+            bits = memory.allocate(nbytes, "the splats that go")
+            self._launch("marked_bits", bits)
+            return self._device.download(bits, (nbytes,), np.uint8)
+
+    def _launch(self, name: str, bits: cl.Buffer) -> None:
+        kernel = self._device.shared_kernel("prune/marks.cl", name)
+        kernel.bind(states=self.buffer, splats=self._splats, bits=bits)
+        kernel.launch((-(-self._splats // (8 * _GROUP)) * _GROUP,), (_GROUP,))
 
     def marked_by_device(self) -> None:
         """Note that the device has changed states from ALIVE to JUST_REMOVED, and that the host does not know which."""

@@ -4,13 +4,16 @@ from __future__ import annotations
 
 import dataclasses
 from dataclasses import dataclass
+from functools import lru_cache
 
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.host import mapped
+from potr_cl.host.threads import Run
+from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
-from potr_cl.stages.pruning.schedule import Pruned
+from potr_cl.stages.pruning.schedule import Course, Pruned
 from potr_cl.stages.stage import State
 
 #: What can be done with them.
@@ -58,12 +61,17 @@ class Split:
     unseen_splats: NDArray[np.int64]
 
 
-def find_unseen(state: State) -> tuple[NDArray[np.bool_], float]:
+def find_unseen(state: State, groups: SplatGroups | None = None, run: Run = map) -> tuple[NDArray[np.bool_], float]:
     """Which splats of a state no given training view sees, and their part of the opacity-weighted area.
 
     Added views do not count: the one that happens to see a splat, perhaps from afar, cannot say what it is worth.
+
+    Args:
+        state: whose scene and views.
+        groups: of the scene, where they are known.
+        run: shares the work out.
     """
-    unseen = unseen_splats(state.scene, state.views[: len(state.views) - state.added])
+    unseen = unseen_splats(state.scene, state.views[: len(state.views) - state.added], groups, run)
     if not unseen.any():  # as usual
         return unseen, 0.0
     areas = opacity_weighted_areas(state.scene)
@@ -96,7 +104,7 @@ def put_back(split: Split, pruned: State) -> State:
         opacity_logits=np.concatenate([left.opacity_logits, scene.opacity_logits])[order],
         sh=np.concatenate([left.sh, scene.sh])[order],
     )
-    return dataclasses.replace(pruned, scene=together, survivors=numbers[order], geometry=None)
+    return dataclasses.replace(pruned, scene=together, survivors=numbers[order], geometry=None, cut=None)
 
 
 def without_directions(state: State, unseen: NDArray[np.int64]) -> State:
@@ -116,14 +124,15 @@ def without_directions(state: State, unseen: NDArray[np.int64]) -> State:
 def as_of_whole(split: Split, pruned: Pruned) -> Pruned:
     """What pruning did to the seen splats, as what it did to all: the unseen ones were kept, and nobody misses them."""
     aside = len(split.unseen_splats)
-    removed = len(pruned.order) - pruned.kept
-    iteration_of = np.full(aside + len(pruned.order), -1, np.int32)
+    removed = len(split.seen_splats) - pruned.kept
+    iteration_of = np.full(aside + len(split.seen_splats), -1, np.int32)
     iteration_of[split.seen_splats] = pruned.iteration_of
-    seen = split.seen_splats[pruned.order]
-    return Pruned(
-        np.concatenate([seen[:removed], split.unseen_splats, seen[removed:]]),
-        pruned.kept + aside,
-        iteration_of,
-        pruned.iterations,
-        tuple(dataclasses.replace(each, left=each.left + aside) for each in pruned.history),
-    )
+
+    def course() -> Course:
+        seen = split.seen_splats[pruned.order]
+        return Course(
+            np.concatenate([seen[:removed], split.unseen_splats, seen[removed:]]),
+            tuple(dataclasses.replace(each, left=each.left + aside) for each in pruned.history),
+        )
+
+    return Pruned(pruned.kept + aside, iteration_of, pruned.iterations, lru_cache(maxsize=1)(course))

@@ -49,7 +49,7 @@ class Helpers(Protocol):
     def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
         """Have them begin with :meth:`ColourMap.sum_gradient` of their views."""
 
-    def begin_normal(self, direction: cl.Buffer, unit: float, constant: bool) -> None:
+    def begin_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool) -> None:
         """Have them begin with :meth:`ColourMap.sum_normal` of their views."""
 
     def add(self, sums: cl.Buffer, blocks: cl.Buffer | None) -> dict[int, float]:
@@ -270,7 +270,8 @@ class ColourMap(Owner):
         unit = 1 / largest
         on_device = self._coefficients.on_device(direction)
         if self._helpers is not None:
-            self._helpers.begin_normal(on_device, unit, constant)
+            assert isinstance(at, cl.Buffer), "several devices have their vectors on the master's device"
+            self._helpers.begin_normal(on_device, at, unit, constant)
         self.sum_normal(on_device, at, unit, constant)
         if self._helpers is not None:
             self._helpers.add(self.sums, None)

@@ -8,11 +8,14 @@ from numpy.typing import NDArray
 
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Owner, Scratch, Staging
+from potr_cl.opencl.relay import Lent, Relay
 from potr_cl.stages.refitting.coefficients import Coefficients
 
 _SOURCE = "refit/packing.cl"
 #: Work-items of a work-group.
 _GROUP = 64
+#: Bytes of lent sums that are added at a time.
+_AT_ONCE = 1 << 27
 
 
 class Packing(Owner):
@@ -37,6 +40,7 @@ class Packing(Owner):
             for name in ("pack_floats", "unpack_floats", "pack_sums", "add_sums", "add_rows")
         }
         self._staging = Staging(device)
+        self._relay = Relay(device)
         self.flags: NDArray[np.uint32] | None = None
         self.count = 0
         self._places = Scratch(device, "the coefficients' places")
@@ -52,7 +56,9 @@ class Packing(Owner):
         return True
 
     def give_flags(self, flags: NDArray[np.uint32]) -> None:
-        """Have these flags, (2, N) uint32, on the device, and pack by them from now on."""
+        """Have these flags, (2, N) uint32, on the device, and pack by them from now on; the array must not change."""
+        if flags is self.flags:
+            return
         words = np.zeros((2, self._coefficients.layout.stride), np.uint32)
         words[:, : flags.shape[1]] = flags
         self._coefficients.restore_flags(words)
@@ -65,9 +71,15 @@ class Packing(Owner):
         packed: FloatArray = self._staging.download(self._packed.buffer, (self.count,), np.float32)
         return packed
 
-    def set_floats(self, x: cl.Buffer, packed: FloatArray) -> None:
+    def lend_floats(self, x: cl.Buffer) -> Lent:
+        """The same on the device, for others of this process."""
+        self._packed.reserve(4 * self.count)
+        self._launch("pack_floats", x)
+        return Lent(self._coefficients.device, self._packed.buffer, 4 * self.count)
+
+    def set_floats(self, x: cl.Buffer, packed: FloatArray | Lent) -> None:
         """Set a vector; coefficients that are not active become 0."""
-        self._upload(packed)
+        self._take(packed, 4)
         self._launch("unpack_floats", x)
 
     def sums(self, columns: cl.Buffer) -> NDArray[np.int64]:
@@ -80,18 +92,39 @@ class Packing(Owner):
         packed: NDArray[np.int64] = self._staging.download(self._packed.buffer, (self.count,), np.int64)
         return packed
 
-    def add_sums(self, columns: cl.Buffer, packed: NDArray[np.int64]) -> None:
+    def lend_sums(self, columns: cl.Buffer) -> Lent:
+        """The same on the device, for others of this process."""
+        self._packed.reserve(8 * self.count)
+        self._launch("pack_sums", columns)
+        return Lent(self._coefficients.device, self._packed.buffer, 8 * self.count)
+
+    def add_sums(self, columns: cl.Buffer, packed: NDArray[np.int64] | Lent) -> None:
         """Add to sums over views."""
-        self._upload(packed)
+        self._take(packed, 8)
         self._launch("add_sums", columns)
 
     def add_rows(self, sums: cl.Buffer, row: int, more: NDArray[np.int64]) -> None:
         """Add whole rows, (rows, stride) int64, to sums from a row on."""
         self._packed.reserve(more.nbytes)
         self._copy_to(self._packed, more)
+        self._add_packed(sums, row * more.shape[1], more.size)
+
+    def add_lent(self, sums: cl.Buffer, more: Lent) -> None:
+        """Add all of a device's sums, as many int64 as there are here, some at a time."""
+        for start in range(0, more.nbytes, _AT_ONCE):
+            nbytes = min(_AT_ONCE, more.nbytes - start)
+            self._packed.reserve(nbytes)
+            self._relay.fetch(self._packed.buffer, more, start, nbytes)
+            self._add_packed(sums, start // 8, nbytes // 8)
+
+    def _add_packed(self, sums: cl.Buffer, start: int, count: int) -> None:
         kernel = self._kernels["add_rows"]
-        kernel.bind(sums=sums, start=row * more.shape[1], more=self._packed.buffer, count=more.size)
-        kernel.launch((-(-more.size // _GROUP) * _GROUP,), (_GROUP,))
+        kernel.bind(sums=sums, start=start, more=self._packed.buffer, count=count)
+        kernel.launch((-(-count // _GROUP) * _GROUP,), (_GROUP,))
+
+    def fetch(self, x: cl.Buffer, lent: Lent) -> None:
+        """Take a whole vector from another device, which lays it out in the same way."""
+        self._relay.fetch(x, lent)
 
     def _know(self, flags: NDArray[np.uint32]) -> None:
         self.flags = flags
@@ -101,11 +134,15 @@ class Packing(Owner):
         self._places.reserve(8 * len(ends))
         self._copy_to(self._places, ends - counts)
 
-    def _upload(self, packed: NDArray[np.generic]) -> None:
-        if len(packed) != self.count:
-            raise ValueError(f"{len(packed)} packed coefficients, where {self.count} are active")
+    def _take(self, packed: NDArray[np.generic] | Lent, nbytes: int) -> None:
+        """Have packed coefficients of so many bytes each on the device."""
+        if packed.nbytes != nbytes * self.count:
+            raise ValueError(f"{packed.nbytes // nbytes} packed coefficients, where {self.count} are active")
         self._packed.reserve(packed.nbytes)
-        self._copy_to(self._packed, packed)
+        if isinstance(packed, Lent):
+            self._relay.fetch(self._packed.buffer, packed)
+        else:
+            self._copy_to(self._packed, packed)
 
     def _copy_to(self, scratch: Scratch, array: NDArray[np.generic]) -> None:
         if array.nbytes:
@@ -130,3 +167,4 @@ class Packing(Owner):
         self._places.close()
         self._packed.close()
         self._staging.close()
+        self._relay.close()

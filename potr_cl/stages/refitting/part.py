@@ -14,6 +14,8 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Staging
+from potr_cl.opencl.relay import Lent
+from potr_cl.raster.kept_scene import KeptScene, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients
@@ -32,15 +34,17 @@ class Gradient:
     Attributes:
         errors: the squared error by W of each view, by number.
         sums: (active coefficients,) int64.
+        blocks: (M (M + 1) / 2, stride) int64, the sums of the splats' own blocks, where they are lent.
     """
 
     errors: dict[int, float]
-    sums: NDArray[np.int64]
+    sums: NDArray[np.int64] | Lent
+    blocks: Lent | None = None
 
     @property
     def nbytes(self) -> int:
         """Bytes that travel."""
-        return 16 * len(self.errors) + self.sums.nbytes
+        return 16 * len(self.errors) + self.sums.nbytes + (self.blocks.nbytes if self.blocks else 0)
 
 
 class ColourPart(Part):
@@ -52,7 +56,7 @@ class ColourPart(Part):
         scene: whose geometry and opacities are used; its colours need no more than their constant coefficients.
         sh_count: M, coefficients of a channel.
         rules, background: of the rasterizer.
-        source: the scene whose pictures are the targets.
+        source: the scene whose pictures are the targets, perhaps kept on devices.
         cameras: all views.
         numbers: of the views of this part, ascending.
 
@@ -68,14 +72,15 @@ class ColourPart(Part):
         sh_count: int,
         rules: RasterRules,
         background: tuple[float, float, float],
-        source: Scene,
+        source: Scene | KeptScene,
         cameras: Sequence[Camera],
         numbers: Sequence[int],
     ) -> None:
         self._device = device
         with ExitStack() as owned:
             rasterizer = owned.enter_context(Rasterizer(device, scene, rules))
-            of_source = owned.enter_context(Rasterizer(device, source, background=background))
+            pictured = owned.enter_context(lying_on(device, source))
+            of_source = owned.enter_context(Rasterizer(device, pictured, background=background))
             launcher = launcher_for(device, rules)
             layout = Layout(len(scene), rasterizer.stride, sh_count, launcher.lanes)
             self._coefficients = owned.enter_context(Coefficients(device, layout))
@@ -90,24 +95,31 @@ class ColourPart(Part):
             self._block_sums: cl.Buffer | None = None
             self._owned = owned.pop_all()
 
-    def gradient(self, x: FloatArray, flags: NDArray[np.uint32], blocks: bool, constant: bool) -> Gradient:
+    def gradient(self, x: FloatArray | Lent, flags: NDArray[np.uint32], blocks: bool, constant: bool) -> Gradient:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.gradient`.
 
         Args:
-            x: (3 M, N or more) float32, the columns of the coefficients.
+            x: (3 M, N or more) float32, the columns of the coefficients. If they are lent, the sums are lent too, and
+                the blocks with them.
             flags: (2, N) uint32, which of them are active.
-            blocks: whether the splats' own blocks are wanted, see :meth:`block_rows`.
+            blocks: whether the splats' own blocks are wanted; see :meth:`block_rows`.
             constant: whether only the constant coefficients are active.
         """
         self._forget_blocks()
         layout = self._coefficients.layout
         self._packing.give_flags(flags)
-        self._coefficients.write_columns(self._x, x)
+        if isinstance(x, Lent):
+            self._packing.fetch(self._x, x)
+        else:
+            self._coefficients.write_columns(self._x, x)
         if blocks:
             triangle = layout.sh_count * (layout.sh_count + 1) // 2
             self._block_sums = self._blocks.allocate(8 * triangle * layout.stride, "the splats' normal equations")
             self._coefficients.zero(self._block_sums)
         errors = self._map.sum_gradient(self._x, self._targets, self._block_sums, constant)
+        if isinstance(x, Lent):
+            lent = None if self._block_sums is None else Lent(self._device, self._block_sums, self._block_sums.size)
+            return Gradient(errors, self._packing.lend_sums(self._map.sums), lent)
         return Gradient(errors, self._packing.sums(self._map.sums))
 
     def block_rows(self, first: int, rows: int) -> NDArray[np.int64]:
@@ -124,11 +136,11 @@ class ColourPart(Part):
         self._blocks.close()
         self._block_sums = None
 
-    def normal(self, direction: FloatArray, unit: float, constant: bool) -> NDArray[np.int64]:
+    def normal(self, direction: FloatArray | Lent, unit: float, constant: bool) -> NDArray[np.int64] | Lent:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.normal`.
 
         Args:
-            direction: (active coefficients,) float32.
+            direction: (active coefficients,) float32. If it is lent, the sums are lent too.
             unit: it is multiplied by this.
             constant: whether only the constant coefficients are active.
 
@@ -138,6 +150,8 @@ class ColourPart(Part):
         self._forget_blocks()
         self._packing.set_floats(self._direction, direction)
         self._map.sum_normal(self._direction, self._x, unit, constant)
+        if isinstance(direction, Lent):
+            return self._packing.lend_sums(self._map.sums)
         return self._packing.sums(self._map.sums)
 
     def close(self) -> None:

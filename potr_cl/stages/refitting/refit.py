@@ -28,6 +28,7 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
 from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients
@@ -255,11 +256,11 @@ class HelpFrom:
 
     Attributes:
         pool: the workers.
-        source: the scene whose pictures are the targets.
+        source: the scene whose pictures are the targets, perhaps kept on devices.
     """
 
     pool: Pool
-    source: Scene
+    source: Scene | KeptScene
 
 
 class ColourRefit(Owner):
@@ -319,9 +320,10 @@ class ColourRefit(Owner):
             owned.callback(blocks.close)
             self._solver = ColourSolver(self.coefficients, blocks)
             helpers = None
-            if others is not None:
+            if help_from is not None and others is not None:
                 assert isinstance(self.coefficients, Coefficients)
-                helpers = owned.enter_context(SharedViews(self.coefficients, others))
+                in_process = help_from.pool.in_process
+                helpers = owned.enter_context(SharedViews(self.coefficients, others, in_process))
             self.colour_map = owned.enter_context(
                 ColourMap(
                     launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory, own, helpers

@@ -10,8 +10,10 @@ import numpy as np
 import pyopencl as cl
 
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.memory import Owner, Staging
+from potr_cl.opencl.relay import Lent
+from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rules import RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.packing import Packing
@@ -30,13 +32,15 @@ class SharedViews(Owner):
     Args:
         coefficients: the master's, whose vectors are sent.
         others: parts, each a :class:`potr_cl.stages.refitting.part.ColourPart`.
+        in_process: whether they are threads of this process, which read what lies on the master's device themselves.
 
     Raises:
         DeviceError: the kernels cannot be built.
     """
 
-    def __init__(self, coefficients: Coefficients, others: Parts) -> None:
-        self._coefficients, self._others = coefficients, others
+    def __init__(self, coefficients: Coefficients, others: Parts, in_process: bool) -> None:
+        self._coefficients, self._others, self._in_process = coefficients, others, in_process
+        self._x: Lent | None = None
         self._packing = Packing(coefficients)
         self._columns = Staging(coefficients.device)
         self._pending: Pending | None = None
@@ -44,28 +48,41 @@ class SharedViews(Owner):
     def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
         """Have them begin with a gradient at x."""
         self._packing.take_flags()
-        layout = self._coefficients.layout
-        columns = self._columns.download(x, (layout.columns, layout.stride), np.float32)[:, : layout.splats]
-        flags = self._packing.flags
-        self._pending = self._others.begin("gradient", columns, flags, blocks, constant, anew=True)
+        given = (self._packing.flags, blocks, constant)
+        self._pending = self._others.begin("gradient", self._sent(x), *given, anew=True)
 
-    def begin_normal(self, direction: cl.Buffer, unit: float, constant: bool) -> None:
+    def _sent(self, x: cl.Buffer) -> Lent | FloatArray:
+        layout = self._coefficients.layout
+        if self._in_process:
+            self._x = Lent(self._coefficients.device, x, 4 * layout.columns * layout.stride)
+            return self._x
+        columns: FloatArray = self._columns.download(x, (layout.columns, layout.stride), np.float32)
+        return columns[:, : layout.splats]
+
+    def begin_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool) -> None:
         """Have them begin with a product of the normal matrix."""
-        self._pending = self._others.begin("normal", self._packing.floats(direction), unit, constant, logged=False)
+        if self._x is not None:
+            self._x.lend(at)  # a part that is made again asks for it; where it was before it may have changed
+        packed = self._packing.lend_floats(direction) if self._in_process else self._packing.floats(direction)
+        self._pending = self._others.begin("normal", packed, unit, constant, logged=False)
 
     def add(self, sums: cl.Buffer, blocks: cl.Buffer | None) -> dict[int, float]:
         """Add what they found to sums on the master's device."""
         pending, self._pending = self._pending, None
         assert pending is not None, "nothing was begun"
         errors: dict[int, float] = {}
-        for found in pending.results():
+        results = pending.results()
+        for found in results:
             if isinstance(found, Gradient):
                 errors |= found.errors
                 found = found.sums
             self._packing.add_sums(sums, found)
         if blocks is not None:
-            for place in range(len(self._others)):
-                self._add_blocks(blocks, place)
+            for place, found in enumerate(results):
+                if found.blocks is not None and found.blocks.nbytes == blocks.size:
+                    self._packing.add_lent(blocks, found.blocks)
+                else:
+                    self._add_blocks(blocks, place)
         return errors
 
     def _add_blocks(self, blocks: cl.Buffer, place: int) -> None:
@@ -95,7 +112,7 @@ def colour_parts(
     scene: Scene,
     rules: RasterRules,
     background: tuple[float, float, float],
-    source: Scene,
+    source: Scene | KeptScene,
     cameras: Sequence[Camera],
     memory: int | None,
 ) -> Iterator[Parts]:
@@ -106,7 +123,7 @@ def colour_parts(
         shares: who does which views.
         scene: whose colours are re-fitted.
         rules, background: of the rasterizer.
-        source: the scene whose pictures are the targets.
+        source: the scene whose pictures are the targets, perhaps kept on devices.
         cameras: all views.
         memory: bytes of a device's memory that prepared views and targets may take; None: the default.
     """

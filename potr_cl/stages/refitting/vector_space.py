@@ -23,8 +23,6 @@ from potr_cl.opencl.memory import Owner
 _GROUP = 64
 #: Columns whose flags share a word.
 _FLAGS = 24
-#: Bytes that are filled at a time: no runtime has to count beyond 32 bits.
-_FILLED = 1 << 30
 
 #: A vector: a device buffer, or what else a :class:`VectorSpace` makes; only that knows its layout.
 Vector: TypeAlias = Any
@@ -114,8 +112,7 @@ class VectorSpace(Owner):
 
     def clear(self, buffer: cl.Buffer) -> None:
         """Enqueue: all bytes of a device buffer become 0."""
-        for start in range(0, buffer.size, _FILLED):
-            cl.enqueue_fill_buffer(self.device.queue, buffer, np.float32(0), start, min(_FILLED, buffer.size - start))
+        self.device.fill(buffer, np.float32(0))
 
     # ------------------------------------------------------------------------------------------ vectors
 

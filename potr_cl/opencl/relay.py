@@ -1,0 +1,147 @@
+"""From the memory of one device of this computer to that of another: :class:`Relay`, and what it takes, :class:`Lent`.
+
+Devices that were opened apart share no memory, so what goes from one to the other goes through the host, in slices:
+while one slice arrives, the next one is on its way. Memory that a driver knows (:class:`potr_cl.opencl.memory.Staging`)
+makes that several times as fast as a download and an upload of everything.
+"""
+
+from __future__ import annotations
+
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner, Staging
+
+#: Bytes of a slice, and slices that the host has room for.
+_SLICE, _SLOTS = 1 << 23, 4
+
+
+class Lent:
+    """A part of a device's memory for others of this process to read, as it will be once all before it is done.
+
+    Who lends it does not change it before the others have said that they have it.
+
+    Args:
+        device: whose memory it is.
+        buffer: is read from its beginning on.
+        nbytes: of it that are lent.
+
+    Attributes:
+        device, buffer, nbytes: as given.
+        ready: when the content is there.
+    """
+
+    def __init__(self, device: Device, buffer: cl.Buffer, nbytes: int) -> None:
+        self.device, self.nbytes = device, nbytes
+        self.lend(buffer)
+
+    def lend(self, buffer: cl.Buffer) -> None:
+        """Lend another buffer in its place, with the same content."""
+        self.buffer = buffer
+        with self.device.errors("failed while computing"):
+            self.ready: cl.Event = cl.enqueue_marker(self.device.queue)
+            self.device.queue.flush()
+
+
+class Relay(Owner):
+    """Copies what is lent to one device.
+
+    Args:
+        device: that receives.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self._device = device
+        self._queue = _queue_beside(device)
+        self._ways: dict[int, _Way] = {}
+
+    def fetch(self, target: cl.Buffer, lent: Lent, start: int = 0, nbytes: int | None = None) -> None:
+        """Copy what is lent, or a part of it, to the beginning of a buffer; it is there when the method returns.
+
+        Args:
+            target: on this device.
+            lent: by another device, or by this one.
+            start: first byte of the part.
+            nbytes: of the part; None: all that follow.
+
+        Raises:
+            DeviceError: a device failed.
+        """
+        nbytes = lent.nbytes - start if nbytes is None else nbytes
+        if not nbytes:
+            return
+        device = self._device
+        with device.errors("failed while computing"), lent.device.errors("failed while computing"):
+            # Kernels that were enqueued before may still look at what the target held.
+            free = cl.enqueue_marker(device.queue)
+            device.queue.flush()
+            if lent.device is device:
+                waits = [free, lent.ready]
+                cl.enqueue_copy(
+                    self._queue, target, lent.buffer, byte_count=nbytes, src_offset=start, wait_for=waits
+                ).wait()
+            else:
+                self._through_host(target, lent, start, nbytes, free)
+
+    def _through_host(self, target: cl.Buffer, lent: Lent, start: int, nbytes: int, free: cl.Event) -> None:
+        way = self._ways.setdefault(id(lent.device), _Way(lent.device))
+        slots = way.staging.array((_SLOTS, _SLICE), np.uint8)
+        sizes = [min(_SLICE, nbytes - first) for first in range(0, nbytes, _SLICE)]
+        down: list[cl.Event] = []
+        up: list[cl.Event] = []
+
+        def depart(number: int) -> None:
+            if number >= _SLOTS:
+                up[number - _SLOTS].wait()
+            slot, first = slots[number % _SLOTS][: sizes[number]], start + number * _SLICE
+            waits = None if number else [lent.ready]
+            down.append(
+                cl.enqueue_copy(way.queue, slot, lent.buffer, src_offset=first, is_blocking=False, wait_for=waits)
+            )
+            way.queue.flush()
+
+        def land(number: int) -> None:
+            down[number].wait()
+            slot, first = slots[number % _SLOTS][: sizes[number]], number * _SLICE
+            waits = None if number else [free]
+            up.append(cl.enqueue_copy(self._queue, target, slot, dst_offset=first, is_blocking=False, wait_for=waits))
+            self._queue.flush()
+
+        try:
+            # One slot less is under way than there are: who waits for a slot waits for the copy before the last.
+            ahead = _SLOTS - 1
+            for number in range(len(sizes) + ahead):
+                if number < len(sizes):
+                    depart(number)
+                if number >= ahead:
+                    land(number - ahead)
+        finally:
+            # What is on its way uses memory that must not be given up.
+            way.queue.finish()
+            self._queue.finish()
+
+    def close(self) -> None:
+        """Give the host's memory back."""
+        for way in self._ways.values():
+            way.staging.close()
+        self._ways = {}
+
+
+class _Way:
+    """From another device to the host."""
+
+    def __init__(self, device: Device) -> None:
+        self.device = device  # is kept, so that its number is nobody else's
+        self.queue = _queue_beside(device)
+        self.staging = Staging(device)
+
+
+def _queue_beside(device: Device) -> Any:
+    """A queue on which something is copied while the device's own is busy, where the driver can do that."""
+    if not device.several_queues:
+        return device.queue
+    with device.errors("cannot be opened"):
+        return cl.CommandQueue(device.context, device.info.handle)

@@ -1,0 +1,79 @@
+"""What one device lends, another one has: whole, in parts, and no sooner than it is there."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from potr_cl.opencl import relay
+from potr_cl.opencl.memory import Memory
+from potr_cl.opencl.relay import Lent, Relay
+from tests.devices import KERNELS, open_device
+
+
+@pytest.fixture(scope="module", params=KERNELS)
+def devices(request):
+    devices = [open_device(request.param) for _ in range(2)]
+    yield devices
+    assert [device.allocated for device in devices] == [0, 0]
+
+
+@pytest.fixture(params=["apart", "the same"])
+def between(request, devices):
+    """Who lends, and who is lent to."""
+    return devices if request.param == "apart" else [devices[0]] * 2
+
+
+@pytest.mark.parametrize("count", [1, 1000, 4096, 4097, 100_003])
+def test_all_arrives(between, count, monkeypatch):
+    monkeypatch.setattr(relay, "_SLICE", 4096)  # many slices, and a last one that is shorter
+    lender, borrower = between
+    values = np.random.default_rng(count).integers(0, 2**32, count, np.uint32)
+    with Memory(lender) as there, Memory(borrower) as here, Relay(borrower) as relayed:
+        lent = Lent(lender, there.upload(values, "a test"), values.nbytes)
+        target = here.upload(np.zeros(count + 1, np.uint32), "a test")
+        for _ in range(2):  # the second time through memory that is there already
+            relayed.fetch(target, lent)
+            found = borrower.download(target, (count + 1,), np.uint32)
+            assert np.array_equal(found[:-1], values)
+            assert found[-1] == 0
+
+
+def test_a_part_of_it(between, monkeypatch):
+    monkeypatch.setattr(relay, "_SLICE", 4096)
+    lender, borrower = between
+    values = np.arange(10_000, dtype=np.uint32)
+    with Memory(lender) as there, Memory(borrower) as here, Relay(borrower) as relayed:
+        lent = Lent(lender, there.upload(values, "a test"), values.nbytes)
+        target = here.upload(np.zeros(10_000, np.uint32), "a test")
+        relayed.fetch(target, lent, 4 * 1000, 4 * 3000)
+        found = borrower.download(target, (10_000,), np.uint32)
+    assert np.array_equal(found[:3000], values[1000:4000])
+    assert not found[3000:].any()
+
+
+def test_it_is_lent_as_it_is_after_what_was_enqueued(between):
+    """Nobody waits between a kernel and a loan: what is read is what the kernel leaves."""
+    lender, borrower = between
+    count = 1 << 18
+    more = np.ones(count, np.int64)
+    with Memory(lender) as there, Memory(borrower) as here, Relay(borrower) as relayed:
+        totals = there.upload(np.zeros(count, np.int64), "a test")
+        ones = there.upload(more, "a test")
+        target = here.allocate(8 * count, "a test")
+        add = lender.kernel("prune/add_totals.cl", "add_totals").bind(totals=totals, more=ones, count=count)
+        for rounds in range(1, 6):
+            for _ in range(20):
+                add.launch((count,), (64,))
+            relayed.fetch(target, Lent(lender, totals, 8 * count))
+            assert (borrower.download(target, (count,), np.int64) == 20 * rounds).all()
+
+
+def test_another_buffer_can_take_its_place(devices):
+    lender, borrower = devices
+    with Memory(lender) as there, Memory(borrower) as here, Relay(borrower) as relayed:
+        lent = Lent(lender, there.upload(np.zeros(10, np.int64), "a test"), 80)
+        lent.lend(there.upload(np.ones(10, np.int64), "a test"))
+        target = here.allocate(80, "a test")
+        relayed.fetch(target, lent)
+        assert borrower.download(target, (10,), np.int64).tolist() == [1] * 10
