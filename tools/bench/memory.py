@@ -26,7 +26,7 @@ from tools.results import Column, Results, Table
 
 
 def resident(field: str) -> float:
-    """Gigabytes of this process: "VmHWM", the peak since the last reset; "VmRSS", now; "RssAnon", that of no file, now."""
+    """Gigabytes of this process: "VmHWM", the peak since the last reset; now, "VmRSS", or "RssAnon": of no file."""
     for line in Path("/proc/self/status").read_text().splitlines():
         if line.startswith(field + ":"):
             return int(line.split()[1]) * 1024 / 1e9

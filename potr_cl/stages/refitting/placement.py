@@ -35,7 +35,9 @@ _OF_FREE, _OF_GIVEN = 0.75, 0.5
 _ANYWAY = 256e6
 #: Of the memory, what a slice may take, and the integers of blocks that are on the device at a time.
 _SLICE, _BLOCKS = 1 / 32, 1 / 5
-_LEAST_SLICE, _MOST_SLICE = 1 << 12, 1 << 18
+_LEAST_SLICE, _MOST_SLICE = 1 << 14, 1 << 18
+#: For the blocks, all views are looked at so many times at most.
+_MOST_RANGES = 8
 
 
 @dataclass(frozen=True)
@@ -74,7 +76,7 @@ def placed(device: Device, splats: int, sh_count: int, memory: int | None, slice
     total = free if memory is None else min(memory, free)
     of_slice = 2 * vector + 4 * triangle + 8
     some = slices or min(max(int(_SLICE * total / of_slice), _LEAST_SLICE), _MOST_SLICE)
-    blocks = slices or max(int(_BLOCKS * total / (8 * triangle)), 1)
+    blocks = slices or max(int(_BLOCKS * total / (8 * triangle)), -(-splats // _MOST_RANGES))
     # A place for a vector that views are looked at with, the sums, and some vectors.
     room = int((_OF_VECTORS * total / max(splats, 1) - _SWEEP) / vector) - 3
     resident = min(max(room, _FEWEST), _MOST) if slices is None else _FEWEST
