@@ -25,8 +25,9 @@ from potr_cl.stages.refitting.vector_space import Layout, Vector, VectorSpace
 _VECTORS = 7
 #: Vectors that lie on the device in any case, and at most: beyond, the blocks are most of what travels.
 _FEWEST, _MOST = 1, 6
-#: They take no more than this part of the memory together with the sums: prepared views need some too.
-_OF_VECTORS = 0.6
+#: With the sums they take no more than this part of a GPU's memory: to take one there again and again costs more than
+#: to prepare views that it leaves no room for; and of the host's, where a CPU computes: there it is the other way.
+_OF_VECTORS, _OF_HOST = 0.8, 0.5
 #: What a sweep has besides for each splat: geometry, the splats of a view as they are projected, and its sums.
 _SWEEP = 68 + 32 + 16 + 16 + 32 + 8
 #: The vectors lie on the device if they take no more than this part of what is free, or of the memory that is given.
@@ -78,7 +79,8 @@ def placed(device: Device, splats: int, sh_count: int, memory: int | None, slice
     some = slices or min(max(int(_SLICE * total / of_slice), _LEAST_SLICE), _MOST_SLICE)
     blocks = slices or max(int(_BLOCKS * total / (8 * triangle)), -(-splats // _MOST_RANGES))
     # A place for a vector that views are looked at with, the sums, and some vectors.
-    room = int((_OF_VECTORS * total / max(splats, 1) - _SWEEP) / vector) - 3
+    of_host = device.info.kind == "cpu" or device.info.integrated
+    room = int(((_OF_HOST if of_host else _OF_VECTORS) * total / max(splats, 1) - _SWEEP) / vector) - 3
     resident = min(max(room, _FEWEST), _MOST) if slices is None else _FEWEST
     besides = splats * ((3 + resident) * vector + _SWEEP) + some * of_slice + 8 * triangle * min(blocks, splats)
     return Place(some, blocks, max(int(total - besides), 0), resident)
