@@ -45,6 +45,8 @@ study.compare_formats      what would people use instead?
 study.output_formats       how small are encodes to the formats that viewers open, and what do others read of them?
 study.virtual_views        how many virtual views, how large, how wide, at what time and memory?
 study.rates                where do the bits go, and what do they buy?
+study.fit_guards           is a file with the fit ever worse than one without: few views, thresholds by hand?
+study.photographs          how much nearer to unseen photographs does a fit to others bring a scene and its file?
 study.gauss_newton         does Gauss-Newton fit a pruned scene in less time than Adam?
 study.antialiasing         what is lost if an antialiased scene is encoded as a classic one?
 study.compaction_curves    what does the compaction do to sparsity and pictures?
@@ -84,9 +86,9 @@ make.benchmark_pages  the tables and plots of docs/benchmarks, from the results 
 ====================  ==================================================================================================
 
 Shared: :mod:`tools.results` (tables that say what they are of), :mod:`tools.workloads` (scenes, views, repeated work),
-:mod:`tools.viewer_tab` (a browser's tab without the browser),
-:mod:`tools.study.evaluation` (what a candidate loses to its scene), :mod:`tools.study.pruning_baselines` (the orders of
-other pruners), :mod:`tools.stress.cases` (inputs at their worst). Tools import the package and its float64 definitions
-(:mod:`potr_cl.reference`), never the tests; kernels of their own are given to a
+:mod:`tools.viewer_tab` (a browser's tab without the browser), :mod:`tools.study.evaluation` (what a candidate loses to
+its scene), :mod:`tools.study.pruning_baselines` (the orders of other pruners), :mod:`tools.stress.cases` (inputs at
+their worst), :mod:`tools.stress.precise` (what they give in float64). Tools import the package and its float64
+definitions (:mod:`potr_cl.reference`), never the tests; kernels of their own are given to a
 :class:`potr_cl.opencl.device.Device` as variants. Their own tests are in tools/tests.
 """

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import argparse
+import shutil
 import time
 from collections.abc import Callable, Sequence
 from pathlib import Path
@@ -22,6 +23,15 @@ from potr_cl.stages.stage import State
 
 #: Whole scenes, for tools that take none on the command line: folders lego and plush.
 SCENES = Path(__file__).parents[2] / "shared" / "scenes"
+_TEST_DATA = Path(__file__).parents[1] / "tests" / "data"
+
+
+def excerpt(folder: Path) -> Path:
+    """The bundled excerpt as a scene's folder."""
+    folder.mkdir()
+    shutil.copy(_TEST_DATA / "plush_excerpt.ply", folder / "point_cloud.ply")
+    shutil.copy(_TEST_DATA / "plush_excerpt_cameras.json", folder / "cameras.json")
+    return folder
 
 
 def scene_parser(description: str | None) -> argparse.ArgumentParser:

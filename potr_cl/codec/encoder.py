@@ -38,10 +38,12 @@ class Coded:
     Attributes:
         pieces: the file's bytes, to be written one after another.
         order: (N,) index in the scene of each splat of the file.
+        sh_degree: of the file, where that was for its format to choose; None: of the scene.
     """
 
     pieces: list[bytes]
     order: NDArray[np.int64]
+    sh_degree: int | None = None
 
     @property
     def nbytes(self) -> int:

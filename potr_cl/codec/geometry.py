@@ -14,16 +14,14 @@ from numpy.typing import NDArray
 
 from potr_cl.codec import octree, quantize
 from potr_cl.codec.native.library import native
-from potr_cl.codec.outliers import check_positions
+from potr_cl.codec.outliers import check_positions, may_be_coarse
+from potr_cl.codec.splat_levels import BLOCK, splat_levels
 from potr_cl.codec.steps.fitting import fit_steps
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.scene import Scene
-
-#: Splats worked on at a time: a few arrays of them fit a second-level cache.
-_BLOCK = 1 << 14
 
 
 @dataclass(frozen=True)
@@ -107,21 +105,23 @@ def quantise_geometry(
     """
     version = VERSIONS[parameters.version]
     nearest = distances_to_views(scene.means, views, run)
-    world = version.in_world_units(parameters, scene, nearest)
-    return quantise_in_world_units(scene, parameters, world, nearest, run)
+    world = version.in_world_units(parameters, scene, nearest, run)
+    return quantise_in_world_units(scene, None, parameters, world, nearest, run)[0]
 
 
 def quantise_in_world_units(
     scene: Scene,
+    rows: Sequence[NDArray[np.int64]] | None,
     parameters: quantize.HyperParameters,
     world: quantize.HyperParameters,
     nearest: NDArray[np.float64],
     run: Run = map,
-) -> Geometry:
-    """Quantise a scene's geometry, or that of a part of a scene.
+) -> list[Geometry]:
+    """Quantise the geometry of parts of a scene, which know nothing of each other.
 
     Args:
         scene: as of :func:`quantise_geometry`; its colours are not looked at.
+        rows: numbers of the splats of each part; None: the scene is the only one. A part's order is one of its splats.
         parameters: as asked for.
         world: the same in world units.
         nearest: (N,) distance to the nearest view; 0 where there is none.
@@ -130,18 +130,28 @@ def quantise_in_world_units(
     Raises:
         As :func:`quantise_geometry`.
     """
-    version = VERSIONS[parameters.version]
-    tolerance = np.maximum(world.gamma, world.beta * nearest)
-    tree, order = octree.build(scene.means, tolerance, absolute=version.absolute_leaf_levels)
-    check_positions(scene, tolerance, tree, order)
-    imaginary, log_scales = _canonical(scene, order, run)
-    scales = list(run(lambda part: version.quantize_scales(part.astype(np.float64), world.sf_scale), log_scales.T))
-    logits = scene.opacity_logits[order].astype(np.float64)
-    rotations = version.quantize_rotations(imaginary, scales, world.sf_rotation, run)
-    opacities = version.quantize_opacities(logits, world.sf_opacity)
-    return Geometry(
-        parameters, world, tree, order, scales, list(rotations), opacities, scene.antialiased, scene.low_pass
-    )
+    absolute = VERSIONS[parameters.version].absolute_leaf_levels
+
+    def built(numbers: NDArray[np.int64] | None) -> tuple[octree.OctreeStreams, NDArray[np.int64]]:
+        own = slice(None) if numbers is None else numbers
+        tolerance = np.maximum(world.gamma, world.beta * nearest[own])
+        tree, order = octree.build(scene.means[own], tolerance, absolute=absolute)
+        if may_be_coarse(tree):
+            check_positions(scene.means[own], scene.log_scales[own], tolerance, tree, order)
+        return tree, order
+
+    parts = [None] if rows is None else rows
+    found = []
+    # Threads share out the parts here, and each part's splats there.
+    for own, (tree, order) in zip(parts, run(built, parts), strict=True):
+        levels = splat_levels(scene, order if own is None else own[order], world, run)
+        found.append(
+            Geometry(
+                parameters, world, tree, order, levels.scales, levels.rotations, levels.opacities,
+                scene.antialiased, scene.low_pass,
+            )
+        )  # fmt: skip
+    return found
 
 
 def distances_to_views(means: NDArray[np.float32], views: Sequence[Camera], run: Run) -> NDArray[np.float64]:
@@ -155,11 +165,11 @@ def distances_to_views(means: NDArray[np.float32], views: Sequence[Camera], run:
 
     def find(start: int) -> None:
         if functions is not None:
-            some = np.ascontiguousarray(means[start : start + _BLOCK], np.float32)
-            functions.quantising.nearest(some, centres, nearest[start : start + _BLOCK])
+            some = np.ascontiguousarray(means[start : start + BLOCK], np.float32)
+            functions.quantising.nearest(some, centres, nearest[start : start + BLOCK])
             return
-        axes = means[start : start + _BLOCK].T.astype(np.float64)
-        least = nearest[start : start + _BLOCK]
+        axes = means[start : start + BLOCK].T.astype(np.float64)
+        least = nearest[start : start + BLOCK]
         squared, part = np.empty_like(least), np.empty_like(least)
         least[:] = np.inf
         for camera_centre in centres:
@@ -172,19 +182,5 @@ def distances_to_views(means: NDArray[np.float32], views: Sequence[Camera], run:
             np.minimum(least, squared, out=least)
         np.sqrt(least, out=least)
 
-    list(run(find, range(0, len(means), _BLOCK)))
+    list(run(find, range(0, len(means), BLOCK)))
     return nearest
-
-
-def _canonical(scene: Scene, order: NDArray[np.int64], run: Run) -> tuple[NDArray[np.float64], NDArray[np.float32]]:
-    """:func:`potr_cl.codec.quantize.canonical_rotations` in the order of the file."""
-    imaginary = np.empty((len(scene), 3))
-    log_scales = np.empty((len(scene), 3), np.float32)
-
-    def turn(start: int) -> None:
-        rows = order[start : start + _BLOCK]
-        block = slice(start, start + len(rows))
-        imaginary[block], log_scales[block] = quantize.canonical_rotations(scene.quaternions, scene.log_scales, rows)
-
-    list(run(turn, range(0, len(scene), _BLOCK)))
-    return imaginary, log_scales

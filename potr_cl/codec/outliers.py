@@ -7,7 +7,6 @@ from numpy.typing import NDArray
 
 from potr_cl.codec import octree
 from potr_cl.errors import DataError
-from potr_cl.model.scene import Scene
 
 #: An octree that is no deeper has cells fine enough for its tolerances, and float64 tells them apart.
 _SAFE_DEPTH = 44
@@ -17,34 +16,42 @@ _PART_OF_A_SPLAT, _PART_OF_THE_SCENE = 2.0**-20, 2.0**-32
 _NAMED = 3
 
 
+def may_be_coarse(tree: octree.OctreeStreams) -> bool:
+    """Whether there is something to check for :func:`check_positions`."""
+    return tree.depth > _SAFE_DEPTH
+
+
 def check_positions(
-    scene: Scene, tolerance: NDArray[np.float64], tree: octree.OctreeStreams, order: NDArray[np.int64]
+    centres: NDArray[np.float32],
+    log_scales: NDArray[np.float32],
+    tolerance: NDArray[np.float64],
+    tree: octree.OctreeStreams,
+    order: NDArray[np.int64],
 ) -> None:
     """Refuse a scene where a far splat would make the positions of others coarser than they are without it.
 
     Args:
-        scene: as it was given to the octree.
+        centres: (N, 3) as they were given to the octree.
+        log_scales: (N, 3) of the splats.
         tolerance: (N,) allowed distances of centres, world units.
         tree, order: what :func:`potr_cl.codec.octree.build` made of them.
 
     Raises:
         DataError: there is such a splat.
     """
-    if tree.depth <= _SAFE_DEPTH:
-        return
-    means = scene.means.astype(np.float64)
+    means = centres.astype(np.float64)
     resolution = np.abs(means).max(axis=1) * 2.0**-23
-    sizes = np.exp(np.clip(scene.log_scales.max(axis=1).astype(np.float64), -60, 60))
+    sizes = np.exp(np.clip(log_scales.max(axis=1).astype(np.float64), -60, 60))
     distance = np.abs(means - np.median(means, axis=0)).max(axis=1)
     harmless = np.maximum(sizes * _PART_OF_A_SPLAT, float(np.median(distance)) * _PART_OF_THE_SCENE)
     allowed = np.maximum(np.maximum(tolerance, resolution), harmless)
     decoded = np.empty_like(means)
-    decoded[order] = octree.parse(tree, len(scene))
+    decoded[order] = octree.parse(tree, len(centres))
     decoded -= means
     # Single precision rounds once more.
     if (np.sqrt(np.einsum("ij,ij->i", decoded, decoded)) <= allowed + resolution).all():
         return
-    far = scene.means[_far(means, distance, allowed)]
+    far = centres[_far(means, distance, allowed)]
     named = ", ".join(f"({x:.4g}, {y:.4g}, {z:.4g})" for x, y, z in far[:_NAMED])
     what = f"the splat at {named} is" if len(far) == 1 else f"{len(far)} splats, such as those at {named}, are"
     raise DataError(

@@ -34,7 +34,7 @@ PRESETS: tuple[Preset, ...] = ("paper", "fast", "best", "smallest")
 #: Added to a quantised opacity before the division: the paper's shift of the reconstruction off the bin's centre.
 OPACITY_SHIFT = 0.25
 #: Where logits are quantised themselves: the smallest, an opacity that shows nowhere, and the largest told apart.
-LEAST_LOGIT, _LARGEST_LOGIT = -8.0, 12.0
+RANGE_OF_LOGITS = LEAST_LOGIT, _LARGEST_LOGIT = -8.0, 12.0
 #: A standard deviation that rounds to 0 comes back as this part of a step: its logarithm must stay finite.
 ZERO_SCALE = 0.25
 #: Quaternions turned at a time: few enough that a BLAS does not wake its threads, which takes longer than the work.
@@ -169,10 +169,15 @@ def _to_levels(values: F64, scale_factor: float | F32, what: str) -> Integers:
         raise DataError(
             f"a {what} of {np.abs(values).max():.3g} is too large to quantise: remove that splat or lower SF"
         )
+    return levels.astype(level_type(largest))
+
+
+def level_type(largest: float) -> type[np.signedinteger]:
+    """The smallest of the integer types of levels that holds ± some number."""
     for dtype in (np.int16, np.int32):
         if largest <= np.iinfo(dtype).max:
-            return levels.astype(dtype)
-    return levels.astype(np.int64)
+            return dtype
+    return np.int64
 
 
 # ------------------------------------------------------------------------------------------------ scales

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
+from potr_cl.codec.median import median
 from potr_cl.codec.quantize import F32, F64, HyperParameters, Integers
 from potr_cl.codec.sections import Coder
 from potr_cl.errors import UsageError
@@ -73,14 +74,22 @@ class FormatVersion(abc.ABC):
                 f"version {self.number} (preset paper) have one for both: set both alike or choose another preset"
             )
 
+    def quantises_splats_as(self, other: type[FormatVersion]) -> bool:
+        """Whether scales, rotations and opacities become the same levels as in another version."""
+        names = ("quantize_scales", "quantize_rotations", "quantize_opacities")
+        return all(getattr(type(self), name) is getattr(other, name) for name in names)
+
     @abc.abstractmethod
-    def in_world_units(self, parameters: HyperParameters, scene: Scene, nearest: F64) -> HyperParameters:
+    def in_world_units(
+        self, parameters: HyperParameters, scene: Scene, nearest: F64, run: Run = map
+    ) -> HyperParameters:
         """Hyper-parameters whose β is a part of the distance to the nearest camera, and γ and SF_scale in world units.
 
         Args:
             parameters: as asked for.
             scene: that is to be coded.
             nearest: (N,) float64 distance of each splat to the nearest view, world units; 0 where there is no view.
+            run: in place of :func:`map`, to work with several threads.
         """
 
     def quantize_scales(self, log_scales: F64, sf_scale: float) -> Integers:
@@ -127,7 +136,9 @@ class Version1(FormatVersion):
     absolute_leaf_levels = False
     rotations_need_scales = False
 
-    def in_world_units(self, parameters: HyperParameters, scene: Scene, nearest: F64) -> HyperParameters:
+    def in_world_units(
+        self, parameters: HyperParameters, scene: Scene, nearest: F64, run: Run = map
+    ) -> HyperParameters:
         return parameters
 
     def quantize_rotations(
@@ -154,7 +165,9 @@ class Version2(FormatVersion):
     absolute_leaf_levels = True
     rotations_need_scales = True
 
-    def in_world_units(self, parameters: HyperParameters, scene: Scene, nearest: F64) -> HyperParameters:
+    def in_world_units(
+        self, parameters: HyperParameters, scene: Scene, nearest: F64, run: Run = map
+    ) -> HyperParameters:
         """β and SF_scale are given in sizes of a typical splat, so that the scene's unit of length does not matter.
 
         A splat's size is its largest standard deviation, the typical one their median; seen from the views, the median
@@ -163,14 +176,24 @@ class Version2(FormatVersion):
         Scales of antialiased scenes have finer steps: their splats' opacity follows the area on screen, so that an
         error in a thin splat's width is seen as one in its opacity.
         """
-        sizes = np.exp(np.clip(scene.log_scales.max(axis=1).astype(np.float64), -60, 60))
-        size = float(np.median(sizes))
+        sizes, seen = np.empty(len(nearest)), np.empty(len(nearest))
+
+        def look(start: int) -> None:
+            rows = slice(start, start + _ROWS)
+            first, second, third = scene.log_scales[rows].T
+            largest = np.maximum(np.maximum(first, second), third)
+            np.exp(np.clip(largest.astype(np.float64), -60, 60), out=sizes[rows])
+            with np.errstate(divide="ignore"):  # where there is no view
+                np.divide(sizes[rows], nearest[rows], out=seen[rows])
+
+        list(run(look, range(0, len(nearest), _ROWS)))
+        whole = bool((nearest > 0).all())
+        size, ratio = run(median, (sizes, seen if whole else seen[nearest > 0]))
+        assert size is not None  # there is a splat
         finer = ANTIALIASED_SCALE_STEPS if scene.antialiased else 1
         sf_scale = min(max(finer * parameters.sf_scale / size, 1e-3), 1e9)
-        seen = nearest > 0
-        if seen.any():
-            beta = parameters.beta * float(np.median(sizes[seen] / nearest[seen]))
-            return replace(parameters, beta=beta, sf_scale=sf_scale)
+        if ratio is not None:
+            return replace(parameters, beta=parameters.beta * ratio, sf_scale=sf_scale)
         return replace(parameters, gamma=max(parameters.gamma, parameters.beta * size), sf_scale=sf_scale)
 
     def quantize_rotations(
@@ -201,6 +224,10 @@ class Version3(Version2):
     coders = frozenset({Coder.RAW, Coder.ZSTD, Coder.DEFLATE, Coder.BUNDLES})
     colour_steps = True
     in_blocks = True
+
+
+#: Splats worked on at a time.
+_ROWS = 1 << 15
 
 
 #: All versions that are read, by their number.

@@ -5,28 +5,42 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import Run
+
 #: Of each coordinate, in a code of 64 bits.
 BITS = 21
 #: Centres whose codes are made at a time.
-_ROWS = 1 << 18
+_ROWS = 1 << 16
 
 
 def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
-    """(N,) the numbers of (N, 3) centres along a Morton curve through the cube that holds nearly all of them.
+    """(N,) the numbers of (N, 3) centres along a Morton curve (:func:`morton_codes`)."""
+    return np.argsort(morton_codes(means), kind="stable")
+
+
+def morton_codes(means: NDArray[np.float32], run: Run = map) -> NDArray[np.uint64]:
+    """(N,) places of (N, 3) centres along a Morton curve through the cube that holds nearly all of them.
 
     The cube is the smallest around the second to the last but one hundredth of the centres on each axis, twice as
     large: a far splat must not take all of the curve's levels. What lies outside of it counts as on its faces.
+
+    Args:
+        means: finite.
+        run: in place of :func:`map`, to work with several threads.
     """
     some = means[:: max(len(means) // 100_000, 1)].astype(np.float64)
     low, high = np.percentile(some, (2, 98), axis=0)
     middle, side = (low + high) / 2, max(2 * float((high - low).max()), 1e-30)
     corner = middle - side / 2
     codes = np.empty(len(means), np.uint64)
-    for start in range(0, len(means), _ROWS):
+
+    def place(start: int) -> None:
         rows = slice(start, start + _ROWS)
         cells = np.clip((means[rows] - corner) * ((1 << BITS) / side), 0, (1 << BITS) - 1).astype(np.uint64)
         codes[rows] = spread(cells[:, 0]) | spread(cells[:, 1]) << np.uint64(1) | spread(cells[:, 2]) << np.uint64(2)
-    return np.argsort(codes, kind="stable")
+
+    list(run(place, range(0, len(means), _ROWS)))
+    return codes
 
 
 def spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:

@@ -76,6 +76,13 @@ class SplatGroups:
         """(G,) splats of each group."""
         return np.diff(self.starts)
 
+    @property
+    def group_of(self) -> NDArray[np.uint32]:
+        """(N,) the group of each splat."""
+        found = np.empty(len(self.order), np.uint32)
+        found[self.order] = np.repeat(np.arange(len(self.starts) - 1, dtype=np.uint32), self.counts)
+        return found
+
     def splats(self, groups: NDArray[np.bool_]) -> Indices:
         """The numbers of the splats of some groups, ascending; ``groups``: (G,)."""
         return np.sort(self.order[np.repeat(groups, self.counts)])

@@ -19,6 +19,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.scene import Scene
@@ -46,6 +47,7 @@ def views_between(
     spread: float = SPREAD,
     first: int = 0,
     known: GivenViews | None = None,
+    run: Run = map,
 ) -> list[Camera]:
     """Views between given ones, the same ones every time.
 
@@ -57,6 +59,7 @@ def views_between(
         first: the number of the first round: rounds of other numbers give other views, so that
             ``each=1, first=1`` adds to those of ``each=1``.
         known: what the given views show, if that has been found already.
+        run: in place of :func:`map`, to work with several threads.
 
     Returns:
         Training views with the intrinsics of the given ones and no photograph, in rounds: first one for each given
@@ -69,7 +72,8 @@ def views_between(
         raise UsageError(f"{each:g} views between with a spread of {spread:g}: at least 0, and a spread from 0 to 10")
     if each == 0 or len(cameras) < 2:
         return []
-    known = known or GivenViews(scene, cameras)
+    known = known or GivenViews(scene, cameras, run)
+    known.recall()
     centres = camera_centres(cameras)
     distance = np.linalg.norm(centres[:, None] - centres, axis=2)
     np.fill_diagonal(distance, np.inf)
@@ -91,7 +95,7 @@ def views_between(
             off *= _NEARER
         return None
 
-    return [view for view in map(view_of, _rounds(len(cameras), each, first)) if view is not None]
+    return [view for view in run(view_of, _rounds(len(cameras), each, first)) if view is not None]
 
 
 def _rounds(count: int, each: float, first: int) -> list[tuple[int, int]]:

@@ -28,6 +28,9 @@ logger = logging.getLogger("potr_cl")
 #: Held while a program is built or loaded.
 _BUILDING = threading.RLock()
 
+#: Bytes that are filled at a time: no driver has to count beyond 32 bits.
+_FILLED = 1 << 30
+
 #: How drivers say that there is not enough memory, besides what pyopencl makes a MemoryError of.
 _NO_MEMORY = (
     "OUT_OF_HOST_MEMORY",
@@ -272,6 +275,22 @@ class Device:
             if pending is not None:
                 pending.append(event)
         return buffer
+
+    def fill(self, buffer: cl.Buffer, value: np.generic, nbytes: int | None = None) -> None:
+        """Enqueue that a buffer holds one value again and again.
+
+        Args:
+            buffer: of any size.
+            value: of 1 to 8 bytes.
+            nbytes: how many of the buffer's bytes, from its beginning on; None: all whole values that it has room for.
+        """
+        nbytes = buffer.size // value.nbytes * value.nbytes if nbytes is None else nbytes
+        with self.errors("failed to fill a buffer"):
+            for start in range(0, nbytes, _FILLED):
+                count = min(_FILLED, nbytes - start)
+                # NVIDIA's driver (quirks.SHORT_FILLS) writes elsewhere where the offset is large.
+                some = buffer.get_sub_region(start, count) if start else buffer
+                cl.enqueue_fill_buffer(self.queue, some, value, 0, count)
 
     def download(self, buffer: cl.Buffer, shape: tuple[int, ...], dtype: Any, start: int = 0) -> np.ndarray[Any, Any]:
         """A copy of a part of a buffer, from the byte ``start`` on, once everything before it in the queue is done."""

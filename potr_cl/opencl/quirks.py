@@ -121,6 +121,15 @@ NO_PREFETCH = Quirk(
     test=lambda platform, version: "nvidia" in platform or "oclgrind" in platform,
 )
 
+#: Buffers are filled by the gigabyte, each through a sub-buffer of its own. Right everywhere, so nothing asks for it.
+SHORT_FILLS = Quirk(
+    vendor="NVIDIA",
+    versions="driver 580",
+    reason="a fill that begins or ends some gigabytes behind a buffer's beginning writes elsewhere, or ends the queue",
+    still_needed="fill a buffer of 20 GB in one call, and 1 MB at 12 GB, and read both back",
+    test=lambda platform, version: "nvidia" in platform,
+)
+
 #: cl/compact/ridge.cl asks how many views a splat has, not its number alone, before a work-item ends early, and reads
 #: an element of a private array before it chooses. Both are right everywhere.
 CAREFUL_VECTORISER = Quirk(

@@ -38,12 +38,22 @@ class CompressedPlyRounded(RoundedScene):
 
 @dataclass(frozen=True)
 class CompressedPly(Output):
-    """A .compressed.ply file."""
+    """A .compressed.ply file.
+
+    Attributes:
+        to_target: as of :func:`~potr_cl.outputs.degrees.worthwhile_degree`.
+    """
 
     format: ClassVar[SceneFormat] = compressed_ply.FORMAT
     fixes_ac: ClassVar[bool] = True
     replaces: ClassVar[Mapping[str, float]] = {"drop": 0.0}
     bytes_a_splat: ClassVar[float] = 5.0
+
+    to_target: bool = False
+
+    def to_meet_a_target(self) -> CompressedPly:
+        """With degrees left out wherever they are not worth their bytes."""
+        return replace(self, to_target=True)
 
     def losses(self, scene: Scene) -> list[str]:
         """A low-pass filter of the scene's own."""
@@ -81,7 +91,7 @@ class CompressedPly(Output):
     ) -> tuple[CompressedPlyRounded, FloatArray]:
         """Round them; degrees that are not worth their bytes become zero and are not written."""
         assert isinstance(rounded, CompressedPlyRounded)
-        kept = SH_COEFFICIENTS[worthwhile_degree(sh, worth, _COEFFICIENT, _SPLAT, request)]
+        kept = SH_COEFFICIENTS[worthwhile_degree(sh, worth, _COEFFICIENT, _SPLAT, request, self.to_target)]
         whole, sh = sh, sh[:, :kept]
         if request.blocks is not None and kept == whole.shape[1]:
             sh = rounded_in_turn(sh, request.blocks(), _quantise, request.threads)
@@ -109,7 +119,7 @@ class CompressedPly(Output):
             rounded.packed, colours, rounded.ac.take(rounded.order, axis=0), scene.antialiased
         )
         request.progress("pack", 1.0)
-        return Coded(pieces, rounded.order)
+        return Coded(pieces, rounded.order, SH_COEFFICIENTS.index(1 + rounded.ac.shape[1]))
 
     def read(self, data: bytes, trust: bool = False) -> Scene:
         """See :func:`potr_cl.formats.scenes.compressed_ply.scene_of`."""

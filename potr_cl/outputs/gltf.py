@@ -33,4 +33,4 @@ class Gltf(WholeFloats):
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
         """See :func:`potr_cl.formats.scenes.gltf_writer.pieces`."""
         scene, order = self.reduced(scene, rounded, request)
-        return Coded(gltf_writer.pieces(scene), order)
+        return Coded(gltf_writer.pieces(scene), order, scene.sh_degree)

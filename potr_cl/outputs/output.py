@@ -132,6 +132,10 @@ class Output(ABC):
         """What of a scene such a file cannot hold, a clause each; told once, before the work."""
         return []
 
+    def to_meet_a_target(self) -> Output:
+        """The output where a size or a PSNR is asked for: what is not worth its bytes may go, whatever the loss."""
+        return self
+
     @abstractmethod
     def geometry(self, scene: Scene, request: Request) -> Rounded:
         """Round geometry and opacities as the file does; colours are of no account.

@@ -24,4 +24,4 @@ class Ply(WholeFloats):
     def file(self, scene: Scene, rounded: Rounded | None, request: Request) -> Coded:
         """See :func:`potr_cl.formats.scenes.ply.pieces`."""
         scene, order = self.reduced(scene, rounded, request)
-        return Coded([bytes(piece) for piece in ply.pieces(scene)], order)
+        return Coded([bytes(piece) for piece in ply.pieces(scene)], order, scene.sh_degree)

@@ -22,11 +22,18 @@ class WholeFloats(Output):
 
     Attributes:
         splat_bytes: of a splat without AC coefficients.
+        to_target: as of :func:`~potr_cl.outputs.degrees.worthwhile_degree`.
     """
 
     fixes_ac: ClassVar[bool] = True
     replaces: ClassVar[Mapping[str, float]] = {"drop": 0.0}
     splat_bytes: ClassVar[int]
+
+    to_target: bool = False
+
+    def to_meet_a_target(self) -> WholeFloats:
+        """With degrees left out wherever they are not worth their bytes."""
+        return replace(self, to_target=True)
 
     def geometry(self, scene: Scene, request: Request) -> RoundedScene:
         """As it is."""
@@ -37,7 +44,8 @@ class WholeFloats(Output):
     ) -> tuple[RoundedScene, FloatArray]:
         """Degrees that are not worth their bytes become zero and are not written."""
         assert isinstance(rounded, RoundedScene)
-        kept = SH_COEFFICIENTS[worthwhile_degree(sh, worth, _COEFFICIENT, self.splat_bytes, request)]
+        degree = worthwhile_degree(sh, worth, _COEFFICIENT, self.splat_bytes, request, self.to_target)
+        kept = SH_COEFFICIENTS[degree]
         rounded = replace(rounded, ac=kept)
         if kept == sh.shape[1]:
             return rounded, sh

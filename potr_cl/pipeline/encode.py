@@ -63,6 +63,7 @@ class Encoded:
         source_splats: how many splats the source scene has.
         parameters: the hyper-parameters that the stages took.
         shared: who did the work, where views were shared out.
+        left_out: how many of the scene's SH degrees, the highest ones, the file's format has left out.
     """
 
     pieces: list[bytes]
@@ -80,6 +81,7 @@ class Encoded:
     source_splats: int
     parameters: HyperParameters
     shared: SharedOut | None = None
+    left_out: int = 0
 
     def __repr__(self) -> str:
         q = f"q {self.options.q:.4g} of preset {self.options.preset}"
@@ -215,7 +217,9 @@ def encode(
             device = device or (Device() if pool is None else pool.first)
             kept = stack.enter_context(KeptScene(device, scene))
         run = Run(options, watch, device, kept, pool)
-        return run.finished(run.stages(State.of(scene, train_views(cameras) if cameras else [])))
+        encoded = run.finished(run.stages(State.of(scene, train_views(cameras) if cameras else [])))
+    tell_left_out(scene, encoded)
+    return encoded
 
 
 def tell_losses(scene: Scene, options: EncodeOptions) -> None:
@@ -223,6 +227,18 @@ def tell_losses(scene: Scene, options: EncodeOptions) -> None:
     losses = options.output.losses(scene)
     if losses:
         _log.warning("%s cannot hold all of this scene: %s", options.output.format.name, "; ".join(losses))
+
+
+def tell_left_out(scene: Scene, encoded: Encoded) -> None:
+    """Say in one line which SH degrees are missing in a file whose format has to keep them for all splats or none."""
+    if encoded.left_out:
+        first, last = scene.sh_degree - encoded.left_out + 1, scene.sh_degree
+        _log.warning(
+            "the %s file has no SH coefficients of degree %s: all of them together are not worth their bytes; a higher "
+            "quality or a larger size keeps them",
+            encoded.options.output.format.name,
+            f"{first} to {last}" if first < last else f"{last}",
+        )
 
 
 def cameras_or_virtual(
@@ -358,6 +374,7 @@ class Run:
             source_splats=len(state.source),
             shared=None if self._pool is None else SharedOut.by(self._pool, self._before),
             parameters=as_done(self._options, state).parameters,
+            left_out=0 if coded.sh_degree is None else state.scene.sh_degree - coded.sh_degree,
         )
 
 

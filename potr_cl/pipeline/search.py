@@ -28,7 +28,7 @@ from potr_cl.errors import UnreachableError, UsageError
 from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, as_done, cameras_or_virtual, tell_losses
+from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, as_done, cameras_or_virtual, tell_left_out, tell_losses
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.growth import FASTEST, SLOWEST, FinenessAxis, Typical, meet, with_colour_steps, with_steps
 from potr_cl.pipeline.options import EncodeOptions
@@ -97,6 +97,7 @@ def encode_to_target(
         DeviceError: no device does the work.
     """
     options = options or EncodeOptions()
+    options = options.changed(output=options.output.to_meet_a_target())
     scene = scene.rendered(antialiased)
     tell_losses(scene, options)
     watch = Stopwatch(progress, tell)
@@ -115,6 +116,7 @@ def encode_to_target(
             search.close()
 
     found, _ = on_device(device or (Device() if pool is None else pool.first), options.memory, work)
+    tell_left_out(scene, found.encoded)
     return found
 
 

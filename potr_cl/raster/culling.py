@@ -6,6 +6,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.typing import NDArray
 
 from potr_cl.model.camera import Camera
 from potr_cl.model.morton import morton_order
@@ -30,37 +31,67 @@ class ViewPart:
     splats: Indices
 
 
-def parts_of_views(scene: Scene, cameras: Sequence[Camera], near: float) -> list[ViewPart]:
-    """Deal all views out to parts that see much of the same, so that the splats of all parts together are few.
+@dataclass(frozen=True)
+class Sights:
+    """What views may draw of a scene.
 
-    Args:
-        scene: clean.
-        cameras: the views.
-        near: as in the rasterizer's rules.
+    Attributes:
+        groups: the scene's splats in groups.
+        seen: (views, G) the groups of which a view may draw a splat.
     """
-    groups = SplatGroups.of(scene)
-    counts = groups.counts.astype(np.float64)
-    seen = np.stack([groups.visible(camera, near) for camera in cameras])
-    totals = seen @ counts
-    most = max(_SPREAD * float(np.quantile(totals, _QUANTILE)), _LEAST_PART * len(scene))
-    # Along a curve through the middles of what they see, neighbours see much of the same.
-    with np.errstate(invalid="ignore", divide="ignore"):
-        middles = np.nan_to_num((seen * counts) @ groups.centres / totals[:, None])
-    order = morton_order(middles.astype(np.float32))
-    dealt: list[list[int]] = []
-    together = np.zeros(len(counts), bool)
-    for number in order[totals[order] <= most].tolist():
-        more = together | seen[number]
-        if dealt and more @ counts <= most:
-            dealt[-1].append(number)
-            together = more
-        else:
-            dealt.append([number])
-            together = seen[number]
-    dealt.append(order[totals[order] > most].tolist())
-    return [
-        ViewPart(sorted(numbers), groups.splats(np.logical_or.reduce(seen[numbers]))) for numbers in dealt if numbers
-    ]
+
+    groups: SplatGroups
+    seen: NDArray[np.bool_]
+
+    @staticmethod
+    def of(scene: Scene, cameras: Sequence[Camera], near: float, groups: SplatGroups | None = None) -> Sights:
+        """What some views may draw.
+
+        Args:
+            scene: clean.
+            cameras: the views, at least one.
+            near: as in the rasterizer's rules.
+            groups: of the scene, where they are known.
+        """
+        groups = groups or SplatGroups.of(scene)
+        return Sights(groups, np.stack([groups.visible(camera, near) for camera in cameras]))
+
+    @property
+    def totals(self) -> NDArray[np.int64]:
+        """(views,) the splats that each view may draw."""
+        return np.array([int(self.groups.counts[row].sum()) for row in self.seen])
+
+    def parts(self) -> list[ViewPart]:
+        """All views, dealt out to parts that see much of the same, so that the splats of all parts are few."""
+        groups, seen = self.groups, self.seen
+        counts = groups.counts.astype(np.float64)
+        totals = seen @ counts
+        most = max(_SPREAD * float(np.quantile(totals, _QUANTILE)), _LEAST_PART * len(groups.order))
+        # Along a curve through the middles of what they see, neighbours see much of the same.
+        with np.errstate(invalid="ignore", divide="ignore"):
+            middles = np.nan_to_num((seen * counts) @ groups.centres / totals[:, None])
+        order = morton_order(middles.astype(np.float32))
+        dealt: list[list[int]] = []
+        together = np.zeros(len(counts), bool)
+        for number in order[totals[order] <= most].tolist():
+            more = together | seen[number]
+            if dealt and more @ counts <= most:
+                dealt[-1].append(number)
+                together = more
+            else:
+                dealt.append([number])
+                together = seen[number]
+        dealt.append(order[totals[order] > most].tolist())
+        return [
+            ViewPart(sorted(numbers), groups.splats(np.logical_or.reduce(seen[numbers])))
+            for numbers in dealt
+            if numbers
+        ]
+
+
+def parts_of_views(scene: Scene, cameras: Sequence[Camera], near: float) -> list[ViewPart]:
+    """The :meth:`Sights.parts` of some views of a scene, with :meth:`Sights.of`'s arguments."""
+    return Sights.of(scene, cameras, near).parts()
 
 
 def work(parts: Sequence[ViewPart]) -> int:

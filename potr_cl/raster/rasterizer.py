@@ -87,6 +87,7 @@ class Rasterizer(Owner):
                 NEAR=float(rules.near),
                 SQUARE_EXTENT=int(rules.square_extent),
                 **self._filter_macros,
+                **self._scene.pick_macros,
             )
         self._bounds = Scratch(device, "the projected splats' bounds")
         self._counts = Scratch(device, "the tile counts")
@@ -298,7 +299,7 @@ class Rasterizer(Owner):
     def _zeroed_counts(self, views: ViewSet) -> cl.Buffer:
         """Counters for all tiles. They are zero, and the kernels that use them leave them zero."""
         if self._counts.reserve(self._launcher.counter_bytes * views.tiles):
-            cl.enqueue_fill_buffer(self.device.queue, self._counts.buffer, np.uint32(0), 0, self._counts.nbytes)
+            self.device.fill(self._counts.buffer, np.uint32(0), self._counts.nbytes)
         return self._counts.buffer
 
     def _enqueue_project(
@@ -311,6 +312,7 @@ class Rasterizer(Owner):
     ) -> None:
         self._projection.bind(
             **self._scene.geometry,
+            **self._scene.picks,
             sh=self.sh if sh is None else sh,
             views=views.table,
             shapes=views.shapes if shapes is None else shapes,

@@ -20,8 +20,6 @@ SPLAT_GROUP = 256
 
 #: Splats whose parameters are uploaded at a time.
 _UPLOADED = 1 << 18
-#: Bytes that are filled at a time: no runtime has to count beyond 32 bits.
-_FILLED = 1 << 30
 
 
 class SceneBuffers(Owner):
@@ -104,6 +102,16 @@ class SceneBuffers(Owner):
             "quaternions": self.quaternions,
             "log2_opacities": self.log2_opacities,
         }
+
+    @property
+    def pick_macros(self) -> dict[str, int]:
+        """Macros of the projection that follow from which splats of the buffers are this scene's: here all are."""
+        return {}
+
+    @property
+    def picks(self) -> dict[str, Any]:
+        """The projection's arguments that say which they are, by their names."""
+        return {"whole_stride": self.stride, "numbers": self.means, "picked": self.splats}
 
     def write_rows(
         self,
@@ -273,9 +281,7 @@ class SceneBuffers(Owner):
 
     def _columns(self, number: int, value: float, what: str, memory: Memory | None = None) -> cl.Buffer:
         buffer = (memory or self._memory).allocate(4 * number * self.stride, what)
-        nbytes = 4 * number * self.stride
-        for start in range(0, nbytes, _FILLED):
-            cl.enqueue_fill_buffer(self.device.queue, buffer, np.float32(value), start, min(_FILLED, nbytes - start))
+        self.device.fill(buffer, np.float32(value))
         return buffer
 
     def rest(self) -> None:

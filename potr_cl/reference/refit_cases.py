@@ -15,6 +15,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.refit import Array, Reference
 from potr_cl.stages.refitting.blocks import SplatBlocks
+from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, Refitted, refit_colours
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 
@@ -63,6 +64,7 @@ class Linearised:
     def __init__(self, case: Case, targets: Targets | None = None, memory: int | None = None) -> None:
         self._refit = ColourRefit(case.device, case.scene, case.cameras, background=case.background, memory=memory)
         vectors, colour_map = self._refit.coefficients, self._refit.colour_map
+        assert isinstance(vectors, Coefficients)
         self._at, result = vectors.vector(), vectors.vector()
         vectors.write_sh(self._at, case.scene.sh)
         vectors.zero(result)

@@ -43,10 +43,14 @@ _FIRST = 0.25
 _WORTH = 1.25
 #: What is left of the cost has to be less than this part of it: a few held-out views are no exact judges.
 _LESS = 0.97
+#: A fit that has made up for no splats has to leave less than this part of the held-out views' error: the re-fit takes
+#: most of what a little one mends off by itself, and splats that have moved have fewer coefficients that are 0.
+_LESS_ALONE = 0.7
 #: Why a fit was left out.
 _TOO_FEW_VIEWS = "it needs two training views or more, because one of them is held out and tells whether it helps"
 _NO_GAIN = "on the views that were held out it did not make up for the splats that were removed before it"
-_INTERRUPTED = "it was interrupted before it had made up for the splats that were removed before it"
+_LITTLE_GAIN = "on the views that were held out it gained little beyond what the re-fit of the colours does"
+_INTERRUPTED = "it was interrupted before it had gained enough"
 
 
 @dataclass(frozen=True)
@@ -232,13 +236,14 @@ class Fit(Stage):
             fitted = self._fitted(last, bench, targets, steps, progress, asked)
             last, done = dataclasses.replace(last, scene=fitted.scene, geometry=None), done + steps
             cost = fitted.error + worth * len(fitted.scene)
-            if price is None or cost < least:
-                spared = len(state.scene) - len(fitted.scene)
+            spared = len(state.scene) - len(fitted.scene)
+            if cost < least and (spared or fitted.error < _LESS_ALONE * without):
                 best, least, taken = last, cost, dataclasses.replace(fitted, spared=spared, without=without)
             if asked:
                 break
         if taken is None:
-            return state.having_learnt(self.name, LeftOut(_INTERRUPTED if asked else _NO_GAIN, bool(asked)))
+            why = _INTERRUPTED if asked else _NO_GAIN if len(steps_of) > 1 else _LITTLE_GAIN
+            return state.having_learnt(self.name, LeftOut(why, bool(asked)))
         return best.having_learnt(self.name, taken)
 
     def _steps_of_cycles(self, family: Family, removing: bool) -> list[int]:

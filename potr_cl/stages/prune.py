@@ -8,7 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
-from potr_cl.raster.culling import ViewPart
+from potr_cl.raster.culling import Sights
 from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
@@ -22,7 +22,7 @@ from potr_cl.stages.pruning.unseen import (
     set_aside,
     without_directions,
 )
-from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, parts_worth_it
+from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, sights_worth_it
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 
@@ -150,9 +150,9 @@ class Prune(Stage):
         # A copy of a large scene without them would take as much memory as the scene.
         options = self._sweep_options(bench.memory)
         alone = bench.pool is None and not bench.interludes and bench.parameters.delta_mse_max < LARGEST_LIMIT
-        parts = parts_worth_it(state.scene, state.views, options) if alone else None
-        if parts is not None:
-            return without_directions(self._pruned(told, bench, parts, hidden), told.survivors[hidden])
+        sights = sights_worth_it(state.scene, state.views, options) if alone else None
+        if sights is not None:
+            return without_directions(self._pruned(told, bench, sights, hidden), told.survivors[hidden])
         split = set_aside(told, hidden)
         if not len(split.seen_splats):
             everything = np.arange(splats)
@@ -166,13 +166,13 @@ class Prune(Stage):
         self,
         state: State,
         bench: Workbench,
-        parts: list[ViewPart] | None = None,
+        sights: Sights | None = None,
         spared: NDArray[np.bool_] | None = None,
     ) -> State:
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene))
         bench.progress("prepare views", 0.0)
-        with measurement(state, bench, self._sweep_options(bench.memory), parts, spared) as removal:
+        with measurement(state, bench, self._sweep_options(bench.memory), sights, spared) as removal:
             course = _Course(state, removal)
 
             def after_iteration(iteration: int) -> None:

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-from collections.abc import Sequence
-from contextlib import ExitStack
+from collections.abc import Iterator, Sequence
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -16,6 +16,7 @@ from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
+from potr_cl.stages.refitting.placement import placed
 from potr_cl.stages.refitting.refit import (
     ColourRefit,
     HelpFrom,
@@ -24,7 +25,7 @@ from potr_cl.stages.refitting.refit import (
     active_coefficients,
     refit_colours,
 )
-from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
+from potr_cl.stages.refitting.targets import GroundTruthTargets, RememberedTargets, RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 
@@ -164,9 +165,7 @@ class Refit(Stage):
 
         with ExitStack() as stack:
             stack.callback(bench.progress, "refit", 1.0)
-            source = bench.drawable(state.source)
-            rasterizer = stack.enter_context(Rasterizer(bench.opened, source, background=bench.background))
-            refitted, geometry = fitted(state.views, RenderedTargets(rasterizer, state.views), 0)
+            refitted, geometry = fitted(state.views, stack.enter_context(_pictures_of_source(state, bench)), 0)
             choice = None
             if self.ground_truth is not None:
                 given = state.views[: len(state.views) - state.added]
@@ -185,6 +184,20 @@ class Refit(Stage):
                     refitted, geometry = to_photographs, its_geometry
         then = replace(state.recoloured(refitted.sh), geometry=geometry).having_learnt(self.name, refitted)
         return then if choice is None else then.having_learnt("photographs", choice)
+
+
+@contextmanager
+def _pictures_of_source(state: State, bench: Workbench) -> Iterator[Targets]:
+    """The pictures of the uncompressed scene; where the re-fit needs its room, they are rendered before."""
+    device, views = bench.opened, state.views
+    in_one_piece = placed(device, len(state.scene), state.scene.sh.shape[1], bench.memory) is None
+    with Rasterizer(device, bench.drawable(state.source), background=bench.background) as rasterizer:
+        targets = RenderedTargets(rasterizer, views)
+        if in_one_piece or bench.pool is not None:
+            yield targets
+            return
+        remembered = RememberedTargets(device, targets, views)
+    yield remembered
 
 
 @dataclass(frozen=True)

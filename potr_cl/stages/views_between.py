@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Literal
 
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.scene import Scene
@@ -103,16 +104,17 @@ class Between(Stage):
         if virtual and self.views == "auto" and not needed_of_virtual(slow):
             return state
         bench.progress("views between", 0.0)
-        known = GivenViews(state.source, state.views)
-        each, shown_by = self.views, None
-        if each == "auto" and virtual:
-            each = needed_of_virtual(slow)
-        elif each == "auto":
-            each, parts = 0.0, known.views_of_parts()
-            if len(parts):
-                shown_by = views_where_few(parts)
-                each = needed(shown_by, given, slow)
-        added = views_between(state.source, state.views, each, self.spread, known=known)
+        with thread_pool(bench.threads) as pool:
+            known = GivenViews(state.source, state.views, pool.map)
+            each, shown_by = self.views, None
+            if each == "auto" and virtual:
+                each = needed_of_virtual(slow)
+            elif each == "auto":
+                each, parts = 0.0, known.views_of_parts()
+                if len(parts):
+                    shown_by = views_where_few(parts)
+                    each = needed(shown_by, given, slow)
+            added = views_between(state.source, state.views, each, self.spread, known=known, run=pool.map)
         if self.views == "auto":
             added = _evenly(added, room_for(added, state, bench))
         bench.progress("views between", 1.0)

@@ -28,6 +28,8 @@ from potr_cl.codec.geometry import quantise_geometry
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.scenes import ply
+from potr_cl.host.threads import thread_pool
+from potr_cl.model.morton import morton_order
 from potr_cl.model.scene import Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
@@ -128,13 +130,29 @@ def test_blocks_are_neighbours_and_all_are_taken():
     assert [len(rows) for rows in everywhere_the_same] == [33, 33, 34]
 
 
+@pytest.mark.parametrize("most", [1, 300, 4000, 9999])
+def test_blocks_are_ranges_of_the_morton_order(most):
+    """Also where a block ends among splats whose codes begin alike, or are the same."""
+    rng = np.random.default_rng(most)
+    means = np.concatenate([rng.normal(size=(5000, 3)), rng.normal(size=(3000, 3)) / 1e4]).astype(np.float32)
+    means = rng.permutation(np.concatenate([means, np.repeat(means[:20], 60, axis=0)]))
+    with thread_pool(3) as pool:
+        blocks = blocks_of(means, most, pool.map)
+    order, start = morton_order(means), 0
+    for rows in blocks:
+        assert np.array_equal(rows, np.sort(order[start : start + len(rows)]))
+        start += len(rows)
+    assert start == len(means)
+    assert max(map(len, blocks)) - min(map(len, blocks)) <= 1
+
+
 def test_many_splats_are_written_in_blocks(monkeypatch, plush_excerpt, plush_excerpt_cameras):
     """By a whole encode, of so many splats that are left; few stay what they were, byte for byte."""
     options = EncodeOptions.for_preset("best", between=False)
     few = encode(plush_excerpt, plush_excerpt_cameras, options)
     assert few.data[8] == 3
     monkeypatch.setattr(blocks_geometry, "MOST_WHOLE", 300)
-    monkeypatch.setattr(splitting.blocks_of, "__defaults__", (256,))
+    monkeypatch.setattr(splitting.blocks_of, "__defaults__", (256, map))
     many = encode(plush_excerpt, plush_excerpt_cameras, options)
     file = open_file(many.data)
     assert isinstance(file, BlockedFile)

@@ -11,8 +11,10 @@ import pytest
 from potr_cl.codec import quantize
 from potr_cl.codec.colours import colour_levels
 from potr_cl.codec.geometry import quantise_geometry
+from potr_cl.codec.median import median
 from potr_cl.codec.native.library import VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.splat_levels import splat_levels
 from potr_cl.errors import DataError
 from potr_cl.raster.activation import unit_quaternions
 from potr_cl.reference.scenes import random_scene, tilted_camera
@@ -140,6 +142,55 @@ def test_geometry(views, both):
     assert_same_bits(a.tree.tails, b.tree.tails)
 
 
+@pytest.mark.parametrize("case", ["usual", "wide", "beyond 32 bits", "balls", "antialiased"])
+@pytest.mark.parametrize("number", [1, 700, 40_000])
+def test_levels_of_splats(case, number, both):
+    """In the types that NumPy chooses, of some of the splats; on halves between two levels as well."""
+    scene = random_scene(number, 0, seed=number)
+    world = replace(HyperParameters.from_quality(0.5, "best"), sf_scale=50.0, sf_opacity=4.0)
+    scene.opacity_logits[::3] = np.round(scene.opacity_logits[::3] * 8) / 8
+    scene.opacity_logits[::50] = 100
+    if case == "wide":
+        scene.log_scales[number // 2] = (8, 9, 10)
+    elif case == "beyond 32 bits":
+        scene.log_scales[number // 2] = 20
+    elif case == "balls":
+        scene.log_scales[:] = scene.log_scales[:, :1]
+    order = np.random.default_rng(1).permutation(number)[: max(number * 2 // 3, 1)]
+    order[0] = number // 2
+    a, b = both(lambda: splat_levels(scene, order, world))
+    for ours, theirs in zip(
+        (*a.scales, *a.rotations, a.opacities), (*b.scales, *b.rotations, b.opacities), strict=True
+    ):
+        assert_same_bits(ours, theirs)
+    assert a.scales[0].dtype == {"wide": np.int32, "beyond 32 bits": np.int64}.get(case, np.int16)
+    if case == "balls":
+        assert not np.any(a.rotations)
+
+
+def test_levels_that_no_number_holds_are_refused_alike(monkeypatch):
+    scene = random_scene(500, 0, seed=1)
+    scene.log_scales[77, 1] = 60
+    for path in ("0", "") if native() is not None else ("0",):
+        monkeypatch.setenv(VARIABLE, path)
+        with pytest.raises(DataError, match=r"a standard deviation of .* is too large to quantise"):
+            splat_levels(scene, np.arange(500), HyperParameters.from_quality(0.5, "best"))
+
+
+@pytest.mark.parametrize("number", [1, 2, 999, 70_001, 200_000])
+@pytest.mark.parametrize("kind", ["normal", "alike", "sorted", "few"])
+def test_medians_are_numpys(number, kind):
+    values = np.random.default_rng(number).lognormal(0, 5, number)
+    if kind == "alike":
+        values[:] = values[0]
+    elif kind == "sorted":
+        values.sort()
+    elif kind == "few":
+        values = np.round(values)
+    assert median(values) == np.median(values)
+    assert median(values[:0]) is None
+
+
 def test_what_does_not_fit_is_refused_before_c_sees_it():
     functions = native()
     if functions is None:
@@ -148,6 +199,12 @@ def test_what_does_not_fit_is_refused_before_c_sees_it():
     ones, sh = np.ones((4, 3), np.float32), np.ones((4, 1, 3), np.float32)
     with pytest.raises(TypeError):
         quantising.nearest(ones, np.ones((2, 3)), np.empty(5))
+    doubles, logits, numbers = np.ones((4, 3)), np.ones(4, np.float32), np.arange(4)
+    for order, start, columns in ((numbers + 1, 0, 7), (numbers, 1, 7), (numbers, -1, 7), (numbers, 0, 6)):
+        with pytest.raises(TypeError):
+            quantising.splat_levels(
+                doubles, doubles, logits, order, (1.0, 1.0, 1.0), (0.0, 1.0), start, np.empty((columns, 4), np.int32)
+            )
     with pytest.raises(TypeError):
         quantising.nearest(ones.astype(np.float64), np.ones((2, 3)), np.empty(4))  # type: ignore[arg-type]
     order, factors, levels = np.arange(4), np.ones(4), np.empty((1, 3, 4), np.int16)

@@ -13,6 +13,7 @@ import pyopencl as cl
 import pytest
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
+from potr_cl.opencl import device as opencl_device
 from potr_cl.opencl import discovery, loader
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, choose_device, compiler_fault, list_devices
@@ -436,6 +437,19 @@ def test_upload_and_download(device: Device) -> None:
     nothing = device.upload(np.empty(0, np.float32), "nothing")
     assert device.download(nothing, (0,), np.float32).size == 0
     device.free(nothing)
+
+
+@pytest.mark.parametrize("values", [1, 4096, 5000])
+def test_a_buffer_is_filled_piece_by_piece(device: Device, values: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opencl_device, "_FILLED", 4096)  # a gigabyte would take too long
+    buffer = device.upload(np.arange(values + 8, dtype=np.uint32), "a test")
+    device.fill(buffer, np.uint32(77), 4 * values)
+    expected = np.arange(values + 8, dtype=np.uint32)
+    expected[:values] = 77
+    assert np.array_equal(device.download(buffer, (values + 8,), np.uint32), expected)
+    device.fill(buffer, np.uint32(3))
+    assert (device.download(buffer, (values + 8,), np.uint32) == 3).all()
+    device.free(buffer)
 
 
 def test_scratch_grows_and_survives_failure(device: Device) -> None:

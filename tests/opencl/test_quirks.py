@@ -27,6 +27,7 @@ CONCERNED = {
     "SMALL_GROUPS": {"PoCL 3", "PoCL 4"},
     "CALLED_BUILTINS": {"PoCL 3", "PoCL 4"},
     "NO_PREFETCH": {"NVIDIA", "Oclgrind"},
+    "SHORT_FILLS": {"NVIDIA"},
     "CAREFUL_VECTORISER": {"Intel"},
 }
 

@@ -174,6 +174,41 @@ def test_degrees_go_where_splats_are_worth_more(plush_excerpt, plush_excerpt_cam
     assert low.sh_degree <= 3
 
 
+@pytest.mark.parametrize("suffix", ["glb", "compressed.ply"])
+def test_highlights_of_a_few_splats_keep_a_degree_unless_a_target_asks_for_its_bytes(suffix, plush_excerpt):
+    """What few splats need costs more than q gives up elsewhere, though less than the bytes of all are worth."""
+    output = output_of_suffix(suffix)
+    request = Request(HyperParameters.from_quality(0.1, "best"))
+    rounded = output.geometry(plush_excerpt, request)
+    count, coefficients = plush_excerpt.sh.shape[:2]
+    sh = np.zeros_like(plush_excerpt.sh)
+    sh[:, 1:] = 0.25
+    faint = np.full((count, coefficients), 1e-14, np.float32)
+    bright = faint.copy()
+    # About a sixth of what the bytes of degree 3 are worth, in one splat of fifty.
+    bright[::50, 9:] = 2 * request.parameters.delta_mse_max
+
+    def degree(output, worth) -> int:
+        fixed = output.fix_ac(rounded, sh, worth, request)[1]
+        return next(degree for degree in (3, 2, 1, 0) if degree == 0 or fixed[:, degree**2 : (degree + 1) ** 2].any())
+
+    assert degree(output, faint) == 0
+    assert degree(output, bright) == 3
+    assert degree(output.to_meet_a_target(), bright) == 0
+
+
+def test_degrees_that_are_left_out_are_told_once(plush_excerpt, plush_excerpt_cameras, device, caplog):
+    flat = dataclasses.replace(plush_excerpt, sh=plush_excerpt.sh.copy())
+    flat.sh[:, 9:] = 0
+    with caplog.at_level(logging.WARNING, "potr_cl"):
+        encoded = potr_cl.encode(flat, plush_excerpt_cameras, to=".compressed.ply", q=0.2, device=device)
+        whole = potr_cl.encode(plush_excerpt, plush_excerpt_cameras, to=".compressed.ply", q=0.8, device=device)
+    assert encoded.scene.sh_degree == 2
+    assert whole.scene.sh_degree == 3
+    (said,) = [record.getMessage() for record in caplog.records if "no SH coefficients" in record.getMessage()]
+    assert "of degree 3:" in said
+
+
 def test_what_a_format_cannot_hold_is_said_once(plush_excerpt, plush_excerpt_cameras, device, caplog):
     scene = antialiased(plush_excerpt)
     with caplog.at_level(logging.WARNING, "potr_cl"):

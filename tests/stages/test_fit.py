@@ -304,9 +304,25 @@ def priced_fit(further, **options):
 
 
 def test_of_a_given_number_of_splats_none_are_removed(family_device, plush_excerpt, small_views):
-    after = Fit(steps=10).run(State.of(plush_excerpt, small_views), bench_of(family_device))
+    before = dataclasses.replace(State.of(plush_excerpt, small_views), scene=shaken(plush_excerpt, only=("sh",)))
+    after = Fit(steps=30).run(before, bench_of(family_device))
     assert len(after.scene) == len(plush_excerpt)
     assert after.learnt["fit"].spared == 0
+
+
+def test_little_is_left_to_the_refit(family_device, plush_excerpt, small_views):
+    """Splats that moved have fewer coefficients that are 0: a fit that gains little makes a larger file."""
+    start = shaken(plush_excerpt, only=("sh",))
+    before = dataclasses.replace(State.of(plush_excerpt, small_views), scene=start)
+    after = Fit(steps=2, between=0).run(before, bench_of(family_device))
+    with Rasterizer(family_device, plush_excerpt) as rasterizer:
+        alone = fit_scene(
+            family_device, start, small_views, RenderedTargets(rasterizer, small_views), FitOptions(steps=2)
+        )
+    assert 0.7 * alone.errors[0] < alone.error < alone.errors[0], "the fit gains, but little"
+    assert isinstance(after.learnt["fit"], LeftOut)
+    assert "gained little" in str(after.learnt["fit"])
+    assert after.scene is before.scene
 
 
 def test_the_threshold_grows_faster_than_what_it_follows():

@@ -8,22 +8,19 @@ import numpy as np
 import pytest
 
 from potr_cl.model import splat_groups
-from potr_cl.model.camera import Camera
-from potr_cl.model.scene import Scene
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.culling import parts_of_views
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import gathered, uploaded
-from potr_cl.reference.captures import looking
-from potr_cl.reference.scenes import random_scene
-from potr_cl.stages.pruning import visible_parts
+from potr_cl.stages.pruning import measured, visible_parts
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.visible_parts import PartedRemoval
+from tests.cases.streets import street
 from tests.devices import KERNELS, open_device
 
 
@@ -37,27 +34,6 @@ def device(request):
 @pytest.fixture(autouse=True)
 def _small_groups(monkeypatch):
     monkeypatch.setattr(splat_groups, "_GROUP", 32)
-
-
-def street(houses: int = 5, splats: int = 300) -> tuple[Scene, list[Camera]]:
-    """Heaps in a row, each with views of its own, and one along the street."""
-    rng = np.random.default_rng(8)
-    scene = random_scene(houses * splats, 1, seed=8)
-    at = np.repeat(np.arange(houses) * 12.0, splats)
-    means = rng.normal(size=(len(scene), 3)) * 0.5
-    means[:, 0] += at
-    rng.shuffle(means)
-    log_scales = rng.normal(-2.2, 0.4, (len(scene), 3))
-    scene = dataclasses.replace(scene, means=means.astype(np.float32), log_scales=log_scales.astype(np.float32))
-    cameras = []
-    for house in range(houses):
-        there = np.array([house * 12.0, 0, 0])
-        for turn in (0.4, 2.2, 4.5):
-            here = there + 3 * np.array([np.cos(turn), np.sin(turn), 0.3])
-            cameras.append(looking(here, there, name=f"{house}_{turn}", wide=0.4))
-    cameras.append(looking(np.array([-6.0, 0, 0.2]), np.array([50.0, 0, 0]), name="along", wide=0.4))
-    cameras = [cameras[k] for k in rng.permutation(len(cameras))]
-    return scene, [dataclasses.replace(c, width=80, height=60, fx=c.fx / 7, fy=c.fy / 7, cx=40, cy=30) for c in cameras]
 
 
 def parted(device, scene, cameras, options, whole=None) -> PartedRemoval:
@@ -175,12 +151,13 @@ def test_a_whole_encode_has_the_same_bytes(device, monkeypatch):
     made = []
 
     def noting(*given):
-        made.append(parts(*given))
-        return made[-1]
+        made.append(given[4])
+        return PartedRemoval(*given)
 
-    parts = visible_parts.parts_of_views
     monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
-    monkeypatch.setattr(visible_parts, "parts_of_views", noting)
+    monkeypatch.setattr(measured, "PartedRemoval", noting)
+    # What a GPU does is another module's matter (test_view_by_view.py).
+    monkeypatch.setattr(SweepOptions, "only_by_tolerance", property(lambda options: False))
     in_parts = encode(scene, cameras, options, device=device)
     assert len(made[0]) > 2
     assert whole.data == in_parts.data

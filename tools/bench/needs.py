@@ -34,7 +34,7 @@ from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from tools.bench.encode import excerpt
+from tools.workloads import excerpt
 
 #: ΔMSE_MAX at q = 0.5.
 DELTA_MSE_MAX = EncodeOptions.for_preset("paper").parameters.delta_mse_max

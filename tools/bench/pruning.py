@@ -19,33 +19,26 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
-import itertools
 import json
 import math
 import statistics
-import sys
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.formats import load_cameras, load_scene
-from potr_cl.formats.images import read_ground_truth
-from potr_cl.model.camera import Camera, test_views, train_views
+from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Owner
-from potr_cl.quality.compare import find_ground_truth
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.schedule import Pruned, PruningOptions, prune
+from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
+from tools.bench.pruned_scene import Bench, log
+from tools.bench.pruning_report import LOSS_LEVELS, ONE_ORDER, PSNR_LEVELS, plot, print_results
 from tools.results import circumstances
-from tools.study.pruning_baselines import KERNELS, mesongs_power, removal_order, scores, transmittance_sums
+from tools.study.pruning_baselines import KERNELS
 from tools.workloads import scaled
 
 F64 = NDArray[np.float64]
@@ -56,147 +49,12 @@ Row = dict[str, Any]
 PARTS = ("curves", "skips", "frames")
 #: ΔMSE_MAX at q = 0.5.
 DELTA_MSE_MAX = 10**-9.8
-#: The losses at which methods are compared: in dB against the photographs, or PSNR against the uncompressed renders.
-LOSS_LEVELS = (0.4, 2.0)
-PSNR_LEVELS = (45.0, 40.0)
-ONE_ORDER = "one order"
 IMAGES = Path(__file__).parents[2] / "docs" / "images"
-
-
-def log(text: str) -> None:
-    """Progress, to standard error."""
-    print(f"[{time.strftime('%H:%M:%S')}] {text}", file=sys.stderr, flush=True)
-
-
-def squared_error(image: Image, reference: Image) -> float:
-    """Mean over pixels and channels; the reference is clamped already."""
-    difference = (np.clip(image, 0, 1) - reference).ravel()
-    return float(difference @ difference) / difference.size
-
-
-def decibels(error: float) -> float:
-    """PSNR of a mean squared error."""
-    return -10 * math.log10(error) if error > 0 else math.inf
 
 
 def ours_name(iterations: int) -> str:
     """What our schedule is called in tables and plots."""
     return f"ours, {iterations} iteration{'s' if iterations > 1 else ''}"
-
-
-class Bench(Owner):
-    """One scene on one device: reference renders, and what pruned versions of it are worth.
-
-    Attributes:
-        train, test: the views to prune by and to judge by.
-    """
-
-    def __init__(self, folder: Path, device: Device, quick: bool, truth: bool) -> None:
-        self.name = folder.name
-        self.device = device
-        self.scene = load_scene(folder / "point_cloud.ply")
-        cameras = load_cameras(folder / "cameras.json")
-        every = 4 if quick else 1
-        self.train, self.test = train_views(cameras)[::every], test_views(cameras)[::every]
-        self.rasterizer = Rasterizer(device, self.scene)
-        self._test_renders = self._renders(self.test)
-        self._train_renders: list[Image] | None = None
-        self._ground_truth: list[Image] | None = None
-        if truth:
-            files = find_ground_truth(folder / "images", self.test)
-            self._ground_truth = [read_ground_truth(files[c.name], self.rasterizer.background) for c in self.test]
-            pairs = zip(self._test_renders, self._ground_truth, strict=True)
-            self._uncompressed = [decibels(squared_error(render, photograph)) for render, photograph in pairs]
-        self._orders: dict[str, Indices] = {}
-        self._baselines: dict[str, Indices] = {}
-        # Builds every kernel, so that no measurement pays for it.
-        self.pruned(self.train[:1], PruningOptions(0, 1, count=len(self.scene) // 2), SweepOptions())
-
-    def _renders(self, cameras: Sequence[Camera]) -> list[Image]:
-        return [np.clip(self.rasterizer.render(camera)[0], 0, 1) for camera in cameras]
-
-    def quality(self, survivors: Indices) -> Row:
-        """PSNR of what the survivors render against the uncompressed scene, and the loss against the photographs."""
-        with Rasterizer(self.device, self.scene.subset(survivors)) as rasterizer:
-            renders, losses = [], []
-            for number, camera in enumerate(self.test):
-                image = rasterizer.render(camera)[0]
-                renders.append(decibels(squared_error(image, self._test_renders[number])))
-                if self._ground_truth is not None:
-                    error = squared_error(image, self._ground_truth[number])
-                    losses.append(self._uncompressed[number] - decibels(error))
-        row: Row = {"kept": len(survivors), "psnr": statistics.mean(renders)}
-        if losses:
-            row["loss"] = statistics.mean(losses)
-        return row
-
-    def train_psnr(self, survivors: Indices) -> float:
-        """PSNR of the mean squared error over all training views: what pruning tries to keep."""
-        if self._train_renders is None:
-            self._train_renders = self._renders(self.train)
-        with Rasterizer(self.device, self.scene.subset(survivors)) as rasterizer:
-            errors = [
-                squared_error(rasterizer.render(camera)[0], reference)
-                for camera, reference in zip(self.train, self._train_renders, strict=True)
-            ]
-        return decibels(statistics.mean(errors))
-
-    def pruned(
-        self, cameras: Sequence[Camera], options: PruningOptions, sweep: SweepOptions, half: int = 0
-    ) -> tuple[Pruned, Row]:
-        """Run a schedule, so many of its measurements of half-size views; its result and its cost in seconds and full
-        sweeps."""
-        started = time.perf_counter()
-        with ExitStack() as owned:
-            removal = owned.enter_context(RemovalSweep(self.rasterizer, cameras, sweep))
-            small: RemovalSweep | None = None
-            if half:
-                small = owned.enter_context(RemovalSweep(self.rasterizer, [scaled(c, 0.5) for c in cameras], sweep))
-            prepared = time.perf_counter()
-            if small:
-                result = prune(HalfSizeFirst(removal, small, half), len(self.scene), options)
-            else:
-                result = prune_scene(removal, options)
-            self.device.queue.finish()
-            ended = time.perf_counter()
-            sweeps = removal.sweeps
-            if small:
-                sweeps += small.sweeps / 4
-        return result, {
-            "prepare_seconds": prepared - started,
-            "prune_seconds": ended - prepared,
-            "seconds": ended - started,
-            "sweeps": sweeps,
-            "rounds": result.iterations,
-        }
-
-    def ours(self, kept: int, iterations: int) -> tuple[Pruned, Row]:
-        """Our schedule to an exact count, at the default skips."""
-        return self.pruned(self.train, PruningOptions(0, iterations, count=kept), SweepOptions())
-
-    def one_order(self, kept: int, iterations: int) -> Indices:
-        """The order of one schedule down to ``kept`` survivors, made once."""
-        key = f"{kept} {iterations}"
-        if key not in self._orders:
-            self._orders[key] = self.ours(kept, iterations)[0].order
-        return self._orders[key]
-
-    def baselines(self) -> dict[str, Indices]:
-        """The other pruners' orders."""
-        if not self._baselines:
-            with RemovalSweep(self.rasterizer, self.train, SweepOptions(transmittance_threshold=None)) as sweep:
-                importance = sweep.measure()[1]
-            transmittance = transmittance_sums(self.rasterizer, self.train)
-            found = scores(self.scene, importance, transmittance, mesongs_power(self.name))
-            self._baselines = {name: removal_order(score) for name, score in found.items()}
-        return self._baselines
-
-    def close(self) -> None:
-        """Give the device's memory back."""
-        self.rasterizer.close()
-
-
-# ---------------------------------------------------------------------------------------------- parts
 
 
 def curves(bench: Bench, shares: Sequence[float], iterations: Sequence[int]) -> list[Row]:
@@ -241,30 +99,6 @@ class Setting:
     every: int = 1
     half: int = 0
     pruning: Row = dataclasses.field(default_factory=dict)
-
-
-class HalfSizeFirst:
-    """Removal effects of which all measurements but the first and those after some number are of half-size views."""
-
-    def __init__(self, full: RemovalSweep, half: RemovalSweep, number: int) -> None:
-        self._full, self._half, self._left = full, half, number + 1
-        self._first = True
-
-    def measure(self) -> tuple[F64, F64]:
-        """As :meth:`RemovalSweep.measure`."""
-        self._left -= 1
-        if self._left < 0:
-            return self._full.measure()
-        effects = self._half.measure()
-        if self._first:
-            effects = self._full.measure()
-            self._first = False
-        return effects
-
-    def remove(self, splats: Indices) -> None:
-        """As :meth:`RemovalSweep.remove`."""
-        self._full.remove(splats)
-        self._half.remove(splats)
 
 
 def skip_settings(iterations: Sequence[int]) -> list[Setting]:
@@ -384,167 +218,6 @@ def frames(bench: Bench, truth: bool, iterations: int) -> list[Row]:
         rows.append({"level": level, "method": ours_name(iterations), **ours})
         log(f"{bench.name}: level {level:g} done")
     return rows
-
-
-# --------------------------------------------------------------------------------------------- tables
-
-
-def _at(rows: Sequence[Row], level: float) -> float | None:
-    """The share removed at which a curve's loss reaches ``level`` dB, by interpolation from nothing removed."""
-    points = [(0.0, 0.0), *sorted((r["removed"], r["loss"]) for r in rows)]
-    for (share0, loss0), (share1, loss1) in itertools.pairwise(points):
-        if loss0 <= level < loss1:
-            return float(share0 + (share1 - share0) * (level - loss0) / (loss1 - loss0))
-    return None
-
-
-def print_curves(rows: Sequence[Row]) -> None:
-    """PSNR and loss by method and share."""
-    shares = sorted({r["removed"] for r in rows})
-    methods = list(dict.fromkeys(r["method"] for r in rows))
-    truth = "loss" in rows[0]
-    print("| removed | " + " | ".join(f"{s:.0%}" for s in shares) + (" | kept at 0.4 dB |" if truth else " |"))
-    print("|---" * (len(shares) + 1 + truth) + "|")
-    for method in methods:
-        mine = {r["removed"]: r for r in rows if r["method"] == method}
-        cells = [
-            f"{mine[s]['psnr']:.1f}" + (f" / {mine[s]['loss']:.2f}" if truth else "") if s in mine else ""
-            for s in shares
-        ]
-        if truth:
-            removed = _at(list(mine.values()), LOSS_LEVELS[0])
-            cells.append("" if removed is None else f"{1 - removed:.1%}")
-        print(f"| {method} | " + " | ".join(cells) + " |")
-
-
-def pareto(rows: Sequence[Row]) -> list[Row]:
-    """The rows that no other beats in both time and PSNR at equal count, by ascending time."""
-    front: list[Row] = []
-    for row in sorted(rows, key=lambda r: (r["seconds"], -r["psnr_at_equal_count"])):
-        if not front or row["psnr_at_equal_count"] > front[-1]["psnr_at_equal_count"]:
-            front.append(row)
-    return front
-
-
-def print_skips(rows: Sequence[Row]) -> None:
-    """Cost and error of each setting; those on the Pareto front in bold."""
-    front = {r["skipped"] for r in pareto(rows)}
-    full = rows[0]
-    truth = "loss" in full
-    print(
-        "| skipped | iterations | s | of it preparing | full sweeps | kept | PSNR |"
-        + (" loss by photo |" if truth else "")
-        + " PSNR at equal count | against the full computation | on training views |"
-    )
-    print("|---" * (10 + truth) + "|")
-    for r in rows:
-        name = f"**{r['skipped']}**" if r["skipped"] in front else r["skipped"]
-        print(
-            f"| {name} | {r['iterations']} | {r['seconds']:.2f} | {r['prepare_seconds']:.2f} | {r['sweeps']:.1f} | "
-            f"{r['kept']:,} | {r['psnr']:.2f} | "
-            + (f"{r['loss']:.3f} | " if truth else "")
-            + f"{r['psnr_at_equal_count']:.2f} | {r['psnr_at_equal_count'] - full['psnr_at_equal_count']:+.2f} | "
-            f"{r['train_psnr_at_equal_count'] - full['train_psnr_at_equal_count']:+.2f} |"
-        )
-
-
-def print_frames(rows: Sequence[Row]) -> None:
-    """Splats, tile intersections and frame rates at equal loss."""
-    truth = any("loss" in r for r in rows)
-    unit = "dB lost against the photographs" if truth else "dB against the uncompressed renders"
-    print(f"| {unit} | order | found | kept | tile intersections a view | frames/s | against unpruned |")
-    print("|---" * 7 + "|")
-    for r in rows:
-        unpruned = next(u for u in rows if u["level"] == r["level"] and u["method"] == "unpruned")
-        found = f"{r['loss' if truth else 'psnr']:.2f}" if "psnr" in r else ""
-        print(
-            f"| {r['level']:g} | {r['method']} | {found} | {r['kept']:,} | {r['intersections']:,.0f} | "
-            f"{r['frames_per_second']:.0f} | {r['frames_per_second'] / unpruned['frames_per_second']:.2f} |"
-        )
-
-
-def print_results(results: Row) -> None:
-    """All tables."""
-    for name, found in results["scenes"].items():
-        print(f"\n## {name}: {found['splats']:,} splats, {found['train']} training and {found['test']} test views")
-        print(f"\n{results['device']}")
-        for part, printer in (("curves", print_curves), ("skips", print_skips), ("frames", print_frames)):
-            if part in found:
-                print(f"\n### {part}\n")
-                printer(found[part])
-
-
-# ---------------------------------------------------------------------------------------------- plots
-
-
-def plot_curves(scenes: Row, key: str, label: str, path: Path) -> None:
-    """The paper's figure: quality against the share removed, a panel a scene."""
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(1, len(scenes), figsize=(6 * len(scenes), 4.6), squeeze=False)
-    for axis, (name, found) in zip(axes[0], scenes.items(), strict=True):
-        rows = found["curves"]
-        methods = [m for m in dict.fromkeys(r["method"] for r in rows) if ONE_ORDER not in m]
-        ours = [m for m in methods if m.startswith("ours")]
-        shades = pyplot.get_cmap("Blues")(np.linspace(0.4, 1, len(ours)))
-        for method in methods:
-            mine = sorted((100 * r["removed"], r[key]) for r in rows if r["method"] == method)
-            style: Row = {"marker": ".", "linestyle": "--", "linewidth": 1}
-            if method in ours:
-                style = {"marker": "o", "markersize": 3.5, "color": shades[ours.index(method)]}
-            axis.plot(*zip(*mine, strict=True), label=method, **style)
-        axis.set_title(f"{name}, {found['splats']:,} splats")
-        axis.set_xlabel("% of the splats removed")
-        axis.set_ylabel(label)
-        axis.grid(alpha=0.3)
-        if key == "loss":
-            axis.set_ylim(4, -0.2)
-    axes[0, -1].legend(fontsize=8)
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-
-
-def plot_skips(scenes: Row, device: str, path: Path) -> None:
-    """Time against loss at equal count, with the Pareto front; the points are numbered."""
-    from matplotlib import pyplot
-
-    figure, axes = pyplot.subplots(1, len(scenes), figsize=(7.5 * len(scenes), 5), squeeze=False)
-    for axis, (name, found) in zip(axes[0], scenes.items(), strict=True):
-        rows, front = found["skips"], pareto(found["skips"])
-        full = rows[0]["psnr_at_equal_count"]
-        points = [(r["seconds"], full - r["psnr_at_equal_count"]) for r in front]
-        axis.plot(*zip(*points, strict=True), "-", color="0.6", linewidth=1, zorder=0)
-        for number, r in enumerate(rows, 1):
-            point = r["seconds"], full - r["psnr_at_equal_count"]
-            axis.plot(*point, "o", color="C0" if r in front else "C1", markersize=4, label=f"{number}  {r['skipped']}")
-            axis.annotate(str(number), point, (3, 3), textcoords="offset points", fontsize=8)
-        axis.axhline(0, color="0.8", linewidth=0.8, zorder=0)
-        axis.set_title(f"{name}, q = 0.5, at {rows[0]['kept']:,} splats\n{device}; Pareto front in blue", fontsize=9)
-        axis.set_xscale("log")
-        axis.set_yscale("symlog", linthresh=0.5)
-        axis.set_xlabel("seconds, preparation included")
-        axis.set_ylabel("dB lost against the full computation (test views)")
-        axis.legend(fontsize=7, loc="upper left", bbox_to_anchor=(1, 1), title="skipped", title_fontsize=8)
-        axis.grid(alpha=0.3, which="both")
-    figure.tight_layout()
-    figure.savefig(path, dpi=110)
-
-
-def plot(results: Row, folder: Path) -> None:
-    """All pictures that the results have the rows for."""
-    import matplotlib
-
-    matplotlib.use("Agg")
-    scenes = results["scenes"]
-    folder.mkdir(parents=True, exist_ok=True)
-    with_curves = {n: s for n, s in scenes.items() if "curves" in s}
-    with_skips = {n: s for n, s in scenes.items() if "skips" in s}
-    if with_curves:
-        plot_curves(with_curves, "psnr", "PSNR against the uncompressed renders (dB)", folder / "pruning_curves.png")
-        if all("loss" in s["curves"][0] for s in with_curves.values()):
-            plot_curves(with_curves, "loss", "dB lost against the photographs", folder / "pruning_loss.png")
-    if with_skips:
-        plot_skips(with_skips, results["device"], folder / "pruning_skips.png")
 
 
 def merged(files: Sequence[Path]) -> Row:

@@ -20,11 +20,8 @@ from potr_cl.reference.derivatives import gradient
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.tangents import PictureTangents
+from tools.stress.precise import F64, ULP
 
-F64 = NDArray[np.float64]
-
-#: Half a unit in the last place of a float32, relatively.
-_ULP = 2.0**-24
 #: Colours, and conditions of covariances, beyond which only finiteness is asked for: brighter ones are cut by design,
 #: and float64 itself loses the inverse of thinner ones.
 _BRIGHTEST, _CONDITION = 4.0, 1e7
@@ -64,7 +61,7 @@ def check_derivatives(
         found = _transposed(derivatives, memory, view, values)
         forth = _along(device, derivatives, memory, view, x)
         finite = np.isfinite(found).all() and np.isfinite(forth).all()
-        measures = {"fit: finite": (0.0 if finite else np.inf, _ULP)}
+        measures = {"fit: finite": (0.0 if finite else np.inf, ULP)}
         if not finite:
             return measures
         square = float((forth.astype(np.float64) ** 2).sum())
@@ -82,7 +79,7 @@ def check_derivatives(
     if not lengths.max() > 0:
         return measures
     parts = np.split(found.astype(np.float64) * view.width * view.height / REFERENCE_PIXELS, _ENDS, axis=1)
-    error, expected = _difference(parts, exact, scales), 16 * _ULP
+    error, expected = _difference(parts, exact, scales), 16 * ULP
     for _ in range(draws):
         moved = _exact(*stand_in(rng), rules, values)
         if moved is not None:

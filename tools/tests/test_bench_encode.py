@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import importlib.util
 import json
 
@@ -14,12 +15,14 @@ from potr_cl.opencl.discovery import choose_device
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
 from tests.stages.test_compaction import channels, dense_weights, on_a_sphere, sparse_weights
 from tools.bench import encode as benchmark
-from tools.bench.encode import Row, on_front
+from tools.bench import stage_variants, tradeoffs
+from tools.bench.tradeoffs import Row, on_front
+from tools.workloads import excerpt
 
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    return benchmark.excerpt(tmp_path_factory.mktemp("scene") / "excerpt")
+    return excerpt(tmp_path_factory.mktemp("scene") / "excerpt")
 
 
 def result(info, folder, stages) -> dict:
@@ -48,17 +51,17 @@ def test_kernels_and_their_variants(folder):
     assert any("sorts 4096" in row["variant"] for row in rows)
 
 
-def test_ridge_errors_are_those_of_the_solution():
-    scene = benchmark.load_scene(benchmark.DATA / "plush_excerpt.ply").subset(np.arange(50))
+def test_ridge_errors_are_those_of_the_solution(plush_excerpt):
+    scene = plush_excerpt.subset(np.arange(50))
     centres, weights = on_a_sphere(30), dense_weights(sparse_weights(50, 30))
     options = CompactionOptions(lam=0.1, alpha=1)
     compacted = Compactor(Device()).compact(scene, centres, weights, options)
     seen = np.diff(weights.offsets) > 0
-    assert benchmark.ridge_errors(scene, compacted, centres, weights, options).max() < 2e-6
+    assert stage_variants.ridge_errors(scene, compacted, centres, weights, options).max() < 2e-6
     off = compacted.sh.copy()
     off[:, 0] += 0.01
-    spoiled = benchmark.dataclasses.replace(compacted, sh=off)
-    errors = benchmark.ridge_errors(scene, spoiled, centres, weights, options)
+    spoiled = dataclasses.replace(compacted, sh=off)
+    errors = stage_variants.ridge_errors(scene, spoiled, centres, weights, options)
     assert len(errors) == seen.sum()
     # DC's basis value times the change of Y.
     scale = np.maximum(np.abs(channels(scene.sh)[seen]).max(axis=(1, 2)), 1)
@@ -67,24 +70,24 @@ def test_ridge_errors_are_those_of_the_solution():
 
 @pytest.mark.slow
 def test_every_stage_on_the_excerpt(folder, tmp_path, capsys):
-    found = result(choose_device(), folder, list(benchmark.STAGES))
+    found = result(choose_device(), folder, list(tradeoffs.STAGES))
     kept = json.loads(json.dumps(found))
-    benchmark.print_report(kept)
+    tradeoffs.print_report(kept)
     printed = capsys.readouterr().out
-    for stage in benchmark.STAGES:
+    for stage in tradeoffs.STAGES:
         own = [row for row in found["rows"] if row["stage"] == stage]
         assert len(own) > 3
         assert all(np.isfinite([row["seconds"], row["error"]]).all() for row in own)
         assert [row["default"] for row in own].count(True) == 1, stage
         assert f"#### {stage}: seconds" in printed
     if importlib.util.find_spec("matplotlib"):
-        paths = benchmark.plot(kept, tmp_path / "plots")
-        assert len(paths) == len(benchmark.STAGES)
+        paths = tradeoffs.plot(kept, tmp_path / "plots")
+        assert len(paths) == len(tradeoffs.STAGES)
         assert all(path.stat().st_size > 1000 for path in paths)
 
 
 def test_the_views_of_a_workload(folder):
-    load = benchmark.Workload.of(folder, quick=True)
+    load = stage_variants.Workload.of(folder, quick=True)
     assert len(load.some) == load.views
     assert camera_centres(load.some).shape == (load.views, 3)
     assert {c.split for c in load.train} == {"train"}

@@ -4,7 +4,9 @@ from __future__ import annotations
 
 import numpy as np
 
-from tools.bench.pruning import HalfSizeFirst, pareto, skip_settings
+from tools.bench.pruned_scene import HalfSizeFirst
+from tools.bench.pruning import skip_settings
+from tools.bench.pruning_report import pareto
 
 
 class Recorder:

@@ -15,7 +15,7 @@ from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from tests.devices import FAMILIES, open_device
-from tools.bench.pruning import pareto
+from tools.bench.pruning_report import pareto
 from tools.study import pruning_baselines as baselines
 from tools.study.pruning_baselines import mesongs_power, removal_order, scores, transmittance_sums
 

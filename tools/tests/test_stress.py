@@ -13,7 +13,7 @@ from potr_cl.reference import raster as reference
 from potr_cl.reference.scenes import random_splats, tilted_camera
 from tests.devices import FAMILIES, open_device
 from tools.stress import cases as stress_cases
-from tools.stress import run as stress
+from tools.stress import measures, precise, run, solvers, views
 
 
 @pytest.fixture(scope="module", params=FAMILIES)
@@ -26,18 +26,18 @@ def device(request):
 CASE = stress_cases.Case("some splats", random_splats(40, 1, seed=1), tilted_camera(1, 37, 26))
 
 
-def spoiled(monkeypatch, change) -> stress.Measures:
+def spoiled(monkeypatch, change) -> measures.Measures:
     """What the checks find once ``change`` has been at the device's results."""
-    untouched = stress.rasterized
-    monkeypatch.setattr(stress, "rasterized", lambda *args: change(untouched(*args)))
-    return stress.check(Device(), CASE)
+    untouched = views.rasterized
+    monkeypatch.setattr(views, "rasterized", lambda *args: change(untouched(*args)))
+    return views.check(Device(), CASE)
 
 
 @pytest.mark.slow
 def test_every_kernel_stays_within_what_rounding_explains(device):
-    result = stress.run_device(device, examples=12)
+    result = run.run_device(device, examples=12)
     assert result["failures"] == {}
-    assert set(result["worst"]) == set(stress.WHAT)
+    assert set(result["worst"]) == set(measures.WHAT)
     for worst in result["worst"].values():
         assert worst["checked"] > 40
         assert np.isfinite(worst["error"])
@@ -46,12 +46,12 @@ def test_every_kernel_stays_within_what_rounding_explains(device):
 @pytest.mark.parametrize("rules", [INRIA, GSPLAT])
 def test_the_composite_is_the_definition(rules):
     case = dataclasses.replace(CASE, rules=rules)
-    true = stress.projected(case)
-    pixels, shape = stress.Pixels.of(case.view), (case.view.height, case.view.width)
+    true = precise.projected(case)
+    pixels, shape = precise.Pixels.of(case.view), (case.view.height, case.view.width)
     inside = [
         reference.footprint(c, s, rules, shape).ravel() for c, s in zip(true.centre, true.covariance, strict=True)
     ]
-    ours = stress.composite(stress.alphas_of_covariances(true, pixels) * inside, true.colour, rules)
+    ours = precise.composite(precise.alphas_of_covariances(true, pixels) * inside, true.colour, rules)
     wanted = reference.render(case.scene, case.view, rules)
     assert np.allclose(ours.image, wanted.image.reshape(-1, 3), atol=1e-12)
     assert np.allclose(ours.transmittance, wanted.transmittance.ravel(), atol=1e-12)
@@ -61,11 +61,11 @@ def test_removal_effects_are_those_of_the_definition():
     """One splat after the other left out, where no pixel ends."""
     thin = dataclasses.replace(CASE.scene, opacity_logits=np.full(40, -4, np.float32))
     case = dataclasses.replace(CASE, scene=thin)
-    true, pixels = stress.projected(case), stress.Pixels.of(case.view)
-    alpha = stress.composite(stress.alphas_of_covariances(true, pixels), true.colour, GSPLAT).alpha
+    true, pixels = precise.projected(case), precise.Pixels.of(case.view)
+    alpha = precise.composite(precise.alphas_of_covariances(true, pixels), true.colour, GSPLAT).alpha
     wanted = np.full((len(pixels.x), 3), 0.1)
     splats = np.arange(0, len(true.index), 3)
-    effects, magnitudes, importances = stress.removal_effects(alpha, true.colour, wanted, splats)
+    effects, magnitudes, importances = precise.removal_effects(alpha, true.colour, wanted, splats)
 
     def error(scene) -> float:
         return float(np.mean((reference.render(scene, case.view, GSPLAT).image.reshape(-1, 3) - wanted) ** 2))
@@ -79,14 +79,14 @@ def test_removal_effects_are_those_of_the_definition():
 def test_rounding_moves_a_result_and_not_far():
     rng = np.random.default_rng(0)
     values = rng.normal(size=10000)
-    moved = stress.rounded(values, rng)
-    assert 0 < np.abs(moved / values - 1).max() <= stress.ULP * 1.0001
-    true, other = stress.projected(CASE), stress.projected(CASE, rng)
+    moved = precise.rounded(values, rng)
+    assert 0 < np.abs(moved / values - 1).max() <= precise.ULP * 1.0001
+    true, other = precise.projected(CASE), precise.projected(CASE, rng)
     assert 0 < np.abs(other.depth / true.depth - 1).max() < 1e-6
 
 
 def test_a_sound_device_is_not_accused(device):
-    for measure, (error, expected) in stress.check(device, CASE).items():
+    for measure, (error, expected) in views.check(device, CASE).items():
         assert error <= 20 * expected, measure
 
 
@@ -98,7 +98,7 @@ def test_the_cap_that_a_device_gets_is_no_fault(device):
         log_scales=np.array([[6] * 3, [0] * 3], np.float32),
         opacity_logits=np.array([50, 0], np.float32),
     )
-    found = stress.check(device, dataclasses.replace(CASE, scene=veil, rules=GSPLAT))
+    found = views.check(device, dataclasses.replace(CASE, scene=veil, rules=GSPLAT))
     for measure in ("removal: effect", "removal: importance"):
         error, expected = found[measure]
         assert error <= 20 * expected, measure
@@ -124,61 +124,61 @@ def test_the_cap_that_a_device_gets_is_no_fault(device):
 )
 def test_faults_are_noticed(monkeypatch, measure, change):
     error, expected = spoiled(monkeypatch, change)[measure]
-    assert not error <= stress.LIMIT * expected if measure != "sort" else error > 0
+    assert not error <= measures.LIMIT * expected if measure != "sort" else error > 0
 
 
 def test_a_wrong_removal_effect_is_noticed(monkeypatch):
-    measured = stress.RemovalSweep.measure
+    measured = views.RemovalSweep.measure
 
     def off(self):
         effect, importance = measured(self)
         return effect * 1.001, importance * 1.001
 
-    monkeypatch.setattr(stress.RemovalSweep, "measure", off)
-    found = stress.check(Device(), CASE)
+    monkeypatch.setattr(views.RemovalSweep, "measure", off)
+    found = views.check(Device(), CASE)
     for measure in ("removal: effect", "removal: importance"):
         error, expected = found[measure]
-        assert error > 0.9e-3 > stress.LIMIT * expected
+        assert error > 0.9e-3 > measures.LIMIT * expected
 
 
 def test_a_wrong_least_squares_solution_is_noticed(monkeypatch):
     ridge, refit = next(stress_cases.known_ridges()), next(stress_cases.known_refits())
-    compact, solve = stress.Compactor.compact, stress.refit_colours
+    compact, solve = solvers.Compactor.compact, solvers.refit_colours
 
     def off(scene):
         return dataclasses.replace(scene, sh=(scene.sh * np.float32(1.01)))
 
-    monkeypatch.setattr(stress.Compactor, "compact", lambda *args: off(compact(*args)))
-    monkeypatch.setattr(stress, "refit_colours", lambda *args: off(solve(*args)))
-    error, promised = stress.check_ridge(Device(), ridge)["ridge"]
+    monkeypatch.setattr(solvers.Compactor, "compact", lambda *args: off(compact(*args)))
+    monkeypatch.setattr(solvers, "refit_colours", lambda *args: off(solve(*args)))
+    error, promised = solvers.check_ridge(Device(), ridge)["ridge"]
     assert error > promised
-    error, promised = stress.check_refit(Device(), refit)["re-fit: optimum"]
+    error, promised = solvers.check_refit(Device(), refit)["re-fit: optimum"]
     assert error > promised
 
 
 def test_hypothesis_finds_the_worst_and_the_smallest():
     """A measure that is at its worst where a splat is large."""
 
-    def run(case: stress_cases.Case) -> stress.Measures:
+    def run(case: stress_cases.Case) -> measures.Measures:
         return {"size": (float(np.exp(case.scene.log_scales.max())), 1.0)}
 
-    worst: dict[str, stress.Worst] = {}
-    stress.search("size", stress_cases.small_scenes(), run, worst, 60)
+    worst: dict[str, measures.Worst] = {}
+    measures.search("size", stress_cases.small_scenes(), run, worst, 60)
     assert worst["size"].error > 1000
-    smallest = stress.smallest_failure("size", stress_cases.small_scenes(), run, 200)
+    smallest = measures.smallest_failure("size", stress_cases.small_scenes(), run, 200)
     assert smallest is not None
     assert smallest.count("μ") == 1
 
 
 def test_the_report_names_what_failed(capsys):
-    fine = stress.Worst()
+    fine = measures.Worst()
     fine.add(1e-7, 1e-7, "a case")
     worst = {"composite": dataclasses.asdict(fine)}
     results = [
         {"device": "A", "family": "cpu", "worst": worst, "failures": {"composite": "one splat"}},
         {"device": "B", "family": "gpu", "failed": "crashed"},
     ]
-    stress.print_report(results)
+    run.print_report(results)
     printed = capsys.readouterr().out
     assert "composite on A, cpu kernels: one splat" in printed
     assert "failed: crashed" in printed

@@ -13,13 +13,18 @@
        ANTIALIASED    1: what the low-pass filter adds to a splat's area it takes from its opacity, which is multiplied
                       by sqrt(det S / det(S + LOW_PASS I)), S the covariance on screen; 0, the default: it does not;
        LEAST_COMPENSATION_SQUARED  the least value under that root; must be given if ANTIALIASED;
-       LOW_PASS, LOW_PASS_SQUARED  square pixels added to a splat's variances on screen, and their square. */
+       LOW_PASS, LOW_PASS_SQUARED  square pixels added to a splat's variances on screen, and their square;
+       PICKED         1: only the splats that `numbers` names are projected, `picked` of them, of a scene that is
+                      `whole_stride` long; what is found lies in their order; LANES must be 1. 0, the default: all. */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
 #include "include/view_set.clh"
 #include "include/sh.clh"
 
+#ifndef PICKED
+#define PICKED 0
+#endif
 #ifndef ANTIALIASED
 #define ANTIALIASED 0
 #endif
@@ -58,19 +63,28 @@ kernel void project(
     global const float *log2_opacities,
     global const float *sh,
     uint stride,
+    uint whole_stride,
+    global const uint *numbers,
+    uint picked,
     global const SetView *views,
     global float4 *shapes,
     global float4 *colours,
     global ushort4 *bounds)
 {
-    const size_t index = get_global_id(0);
-    const size_t column = stride; /* a parameter's columns lie so far apart */
     global const View *view = &views[get_global_id(1)].view;
-    shapes += 2 * column * get_global_id(1);
-    colours += column * get_global_id(1);
-    bounds += column * get_global_id(1);
-
+    shapes += 2 * (size_t)stride * get_global_id(1);
+    colours += (size_t)stride * get_global_id(1);
+    bounds += (size_t)stride * get_global_id(1);
+    const size_t place = get_global_id(0); /* of the results */
+#if PICKED
+    const size_t column = whole_stride; /* a parameter's columns lie so far apart */
+    const size_t index = numbers[min(place, (size_t)picked - 1)];
+    vfloat lo = place < picked ? log2_opacities[index] : -INFINITY;
+#else
+    const size_t column = stride;
+    const size_t index = place;
     vfloat lo = VLOAD(index, log2_opacities);
+#endif
     /* The camera centre is subtracted first: both are large where a scene is far from the origin, their difference is
        not. */
     vfloat dx = (VLOAD(index, means) - view->camera_centre_high[0]) - view->camera_centre_low[0];
@@ -156,14 +170,14 @@ kernel void project(
     }
 
 #if LANES == 1
-    shapes[2 * index] = (float4)(x, y, a, b);
-    shapes[2 * index + 1] = (float4)(c, lo, tz, 0.0f);
+    shapes[2 * place] = (float4)(x, y, a, b);
+    shapes[2 * place + 1] = (float4)(c, lo, tz, 0.0f);
     ushort4 tiles = (ushort4)(0);
     if (drawn)
         tiles = (ushort4)((ushort)first_column, (ushort)end_column, (ushort)first_row, (ushort)end_row);
-    bounds[index] = tiles;
+    bounds[place] = tiles;
     if (drawn)
-        colours[index] = (float4)(rgb[0], rgb[1], rgb[2], 0.0f);
+        colours[place] = (float4)(rgb[0], rgb[1], rgb[2], 0.0f);
 #else
     vfloat zero = 0.0f;
     float columns[14][LANES];
@@ -173,7 +187,7 @@ kernel void project(
     for (int k = 0; k < 14; ++k)
         VSTORE(values[k], 0, columns[k]);
     for (int lane = 0; lane < LANES; ++lane) {
-        size_t splat = index * LANES + lane;
+        size_t splat = place * LANES + lane;
         shapes[2 * splat] = (float4)(columns[0][lane], columns[1][lane], columns[2][lane], columns[3][lane]);
         shapes[2 * splat + 1] = (float4)(columns[4][lane], columns[5][lane], columns[6][lane], 0.0f);
         colours[splat] = (float4)(columns[7][lane], columns[8][lane], columns[9][lane], 0.0f);

@@ -63,11 +63,18 @@ kernel void combine(float a, global float *y, float b, global const float *x)
 }
 
 /* parts[i] = the sum of x y over every get_global_size(0)-th element from i on, in a fixed order;
-   parts[get_global_size(0) + i] = the largest |x| among them. */
-kernel void dot_parts(global const float *x, global const float *y, ulong count, global float *parts)
+   parts[get_global_size(0) + i] = the largest |x| among them; the third part is what the sums still lack. With `more`,
+   it goes on where it was: x and y are then the next elements of longer vectors, all pieces of which but the last are
+   whole multiples of get_global_size(0). */
+kernel void dot_parts(global const float *x, global const float *y, ulong count, uint more, global float *parts)
 {
     const size_t items = get_global_size(0), first = get_global_id(0);
     float sum = 0.0f, lost = 0.0f, largest = 0.0f;
+    if (more) {
+        sum = parts[first];
+        largest = parts[items + first];
+        lost = parts[2 * items + first];
+    }
     for (size_t i = first; i < count; i += items) {
         /* Kahan's compensated sum. */
         const float term = MAD(x[i], y[i], -lost);
@@ -78,4 +85,5 @@ kernel void dot_parts(global const float *x, global const float *y, ulong count,
     }
     parts[first] = sum;
     parts[items + first] = largest;
+    parts[2 * items + first] = lost;
 }

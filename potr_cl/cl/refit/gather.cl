@@ -4,7 +4,8 @@
    What views add to coefficients and blocks is made integers, view by view, before it is added up. So the sums are the
    same whatever views are done together, in whatever order and on however many devices.
 
-   Macros: LANES (splats a work-item), SH_COUNT, WEIGHTS (1: the totals hold the sums of w^2 too, for the blocks). */
+   Macros: LANES (splats a work-item), SH_COUNT, WEIGHTS (1: the totals hold the sums of w^2 too, for the blocks),
+   SOME_BLOCKS (1: only the blocks of some splats are added up). */
 
 #include "refit/refit.clh"
 #include "refit/view_colours.clh"
@@ -58,8 +59,8 @@ inline vlong to_fixed_lanes(vfloat value)
 }
 
 /* The totals of a set's views, times the view's scale, onto the coefficients: result += basis x (Y, Co, Cg) of the free
-   channels' sums, view by view. With WEIGHTS also blocks += the sum of w^2 x basis x basis. Both are columns of
-   integers; the scales say what is 1. Leaves the totals zero. */
+   channels' sums, view by view. With WEIGHTS also blocks += the sum of w^2 x basis x basis, for `block_stride` splats from
+   number `first_block` on. Both are columns of integers; the scales say what is 1. Leaves the totals zero. */
 kernel void gather(
     global long *totals,
     global const float *means,
@@ -70,6 +71,8 @@ kernel void gather(
     uint first_scale,
     global const float4 *free,
     global long *result,
+    ulong first_block,
+    ulong block_stride,
     global long *blocks)
 {
     const size_t index = get_global_id(0);
@@ -97,10 +100,15 @@ kernel void gather(
                 results[3 * m + c] += to_fixed_lanes(basis[m] * channels[c]);
 #if WEIGHTS
         const vfloat weight = sums[3];
+        const size_t block = index - first_block / LANES;
+#if SOME_BLOCKS
+        if (index < first_block / LANES || block >= block_stride / LANES)
+            continue;
+#endif
         for (int i = 0; i < SH_COUNT; ++i)
             for (int j = i; j < SH_COUNT; ++j) {
-                global long *column = blocks + AT(i, j) * stride;
-                VSTORE(VLOAD(index, column) + to_fixed_lanes(weight * basis[i] * basis[j]), index, column);
+                global long *column = blocks + AT(i, j) * block_stride;
+                VSTORE(VLOAD(block, column) + to_fixed_lanes(weight * basis[i] * basis[j]), block, column);
             }
 #endif
     }
@@ -109,13 +117,13 @@ kernel void gather(
             VSTORE(results[i], index, result + i * stride);
 }
 
-/* result += unit x sums, and the sums become 0. One number a work-item. */
-kernel void from_fixed(global long *sums, float unit, global float *result)
+/* result += unit x sums from number `first` on, and these become 0. One number a work-item. */
+kernel void from_fixed(global long *sums, ulong first, float unit, global float *result)
 {
     const size_t i = get_global_id(0);
-    const long sum = sums[i], high = (sum + (1l << 30)) >> 31;
+    const long sum = sums[first + i], high = (sum + (1l << 30)) >> 31;
     /* In two parts of 32 bits: conversions of 64 are calls on some CPU runtimes. */
     const float value = MAD((float)(int)high, 0x1p31f, (float)(int)(sum - (high << 31)));
     result[i] = MAD(value, unit, result[i]);
-    sums[i] = 0;
+    sums[first + i] = 0;
 }

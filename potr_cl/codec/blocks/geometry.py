@@ -19,9 +19,6 @@ from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 
-#: Blocks that are quantised side by side: each takes some hundred bytes a splat meanwhile.
-_SIDE_BY_SIDE = 4
-
 
 @dataclass(frozen=True)
 class GeometryOfBlocks:
@@ -103,31 +100,19 @@ def quantise(
         As :func:`potr_cl.codec.geometry.quantise_geometry`.
     """
     if rows is None and in_blocks(len(scene), parameters):
-        rows = blocks_of(scene.means)
+        rows = blocks_of(scene.means, run=run)
     if rows is None:
         return quantise_geometry(scene, parameters, views, run)
     nearest = distances_to_views(scene.means, views, run)
-    world = VERSIONS[parameters.version].in_world_units(parameters, scene, nearest)
+    world = VERSIONS[parameters.version].in_world_units(parameters, scene, nearest, run)
 
-    def quantised(own: NDArray[np.int64]) -> Geometry:
-        return quantise_in_world_units(_without_colours(scene, own), parameters, world, nearest[own])
-
-    blocks: list[Geometry] = []
-    for start in range(0, len(rows), _SIDE_BY_SIDE):
-        blocks += run(quantised, rows[start : start + _SIDE_BY_SIDE])
+    blocks = quantise_in_world_units(scene, rows, parameters, world, nearest, run)
     return GeometryOfBlocks(parameters, world, tuple(rows), tuple(blocks))
 
 
 def in_blocks(splats: int, parameters: quantize.HyperParameters) -> bool:
     """Whether a scene of so many splats is cut into blocks."""
     return VERSIONS[parameters.version].in_blocks and splats > MOST_WHOLE
-
-
-def _without_colours(scene: Scene, rows: NDArray[np.int64]) -> Scene:
-    return Scene(
-        scene.means[rows], scene.log_scales[rows], scene.quaternions[rows], scene.opacity_logits[rows],
-        _colourless(len(rows)), scene.antialiased, scene.low_pass,
-    )  # fmt: skip
 
 
 def _colourless(splats: int) -> FloatArray:

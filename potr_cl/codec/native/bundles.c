@@ -46,7 +46,7 @@ static void clear_idle(uint8_t *tokens, size_t splats, size_t whole)
 }
 
 /* Weighted sums of terms in rows. */
-POTR_WIDE_INTEGERS
+POTR_WIDE
 static void add_terms(
     int32_t *restrict sums, int32_t constant, const int32_t *weights, const int16_t *const *terms, size_t number,
     size_t places)
@@ -66,7 +66,7 @@ static void add_terms(
 }
 
 /* The integers of a stream of an item a splat. Nearly all are tokens by themselves. */
-POTR_WIDE_INTEGERS
+POTR_WIDE
 static void keep_dense(const stream_model *model, const work *w, size_t places, int is_signed, int32_t *restrict integers)
 {
     const uint8_t *const tokens = w->tokens;

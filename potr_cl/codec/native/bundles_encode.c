@@ -88,7 +88,7 @@ static INLINE uint8_t token_of(uint32_t u)
 }
 
 /* About 8 times the mean size of the last items in the lane, before each. */
-POTR_WIDE_INTEGERS
+POTR_WIDE
 static void recent_sizes(const int16_t *restrict sizes, size_t rows, int16_t *restrict recent)
 {
     memset(recent, 0, LANES * sizeof *recent);
@@ -96,14 +96,14 @@ static void recent_sizes(const int16_t *restrict sizes, size_t rows, int16_t *re
         recent[i + LANES] = (int16_t)(recent[i] - (recent[i] >> 2) + 2 * sizes[i]);
 }
 
-POTR_WIDE_INTEGERS
+POTR_WIDE
 static void weigh(int32_t *restrict sums, const int16_t *restrict term, int32_t weight, size_t number)
 {
     for (size_t i = 0; i < number; i++)
         sums[i] += weight * term[i];
 }
 
-POTR_WIDE_INTEGERS
+POTR_WIDE
 static void cut(const int32_t *restrict sums, uint8_t *restrict expected, size_t number)
 {
     for (size_t i = 0; i < number; i++) {
@@ -112,7 +112,7 @@ static void cut(const int32_t *restrict sums, uint8_t *restrict expected, size_t
     }
 }
 
-POTR_WIDE_INTEGERS
+POTR_WIDE
 static int64_t dot(const int32_t *restrict a, const int32_t *restrict b, size_t number)
 {
     int64_t sum = 0;
@@ -233,7 +233,7 @@ static void dense_section(
 }
 
 /* Sets bit k of the mask of each splat that has a coefficient of which a channel is not 0. */
-POTR_WIDE_INTEGERS
+POTR_WIDE
 static void add_to_masks(
     uint8_t *restrict masks, const int32_t *restrict y, const int32_t *restrict co, const int32_t *restrict cg,
     size_t splats, unsigned k)

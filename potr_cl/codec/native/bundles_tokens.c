@@ -131,7 +131,7 @@ static INLINE int any_large(const uint8_t *tokens, size_t count)
     return any & DIRECT;
 }
 
-POTR_WIDE_INTEGERS
+POTR_WIDE
 static int decode_plainly(
     const stream_model *model, reader *r, uint32_t *states, size_t lanes, size_t items, const rows_of_tokens *out)
 {

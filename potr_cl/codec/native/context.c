@@ -91,7 +91,7 @@ static INLINE size_t group_of_tokens(
  * tokens, sizes: (steps, lanes), filled; 0 where a lane has no splat.
  *
  * Returns 0, or 1 if there are too few words. */
-POTR_WIDE_INTEGERS
+POTR_WIDE
 POTR_EXPORT int potr_context_stream(
     const uint8_t *words, size_t available, size_t *read, uint32_t *states, int32_t *recent, size_t lanes,
     const uint32_t *entries, const uint32_t *bases, const int16_t *size_of, const int16_t *const *known,
@@ -145,7 +145,7 @@ POTR_EXPORT int potr_context_stream(
 }
 
 /* How many bits stand beside some tokens; *largest becomes the largest of them, 0 if there are none. */
-POTR_WIDE_INTEGERS
+POTR_WIDE
 POTR_EXPORT uint64_t potr_context_beside(const uint8_t *tokens, size_t number, uint8_t *largest)
 {
     uint8_t most = 0;

@@ -32,6 +32,17 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     ),
     "potr_octree_padding": (_NUMBER, [_POINTER, _POINTER]),
     "potr_octree_centres": (None, [_POINTER] * 9),
+    "potr_octree_bounds": (None, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER, _POINTER]),
+    "potr_octree_words": (
+        None,
+        [_POINTER, _SIZE, _POINTER, ctypes.c_double, ctypes.c_double, _NUMBER, _SIZE, _SIZE, _POINTER],
+    ),
+    "potr_octree_wanted": (None, [_POINTER, _SIZE, ctypes.c_double, _NUMBER, _POINTER]),
+    "potr_octree_sorting": (_SIZE, []),
+    "potr_octree_sort": (_NUMBER, [_SIZE, *[_POINTER] * 5]),
+    "potr_octree_sizes": (_SIZE, []),
+    "potr_octree_survey": (None, [_POINTER, _SIZE, _SIZE, _NUMBER, *[_POINTER] * 3]),
+    "potr_octree_streams": (None, [_POINTER, _SIZE, _SIZE, _NUMBER, *[_POINTER] * 8]),
     "potr_encode_recent": (None, [_POINTER, _SIZE, _SIZE, _POINTER]),
     "potr_encode_cells": (None, [_POINTER, _SIZE, _POINTER, _POINTER, _SIZE, ctypes.c_int32, _POINTER]),
     "potr_encode_count": (None, [_POINTER, _SIZE, _POINTER]),
@@ -51,6 +62,19 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_bundles_contexts": (_SIZE, [_POINTER, _SIZE, *[_POINTER] * 4]),
     "potr_nearest": (None, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER]),
     "potr_canonical": (None, [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _POINTER, _POINTER, _POINTER]),
+    "potr_splat_levels": (
+        _NUMBER,
+        [
+            *[_POINTER] * 4,
+            _SIZE,
+            ctypes.c_double,
+            _REAL,
+            *[ctypes.c_double] * 3,
+            _SIZE,
+            _POINTER,
+            _POINTER,
+        ],
+    ),
     "potr_unit_quaternions": (None, [_POINTER, _SIZE, _POINTER]),
     "potr_colour_levels": (
         _NUMBER,
@@ -85,7 +109,15 @@ _OF_KINDS: dict[str, tuple[Any, list[Any], tuple[str, ...]]] = {
 
 #: Those that take some microseconds, however large a file is. They keep the interpreter: to get it back among threads
 #: that all want it takes longer than they do.
-_SHORT = {"potr_bundles_table", "potr_bundles_work", "potr_bundles_vectors", "potr_octree_cut", "potr_octree_padding"}
+_SHORT = {
+    "potr_bundles_table",
+    "potr_bundles_work",
+    "potr_bundles_vectors",
+    "potr_octree_cut",
+    "potr_octree_padding",
+    "potr_octree_sorting",
+    "potr_octree_sizes",
+}
 
 
 def declared(path: str) -> dict[str, Any]:

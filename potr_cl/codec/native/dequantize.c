@@ -1,7 +1,6 @@
 /* Levels to single precision values (docs/format.md, "Attributes" and "Single precision").
  *
- * Each operation is rounded by itself: the build forbids to fuse multiplications and additions, and nothing here may be
- * compiled for processors on which that could not be told (POTR_WIDE_INTEGERS is not for floats).
+ * Each operation is rounded by itself: the build forbids to fuse multiplications and additions.
  *
  * Levels come in three kinds: *narrow*, one byte each, mapped to unsigned as the format says where they are signed;
  * *medium*, the values themselves in 32 bits, below 2^29 in magnitude; and *wide*, the same in 64 bits, any. */

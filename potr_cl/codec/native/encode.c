@@ -14,7 +14,7 @@ enum {
 };
 
 /* About 8 times the mean size of a lane's last splats, before each. sizes, recent: (steps, lanes). */
-POTR_WIDE_INTEGERS
+POTR_WIDE
 POTR_EXPORT void potr_encode_recent(
     const int32_t *restrict sizes, size_t steps, size_t lanes, int32_t *restrict recent)
 {
@@ -27,7 +27,7 @@ POTR_EXPORT void potr_encode_recent(
  *
  * terms: (count) arrays (number) of sizes; weights: (count), and then the constant. tokens: below the alphabet, which is
  * below 256. */
-POTR_WIDE_INTEGERS
+POTR_WIDE
 POTR_EXPORT void potr_encode_cells(
     const int32_t *const *terms, size_t count, const int32_t *weights, const uint8_t *restrict tokens, size_t number,
     int32_t alphabet, uint16_t *restrict cells)

@@ -18,6 +18,7 @@ from potr_cl.codec.native.bundles import BundledFile, SectionWords, native_steps
 from potr_cl.codec.native.bundles_encode import BundleEncoder
 from potr_cl.codec.native.declarations import declared
 from potr_cl.codec.native.octree import OctreeFunctions
+from potr_cl.codec.native.octree_build import OctreeBuilding
 from potr_cl.codec.native.quantising import Quantising
 from potr_cl.codec.steps.rule import ColourSteps
 
@@ -47,7 +48,7 @@ class Functions:
 
     Attributes:
         quantising: those of the encoder that are about splats, and not about integers.
-        octree: those about positions.
+        octree: those about positions. octree_build: those of the encoder.
 
     Raises:
         OSError: it cannot be loaded.
@@ -58,6 +59,7 @@ class Functions:
         self._c = declared(path)
         self.quantising = Quantising(self._c)
         self.octree = OctreeFunctions(self._c)
+        self.octree_build = OctreeBuilding(self._c)
 
     def bundled_file(
         self, splats: int, sections: Mapping[int, SectionWords], steps: ColourSteps | None, vectors: bool = True

@@ -33,14 +33,14 @@
 #define POTR_EXPORT __attribute__((visibility("default")))
 #endif
 
-/* Loops over integers whose vectors profit from wider registers than every processor has: compiled for several, and
- * chosen when the library is loaded. Only for integers: a wider version could fuse multiplications and additions of
- * floats. */
+/* Loops whose vectors profit from wider registers than every processor has: compiled for several, and chosen when the
+ * library is loaded. Floats too: the wider version has no instruction that multiplies and adds at once (that is not part
+ * of AVX2), and the build forbids to fuse them anyway. */
 #if defined(__x86_64__) && defined(__linux__) && defined(__GLIBC__) && !defined(POTR_SANITIZED) \
     && defined(__GNUC__) && !defined(__clang__) /* which refuses it for functions that a library shows */
-#define POTR_WIDE_INTEGERS __attribute__((target_clones("default", "avx2")))
+#define POTR_WIDE __attribute__((target_clones("default", "avx2")))
 #else
-#define POTR_WIDE_INTEGERS
+#define POTR_WIDE
 #endif
 
 #endif

@@ -1,8 +1,7 @@
-/* The encoder's loops over all splats: distances to views, canonical rotations, colours in Y, Co, Cg.
+/* The encoder's loops over all splats: distances to views, canonical rotations, levels of all but centres.
  *
  * Each operation is rounded by itself, in the order of the NumPy modules (geometry.py, quantize.py), whose bits these
- * functions give: the build forbids to fuse multiplications and additions, and nothing here may be compiled for
- * processors on which that could not be told. */
+ * functions give: the build forbids to fuse multiplications and additions. */
 
 #include <math.h>
 
@@ -17,6 +16,7 @@
 #define LANES 8
 
 /* The least distance of n points (n, 3) to v others (v, 3). */
+POTR_WIDE
 POTR_EXPORT void potr_nearest(
     const float *restrict points, size_t n, const double *restrict others, size_t v, double *restrict nearest)
 {
@@ -53,6 +53,7 @@ static INLINE double nearest_whole(double x)
  *
  * quaternions: (rows, 4) w, x, y, z; log_scales: (rows, 3). group: (4, 24) w, x, y, z of the axes' rotations, conjugated;
  * permutations: (24, 3), the scales that each makes first, second and third. imaginary, turned: (n, 3). */
+POTR_WIDE
 POTR_EXPORT void potr_canonical(
     const float *restrict quaternions, const float *restrict log_scales, const int64_t *restrict order, size_t n,
     const double *restrict group, const uint8_t *restrict permutations, double *restrict imaginary,
@@ -87,6 +88,59 @@ POTR_EXPORT void potr_canonical(
         for (size_t axis = 0; axis < 3; axis++)
             turned[3 * i + axis] = scales[permutations[3 * best + axis]];
     }
+}
+
+/* The whole number below x, of at most 31 bits; *fits becomes 0 where there is none. */
+static INLINE int32_t floor_of(double x, int *fits)
+{
+    const int sound = (x > -2147483647.0) & (x < 2147483648.0);
+    const double safe = sound ? x : 0.0;
+    const int32_t whole = (int32_t)safe;
+    *fits &= sound;
+    return whole - (safe < whole);
+}
+
+static INLINE void widen(int32_t level, int32_t *largest)
+{
+    const int32_t size = level < 0 ? -level : level;
+    *largest = size > *largest ? size : *largest;
+}
+
+/* Levels of the scales, rotations and opacities of n splats.
+ *
+ * sizes: (n, 3) standard deviations. imaginary: (n, 3) of unit quaternions. logits: of opacities, of the splats that
+ * `order` (n) picks among them; counted from `least` to `most`. levels: (7, stride), of which n are filled: three of
+ * scales, three of rotations, opacities. largest: (7), of their magnitudes. Returns whether all fit; if not, what was
+ * filled means nothing. */
+POTR_WIDE
+POTR_EXPORT int potr_splat_levels(
+    const double *restrict sizes, const double *restrict imaginary, const float *restrict logits,
+    const int64_t *restrict order, size_t n, double sf_scale, float sf_rotation, double sf_opacity, double least,
+    double most, size_t stride, int32_t *restrict levels, int32_t *restrict largest)
+{
+    int fits = 1;
+    for (size_t i = 0; i < n; i++) {
+        int32_t scales[3], longest = 1;
+        for (size_t axis = 0; axis < 3; axis++) {
+            scales[axis] = floor_of(sizes[3 * i + axis] * sf_scale + 0.5, &fits);
+            levels[axis * stride + i] = scales[axis];
+            longest = scales[axis] > longest ? scales[axis] : longest;
+            widen(scales[axis], &largest[axis]);
+        }
+        const float factor = sqrtf((float)longest) * sf_rotation;
+        /* What is decoded as a ball has no direction. */
+        const int ball = (scales[0] == scales[1]) & (scales[1] == scales[2]);
+        for (size_t axis = 0; axis < 3; axis++) {
+            const int32_t level = floor_of(imaginary[3 * i + axis] * (double)factor + 0.5, &fits);
+            levels[(3 + axis) * stride + i] = ball ? 0 : level;
+            widen(level, &largest[3 + axis]);
+        }
+        const double logit = logits[order[i]], above = logit < least ? least : logit, kept = above > most ? most : above;
+        const int32_t opacity = floor_of((kept - least) * sf_opacity + 0.5, &fits);
+        levels[6 * stride + i] = opacity;
+        widen(opacity, &largest[6]);
+    }
+    return fits;
 }
 
 /* R, G, B of `some` splats, which lie `step` floats apart, to Y, Co, Cg. */

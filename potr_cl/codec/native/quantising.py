@@ -68,6 +68,42 @@ class Quantising:
             address(turned, np.float32, 3 * number, True),
         )
 
+    def splat_levels(
+        self, sizes: F64, imaginary: F64, logits: F32, order: I64, factors: tuple[float, float, float],
+        range_of_logits: tuple[float, float], start: int, levels: NDArray[np.int32],
+    ) -> NDArray[np.int32] | None:  # fmt: skip
+        """Levels of the scales, rotations and opacities of some splats, as version 2 of the format has them.
+
+        Args:
+            sizes, imaginary: (n, 3) standard deviations, and imaginary parts of unit quaternions.
+            logits: (rows,) of opacities, of which ``order`` (n,) tells which are theirs.
+            factors: scale factors of scales, rotations and opacities.
+            range_of_logits: the least one, from which they are counted, and the largest.
+            levels: (7, stride) of three scales, three rotations, opacities; ``start`` to ``start + n`` are set.
+
+        Returns:
+            (7,) the largest magnitude of each; None if one does not fit, and what was set means nothing.
+        """
+        number, stride = len(order), levels.shape[1]
+        if number and not 0 <= int(order.min()) <= int(order.max()) < len(logits):
+            raise TypeError("the native path was given splats that are not there")
+        if len(levels) != 7 or not 0 <= start <= stride - number:
+            raise TypeError("the native path was given columns that are too short")
+        largest = np.zeros(7, np.int32)
+        fits = self._c["potr_splat_levels"](
+            address(sizes, np.float64, 3 * number),
+            address(imaginary, np.float64, 3 * number),
+            address(logits, np.float32, len(logits)),
+            address(order, np.int64, number),
+            number,
+            *factors,
+            *range_of_logits,
+            stride,
+            address(levels, np.int32, 7 * stride, True) + 4 * start,
+            address(largest, np.int32, 7, True),
+        )
+        return largest if fits else None
+
     def colour_levels(
         self, sh: F32, planar: bool, order: I64, dc: F64, ac: F64, start: int, levels: NDArray[np.int16]
     ) -> bool:

@@ -43,7 +43,7 @@ static INLINE int64_t beside_scales(const colour_steps *steps, int32_t opacity, 
         + 8 * steps->groups[splat >> steps->group_bits];
 }
 
-POTR_WIDE_INTEGERS
+POTR_WIDE
 void find_classes(
     const colour_steps *steps, const int16_t *logarithms, const int32_t *const *scales, const int32_t *opacities,
     uint64_t first, size_t apart, size_t n, uint8_t *dc, uint8_t *ac)

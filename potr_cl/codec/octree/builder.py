@@ -5,6 +5,8 @@ from __future__ import annotations
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec.native.library import native
+from potr_cl.codec.native.octree_build import OctreeBuilding
 from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, U64, OctreeStreams
 from potr_cl.model.morton import spread
 
@@ -31,6 +33,9 @@ def build(
     Returns:
         The streams, and ``order`` (N,): the splats' indices in the order of the leaves.
     """
+    functions = native()
+    if absolute and functions is not None:
+        return _build_natively(functions.octree_build, means, tolerance)
     n = len(means)
     axes, low, side, limit, depth, grid = _gridded(means, tolerance)
     words = _morton_words(grid, depth)
@@ -75,8 +80,39 @@ def build(
 
 def leaf_order(means: NDArray[np.float32], tolerance: F64 | float) -> NDArray[np.int64]:
     """The order that :func:`build` returns, without the streams."""
+    functions = native()
+    if functions is not None:
+        *_, words = _words_of(functions.octree_build, means, tolerance)
+        return functions.octree_build.order(words)[0]
     *_, depth, grid = _gridded(means, tolerance)
     return _depth_first(_morton_words(grid, depth))
+
+
+def _build_natively(
+    functions: OctreeBuilding, means: NDArray[np.float32], tolerance: F64 | float
+) -> tuple[OctreeStreams, NDArray[np.int64]]:
+    """:func:`build` with ``absolute``."""
+    low, side, limit, depth, words = _words_of(functions, means, tolerance)
+    order, words = functions.order(words)
+    half_diagonal = _half_diagonal(side)
+    wanted = functions.wanted(limit, half_diagonal, depth) if half_diagonal else np.zeros(len(limit), np.int8)
+    unclear = np.flatnonzero(wanted < 0)
+    wanted[unclear] = _levels_for(side, limit[unclear], depth)
+    occupancy, several, multiplicities, lengths, tails = functions.streams(words, depth, order, wanted)
+    origin = (float(low[0]), float(low[1]), float(low[2]))
+    return OctreeStreams(origin, side, depth, occupancy, several, multiplicities, lengths, tails, absolute=True), order
+
+
+def _words_of(
+    functions: OctreeBuilding, means: NDArray[np.float32], tolerance: F64 | float
+) -> tuple[F64, float, F64, int, U64]:
+    """The cube's corner and side; tolerances; the deepest level, and Morton words."""
+    means = np.ascontiguousarray(means, np.float32)
+    tolerances = np.ascontiguousarray(np.atleast_1d(tolerance), np.float64)
+    low, high, limit, finest = functions.bounds(means, tolerances)
+    side = float((high - low).max())
+    depth = _depth_for(side, finest)
+    return low, side, limit, depth, functions.words(means, low, 2.0**depth / side if side > 0 else 0.0, depth)
 
 
 def _gridded(
@@ -124,15 +160,19 @@ def _ascending(words: U64) -> NDArray[np.int64]:
 
 def _depth_for(side: float, tolerance: float) -> int:
     """The first level whose cells' half diagonal is below the tolerance (with a margin for rounding)."""
-    half_diagonal = side * (np.sqrt(3) / 2)
+    half_diagonal = _half_diagonal(side)
     if half_diagonal == 0 or half_diagonal < tolerance:
         return 0
     return min(DEEPEST_LEVEL, int(np.floor(np.log2(half_diagonal / tolerance) + 1e-6)) + 1)
 
 
+def _half_diagonal(side: float) -> float:
+    return side * float(np.sqrt(3) / 2)
+
+
 def _levels_for(side: float, tolerance: F64, depth: int) -> NDArray[np.int8]:
     """:func:`_depth_for` of each tolerance."""
-    half_diagonal = side * (np.sqrt(3) / 2)
+    half_diagonal = _half_diagonal(side)
     if half_diagonal == 0:
         return np.zeros(len(tolerance), np.int8)
     levels = np.floor(np.log2(half_diagonal / tolerance) + 1e-6) + 1

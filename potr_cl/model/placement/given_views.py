@@ -9,15 +9,18 @@ from functools import cached_property
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.placement.colour_memory import ColourMemory
-from potr_cl.model.placement.matter import CROWDED, cell_of, frame_of, matter_of, surroundings
+from potr_cl.model.placement.matter import CROWDED, cell_of, frame_of, matter_of, surroundings_of
 from potr_cl.model.scene import Scene
 
 F32 = NDArray[np.float32]
 
 #: So many splats, evenly taken, tell where a scene is; views are judged by so many of them, and points that hide them.
 _TAKEN, _TARGETS, _OCCLUDERS = 20_000, 1_000, 8_000
+#: Views that are looked at together: what is found of them on the way stays in a cache.
+_AT_ONCE = 8
 #: Part of what a new view shows that some given view must show, too.
 _KNOWN = 0.9
 #: A new view shows at least this part of what the view shows that it lies beside, by number of splats.
@@ -32,34 +35,42 @@ class GivenViews:
     Args:
         scene: that they show.
         cameras: the given views, at least one.
+        run: in place of :func:`map`, to work with several threads, as long as somebody asks.
     """
 
-    def __init__(self, scene: Scene, cameras: Sequence[Camera]) -> None:
+    def __init__(self, scene: Scene, cameras: Sequence[Camera], run: Run = map) -> None:
         every = max(len(scene) // _TAKEN, 1)
         some = scene.subset(np.arange(0, len(scene), every))
-        self._frame = frame_of(some)
+        self._run = run
+        self._frame = frame_of(some, run)
         matter = matter_of(some, self._frame, _TARGETS, _OCCLUDERS)
         # Each point stands for the surface of the splats that were not taken, too.
         self._matter = dataclasses.replace(matter, areas=matter.areas * np.float32(every))
-        shown, blocked = zip(*map(self._look, cameras), strict=True)
-        self._shown: F32 = np.stack(shown)
+        parts = [cameras[first : first + _AT_ONCE] for first in range(0, len(cameras), _AT_ONCE)]
+        shown, blocked = zip(*run(self._look, parts), strict=True)
+        self._shown: F32 = np.concatenate(shown)
         self._known: F32 = self._shown.max(axis=0)
         # Whoever photographs indoors, stands close to things.
-        self._crowded = max(CROWDED, max(blocked))
+        self._crowded = max(CROWDED, max(map(max, blocked)))
         self._places = (camera_centres(cameras) - self._frame.centre) / self._frame.unit
 
     @cached_property
     def _memory(self) -> tuple[ColourMemory, float]:
         """What colours remember of given places, and the least that they must remember of others."""
-        memory = ColourMemory(self._places, self._matter)
+        memory = ColourMemory(self._places, self._matter, self._run)
         if not memory.tells:
             return memory, 0.0
-        return memory, _REMEMBERED * min(memory.of_known(*given) for given in enumerate(self._shown))
+        known = self._run(lambda number: memory.of_known(number, self._shown[number]), range(len(self._shown)))
+        return memory, _REMEMBERED * min(known)
 
     def views_of_parts(self) -> NDArray[np.int64]:
         """(K,) how many given views show each of some splats, evenly taken; those that none shows are left out."""
         counts: NDArray[np.int64] = np.count_nonzero(self._shown, axis=0)
         return counts[counts > 0]
+
+    def recall(self) -> None:
+        """Find out what colours remember, which :meth:`allow` asks, before several threads do."""
+        _ = self._memory
 
     def allow(self, camera: Camera, beside: int) -> bool:
         """Whether a camera might have been here.
@@ -73,7 +84,7 @@ class GivenViews:
         """
         if not np.isfinite(camera.translation).all():
             return False
-        shown, blocked = self._look(camera)
+        (shown,), (blocked,) = self._look([camera])
         total = float(shown.sum())
         if blocked > self._crowded or total < _FULL * float(self._shown[beside].sum()):
             return False
@@ -83,16 +94,21 @@ class GivenViews:
         memory, least = self._memory
         return not memory.tells or memory.of(place, shown) >= least
 
-    def _look(self, camera: Camera) -> tuple[F32, float]:
-        """(K,) 1 for each target that the view shows, else 0; and how much matter there is close by."""
+    def _look(self, cameras: Sequence[Camera]) -> tuple[F32, list[float]]:
+        """(V, K) 1 for each target that a view shows, else 0; and how much matter there is close by each view."""
         matter, frame = self._matter, self._frame
-        place = (camera.centre - frame.centre) / frame.unit
-        horizon, blocked = surroundings(place, matter)
-        rays = matter.targets - place
-        distance = np.linalg.norm(rays, axis=1)
-        x, y, z = camera.rotation @ rays.T
+        places = (camera_centres(cameras) - frame.centre) / frame.unit
+        horizons, blocked = surroundings_of(places, matter)
+        rays = matter.targets - places[:, None]
+        distance = np.linalg.norm(rays, axis=2)
+        rotations = np.stack([camera.rotation for camera in cameras])
+        x, y, z = np.matmul(rotations, rays.transpose(0, 2, 1)).transpose(1, 0, 2)
+        fx, fy, cx, cy, width, height = np.array(
+            [(c.fx, c.fy, c.cx, c.cy, c.width, c.height) for c in cameras], np.float64
+        ).T[:, :, None]
         with np.errstate(divide="ignore", invalid="ignore", over="ignore"):
-            u, v = camera.fx * x / z + camera.cx, camera.fy * y / z + camera.cy
-            inside = (z > frame.near) & (u > 0) & (u < camera.width) & (v > 0) & (v < camera.height)
-        visible = distance <= 1.1 * horizon[cell_of(rays.T.astype(np.float32))] + 0.02
+            u, v = fx * x / z + cx, fy * y / z + cy
+            inside = (z > frame.near) & (u > 0) & (u < width) & (v > 0) & (v < height)
+        cells = cell_of(rays.transpose(2, 0, 1).astype(np.float32))
+        visible = distance <= 1.1 * np.take_along_axis(horizons, cells, axis=1) + 0.02
         return (inside & visible).astype(np.float32), blocked

@@ -129,17 +129,31 @@ def surroundings(camera_centre: F64, matter: Matter) -> tuple[F32, float]:
         Distance of the nearest point in each cell of the cube map, infinite where there is none; and the part of all
         directions that matter within arm's length takes up.
     """
-    rays = matter.occluders - camera_centre.astype(np.float32)[:, None]
-    squared = np.einsum("ij,ij->j", rays, rays)
-    horizon = np.full(6 * _CELLS * _CELLS, np.inf, np.float32)
-    np.minimum.at(horizon, cell_of(rays), np.sqrt(squared))
-    near = squared < _ELBOW_ROOM**2
-    blocked = np.minimum(matter.areas[near] / np.maximum(4 * np.pi * squared[near], 1e-30), 1)
-    return horizon, float(blocked.sum(dtype=np.float64))
+    horizons, (blocked,) = surroundings_of(camera_centre[None], matter)
+    return horizons[0], blocked
+
+
+def surroundings_of(places: F64, matter: Matter) -> tuple[F32, list[float]]:
+    """The same of some places, (V, 3): horizons (V, cells), and what is taken up of each."""
+    rays = matter.occluders[:, None] - places.T.astype(np.float32)[:, :, None]
+    x, y, z = rays
+    squared = x * x
+    squared += y * y
+    squared += z * z
+    cells = 6 * _CELLS * _CELLS
+    horizons = np.full((len(places), cells), np.inf, np.float32)
+    at = cell_of(rays) + np.arange(0, horizons.size, cells)[:, None]
+    np.minimum.at(horizons.reshape(-1), at.reshape(-1), np.sqrt(squared).reshape(-1))
+    blocked = []
+    for row in squared:
+        near = row < _ELBOW_ROOM**2
+        parts = np.minimum(matter.areas[near] / np.maximum(4 * np.pi * row[near], 1e-30), 1)
+        blocked.append(float(parts.sum(dtype=np.float64)))
+    return horizons, blocked
 
 
 def cell_of(rays: F32) -> NDArray[np.int64]:
-    """Number of the cube map's cell in each direction, (3, n), of any length but 0."""
+    """Number of the cube map's cell in each direction, (3, …), of any length but 0."""
     x, y, z = rays
     sizes = np.abs(rays)
     largest = np.maximum(np.maximum(sizes[0], sizes[1]), sizes[2])

@@ -78,7 +78,7 @@ class Adam(Parameters):
             nbytes = self.values.size
             self._moments = [self._memory.allocate(nbytes, "the gradient's moments") for _ in range(2)]
             for moment in self._moments:
-                cl.enqueue_fill_buffer(device.queue, moment, np.float32(0), 0, nbytes)
+                device.fill(moment, np.float32(0), nbytes)
             self._steps = self._memory.upload(_steps(columns, rates, limits), "the steps")
             self._step = device.shared_kernel("fit/adam.cl", "adam")
         except BaseException:

@@ -115,7 +115,7 @@ class PictureDerivatives(Owner):
 
     def forget(self) -> None:
         """Set the gradient to 0."""
-        cl.enqueue_fill_buffer(self._device.queue, self.gradient, np.float32(0), 0, self.gradient.size)
+        self._device.fill(self.gradient, np.float32(0))
 
     def add(self, cameras: Sequence[Camera], target: cl.Buffer, given: bool = False, unit: float = 1.0) -> None:
         """Add Jᵀ W v of some views to the gradient.
@@ -159,7 +159,7 @@ class PictureDerivatives(Owner):
     def _reserve(self, views: ViewSet) -> None:
         if self._totals.reserve(_SUMS * views.stride * len(views.views)):
             # They become zero again whenever they have been used.
-            cl.enqueue_fill_buffer(self._device.queue, self._totals.buffer, np.uint32(0), 0, self._totals.nbytes)
+            self._device.fill(self._totals.buffer, np.uint32(0), self._totals.nbytes)
         self._errors.reserve(4 * views.tiles)
         if self._factors.reserve(4 * len(views.views)):
             self._written = None

@@ -99,7 +99,7 @@ class CachedSweep(Owner):
         self.settle()
         count = self._prepared.cached_tiles
         if count:
-            cl.enqueue_fill_buffer(self._device.queue, self._buffers.stale, np.float32(np.inf), 0, 4 * count)
+            self._device.fill(self._buffers.stale, np.float32(np.inf), 4 * count)
 
     def settle(self) -> None:
         """Wait until the last removal is noted, and sweep the tiles that the device has listed on its own."""
@@ -117,7 +117,7 @@ class CachedSweep(Owner):
     def have_listed(self, tolerance: float) -> None:
         """Have the device note what has been removed, and list the tiles that are staler than ``tolerance``."""
         counts, listed = len(self._kernels), self._buffers.listed
-        cl.enqueue_fill_buffer(self._device.queue, listed, np.uint32(0), 0, 4 * counts)
+        self._device.fill(listed, np.uint32(0), 4 * counts)
         for kernels in self._kernels:
             kernels.note_removal(list_above=tolerance)
         self._listed = self._device.download(listed, (counts,), np.uint32).tolist()

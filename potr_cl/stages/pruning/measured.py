@@ -9,20 +9,22 @@ from typing import TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.raster.culling import ViewPart
+from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import lying_on
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.pruning.part import RemovalPart
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.shared_removal import SharedRemoval
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.pruning.visible_parts import PartedRemoval, parts_worth_it, whole_on_device
+from potr_cl.stages.pruning.view_by_view import ViewByView
+from potr_cl.stages.pruning.visible_parts import PartedRemoval, first_totals, sights_worth_it, whole_on_device
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.workers.dealing import shares
 from potr_cl.workers.parts import Parts
 
-#: What measures: one device, perhaps part by part, or several together.
-Removal: TypeAlias = RemovalSweep | SharedRemoval | PartedRemoval
+#: What measures: one device, perhaps part by part or view by view, or several together.
+Removal: TypeAlias = RemovalSweep | SharedRemoval | PartedRemoval | ViewByView
 
 
 @contextmanager
@@ -30,15 +32,15 @@ def measurement(
     state: State,
     bench: Workbench,
     options: SweepOptions,
-    parts: list[ViewPart] | None = None,
+    sights: Sights | None = None,
     spared: NDArray[np.bool_] | None = None,
 ) -> Iterator[Removal]:
     """A removal sweep over the views of a state, its splats numbered as in the state's scene.
 
     Args:
         state, bench, options: of the stage.
-        parts: of the views, where these were found before.
-        spared: as of :class:`~potr_cl.stages.pruning.visible_parts.PartedRemoval`; only with ``parts``.
+        sights: of the views, where these were found before to be worth it.
+        spared: as of :class:`~potr_cl.stages.pruning.visible_parts.PartedRemoval`; only with ``sights``.
 
     Raises:
         DeviceError: the scene or a view does not fit the device.
@@ -52,22 +54,26 @@ def measurement(
     share = None if pool is None or options.sample < 1 else shares(pool, len(views))
     with ExitStack() as stack:
         if pool is None or share is None or not share.others:
-            if parts is None:
-                parts = parts_worth_it(state.scene, views, options)
-            if parts is not None:
+            if sights is None:
+                sights = sights_worth_it(state.scene, views, options)
+            if sights is not None:
                 whole = stack.enter_context(whole_on_device(device, bench.drawable(state.scene)))
-                yield stack.enter_context(
-                    PartedRemoval(device, state.scene, whole, views, parts, options, bench.background, progress, spared)
-                )
+                given = (options, bench.background, progress)
+                if isinstance(whole, SceneBuffers) and device.family == "gpu" and options.only_by_tolerance:
+                    first = first_totals(len(state.scene), spared)
+                    yield stack.enter_context(ViewByView(device, whole, views, sights, *given, first))
+                else:
+                    parts = sights.parts()
+                    yield stack.enter_context(PartedRemoval(device, state.scene, whole, views, parts, *given, spared))
                 return
             drawable = stack.enter_context(lying_on(device, bench.placed(state)))
             rasterizer = stack.enter_context(Rasterizer(device, drawable, background=bench.background))
             yield stack.enter_context(RemovalSweep(rasterizer, views, options, progress))
             return
         scene = stack.enter_context(pool.shared(bench.shared(state)))
-        given = [(scene, views, options, bench.background, numbers) for numbers in share.others]
+        each = [(scene, views, options, bench.background, numbers) for numbers in share.others]
         others = stack.enter_context(
-            Parts(pool, RemovalPart, given, options.memory, [len(each) for each in share.others])
+            Parts(pool, RemovalPart, each, options.memory, [len(each) for each in share.others])
         )
         own, stride = None, len(state.scene)
         if share.own:

@@ -93,7 +93,7 @@ class _Controller(Owner):
         remaining = options.iterations - iteration
         effect_unit, importance_unit = removal.units
         everywhere = {"splats": self._splats, "totals": removal.totals, "keys": self._keys, "state": self._state}
-        cl.enqueue_fill_buffer(self._device.queue, self._state, np.uint32(0), 0, _STATE.itemsize)
+        self._device.fill(self._state, np.uint32(0), _STATE.itemsize)
         self._rank.bind(
             **everywhere,
             alive=removal.marks,

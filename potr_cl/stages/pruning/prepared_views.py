@@ -181,7 +181,7 @@ class PreparedSet(Owner):
 
     def zero_sums(self) -> None:
         """Enqueue that all sums become 0, as before the first sweep."""
-        cl.enqueue_fill_buffer(self._device.queue, self.sums, np.float32(0), 0, self.sums.size)
+        self._device.fill(self.sums, np.float32(0))
 
     def read_sums(self) -> Iterator[tuple[int, View, NDArray[np.uint32], NDArray[np.float32]]]:
         """What the last sweep left, view by view.

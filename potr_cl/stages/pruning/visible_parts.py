@@ -20,9 +20,10 @@ from numpy.typing import NDArray
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.raster.culling import ViewPart, parts_of_views, work
+from potr_cl.raster.culling import Sights, ViewPart, work
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, uploaded
@@ -47,13 +48,35 @@ _SOURCE = "prune/parts.cl"
 _GROUP = 64
 
 
-def parts_worth_it(scene: Scene, cameras: Sequence[Camera], options: SweepOptions) -> list[ViewPart] | None:
-    """The parts of the views; None where the views had better share one scene."""
+def sights_worth_it(
+    scene: Scene, cameras: Sequence[Camera], options: SweepOptions, groups: SplatGroups | None = None
+) -> Sights | None:
+    """What the views see; None where they had better share one scene.
+
+    Args:
+        scene: clean.
+        cameras: the views.
+        options: of the sweep.
+        groups: of the scene, where they are known.
+    """
     # A sample of the tiles is drawn from all of them in turn.
     if len(scene) < LEAST_SPLATS or options.sample < 1:
         return None
-    parts = parts_of_views(scene, cameras, INRIA.near)
-    return parts if work(parts) <= _WORTH_IT * len(scene) * len(cameras) else None
+    sights = Sights.of(scene, cameras, INRIA.near, groups)
+    return sights if sights.totals.sum() <= _WORTH_IT * len(scene) * len(cameras) else None
+
+
+def first_totals(splats: int, spared: NDArray[np.bool_] | None) -> NDArray[np.int64]:
+    """(N, 2) totals to begin with, for which an effect beyond all limits keeps a splat.
+
+    Args:
+        splats: N.
+        spared: (N,) the splats to keep; None: none.
+    """
+    totals = np.zeros((splats, 2), np.int64)
+    if spared is not None:
+        totals[spared, 0] = _SPARED
+    return totals
 
 
 @contextmanager
@@ -123,10 +146,7 @@ class PartedRemoval(Owner):
         spared: NDArray[np.bool_] | None = None,
     ) -> None:
         self.splats = len(scene)
-        #: What totals begin with: an effect beyond all limits keeps a splat.
-        self._first_totals = np.zeros((self.splats, 2), np.int64)
-        if spared is not None:
-            self._first_totals[spared, 0] = _SPARED
+        self._first_totals = first_totals(self.splats, spared)
         self._device, self._scene, self._whole = device, scene, whole
         self._fixed_point = FixedPoint.of_views(cameras)
         self._alive = np.ones(self.splats, bool)

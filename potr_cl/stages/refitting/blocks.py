@@ -11,7 +11,8 @@ import pyopencl as cl
 
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Memory, Owner
-from potr_cl.stages.refitting.coefficients import Coefficients, Ridge
+from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.vector_space import Ridge
 
 _SOURCE = "refit/blocks.cl"
 
@@ -40,9 +41,19 @@ class SplatBlocks(Owner):
         self.buffer = self._memory.allocate(4 * self._triangle * layout.stride, "the splats' normal equations")
 
     @property
-    def nbytes(self) -> int:
-        """Bytes of :attr:`buffer`."""
-        return 4 * self._triangle * self._coefficients.layout.stride
+    def ranges(self) -> list[range]:
+        """The splats whose blocks a sweep adds up together: all."""
+        return [range(self._coefficients.layout.stride)]
+
+    def add_fixed(self, splats: range, sums: cl.Buffer, unit: float) -> None:
+        """Enqueue: blocks += unit times integers, which become 0.
+
+        Args:
+            splats: whose blocks, one of :attr:`ranges`.
+            sums: (M (M + 1) / 2, len(splats)) int64.
+            unit: in single precision.
+        """
+        self._coefficients.add_fixed_some(self.buffer, sums, 0, self._triangle * len(splats), unit)
 
     def zero(self) -> None:
         """Have all blocks 0."""

@@ -1,8 +1,7 @@
-"""Vectors of SH coefficients on the device: where they lie, what is computed with them, and which may change."""
+"""Vectors of SH coefficients in the device's memory: :class:`Coefficients`."""
 
 from __future__ import annotations
 
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
@@ -11,86 +10,20 @@ from numpy.typing import NDArray
 
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.kernel import Kernel
-from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.opencl.memory import Memory
+from potr_cl.stages.refitting.vector_space import Layout, Ridge, VectorSpace
 
 _SOURCE = "refit/coefficients.cl"
 #: Work-items that share a dot product.
-_DOT_ITEMS = 16384
+DOT_ITEMS = 16384
 #: Work-items of a work-group.
 _GROUP = 64
 #: Splats whose coefficients are uploaded at a time.
 _TURNED = 1 << 18
-#: Columns whose flags share a word on the device.
-_FLAGS = 24
-
-#: Bytes that are filled at a time: no runtime has to count beyond 32 bits.
-_FILLED = 1 << 30
 
 
-@dataclass(frozen=True)
-class Layout:
-    """Where the coefficients of a scene's splats lie on the device (cl/refit/coefficients.clh).
-
-    Attributes:
-        splats: N. stride: N padded; a column has so many values.
-        sh_count: M, coefficients of a channel.
-        lanes: splats a work-item.
-    """
-
-    splats: int
-    stride: int
-    sh_count: int
-    lanes: int
-
-    @property
-    def columns(self) -> int:
-        """Coefficients of a splat; coefficient m, channel c of Y, Co, Cg is in column 3 m + c."""
-        return 3 * self.sh_count
-
-    @property
-    def macros(self) -> dict[str, int]:
-        """What the kernels must know of it when they are built."""
-        return {"LANES": self.lanes, "SH_COUNT": self.sh_count}
-
-    def some(self, constant: bool) -> dict[str, int]:
-        """The same for kernels that look at all coefficients, or at the constant ones, whose columns come first."""
-        return {**self.macros, "SH_COUNT": 1} if constant else self.macros
-
-    def over_splats(self, kernel: Kernel, *others: int) -> None:
-        """Launch a bound kernel over all splats, and in the second dimension over ``others``."""
-        group = max(_GROUP // self.lanes, 1)
-        kernel.launch((self.stride // self.lanes, *others), (group, *(1 for _ in others)))
-
-
-@dataclass(frozen=True)
-class Ridge:
-    """The penalty beside the pictures' error: lam |x_AC|^2 + prior |x - start|^2, with a larger lam on chroma.
-
-    Attributes:
-        lam: on the AC coefficients of Y, in pixels of an image of ``REFERENCE_PIXELS``.
-        chroma_factor: lambda of Co and Cg over that of Y.
-        prior: on every coefficient's distance to its start, in the same unit.
-    """
-
-    lam: float
-    chroma_factor: float
-    prior: float
-
-    @property
-    def scalars(self) -> dict[str, np.float32]:
-        """The arguments of that name of the kernels."""
-        return {
-            "lambda_luma": np.float32(self.lam),
-            "lambda_chroma": np.float32(self.lam * self.chroma_factor),
-            "prior": np.float32(self.prior),
-        }
-
-
-class Coefficients(Owner):
-    """The vectors of one scene's coefficients in Y, Co, Cg, and the flags of those that may change.
-
-    A vector is a device buffer; only this class and the kernels know its layout.
+class Coefficients(VectorSpace):
+    """A :class:`potr_cl.stages.refitting.vector_space.VectorSpace` whose vectors are device buffers.
 
     Args:
         device: to compute on.
@@ -105,15 +38,18 @@ class Coefficients(Owner):
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
-        self.device, self.layout = device, layout
+        super().__init__(device, layout)
         self._regularise, self._combine, self._dot_parts, self._to_ycocg, self._to_rgb = (
             device.shared_kernel(_SOURCE, name, **layout.macros)
             for name in ("regularise", "combine", "dot_parts", "to_ycocg", "to_rgb")
         )
+        self._from_fixed = device.shared_kernel(
+            "refit/gather.cl", "from_fixed", WEIGHTS=0, SOME_BLOCKS=0, **layout.macros
+        )
         self._memory = Memory(device)
         try:
             self.active = self._memory.allocate(8 * layout.stride, "the active coefficients")
-            self._parts = self._memory.allocate(8 * _DOT_ITEMS, "a dot product")
+            self._parts = self._memory.allocate(12 * DOT_ITEMS, "a dot product")
             self.activate(None)
         except BaseException:
             self.close()
@@ -123,38 +59,63 @@ class Coefficients(Owner):
 
     def vector(self) -> cl.Buffer:
         """A new vector, not set; it is given back with the others by :meth:`close`."""
-        return self._memory.allocate(4 * self._length, "the SH coefficients")
-
-    @property
-    def _length(self) -> int:
-        return self.layout.columns * self.layout.stride
+        return self._memory.allocate(4 * self.length, "the SH coefficients")
 
     def zero(self, x: cl.Buffer) -> None:
         """x = 0."""
-        for start in range(0, x.size, _FILLED):
-            cl.enqueue_fill_buffer(self.device.queue, x, np.float32(0), start, min(_FILLED, x.size - start))
+        self.clear(x)
 
     def copy(self, y: cl.Buffer, x: cl.Buffer) -> None:
         """y = x."""
-        cl.enqueue_copy(self.device.queue, y, x, byte_count=4 * self._length)
+        cl.enqueue_copy(self.device.queue, y, x, byte_count=4 * self.length)
 
     def combine(self, a: float, y: cl.Buffer, b: float, x: cl.Buffer) -> None:
         """y = a y + b x."""
-        self._combine.bind(a=np.float32(a), y=y, b=np.float32(b), x=x).launch((self._length,), (_GROUP,))
+        self.combine_some(a, y, b, x, self.length)
+
+    def combine_some(self, a: float, y: cl.Buffer, b: float, x: cl.Buffer, count: int) -> None:
+        """The same of the first ``count`` values of two buffers, a multiple of 64."""
+        self._combine.bind(a=np.float32(a), y=y, b=np.float32(b), x=x).launch((count,), (_GROUP,))
 
     def dot(self, x: cl.Buffer, y: cl.Buffer) -> float:
         """x · y; waits for the device. Not finite where single precision overflows."""
-        return self._dot(x, y)[0]
+        self.begin_dot(x, y, self.length)
+        return self.found_dot()[0]
 
     def largest(self, x: cl.Buffer) -> float:
         """The largest |x_i|; waits for the device."""
-        return self._dot(x, x)[1]
+        self.begin_dot(x, x, self.length)
+        return self.found_dot()[1]
 
-    def _dot(self, x: cl.Buffer, y: cl.Buffer) -> tuple[float, float]:
-        self._dot_parts.bind(x=x, y=y, count=self._length, parts=self._parts).launch((_DOT_ITEMS,), (_GROUP,))
-        parts = self.device.download(self._parts, (2, _DOT_ITEMS), np.float32)
+    def begin_dot(self, x: cl.Buffer, y: cl.Buffer, count: int, more: bool = False) -> None:
+        """Enqueue the dot product of the first ``count`` values of two buffers.
+
+        Args:
+            x, y: the buffers.
+            count: of the values.
+            more: these are the next ones of longer vectors, whose pieces before, each a multiple of :data:`DOT_ITEMS`,
+                it was called with last.
+        """
+        self._dot_parts.bind(x=x, y=y, count=count, more=more, parts=self._parts).launch((DOT_ITEMS,), (_GROUP,))
+
+    def found_dot(self) -> tuple[float, float]:
+        """The dot product of what :meth:`begin_dot` was called with, and the largest |x_i|; waits for the device."""
+        parts = self.device.download(self._parts, (2, DOT_ITEMS), np.float32)
         with np.errstate(invalid="ignore"):  # infinities of both signs: the callers look at the result
             return float(parts[0].sum(dtype=np.float64)), float(parts[1].max())
+
+    def add_fixed(self, x: cl.Buffer, sums: cl.Buffer, unit: float, constant: bool = False) -> None:
+        """See :meth:`VectorSpace.add_fixed`."""
+        # The constant coefficients' columns come first.
+        self.add_fixed_some(x, sums, 0, 3 * self.layout.stride if constant else self.length, unit)
+
+    def add_fixed_some(self, result: cl.Buffer, sums: cl.Buffer, first: int, count: int, unit: float) -> None:
+        """Enqueue: float32 values += unit times as many integers from number ``first`` on, which become 0."""
+        self._from_fixed.bind(sums=sums, first=first, unit=np.float32(unit), result=result).launch((count,))
+
+    def on_device(self, x: cl.Buffer, place: int = 0) -> cl.Buffer:
+        """The vector itself."""
+        return x
 
     def add_ridge(self, sums: cl.Buffer, x: cl.Buffer, ridge: Ridge) -> None:
         """sums += (lam on AC + prior) x on the active coefficients; the others' sums become 0."""
@@ -189,16 +150,17 @@ class Coefficients(Owner):
 
         Args:
             x: the vector.
-            sh: (N, M, 3) R, G, B.
+            sh: (N, M, 3) R, G, B; of fewer splats, the others' coefficients become 0.
         """
         layout, device = self.layout, self.device
         self.zero(x)
         planar = sh.transpose(1, 2, 0)
-        if planar.flags.c_contiguous and planar.dtype == np.float32:  # as a re-fit or a decoder leaves them
+        # As a re-fit or a decoder leaves them.
+        if planar.flags.c_contiguous and planar.dtype == np.float32 and len(sh) == layout.splats:
             cl.enqueue_copy(device.queue, x, planar, is_blocking=True, **self._as_columns(planar))
         else:
             turn = device.shared_kernel("raster/columns.cl", "columns")
-            for first in range(0, layout.splats, _TURNED):
+            for first in range(0, len(sh), _TURNED):
                 rows = sh[first : first + _TURNED].reshape(-1, layout.columns)
                 with Memory(device) as memory:
                     some = memory.upload(rows.astype(np.float32, copy=False), "the SH coefficients")
@@ -212,12 +174,16 @@ class Coefficients(Owner):
         layout, device = self.layout, self.device
         sh = np.empty((layout.sh_count, 3, layout.splats), np.float32)
         with Memory(device) as memory:
-            rgb = memory.allocate(4 * self._length, "the SH coefficients")
-            self._to_rgb.bind(columns=x, stride=layout.stride, result=rgb)
-            layout.over_splats(self._to_rgb)
+            rgb = memory.allocate(4 * self.length, "the SH coefficients")
+            self.to_rgb(x, rgb)
             with device.errors("failed while computing"):
                 cl.enqueue_copy(device.queue, sh, rgb, is_blocking=True, **self._as_columns(sh))
         return sh.transpose(2, 0, 1)
+
+    def to_rgb(self, x: cl.Buffer, result: cl.Buffer) -> None:
+        """Enqueue: result = x in R, G, B."""
+        self._to_rgb.bind(columns=x, stride=self.layout.stride, result=result)
+        self.layout.over_splats(self._to_rgb)
 
     def _as_columns(self, planar: FloatArray) -> dict[str, Any]:
         """How (M, 3, N) lie in a vector, as a copy takes it."""
@@ -236,39 +202,6 @@ class Coefficients(Owner):
         return columns
 
     # ------------------------------------------------------------------------------------------ which may change
-
-    def keep_active(self, x: cl.Buffer) -> None:
-        """x = 0 where it may not change."""
-        self.add_ridge(x, x, Ridge(0.0, 0.0, 0.0))
-
-    def activate_constant(self) -> None:
-        """Say that the constant coefficients may change and no others."""
-        words = np.zeros((2, self.layout.stride), np.uint32)
-        words[0] = 0b111
-        self.restore_flags(words)
-
-    def activate(self, active: NDArray[np.bool_] | None) -> None:
-        """Say which coefficients may change.
-
-        Args:
-            active: (N, M, 3) in Y, Co, Cg; None: all.
-        """
-        layout = self.layout
-        words = np.zeros((2, layout.stride), np.uint32)
-        if active is None:
-            words[0] = (1 << min(layout.columns, _FLAGS)) - 1
-            words[1] = (1 << max(layout.columns - _FLAGS, 0)) - 1
-        else:
-            for column in range(layout.columns):
-                flags = active[:, column // 3, column % 3].astype(np.uint32)
-                words[column // _FLAGS, : layout.splats] |= flags << np.uint32(column % _FLAGS)
-        self.restore_flags(words)
-
-    def is_active(self) -> NDArray[np.bool_]:
-        """(N, M, 3) in Y, Co, Cg, which coefficients may change."""
-        layout, words = self.layout, self.save_flags()[:, : self.layout.splats]
-        bits = [words[column // _FLAGS] >> np.uint32(column % _FLAGS) & 1 for column in range(layout.columns)]
-        return np.array(bits, bool).T.reshape(layout.splats, layout.sh_count, 3)
 
     def save_flags(self) -> NDArray[np.uint32]:
         """The flags as they lie on the device, for :meth:`restore_flags`."""

@@ -30,11 +30,12 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_set import TABLE_ENTRY, TILE, ViewSet
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.blocks import SplatBlocks
-from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.fixed_point import gathered_scale
 from potr_cl.stages.refitting.launcher import Launcher
 from potr_cl.stages.refitting.prepared_views import PreparedViews
+from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
 from potr_cl.stages.refitting.targets import TargetCache, Targets
+from potr_cl.stages.refitting.vector_space import Vector, VectorSpace
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
 _CHANGE, _TOTALS = 16, 32
@@ -87,7 +88,7 @@ class ColourMap(Owner):
         self,
         launcher: Launcher,
         rasterizer: Rasterizer,
-        coefficients: Coefficients,
+        coefficients: VectorSpace,
         means: FloatArray,
         cameras: Sequence[Camera],
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -108,12 +109,16 @@ class ColourMap(Owner):
             for constant in (False, True)
         }
         self._gathers = {
-            (constant, weights): device.shared_kernel(
-                "refit/gather.cl", "gather", WEIGHTS=int(weights), **layout.some(constant)
+            (constant, weights, some): device.shared_kernel(
+                "refit/gather.cl", "gather", WEIGHTS=int(weights), SOME_BLOCKS=int(some), **layout.some(constant)
             )
-            for constant, weights in ((False, False), (False, True), (True, False))
+            for constant, weights, some in (
+                (False, False, False),
+                (False, True, False),
+                (False, True, True),
+                (True, False, False),
+            )
         }
-        self._from_fixed = device.shared_kernel("refit/gather.cl", "from_fixed", WEIGHTS=0, **layout.macros)
         self.total_weight = 3 * REFERENCE_PIXELS * len(cameras)
         self._one = gathered_scale(cameras, [_weight(camera) for camera in cameras])
         fixed_points = self._launcher.fixed_point_scales(cameras)
@@ -141,9 +146,9 @@ class ColourMap(Owner):
                 _Slot(*(_part(of, slot, together) for of in (self._change, self._totals))) for slot in range(together)
             ]
             self._tables = self._memory.allocate(TABLE_ENTRY * at_once, "the views")
-            coefficients.zero(self._totals)
+            coefficients.clear(self._totals)
             self.sums = self._memory.allocate(8 * layout.columns * layout.stride, "the sums over views")
-            coefficients.zero(self.sums)
+            coefficients.clear(self.sums)
             tiles = max((sum(_tiles(cameras[number]) for number in numbers) for numbers in launches), default=0)
             self._errors = self._memory.allocate(4 * tiles, "the tiles' errors")
             # By what each view's sums are multiplied on their way to the coefficients.
@@ -165,10 +170,10 @@ class ColourMap(Owner):
 
     def gradient(
         self,
-        x: cl.Buffer,
+        x: Vector,
         targets: Targets,
-        result: cl.Buffer,
-        blocks: SplatBlocks | None = None,
+        result: Vector,
+        blocks: SplatBlocks | SlicedBlocks | None = None,
         constant: bool = False,
     ) -> float:
         """result += Aᵀ W (pictures(x) - targets), half the gradient of the squared error at x.
@@ -188,17 +193,26 @@ class ColourMap(Owner):
         Raises:
             DeviceError: the device failed. What the targets raise.
         """
+        ranges = [] if blocks is None else blocks.ranges
         with Memory(self._device) as memory:
-            sums = None if blocks is None else self._block_sums(memory, blocks.nbytes)
+            sums = self._block_sums(memory, len(ranges[0])) if ranges else None
+            on_device = self._coefficients.on_device(x)
             if self._helpers is not None:
-                self._helpers.begin_gradient(x, blocks is not None, constant)
-            errors = self.sum_gradient(x, targets, sums, constant)
+                self._helpers.begin_gradient(on_device, blocks is not None, constant)
+            errors = self.sum_gradient(on_device, targets, sums, constant)
             if self._helpers is not None:
                 errors |= self._helpers.add(self.sums, sums)
-            self._finish(self.sums, 1.0, result, constant)
+            self._coefficients.add_fixed(result, self.sums, 1 / self._one, constant)
             if blocks is not None:
-                self._finish(sums, 1.0, blocks.buffer)
+                blocks.add_fixed(ranges[0], sums, 1 / self._one)
                 self._device.queue.finish()  # before their memory is given back
+        for splats in ranges[1:]:
+            with Memory(self._device) as memory:
+                sums = self._block_sums(memory, len(splats))
+                self._sum_blocks(sums, splats.start)
+                assert blocks is not None
+                blocks.add_fixed(splats, sums, 1 / self._one)
+                self._device.queue.finish()
         return math.fsum(errors[number] for number in sorted(errors))
 
     def sum_gradient(
@@ -208,7 +222,7 @@ class ColourMap(Owner):
 
         Args:
             x, targets, constant: as of :meth:`gradient`.
-            blocks: (M (M + 1) / 2, stride) int64, the same of the splats' own blocks; None: they are not wanted.
+            blocks: (M (M + 1) / 2, n) int64, the same of the first n splats' own blocks; None: they are not wanted.
 
         Returns:
             The squared error by W of each view, by number.
@@ -228,7 +242,17 @@ class ColourMap(Owner):
             self._enqueue_gather(group, blocks, constant)
         return errors
 
-    def normal(self, direction: cl.Buffer, at: cl.Buffer, result: cl.Buffer, constant: bool = False) -> None:
+    def _sum_blocks(self, blocks: cl.Buffer, first: int) -> None:
+        """The blocks' part of :meth:`sum_gradient` alone, of the splats from one on."""
+        self._coefficients.clear(self._change)  # black, and no channel is free
+        for group in self._groups:
+            for slot, numbers in zip(self._slots, group, strict=False):
+                with self._views.ready(numbers) as (views, _):
+                    self._enqueue_sweep(numbers, views, slot.change, None, True, slot)
+                    self._enqueue_table(numbers, group, views)
+            self._enqueue_gather(group, blocks, False, first)
+
+    def normal(self, direction: Vector, at: Vector, result: Vector, constant: bool = False) -> None:
         """result += Aᵀ W A direction, nothing if the direction is 0 or not finite.
 
         Args:
@@ -244,25 +268,27 @@ class ColourMap(Owner):
         if not 0 < largest < math.inf:
             return
         unit = 1 / largest
+        on_device = self._coefficients.on_device(direction)
         if self._helpers is not None:
-            self._helpers.begin_normal(direction, at, unit, constant)
-        self.sum_normal(direction, at, unit, constant)
+            assert isinstance(at, cl.Buffer), "several devices have their vectors on the master's device"
+            self._helpers.begin_normal(on_device, at, unit, constant)
+        self.sum_normal(on_device, at, unit, constant)
         if self._helpers is not None:
             self._helpers.add(self.sums, None)
-        self._finish(self.sums, unit, result, constant)
+        self._coefficients.add_fixed(result, self.sums, 1 / (self._one * unit), constant)
 
-    def sum_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool = False) -> None:
+    def sum_normal(self, direction: cl.Buffer, at: Vector, unit: float, constant: bool = False) -> None:
         """The part of :meth:`normal` that is a sum over this device's views: it is added to :attr:`sums`.
 
         Args:
-            direction, at, constant: as of :meth:`normal`.
+            direction, at, constant: as of :meth:`normal`; the direction on the device.
             unit: the direction is multiplied by this.
         """
         for group in self._groups:
             for slot, numbers in zip(self._slots, group, strict=False):
                 with self._views.ready(numbers) as (views, anew):
                     if anew:  # which colours are cut is not known any more
-                        self._enqueue_colours(views, at, views.colours, None)
+                        self._enqueue_colours(views, self._coefficients.on_device(at, 1), views.colours, None)
                     self._enqueue_colours(views, direction, slot.change, unit, constant)
                     self._enqueue_sweep(numbers, views, slot.change, None, False, slot)
                     self._enqueue_table(numbers, group, views)
@@ -270,18 +296,12 @@ class ColourMap(Owner):
 
     # ------------------------------------------------------------------------------------------ their parts
 
-    def _block_sums(self, memory: Memory, nbytes: int) -> cl.Buffer:
-        """Integers for as many floats as take so many bytes, 0."""
-        sums = memory.allocate(2 * nbytes, "the splats' normal equations")
-        self._coefficients.zero(sums)
+    def _block_sums(self, memory: Memory, splats: int) -> cl.Buffer:
+        """Integers for the blocks of so many splats, 0."""
+        triangle = self._layout.sh_count * (self._layout.sh_count + 1) // 2
+        sums = memory.allocate(8 * triangle * splats, "the splats' normal equations")
+        self._coefficients.clear(sums)
         return sums
-
-    def _finish(self, sums: cl.Buffer, unit: float, result: cl.Buffer, constant: bool = False) -> None:
-        """Enqueue: result += the sums in the unit of what was summed; the sums become 0."""
-        # The constant coefficients' columns come first, and the others' sums are 0 then.
-        count = 3 * self._layout.stride if constant else sums.size // 8
-        self._from_fixed.bind(sums=sums, unit=np.float32(1 / (self._one * unit)), result=result)
-        self._from_fixed.launch((count,))
 
     def _enqueue_colours(
         self, views: ViewSet, x: cl.Buffer, result: cl.Buffer, unit: float | None, constant: bool = False
@@ -329,12 +349,16 @@ class ColourMap(Owner):
         nbytes = TABLE_ENTRY * len(numbers)
         cl.enqueue_copy(self._device.queue, self._tables, views.table, byte_count=nbytes, dst_offset=start)
 
-    def _enqueue_gather(self, group: Sequence[range], blocks: cl.Buffer | None, constant: bool) -> None:
+    def _enqueue_gather(
+        self, group: Sequence[range], blocks: cl.Buffer | None, constant: bool, first_block: int = 0
+    ) -> None:
         """Enqueue the way from the sums of some launches' views, which follow each other, to the coefficients.
 
-        And to the blocks, if the sums have their part.
+        And to the blocks, if the sums have their part: of as many splats as there is room for, from the first one on.
         """
-        gather = self._gathers[constant, blocks is not None]
+        triangle = self._layout.sh_count * (self._layout.sh_count + 1) // 2
+        splats = self._layout.stride if blocks is None else blocks.size // (8 * triangle)
+        gather = self._gathers[constant, blocks is not None, splats < self._layout.stride]
         gather.bind(
             totals=self._totals,
             means=self._means,
@@ -345,6 +369,8 @@ class ColourMap(Owner):
             first_scale=group[0][0],
             free=self._change,
             result=self.sums,
+            first_block=first_block,
+            block_stride=splats,
             blocks=self.sums if blocks is None else blocks,
         )
         self._layout.over_splats(gather)

@@ -1,4 +1,4 @@
-"""Preconditioned conjugate gradients on vectors that stay on the device."""
+"""Preconditioned conjugate gradients on vectors that stay where they are."""
 
 from __future__ import annotations
 
@@ -6,7 +6,7 @@ import math
 from collections.abc import Callable
 from typing import Protocol
 
-import pyopencl as cl
+from potr_cl.stages.refitting.vector_space import Vector
 
 #: Steps end where the residual's square, as the preconditioner measures it, has shrunk by this: single precision has no
 #: more digits, and what is left of them leads astray.
@@ -16,19 +16,19 @@ _CONVERGED = 1e-14
 class Vectors(Protocol):
     """Arithmetic of vectors; :class:`potr_cl.stages.refitting.coefficients.Coefficients` is one."""
 
-    def vector(self) -> cl.Buffer:
+    def vector(self) -> Vector:
         """A new vector."""
         ...
 
-    def zero(self, x: cl.Buffer) -> None:
+    def zero(self, x: Vector) -> None:
         """x = 0."""
         ...
 
-    def combine(self, a: float, y: cl.Buffer, b: float, x: cl.Buffer) -> None:
+    def combine(self, a: float, y: Vector, b: float, x: Vector) -> None:
         """y = a y + b x."""
         ...
 
-    def dot(self, x: cl.Buffer, y: cl.Buffer) -> float:
+    def dot(self, x: Vector, y: Vector) -> float:
         """x · y."""
         ...
 
@@ -36,11 +36,11 @@ class Vectors(Protocol):
 class System(Protocol):
     """Linear equations with a symmetric positive matrix H."""
 
-    def precondition(self, residual: cl.Buffer, result: cl.Buffer) -> None:
+    def precondition(self, residual: Vector, result: Vector) -> None:
         """result = about H⁻¹ residual, by a symmetric positive matrix."""
         ...
 
-    def product(self, direction: cl.Buffer, result: cl.Buffer) -> None:
+    def product(self, direction: Vector, result: Vector) -> None:
         """result = H direction."""
         ...
 
@@ -62,8 +62,8 @@ class ConjugateGradients:
     def descend(
         self,
         system: System,
-        x: cl.Buffer,
-        residual: cl.Buffer,
+        x: Vector,
+        residual: Vector,
         objective: float,
         steps: int,
         gain: float,

@@ -18,11 +18,12 @@ from potr_cl.opencl.relay import Lent
 from potr_cl.raster.kept_scene import KeptScene, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
-from potr_cl.stages.refitting.coefficients import Coefficients, Layout
+from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.stages.refitting.vector_space import Layout
 from potr_cl.workers.pool import Part
 
 

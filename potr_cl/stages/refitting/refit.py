@@ -18,7 +18,6 @@ from dataclasses import dataclass, replace
 from typing import Protocol
 
 import numpy as np
-import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.codec.quantize import nonzero_levels
@@ -32,13 +31,15 @@ from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
-from potr_cl.stages.refitting.coefficients import Coefficients, Layout, Ridge
+from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
-from potr_cl.stages.refitting.rounding import ROUNDS, Rounding
+from potr_cl.stages.refitting.placement import blocks_of, placed, rounding_of, vectors_of
+from potr_cl.stages.refitting.rounding import ROUNDS
 from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
 from potr_cl.stages.refitting.targets import Targets
+from potr_cl.stages.refitting.vector_space import Layout, Ridge, Vector
 from potr_cl.workers.dealing import shares
 from potr_cl.workers.pool import Pool
 
@@ -63,6 +64,8 @@ class RefitOptions:
         chroma_factor: lambda of Co and Cg over that of Y.
         prior: the same for every coefficient's distance to its start, so that what no view shows stays as it was.
         memory: bytes of device memory that prepared views and targets may take; None: a quarter of what is free.
+        slices: splats of a slice, with the vectors on the host (:mod:`potr_cl.stages.refitting.placement`); None: only
+            where they do not fit.
 
     Raises:
         UsageError: a value is out of range.
@@ -77,8 +80,11 @@ class RefitOptions:
     chroma_factor: float = 3.0
     prior: float = 0.1
     memory: int | None = None
+    slices: int | None = None
 
     def __post_init__(self) -> None:
+        if self.slices is not None and self.slices < 1:
+            raise UsageError(f"slices of {self.slices} splats: at least 1 is needed")
         if self.steps < 0:
             raise UsageError(f"{self.steps} re-fit steps: it must be 0 or more")
         if not 0 <= self.gain < 1:
@@ -149,7 +155,13 @@ def refit_colours(
             progress(done, steps + more)
 
     with ColourRefit(
-        device, scene, cameras, background=background, memory=options.memory, help_from=help_from
+        device,
+        scene,
+        cameras,
+        background=background,
+        memory=options.memory,
+        help_from=help_from,
+        slices=options.slices,
     ) as refit:
         way: _Rounding
         if colour_grid is not None:
@@ -259,8 +271,10 @@ class ColourRefit(Owner):
         scene: whose geometry, opacities and SH degree are used.
         cameras: the views that count, all the same whatever their size.
         rules, background: of the rasterizer.
-        memory: bytes of device memory that prepared views and targets may take; None: a quarter of what is free.
+        memory: bytes of device memory that prepared views and targets may take; None: a quarter of what is free. Where
+            the vectors do not fit, of all that the re-fit takes.
         help_from: workers that do some of the views.
+        slices: as of :class:`RefitOptions`.
 
     Attributes:
         coefficients, colour_map: the vectors and the map, for callers that want products rather than solutions.
@@ -279,6 +293,7 @@ class ColourRefit(Owner):
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         memory: int | None = None,
         help_from: HelpFrom | None = None,
+        slices: int | None = None,
     ) -> None:
         if not cameras:
             raise UsageError("a re-fit needs at least one view")
@@ -297,11 +312,16 @@ class ColourRefit(Owner):
             rasterizer = owned.enter_context(Rasterizer(device, replace(scene, sh=scene.sh[:, :1]), rules))
             launcher = launcher_for(device, rules)
             layout = Layout(len(scene), rasterizer.stride, scene.sh.shape[1], launcher.lanes)
-            self.coefficients = owned.enter_context(Coefficients(device, layout))
             # The vectors come first: prepared views can do with less memory, and only take longer then.
-            self._solver = owned.enter_context(ColourSolver(self.coefficients))
+            place = placed(device, layout.splats, layout.sh_count, memory, slices) if others is None else None
+            memory = memory if place is None else place.views
+            self.coefficients = owned.enter_context(vectors_of(device, layout, place))
+            blocks = blocks_of(self.coefficients, place)
+            owned.callback(blocks.close)
+            self._solver = ColourSolver(self.coefficients, blocks)
             helpers = None
             if help_from is not None and others is not None:
+                assert isinstance(self.coefficients, Coefficients)
                 in_process = help_from.pool.in_process
                 helpers = owned.enter_context(SharedViews(self.coefficients, others, in_process))
             self.colour_map = owned.enter_context(
@@ -309,7 +329,7 @@ class ColourRefit(Owner):
                     launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory, own, helpers
                 )
             )
-            self._unrounded: cl.Buffer | None = None
+            self._unrounded: Vector | None = None
             self._owned = owned.pop_all()
 
     def solve(
@@ -421,14 +441,14 @@ class ColourRefit(Owner):
         self.coefficients.copy(self._unrounded, solver.x)
         ridge = Ridge(options.lam, options.chroma_factor, options.prior)
         worth = _WORTH * options.drop * self.colour_map.total_weight
-        with Rounding(self.coefficients, grid) as rounding:
+        with rounding_of(self.coefficients, solver.blocks, grid) as round_some:
             *first, last = ROUNDS
             for each in first:
-                rounding.round(solver.x, solver.blocks, each, worth)
+                round_some(solver.x, each, worth)
                 gone_on = solver.go_on(self.colour_map, targets, Descent(each.steps, 0.0, ridge))
                 steps += gone_on.steps
                 errors.append(gone_on.start)
-            rounding.round(solver.x, solver.blocks, last, worth)
+            round_some(solver.x, last, worth)
             solved = solver.solve(self.colour_map, targets, Descent(last.steps, 0.0, ridge), constant=True)
         return Solved((errors[0], solved.errors[1]), steps + solved.steps, solved.start)
 

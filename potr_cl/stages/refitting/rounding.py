@@ -15,6 +15,7 @@ VCEG-AH21, 2008), with an error that counts what the others of the splat make up
 from __future__ import annotations
 
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -24,6 +25,8 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
+from potr_cl.stages.refitting.sliced_coefficients import HostColumns, SlicedCoefficients
 
 _SOURCE = "refit/rounding.cl"
 #: Splats are due in so many turns: every fourth one in the order of the file in turn 0, the next ones in turn 1, …
@@ -50,6 +53,39 @@ class Round:
 ROUNDS = (Round(others=1, constant=1, steps=3), Round(others=3, constant=2, steps=2))
 
 
+@dataclass(frozen=True)
+class Steps:
+    """When each splat is rounded, and to what.
+
+    Attributes:
+        turns: (stride,) int32, the turn in which a splat is due.
+        constant, others: (stride,) float32, as of :class:`potr_cl.outputs.colour_grid.ColourGrid`.
+    """
+
+    turns: NDArray[np.int32]
+    constant: NDArray[np.float32]
+    others: NDArray[np.float32]
+
+    @staticmethod
+    def of(grid: ColourGrid, stride: int) -> Steps:
+        """Those of a grid, padded."""
+        turns = np.full(stride, _NEVER, np.int32)
+        turns[grid.order] = np.arange(len(grid.order)) % TURNS
+        constant, others = np.ones((2, stride), np.float32)
+        constant[: len(grid.constant)], others[: len(grid.others)] = grid.constant, grid.others
+        return Steps(turns, constant, others)
+
+    def part(self, splats: range, stride: int) -> Steps:
+        """Those of some splats, padded."""
+
+        def padded(values: NDArray[Any], by: float) -> NDArray[Any]:
+            some = np.full(stride, by, values.dtype)
+            some[: len(splats)] = values[splats.start : splats.stop]
+            return some
+
+        return Steps(padded(self.turns, _NEVER), padded(self.constant, 1), padded(self.others, 1))
+
+
 class Rounding(Owner):
     """The steps of one scene's colours, on the device.
 
@@ -61,26 +97,22 @@ class Rounding(Owner):
         DeviceError: the device has no room, or the kernels cannot be built.
     """
 
-    def __init__(self, coefficients: Coefficients, grid: ColourGrid) -> None:
+    def __init__(self, coefficients: Coefficients, grid: ColourGrid | Steps) -> None:
         self._coefficients = coefficients
         device, layout = coefficients.device, coefficients.layout
         self._round_ac, self._round_constant = (
             device.shared_kernel(_SOURCE, name, **layout.macros) for name in ("round_ac", "round_constant")
         )
-        turns = np.full(layout.stride, _NEVER, np.int32)
-        turns[grid.order] = np.arange(len(grid.order)) % TURNS
+        steps = grid if isinstance(grid, Steps) else Steps.of(grid, layout.stride)
         self._memory = Memory(device)
         try:
-            self._turns = self._memory.upload(turns, "the turns of splats")
-            self._constant, self._others = (self._upload(steps) for steps in (grid.constant, grid.others))
+            self._turns = self._memory.upload(steps.turns, "the turns of splats")
+            self._constant, self._others = (
+                self._memory.upload(each, "the steps of colours") for each in (steps.constant, steps.others)
+            )
         except BaseException:
             self.close()
             raise
-
-    def _upload(self, steps: NDArray[np.float32]) -> cl.Buffer:
-        padded = np.ones(self._coefficients.layout.stride, np.float32)
-        padded[: len(steps)] = steps
-        return self._memory.upload(padded, "the steps of colours")
 
     def round(self, x: cl.Buffer, blocks: SplatBlocks, this: Round, worth: float) -> None:
         """Round some of the active coefficients, and make them inactive.
@@ -112,3 +144,27 @@ class Rounding(Owner):
     def close(self) -> None:
         """Give the device's memory back."""
         self._memory.close()
+
+
+class SlicedRounding:
+    """What :class:`Rounding` is, where vectors lie on the host.
+
+    Args:
+        coefficients: whose vectors are rounded.
+        grid: the steps.
+    """
+
+    def __init__(self, coefficients: SlicedCoefficients, grid: ColourGrid) -> None:
+        self._coefficients = coefficients
+        self._steps = Steps.of(grid, coefficients.layout.stride)
+
+    def round(self, x: HostColumns, blocks: SlicedBlocks, this: Round, worth: float) -> None:
+        """See :meth:`Rounding.round`."""
+        own = self._coefficients.own
+
+        def one(part: range, some: cl.Buffer) -> None:
+            with Rounding(own, self._steps.part(part, own.layout.stride)) as rounding:
+                rounding.round(some, blocks.give(part), this, worth)
+                own.device.queue.finish()  # before the steps' memory is given back
+
+        self._coefficients.each(x, one)

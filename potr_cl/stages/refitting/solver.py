@@ -18,14 +18,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 
 import numpy as np
-import pyopencl as cl
 
-from potr_cl.opencl.memory import Owner
 from potr_cl.stages.refitting.blocks import SplatBlocks
-from potr_cl.stages.refitting.coefficients import Coefficients, Ridge
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.conjugate_gradients import ConjugateGradients
+from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
 from potr_cl.stages.refitting.targets import Targets
+from potr_cl.stages.refitting.vector_space import Ridge, Vector, VectorSpace
 
 #: Half steps tried when a solution is worse than its start because colours were cut at 0 on the way.
 _HALVINGS = 4
@@ -96,16 +95,16 @@ class _NormalEquations:
     """
 
     colour_map: ColourMap
-    coefficients: Coefficients
-    blocks: SplatBlocks
+    coefficients: VectorSpace
+    blocks: SplatBlocks | SlicedBlocks
     ridge: Ridge
-    at: cl.Buffer
+    at: Vector
     constant: bool
 
-    def precondition(self, residual: cl.Buffer, result: cl.Buffer) -> None:
+    def precondition(self, residual: Vector, result: Vector) -> None:
         self.blocks.precondition(residual, self.ridge, result)
 
-    def product(self, direction: cl.Buffer, result: cl.Buffer) -> None:
+    def product(self, direction: Vector, result: Vector) -> None:
         self.coefficients.zero(result)
         self.colour_map.normal(direction, self.at, result, self.constant)
         self.coefficients.add_ridge(result, direction, self.ridge)
@@ -119,11 +118,12 @@ class _State:
     objective: float
 
 
-class ColourSolver(Owner):
+class ColourSolver:
     """Solves for one scene's coefficients, on vectors of its own.
 
     Args:
         coefficients: makes the vectors, which live as long as it does, and knows which coefficients may change.
+        blocks: the splats' own ones.
 
     Attributes:
         x: the coefficients: set them to the start before :meth:`solve`, which leaves the solution in them.
@@ -133,11 +133,11 @@ class ColourSolver(Owner):
         DeviceError: the device has no room, or the kernels cannot be built.
     """
 
-    def __init__(self, coefficients: Coefficients) -> None:
+    def __init__(self, coefficients: VectorSpace, blocks: SplatBlocks | SlicedBlocks) -> None:
         self._coefficients = coefficients
         self.x, self._start, self._residual = (coefficients.vector() for _ in range(3))
         self._gradients = ConjugateGradients(coefficients)
-        self.blocks = SplatBlocks(coefficients)
+        self.blocks = blocks
 
     def solve(
         self,
@@ -211,7 +211,7 @@ class ColourSolver(Owner):
         start = state.error / colour_map.total_weight
         return Solved((start, math.nan), steps, start)
 
-    def _linearise(self, problem: _Problem, ridge: Ridge, blocks: SplatBlocks | None = None) -> _State:
+    def _linearise(self, problem: _Problem, ridge: Ridge, blocks: SplatBlocks | SlicedBlocks | None = None) -> _State:
         """Settle which colours are cut, and make the residual: minus half the objective's gradient at x."""
         vectors, residual = self._coefficients, self._residual
         change, pulled = self._gradients.direction, self._gradients.product
@@ -285,7 +285,3 @@ class ColourSolver(Owner):
     def _start_here(self, problem: _Problem, ridge: Ridge) -> _State:
         self._coefficients.copy(self._start, self.x)
         return self._linearise(problem, ridge)
-
-    def close(self) -> None:
-        """Give the blocks' memory back."""
-        self.blocks.close()

@@ -8,6 +8,7 @@ from typing import Protocol
 import numpy as np
 import pyopencl as cl
 
+from potr_cl.host.mapped import mapped
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
@@ -46,6 +47,45 @@ class RenderedTargets:
     def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
         """See :meth:`Targets.into`."""
         self._rasterizer.render_into([self._cameras[number] for number in numbers], buffer)
+
+
+class RememberedTargets:
+    """The pictures of others, asked for once and kept on the host: what made them can go.
+
+    They lie in a temporary file that is mapped to memory (:mod:`potr_cl.host.mapped`).
+
+    Args:
+        device: that computes.
+        targets: give the pictures.
+        cameras: the views.
+
+    Raises:
+        PotrError: there is no room for them.
+        DeviceError: the device failed, or a view does not fit it.
+    """
+
+    def __init__(self, device: Device, targets: Targets, cameras: Sequence[Camera]) -> None:
+        self._device = device
+        self._ends = np.cumsum([0, *(_nbytes(camera) // 4 for camera in cameras)])
+        self._pictures = mapped((int(self._ends[-1]),), np.float32, "pictures")
+        with Memory(device) as memory:
+            buffer = memory.allocate(max(map(_nbytes, cameras)), "the target images")
+            for number in range(len(cameras)):
+                targets.into([number], buffer)
+                with device.errors("failed while computing"):
+                    cl.enqueue_copy(device.queue, self._picture(number), buffer, is_blocking=True)
+
+    def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
+        """See :meth:`Targets.into`."""
+        start = 0
+        for number in numbers:
+            picture = self._picture(number)
+            with self._device.errors("failed to take a picture"):
+                cl.enqueue_copy(self._device.queue, buffer, picture, dst_offset=start, is_blocking=True)
+            start += picture.nbytes
+
+    def _picture(self, number: int) -> FloatArray:
+        return self._pictures[self._ends[number] : self._ends[number + 1]]
 
 
 def _nbytes(camera: Camera) -> int:

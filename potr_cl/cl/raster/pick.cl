@@ -1,0 +1,60 @@
+/* The numbers of the splats of some groups, ascending. A work-group looks at CHUNK splats: count finds how many of them
+   are wanted, and write puts their numbers behind those of the work-groups before it. Both kernel families use it.
+
+   Macros: none. */
+
+#define GROUP 256
+#define ROUNDS 16
+#define CHUNK (GROUP * ROUNDS)
+
+/* groups[i] is the group of splat i, wanted[g] is 1 if the splats of group g are. */
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void count_wanted(global const uint *groups, global const uchar *wanted, uint splats, global uint *counts)
+{
+    local uint sum;
+    const uint lid = get_local_id(0);
+    if (lid == 0)
+        sum = 0;
+    barrier(CLK_LOCAL_MEM_FENCE);
+    uint mine = 0;
+    for (uint round = 0; round < ROUNDS; ++round) {
+        const size_t splat = get_group_id(0) * CHUNK + round * GROUP + lid;
+        if (splat < splats)
+            mine += wanted[groups[splat]];
+    }
+    if (mine > 0)
+        atomic_add(&sum, mine);
+    barrier(CLK_LOCAL_MEM_FENCE);
+    if (lid == 0)
+        counts[get_group_id(0)] = sum;
+}
+
+/* starts[w] is where the numbers of work-group w begin. */
+kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
+void write_wanted(
+    global const uint *groups,
+    global const uchar *wanted,
+    uint splats,
+    global const uint *starts,
+    global uint *numbers)
+{
+    local uint sums[GROUP];
+    const uint lid = get_local_id(0);
+    uint start = starts[get_group_id(0)];
+    for (uint round = 0; round < ROUNDS; ++round) {
+        const size_t splat = get_group_id(0) * CHUNK + round * GROUP + lid;
+        const uint flag = splat < splats ? wanted[groups[splat]] : 0;
+        sums[lid] = flag;
+        barrier(CLK_LOCAL_MEM_FENCE);
+        for (uint step = 1; step < GROUP; step *= 2) {
+            const uint before = lid >= step ? sums[lid - step] : 0;
+            barrier(CLK_LOCAL_MEM_FENCE);
+            sums[lid] += before;
+            barrier(CLK_LOCAL_MEM_FENCE);
+        }
+        if (flag)
+            numbers[start + sums[lid] - 1] = (uint)splat;
+        start += sums[GROUP - 1];
+        barrier(CLK_LOCAL_MEM_FENCE);
+    }
+}

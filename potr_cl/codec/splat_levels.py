@@ -1,0 +1,104 @@
+"""Scales, rotations and opacities of splats to the levels of a file: :func:`splat_levels`."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec import quantize
+from potr_cl.codec.native.functions import Functions
+from potr_cl.codec.native.library import native
+from potr_cl.codec.versions import VERSIONS, Version2
+from potr_cl.host.threads import Run
+from potr_cl.model.scene import Scene
+
+#: Splats worked on at a time: a few arrays of them fit a second-level cache.
+BLOCK = 1 << 14
+
+F32 = NDArray[np.float32]
+F64 = NDArray[np.float64]
+I64 = NDArray[np.int64]
+
+
+@dataclass(frozen=True)
+class SplatLevels:
+    """Levels of some splats, each in the smallest of the signed integer types that holds it.
+
+    Attributes:
+        scales, rotations: of the three axes, (n,) each.
+        opacities: (n,).
+    """
+
+    scales: list[quantize.Integers]
+    rotations: list[quantize.Integers]
+    opacities: quantize.Integers
+
+
+def splat_levels(scene: Scene, order: I64, world: quantize.HyperParameters, run: Run = map) -> SplatLevels:
+    """Quantise all of some splats but centres and colours, each in its canonical form.
+
+    Args:
+        scene: clean.
+        order: (n,) numbers of the splats.
+        world: parameters in world units.
+        run: in place of :func:`map`, to work with several threads.
+
+    Raises:
+        DataError: a value too large to quantise.
+    """
+    version, functions = VERSIONS[world.version], native()
+    if functions is not None and version.quantises_splats_as(Version2):
+        found = _natively(functions, scene, order, world, run)
+        if found is not None:
+            return found
+    imaginary, log_scales = _canonical(scene, order, run)
+    scales = list(run(lambda part: version.quantize_scales(part.astype(np.float64), world.sf_scale), log_scales.T))
+    logits = scene.opacity_logits[order].astype(np.float64)
+    rotations = version.quantize_rotations(imaginary, scales, world.sf_rotation, run)
+    opacities = version.quantize_opacities(logits, world.sf_opacity)
+    return SplatLevels(scales, list(rotations), opacities)
+
+
+def _natively(
+    functions: Functions, scene: Scene, order: I64, world: quantize.HyperParameters, run: Run
+) -> SplatLevels | None:
+    """The same; None where a level has more than 32 bits, which NumPy has to say or to hold."""
+    quaternions, log_scales, logits = (
+        np.ascontiguousarray(each, np.float32) for each in (scene.quaternions, scene.log_scales, scene.opacity_logits)
+    )
+    factors = (world.sf_scale, world.sf_rotation, world.sf_opacity)
+    levels = np.empty((7, len(order)), np.int32)
+
+    def quantise(start: int) -> NDArray[np.int32] | None:
+        rows = order[start : start + BLOCK]
+        imaginary, turned = quantize.canonical_rotations(quaternions, log_scales, rows)
+        # The one function here whose last digit another library could round otherwise.
+        with np.errstate(over="ignore"):
+            sizes = np.exp(turned.astype(np.float64))
+        return functions.quantising.splat_levels(
+            sizes, imaginary, logits, rows, factors, quantize.RANGE_OF_LOGITS, start, levels
+        )
+
+    found = list(run(quantise, range(0, len(order), BLOCK)))
+    largest = [each for each in found if each is not None]
+    if len(largest) < len(found):
+        return None
+    types = [quantize.level_type(float(most)) for most in np.max(largest, axis=0)]
+    columns = list(run(lambda k: levels[k].astype(types[k]), range(7)))
+    return SplatLevels(columns[:3], columns[3:6], columns[6])
+
+
+def _canonical(scene: Scene, order: I64, run: Run) -> tuple[F64, F32]:
+    """:func:`potr_cl.codec.quantize.canonical_rotations` in some order."""
+    imaginary = np.empty((len(order), 3))
+    log_scales = np.empty((len(order), 3), np.float32)
+
+    def turn(start: int) -> None:
+        rows = order[start : start + BLOCK]
+        block = slice(start, start + len(rows))
+        imaginary[block], log_scales[block] = quantize.canonical_rotations(scene.quaternions, scene.log_scales, rows)
+
+    list(run(turn, range(0, len(order), BLOCK)))
+    return imaginary, log_scales

@@ -1,0 +1,115 @@
+"""Where a re-fit's vectors lie: in the device's memory, or, where it has not enough, on the host (:func:`placed`).
+
+A splat takes about 3,400 bytes in one piece at SH degree 3: seven vectors of 48 values, the sums over views, the blocks
+of the normal equations and what they are added up in. With the vectors and the blocks on the host it takes about 900:
+two vectors that views are looked at with, and the sums.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager
+from dataclasses import dataclass
+
+from potr_cl.opencl.device import Device
+from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.stages.refitting.blocks import SplatBlocks
+from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.rounding import Round, Rounding, SlicedRounding
+from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
+from potr_cl.stages.refitting.sliced_coefficients import OPERANDS, SlicedCoefficients
+from potr_cl.stages.refitting.vector_space import Layout, Vector, VectorSpace
+
+#: Vectors of a solution: six of the solver and what it was before it was rounded.
+_VECTORS = 7
+#: What a sweep has besides for each splat: geometry, the splats of a view as they are projected, and its sums.
+_SWEEP = 68 + 32 + 16 + 16 + 32 + 8
+#: The vectors lie on the device if they take no more than this part of what is free, or of the memory that is given.
+_OF_FREE, _OF_GIVEN = 0.75, 0.5
+#: Of less nobody needs to be careful.
+_ANYWAY = 256e6
+#: Of the memory, what a slice may take, and the integers of blocks that are on the device at a time.
+_SLICE, _BLOCKS = 1 / 32, 1 / 5
+_LEAST_SLICE, _MOST_SLICE = 1 << 12, 1 << 18
+
+
+@dataclass(frozen=True)
+class Place:
+    """How a re-fit does with little memory on the device.
+
+    Attributes:
+        slice: splats whose coefficients go through the device together.
+        blocks: splats whose blocks are added up together.
+        views: bytes that prepared views and targets may take.
+    """
+
+    slice: int
+    blocks: int
+    views: int
+
+
+def placed(device: Device, splats: int, sh_count: int, memory: int | None, slices: int | None = None) -> Place | None:
+    """How a re-fit has its vectors on the host; None: they lie on the device.
+
+    Args:
+        device: to compute on.
+        splats: N.
+        sh_count: M, coefficients of a channel.
+        memory: bytes of the device's memory that the user would have taken; None: as much as there is.
+        slices: splats of a slice, if the vectors are to lie on the host in any case.
+    """
+    vector, triangle = 12 * sh_count, sh_count * (sh_count + 1) // 2
+    one_piece = splats * (_VECTORS * vector + 2 * vector + 12 * triangle)
+    free = max(device.info.memory - device.allocated, 0)
+    fits = one_piece <= max(_OF_FREE * free if memory is None else min(_OF_GIVEN * memory, _OF_FREE * free), _ANYWAY)
+    if slices is None and fits:
+        return None
+    total = free if memory is None else min(memory, free)
+    of_slice = 2 * vector + 4 * triangle + 8
+    some = slices or min(max(int(_SLICE * total / of_slice), _LEAST_SLICE), _MOST_SLICE)
+    blocks = slices or max(int(_BLOCKS * total / (8 * triangle)), 1)
+    resident = splats * ((OPERANDS + 2) * vector + _SWEEP)
+    besides = some * of_slice + 8 * triangle * min(blocks, splats)
+    return Place(some, blocks, max(int(total - resident - besides), 0))
+
+
+def vectors_of(device: Device, layout: Layout, place: Place | None) -> VectorSpace:
+    """Where a re-fit's vectors lie.
+
+    Raises:
+        PotrError: the host has no room for them.
+        DeviceError: the device has none.
+    """
+    return Coefficients(device, layout) if place is None else SlicedCoefficients(device, layout, place.slice)
+
+
+def blocks_of(vectors: VectorSpace, place: Place | None) -> SplatBlocks | SlicedBlocks:
+    """The splats' own blocks, where the vectors lie; raises what :func:`vectors_of` does."""
+    if isinstance(vectors, SlicedCoefficients):
+        return SlicedBlocks(vectors, vectors.layout.stride if place is None else place.blocks)
+    assert isinstance(vectors, Coefficients)
+    return SplatBlocks(vectors)
+
+
+@contextmanager
+def rounding_of(
+    vectors: VectorSpace, blocks: SplatBlocks | SlicedBlocks, grid: ColourGrid
+) -> Iterator[Callable[[Vector, Round, float], None]]:
+    """The rounding of vectors where they lie, to the steps of a grid, as long as the context lasts.
+
+    Yields:
+        What rounds: called with a vector, what of it is due, and the squared error that it is worth to save an AC
+        coefficient, as :meth:`potr_cl.stages.refitting.rounding.Rounding.round`.
+
+    Raises:
+        DeviceError: the device has no room, or the kernels cannot be built.
+    """
+    if isinstance(vectors, SlicedCoefficients) and isinstance(blocks, SlicedBlocks):
+        in_slices, its_blocks = SlicedRounding(vectors, grid), blocks
+        yield lambda x, this, worth: in_slices.round(x, its_blocks, this, worth)
+        return
+    assert isinstance(vectors, Coefficients)
+    assert isinstance(blocks, SplatBlocks)
+    on_device = blocks
+    with Rounding(vectors, grid) as rounding:
+        yield lambda x, this, worth: rounding.round(x, on_device, this, worth)

@@ -1,0 +1,294 @@
+"""Vectors of SH coefficients in the host's memory: :class:`SlicedCoefficients`.
+
+What a device has no room for goes through it in slices. Where a kernel does one splat after the other, a slice is some
+splats, all columns of them. Sums and dot products do one value after the other: there a slice is a piece of the vector
+as it lies in memory, and each is added to where the slice before it left the sums. So all bits are those of vectors in
+the device's memory.
+
+The vectors lie in temporary files that are mapped to memory (:mod:`potr_cl.host.mapped`): the system may write to the
+disk what is not in use.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator
+from dataclasses import dataclass
+from typing import Any
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from potr_cl.host.mapped import mapped
+from potr_cl.model.scene import FloatArray
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory
+from potr_cl.raster.scene_buffers import SPLAT_GROUP
+from potr_cl.stages.refitting.coefficients import DOT_ITEMS, Coefficients
+from potr_cl.stages.refitting.vector_space import Layout, Ridge, VectorSpace
+
+#: Vectors of which a slice is on the device at a time, and vectors that are there whole to be read.
+_SLICES, OPERANDS = 2, 2
+
+
+@dataclass
+class HostColumns:
+    """Columns of float32, one value a splat, in the host's memory.
+
+    Attributes:
+        values: (columns, stride).
+        zero: they stand for zeros, whatever they are.
+        changes: how often they have changed.
+    """
+
+    values: FloatArray
+    zero: bool = True
+    changes: int = 0
+
+    def changed(self) -> None:
+        """Note that they are no longer what they were, nor zeros."""
+        self.zero = False
+        self.changes += 1
+
+
+class SlicedCoefficients(VectorSpace):
+    """A :class:`potr_cl.stages.refitting.vector_space.VectorSpace` whose vectors are :class:`HostColumns`.
+
+    Args:
+        device: to compute on.
+        layout: of the vectors.
+        splats: of a slice.
+
+    Attributes:
+        own: the slice's vectors and flags on the device.
+
+    Raises:
+        PotrError: there is no room for the vectors.
+        DeviceError: the device has no room for a slice, or the kernels cannot be built.
+    """
+
+    def __init__(self, device: Device, layout: Layout, splats: int) -> None:
+        super().__init__(device, layout)
+        self._splats = min(-(-splats // SPLAT_GROUP) * SPLAT_GROUP, layout.stride)
+        #: Values of a piece of a vector; the sums of a dot product go on after a multiple of their items.
+        self._piece = -(-self._splats * layout.columns // DOT_ITEMS) * DOT_ITEMS
+        self._words = np.zeros((2, layout.stride), np.uint32)
+        self._memory = Memory(device)
+        self._operands: list[cl.Buffer | None] = [None] * OPERANDS
+        self._held: list[tuple[HostColumns, int] | None] = [None] * OPERANDS
+        with device.all_or_nothing():
+            self.own = Coefficients(device, Layout(self._splats, self._splats, layout.sh_count, layout.lanes))
+            self._slices = [self._memory.allocate(4 * self._piece, "the SH coefficients") for _ in range(_SLICES)]
+        self.activate(None)
+
+    # ------------------------------------------------------------------------------------------ vectors
+
+    def columns(self, number: int, what: str) -> HostColumns:
+        """So many new columns of zeros."""
+        return HostColumns(mapped((number, self.layout.stride), np.float32, what))
+
+    def vector(self) -> HostColumns:
+        """A new vector."""
+        return self.columns(self.layout.columns, "SH coefficients")
+
+    def zero(self, x: HostColumns) -> None:
+        """x = 0."""
+        x.changed()
+        x.zero = True
+
+    def copy(self, y: HostColumns, x: HostColumns) -> None:
+        """y = x."""
+        y.changed()
+        y.zero = x.zero
+        if not x.zero:
+            np.copyto(y.values, x.values)
+
+    def combine(self, a: float, y: HostColumns, b: float, x: HostColumns) -> None:
+        """y = a y + b x."""
+        for first, count in self._pieces():
+            some = self._piece_of(y, 0, first, count)
+            self.own.combine_some(a, some, b, self._piece_of(x, 1, first, count), count)
+            self._take_piece(y, some, first, count)
+        y.changed()
+
+    def dot(self, x: HostColumns, y: HostColumns) -> float:
+        """x · y; waits for the device. Not finite where single precision overflows."""
+        return self._dot(x, y)[0]
+
+    def largest(self, x: HostColumns) -> float:
+        """The largest |x_i|; waits for the device."""
+        return self._dot(x, x)[1]
+
+    def _dot(self, x: HostColumns, y: HostColumns) -> tuple[float, float]:
+        for first, count in self._pieces():
+            one = self._piece_of(x, 0, first, count)
+            other = one if y is x else self._piece_of(y, 1, first, count)
+            self.own.begin_dot(one, other, count, more=first > 0)
+        return self.own.found_dot()
+
+    def add_ridge(self, sums: HostColumns, x: HostColumns, ridge: Ridge) -> None:
+        """sums += (lam on AC + prior) x on the active coefficients; the others' sums become 0."""
+        for part in self.parts():
+            self.give_flags(part)
+            some = self.give(sums, part, 0)
+            self.own.add_ridge(some, some if x is sums else self.give(x, part, 1), ridge)
+            self.take(sums, part, some)
+        sums.changed()
+
+    def add_fixed(self, x: HostColumns, sums: cl.Buffer, unit: float, constant: bool = False) -> None:
+        """See :meth:`VectorSpace.add_fixed`."""
+        for first, count in self._pieces(3 * self.layout.stride if constant and not x.zero else self.length):
+            some = self._piece_of(x, 0, first, count)
+            self.own.add_fixed_some(some, sums, first, count, unit)
+            self._take_piece(x, some, first, count)
+        x.changed()
+
+    # ------------------------------------------------------------------------------------------ to and from elsewhere
+
+    def on_device(self, x: HostColumns, place: int = 0) -> cl.Buffer:
+        """See :meth:`VectorSpace.on_device`. What is there already is not taken there again."""
+        if self._operands[place] is None:
+            self._operands[place] = self._memory.allocate(4 * self.length, "the SH coefficients")
+        buffer = self._operands[place]
+        held = self._held[place]
+        if held is None or held[0] is not x or held[1] != x.changes:
+            if x.zero:
+                self.clear(buffer)
+            else:
+                self._copy(buffer, x.values)
+            self._held[place] = (x, x.changes)
+        return buffer
+
+    def write_sh(self, x: HostColumns, sh: FloatArray) -> None:
+        """Set a vector from (N, M, 3) R, G, B."""
+        for part in self.parts():
+            rows = np.ascontiguousarray(sh[part.start : part.stop], np.float32)
+            self.own.write_sh(self._slices[0], rows)
+            self.take(x, part, self._slices[0])
+        x.changed()
+
+    def read_sh(self, x: HostColumns) -> FloatArray:
+        """(N, M, 3) float32, a vector in R, G, B; each coefficient contiguous in memory, which may be a file's."""
+        layout = self.layout
+        sh = mapped((layout.columns, layout.splats), np.float32, "SH coefficients")
+        for part in self.parts():
+            self.own.to_rgb(self.give(x, part, 0), self._slices[1])
+            self._rectangle(sh, range(part.start, min(part.stop, layout.splats)), self._slices[1], to_device=False)
+        return sh.reshape(layout.sh_count, 3, layout.splats).transpose(2, 0, 1)
+
+    def write(self, x: HostColumns, values: NDArray[np.floating]) -> None:
+        """Set a vector from (N, M, 3) in Y, Co, Cg."""
+        x.values[:, self.layout.splats :] = 0
+        x.values[:, : self.layout.splats] = values.reshape(self.layout.splats, -1).T
+        x.changed()
+
+    def read(self, x: HostColumns) -> FloatArray:
+        """(N, M, 3) float32, a vector in Y, Co, Cg."""
+        layout = self.layout
+        if x.zero:
+            return np.zeros((layout.splats, layout.sh_count, 3), np.float32)
+        return np.ascontiguousarray(x.values[:, : layout.splats].T).reshape(layout.splats, layout.sh_count, 3)
+
+    # ------------------------------------------------------------------------------------------ slices
+
+    def parts(self) -> Iterator[range]:
+        """The splats of each slice."""
+        for first in range(0, self.layout.stride, self._splats):
+            yield range(first, min(first + self._splats, self.layout.stride))
+
+    def give(self, columns: HostColumns, part: range, place: int) -> cl.Buffer:
+        """A slice of a vector, on the device: valid until the next call for the place, 0 or 1."""
+        self.copy_part(columns, part, self._slices[place])
+        return self._slices[place]
+
+    def place(self, number: int) -> cl.Buffer:
+        """Where :meth:`give` puts slices."""
+        return self._slices[number]
+
+    def copy_part(self, columns: HostColumns, part: range, buffer: cl.Buffer) -> None:
+        """A slice of columns to a buffer on the device, of as many columns as a slice has splats."""
+        if columns.zero:
+            self.clear(buffer)
+        else:
+            self._rectangle(columns.values, part, buffer, to_device=True)
+
+    def take(self, columns: HostColumns, part: range, buffer: cl.Buffer) -> None:
+        """A slice of columns from the device. The columns are :meth:`HostColumns.changed` when all have come."""
+        self._rectangle(columns.values, part, buffer, to_device=False)
+
+    def give_flags(self, part: range) -> None:
+        """The flags of a slice's splats to the device."""
+        words = np.zeros((2, self._splats), np.uint32)
+        words[:, : len(part)] = self._words[:, part.start : part.stop]
+        self.own.restore_flags(words)
+
+    def take_flags(self, part: range) -> None:
+        """The flags of a slice's splats from the device."""
+        self._words[:, part.start : part.stop] = self.own.save_flags()[:, : len(part)]
+
+    def each(self, x: HostColumns, work: Callable[[range, cl.Buffer], None]) -> None:
+        """Have work done on the slices of a vector and on their flags.
+
+        Args:
+            x: the vector.
+            work: called with the splats and the slice on the device; the flags are those of :attr:`own`.
+        """
+        for part in self.parts():
+            self.give_flags(part)
+            some = self.give(x, part, 0)
+            work(part, some)
+            self.take(x, part, some)
+            self.take_flags(part)
+        x.changed()
+
+    def _pieces(self, length: int | None = None) -> Iterator[tuple[int, int]]:
+        """The first value of each piece of a vector, and how many it has."""
+        length = self.length if length is None else length
+        for first in range(0, length, self._piece):
+            yield first, min(self._piece, length - first)
+
+    def _piece_of(self, x: HostColumns, place: int, first: int, count: int) -> cl.Buffer:
+        if x.zero:
+            self.clear(self._slices[place])
+        else:
+            self._copy(self._slices[place], x.values.reshape(-1)[first : first + count])
+        return self._slices[place]
+
+    def _take_piece(self, x: HostColumns, buffer: cl.Buffer, first: int, count: int) -> None:
+        self._copy(x.values.reshape(-1)[first : first + count], buffer)
+
+    def _copy(self, target: Any, source: Any) -> None:
+        with self.device.errors("failed while computing"):
+            cl.enqueue_copy(self.device.queue, target, source, is_blocking=True)
+
+    def _rectangle(self, values: FloatArray, part: range, buffer: cl.Buffer, to_device: bool) -> None:
+        """Copy some splats of all columns."""
+        pair = (buffer, values) if to_device else (values, buffer)
+        with self.device.errors("failed while computing"):
+            cl.enqueue_copy(
+                self.device.queue,
+                *pair,
+                buffer_origin=(0, 0, 0),
+                host_origin=(4 * part.start, 0, 0),
+                region=(4 * len(part), len(values), 1),
+                buffer_pitches=(4 * self._splats, 0),
+                host_pitches=(4 * values.shape[1], 0),
+                is_blocking=True,
+            )
+
+    # ------------------------------------------------------------------------------------------ flags
+
+    def save_flags(self) -> NDArray[np.uint32]:
+        """See :meth:`VectorSpace.save_flags`."""
+        return self._words.copy()
+
+    def restore_flags(self, words: NDArray[np.uint32]) -> None:
+        """See :meth:`VectorSpace.restore_flags`."""
+        self._words[:] = words
+
+    def close(self) -> None:
+        """Give all device memory back; the vectors' files go with the vectors."""
+        self._held = [None] * OPERANDS
+        self._operands = [None] * OPERANDS
+        self.own.close()
+        self._memory.close()
