@@ -19,7 +19,7 @@ FloatArray = NDArray[np.float32]
 #: Splats looked at at a time where values are checked.
 _BLOCK = 1 << 14
 #: So many splats are copied by threads, an eighth of them at a time.
-_LARGE = 1 << 20
+_LARGE = 1 << 19
 
 #: The logit of an opacity that single precision cannot tell from 1.
 _OPAQUE = np.float32(20)
