@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import DataError, UsageError
+from potr_cl.host import mapped
 from potr_cl.host.threads import thread_pool
 
 FloatArray = NDArray[np.float32]
@@ -183,8 +184,13 @@ class Scene:
 
     def subset(self, index: NDArray[np.generic]) -> Scene:
         """The splats that ``index`` (integers or a boolean mask) selects, in its order."""
-        # Much quicker for whole rows than indexing.
         numbers = np.asarray(index)
+        if (sh := mapped.rows(self.sh, numbers, "SH coefficients")) is not None:
+            own = self.means[numbers], self.log_scales[numbers], self.quaternions[numbers], self.opacity_logits[numbers]
+            return dataclasses.replace(
+                self, means=own[0], log_scales=own[1], quaternions=own[2], opacity_logits=own[3], sh=sh
+            )
+        # Much quicker for whole rows than indexing.
         fast = numbers.dtype.kind in "iu" and self.sh.flags.c_contiguous
         if fast and len(numbers) >= _LARGE and numbers.min() >= 0 and numbers.max() < len(self):
             return self._rows(numbers.astype(np.intp, copy=False))
@@ -285,7 +291,7 @@ def joined(parts: Sequence[Scene]) -> Scene:
         np.empty((splats, 3), np.float32),
         np.empty((splats, 4), np.float32),
         np.empty(splats, np.float32),
-        np.empty((count, 3, splats), np.float32).transpose(2, 0, 1),
+        mapped.array((count, 3, splats), np.float32, "SH coefficients").transpose(2, 0, 1),
         parts[0].antialiased,
         parts[0].low_pass,
     )

@@ -19,7 +19,7 @@ from potr_cl.opencl.memory import Owner
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, gathered, uploaded
 
 #: A scene that takes more than this part of the device's memory is not kept: others may need the room.
-_PART = 16
+_PART = 10
 
 
 class KeptScene(Owner):

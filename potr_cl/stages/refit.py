@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.outputs.colour_grid import ColourGrid
@@ -102,7 +103,7 @@ class Refit(Stage):
     def __post_init__(self) -> None:
         for part in self.at:
             if not 0 <= part <= 1:
-                raise UsageError(f"refit_at is {part:g}, it must lie between 0 and 1")
+                raise UsageError(f"--refit-at is {part:g}, it must lie between 0 and 1")
         _ = RefitOptions(steps=self.steps), RefitOptions(steps=self.at_steps)
 
     @classmethod
@@ -133,7 +134,8 @@ class Refit(Stage):
         geometry = state.geometry
         if geometry is None or geometry.asked != parameters:
             geometry = bench.output.geometry(state.scene, bench.request(state))
-        rounded, decoded = geometry, geometry.decoded(state.scene.sh)
+        with thread_pool(bench.threads) as pool:
+            rounded, decoded = geometry, geometry.decoded(state.scene.sh, pool.map)
 
         def fitted(views: Sequence[Camera], targets: Targets, number: int) -> tuple[Refitted, Rounded]:
             geometry = rounded
