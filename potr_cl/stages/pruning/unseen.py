@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 
@@ -11,6 +12,7 @@ from numpy.typing import NDArray
 
 from potr_cl.host import mapped
 from potr_cl.host.threads import Run
+from potr_cl.model.camera import Camera
 from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
 from potr_cl.stages.pruning.schedule import Course, Pruned
@@ -61,7 +63,12 @@ class Split:
     unseen_splats: NDArray[np.int64]
 
 
-def find_unseen(state: State, groups: SplatGroups | None = None, run: Run = map) -> tuple[NDArray[np.bool_], float]:
+def find_unseen(
+    state: State,
+    groups: SplatGroups | None = None,
+    run: Run = map,
+    surely_seen: Callable[[Sequence[Camera]], NDArray[np.bool_]] | None = None,
+) -> tuple[NDArray[np.bool_], float]:
     """Which splats of a state no given training view sees, and their part of the opacity-weighted area.
 
     Added views do not count: the one that happens to see a splat, perhaps from afar, cannot say what it is worth.
@@ -70,11 +77,19 @@ def find_unseen(state: State, groups: SplatGroups | None = None, run: Run = map)
         state: whose scene and views.
         groups: of the scene, where they are known.
         run: shares the work out.
+        surely_seen: finds quickly, for some views, (N,) most of the splats that they see; the rest are looked at here.
     """
-    unseen = unseen_splats(state.scene, state.views[: len(state.views) - state.added], groups, run)
+    views, scene = state.views[: len(state.views) - state.added], state.scene
+    if surely_seen is None:
+        unseen = unseen_splats(scene, views, groups, run)
+    else:
+        unseen = ~surely_seen(views)
+        rest = np.flatnonzero(unseen)
+        if len(rest):
+            unseen[rest] = unseen_splats(scene.subset(rest), views, None, run)
     if not unseen.any():  # as usual
         return unseen, 0.0
-    areas = opacity_weighted_areas(state.scene)
+    areas = opacity_weighted_areas(scene, run)
     return unseen, float(areas[unseen].sum() / max(float(areas.sum()), 1e-300))
 
 
