@@ -14,13 +14,23 @@ from typing import Any, Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.signals import first_interrupt_asks
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.views_between import views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
-from potr_cl.stages.fitting.fit import FitOptions, FitProgress, Fitted, SupportsBool, fit_scene, held_out_error
+from potr_cl.stages.fitting.fit import (
+    FitOptions,
+    FitProgress,
+    Fitted,
+    SupportsBool,
+    fit_scene,
+    held_out_error,
+    kept_pictures,
+)
+from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refitting.photographs import hold_out
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
@@ -197,7 +207,12 @@ class Fit(Stage):
             source = bench.drawable(state.source)
             rasterizer = stack.enter_context(Rasterizer(bench.opened, source, background=bench.background))
             asked = stack.enter_context(first_interrupt_asks())
-            found = self._cycles(self._looking_between(state, bench), bench, rasterizer, asked)
+            seen = self._looking_between(state, bench)
+            rendered = RenderedTargets(rasterizer, seen.views)
+            targets: Targets | TargetPictures = rendered
+            if bench.memory is None:  # else pruning needs all that is allowed, between two fits
+                targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
+            found = self._cycles(seen, bench, targets, asked)
             found = dataclasses.replace(found, views=state.views, added=state.added)
             return found if asked or bench.photographs is None else self._to_photographs(found, bench, asked)
 
@@ -207,12 +222,12 @@ class Fit(Stage):
         each = self.views_on(bench.opened.family)
         if is_virtual(given) or each * len(given) <= state.added:
             return state
-        added = views_between(state.source, given, each)
+        with thread_pool(bench.threads) as pool:
+            added = views_between(state.source, given, each, run=pool.map)
         return dataclasses.replace(state, views=(*given, *added), added=len(added))
 
-    def _cycles(self, state: State, bench: Workbench, rasterizer: Rasterizer, asked: SupportsBool) -> State:
+    def _cycles(self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool) -> State:
         """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least."""
-        targets = RenderedTargets(rasterizer, state.views)
         price: float | None = state.learnt.get("price")
         worth = 0.0 if price is None else _WORTH * price
         without = held_out_error(bench.opened, state.scene, state.views, targets, state.added, bench.background)
@@ -286,7 +301,7 @@ class Fit(Stage):
         self,
         state: State,
         bench: Workbench,
-        targets: Targets,
+        targets: Targets | TargetPictures,
         steps: int,
         progress: FitProgress,
         asked: SupportsBool,

@@ -6,7 +6,8 @@ A SCENE is a folder with point_cloud.ply, cameras.json and images. A trial is wh
 qualities: "uncompressed:steps=2000,rate=0.3@0.5" fits the uncompressed scene to its training photographs, and then
 encodes what came of it at q = 0.5. "q0.5:…@0.5" starts from what pruning leaves at q = 0.5, "smallest0.5:…" from what
 pruning and fit of that preset leave; these are only re-fitted and coded afterwards. "…@smallest0.5" encodes with that
-preset. Without options the start itself is encoded. Options:
+preset, "…@photos0.5" with --photos, too. "uncompressed:…>smallest0.5:…@0.59" prunes and fits what the first fit has
+made, and fits that to photographs again. Without options the start itself is encoded. Options:
 
 steps, batch, last   as of the fit; rate: part of its rates
 ac                   part of the rate of AC coefficients, on top of that
@@ -91,6 +92,7 @@ class Trial:
         text: as it was given.
         start: "uncompressed", or a preset's name, if it is not best, and q.
         files: of the encodes, as the start.
+        then: what is done after it to what came of it.
     """
 
     text: str
@@ -108,6 +110,7 @@ class Trial:
     hold: int = 0
     loss: str = "mse"
     seed: int = 0
+    then: Trial | None = None
 
     @staticmethod
     def of(text: str) -> Trial:
@@ -117,13 +120,13 @@ class Trial:
             ValueError, TypeError: it is no trial.
         """
         what, *files = text.split("@")
+        what, _, then = what.partition(">")
         start, _, rest = what.partition(":")
         options: dict[str, Any] = {}
         for part in filter(None, rest.split(",")):
             name, _, value = part.partition("=")
-            usual = getattr(Trial, name)
-            options[name] = type(usual)(value)
-        return Trial(text, start, tuple(files), **options)
+            options[name] = type(getattr(Trial, name))(value)
+        return Trial(text, start, tuple(files), then=Trial.of(then) if then else None, **options)
 
     @property
     def rates(self) -> Rates:
@@ -152,9 +155,9 @@ class Photographed(Owner):
     """
 
     def __init__(self, folder: Path, device: Device, crop: int | None = None, views: int | None = None) -> None:
-        self.name, self.device = folder.resolve().name, device
+        self.name, self.device, self.images = folder.resolve().name, device, folder / "images"
         self.scene, cameras = read(folder)
-        paths = find_ground_truth(folder / "images", cameras)
+        paths = find_ground_truth(self.images, cameras)
         cameras = [camera for camera in cameras if camera.name in paths]
         pictures = {camera.name: read_ground_truth(paths[camera.name], (0.0, 0.0, 0.0)) for camera in cameras}
         if crop is not None:
@@ -380,29 +383,43 @@ class Bench:
     def _start(self, name: str) -> State:
         """Where trials of this name start."""
         if name not in self._starts:
-            state = State.of(self._at.scene, self._at.train)
-            if name != "uncompressed":
-                run = Run(options_of(name), Stopwatch(), self._at.device)
-                state = run.stages(state, [Between, Prune, Fit])
-            self._starts[name] = state
+            self._starts[name] = self._begun(self._at.scene, name)
         return self._starts[name]
+
+    def _begun(self, scene: Scene, name: str) -> State:
+        state = State.of(scene, self._at.train)
+        if name == "uncompressed":
+            return state
+        return Run(options_of(name), Stopwatch(), self._at.device).stages(state, [Between, Prune, Fit])
 
     def measure(self, trial: Trial) -> None:
         """Do a trial and put its rows into the table."""
         state = self._start(trial.start)
-        course = fit(self._at, state.scene, trial, self._looks) if trial.steps else None
-        scene = state.scene if course is None else course.scene
-        self._row(trial.text.partition("@")[0], scene, course, None)
+        text, last = trial.text.partition("@")[0], trial
+        while True:
+            course = fit(self._at, state.scene, last, self._looks) if last.steps else None
+            state = dataclasses.replace(state, scene=state.scene if course is None else course.scene)
+            self._row(text, state.scene, course, None)
+            if last.then is None:
+                break
+            last = last.then
+            state = self._begun(state.scene, last.start)
         for file in trial.files:
-            options = options_of(file)
-            if trial.start == "uncompressed":
-                data = encode(scene, self._at.train, options, device=self._at.device).data
-            else:
-                # The re-fit comes back to what the photographs have made of the scene.
-                again = dataclasses.replace(State.of(scene, state.views), added=state.added)
-                coded = Run(options, Stopwatch(), self._at.device).stages(again, [Refit, Code])
-                data = b"".join(coded.learnt["code"].pieces)
-            self._row(f"{trial.text.partition('@')[0]}@{file}", decode(data, trust=True), None, len(data))
+            self._row(f"{text}@{file}", *self._encoded(state, last.start, file))
+
+    def _encoded(self, state: State, start: str, file: str) -> tuple[Scene, None, int]:
+        options = options_of(file.removeprefix("photos"))
+        if file.startswith("photos"):
+            options = options.changed(refit={"ground_truth": self._at.images})
+        if start == "uncompressed":
+            views = [*self._at.train, *self._at.test] if file.startswith("photos") else self._at.train
+            data = encode(state.scene, views, options, device=self._at.device).data
+        else:
+            # The re-fit comes back to what the photographs have made of the scene.
+            again = dataclasses.replace(State.of(state.scene, state.views), added=state.added)
+            coded = Run(options, Stopwatch(), self._at.device).stages(again, [Refit, Code])
+            data = b"".join(coded.learnt["code"].pieces)
+        return decode(data, trust=True), None, len(data)
 
     def _row(self, text: str, scene: Scene, course: Course | None, nbytes: int | None) -> None:
         truth, alike, own = self._at.judged(scene)
