@@ -83,7 +83,7 @@ class State:
 
     @property
     def goal(self) -> Scene:
-        """Whose pictures colours are re-fitted to: the uncompressed scene's, or those of what is nearer to the truth."""
+        """Whose pictures colours are re-fitted to: the uncompressed scene's, or those of what is nearer to truth."""
         return self.source if self.truth is None else self.truth
 
     @staticmethod
