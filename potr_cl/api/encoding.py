@@ -24,6 +24,7 @@ from potr_cl.codec.quantize import Preset
 from potr_cl.errors import UsageError
 from potr_cl.formats.images import Colour
 from potr_cl.host.atomic_write import replacing
+from potr_cl.host.mapped import bounded
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.virtual_cameras import place_cameras
@@ -129,7 +130,8 @@ def encode(
     if report is None and report_view is not None:
         raise UsageError("report_view needs report, the page that shows it")
     views = cameras_of(cameras)
-    what = scene_of(scene, trust, antialiased)
+    with bounded(settings.memory):
+        what = scene_of(scene, trust, antialiased)
     if views is None and virtual_views is not None and settings.look_at_views(what):
         views = place_cameras(what, virtual_views)
     if views is None and report is not None and settings.look_at_views(what):

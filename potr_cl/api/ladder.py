@@ -22,6 +22,7 @@ from potr_cl.errors import UsageError
 from potr_cl.formats.ladder import DESCRIPTION, Ladder, Rung, qualities
 from potr_cl.formats.registry import stem_of_scene
 from potr_cl.host.atomic_write import replacing
+from potr_cl.host.mapped import bounded
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
@@ -83,7 +84,8 @@ def encode_ladder(
         source_bytes=bytes_of_source(scene), cameras_anyway=cameras_anyway,
     )  # fmt: skip
     given = cameras_of(cameras)
-    what = scene_of(scene, trust, antialiased)
+    with bounded(settings.memory):
+        what = scene_of(scene, trust, antialiased)
     looks = settings.look_at_views(what)
     views = views_or_placed(what, given, virtual_views) if looks else given
     name = name_of(scene)

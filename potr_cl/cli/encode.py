@@ -39,6 +39,7 @@ from potr_cl.errors import DeviceError, PotrError, UsageError
 from potr_cl.formats.images import parse_colour
 from potr_cl.formats.registry import suffixes_read
 from potr_cl.host.atomic_write import replacing
+from potr_cl.host.mapped import bounded
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera, within_photographs
 from potr_cl.model.scene import Scene
@@ -148,6 +149,7 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
     options = _options(args, size_of_file(args.scene))
     target, opened, cameras = shared.target, shared.opened, shared.cameras
     with contextlib.ExitStack() as stack:
+        stack.enter_context(bounded(options.memory))
         scene = read_scene(args, args.scene)
         # Drivers take as long to open a device.
         check_frame(scene, cameras, options.cameras_anyway)

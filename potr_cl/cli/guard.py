@@ -138,7 +138,8 @@ def _refuse(written: Sequence[Path], read: Sequence[Path]) -> None:
         if one in outputs:
             raise UsageError(f"two outputs name the same file, '{outputs[one]}' and '{path}': give one another name")
         outputs[one] = path
-    if not any(os.path.lexists(path) for path in written):
+    # A name may lead through a folder that is not there ("new/../scene.ply"): files are written where it points to.
+    if not any(os.path.lexists(os.path.realpath(path)) for path in written):
         return  # new files are nobody's input: folders need not be listed
     for source in read:
         for name in _files(source):

@@ -5,6 +5,7 @@ from __future__ import annotations
 
 import argparse
 import difflib
+import re
 import sys
 from collections.abc import Iterable, Sequence
 from typing import Any, NoReturn
@@ -16,6 +17,8 @@ from potr_cl.plain_text import plain
 _MOST_DIGITS = 12
 #: Of a value that was typed, characters that are shown.
 _SHOWN = 60
+#: A value that begins as an option does.
+_NEGATIVE = re.compile(r"-(?:(?:\d+\.?\d*|\.\d+)(?:e[-+]?\d+)?|inf|infinity)$", re.IGNORECASE)
 #: What argparse says when arguments are missing; their names follow.
 _MISSING = "the following arguments are required: "
 
@@ -27,6 +30,8 @@ class CommandParser(argparse.ArgumentParser):
         super().__init__(*args, **kwargs)
         # Newer Pythons' help has colours as escape sequences, which our own output makes harmless, that is, shows.
         self.color = False
+        # Until 3.14, argparse took -1e-3 for an option; and a box without an end has a corner at -inf.
+        self._negative_number_matcher = _NEGATIVE
 
     def parse_known_args(self, args: Sequence[str] | None = None, namespace: Any = None) -> Any:  # type: ignore[override]
         """As argparse's, but an option that there is not is told before arguments that are missing.

@@ -6,9 +6,9 @@ Threads share the bundles out. Integers of a bundle become values while they are
 from __future__ import annotations
 
 from collections.abc import Callable
-from concurrent.futures import Future
-from dataclasses import dataclass, field
-from functools import cached_property, partial
+from concurrent.futures import Future, ThreadPoolExecutor
+from dataclasses import dataclass
+from functools import cached_property
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -23,24 +23,25 @@ from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
 from potr_cl.codec.context.tokens import largest_integer
 from potr_cl.codec.dequantizer import Dequantizer
-from potr_cl.codec.native.bundles import BEYOND_TABLE, BundledFile, Tables, ValueArrays
+from potr_cl.codec.native.bundles import BEYOND_TABLE
 from potr_cl.codec.native.library import native
+from potr_cl.codec.native.values import PackedValues, Tables, ValueArrays
 from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
 from potr_cl.codec.versions import VERSIONS
-from potr_cl.host.threads import Run, SharedWork, thread_pool
+from potr_cl.host.threads import thread_pool
 
 if TYPE_CHECKING:
-    from potr_cl.codec.destination import Activation, Destination
+    from potr_cl.codec.destination import Activation, BundleTaker, Destination
 
 #: Bundles that NumPy decodes side by side.
 _SIDE_BY_SIDE = 32
 #: Bundles whose integers a thread joins at a time.
 _HANDED = 4
-#: Splats for each thread, so that one more pays.
-SPLATS_A_THREAD = 3 * BUNDLE
-#: Parts of the positions for each thread, so that none waits long for another.
-_PARTS = 2
+#: Bundles for each thread, so that one more pays.
+_BUNDLES_A_THREAD = 2
+#: Bundles for each thread that may be packed, or wait to be taken, at a time.
+_ROOMS_A_THREAD = 2
 #: Levels whose values are looked up.
 _TABLE = 1 << 16
 
@@ -70,68 +71,75 @@ class BundledScene:
         section = self.header.find(*key)
         return None if section is None else (container.stored_bytes(self.data, section), section.name)
 
-    def fill(
-        self,
-        arrays: ValueArrays,
-        threads: int = 1,
-        centres: Callable[[Run, int], None] | None = None,
-        filled: Callable[[int, int], None] | None = None,
-    ) -> None:
+    def fill(self, arrays: ValueArrays, threads: int = 1, beside: Callable[[], None] | None = None) -> None:
         """Fill some arrays; sections of others are not looked at.
 
         Args:
             arrays: what to decode.
             threads: to work with, this one included.
-            centres: what else to do meanwhile; it is told how to share out work, and into how many parts.
-            filled: told from one splat to another which values are there, by this thread; others decode meanwhile.
+            beside: what else is to be done, by any thread.
 
         Raises:
-            DataError: damaged.
+            DataError: damaged; and what ``beside`` raises.
         """
-        work, number = SharedWork(), self.reader.bundles.number
-        # With fewer bundles for each, threads wait for the interpreter, and for memory, longer than they decode.
-        helpers = min(threads, max(self.header.splats // SPLATS_A_THREAD, 2)) - (filled is None)
-        if native() is None:  # others would wait for the interpreter, and take memory meanwhile
-            helpers = 0
-        first = []
-        if centres is not None:
-            first.append(work.add(partial(centres, work.run, _PARTS * helpers if helpers else 1)))
-        with thread_pool(max(helpers, 1)) as pool:
-            try:
-                if helpers and first:  # while this thread opens the sections
-                    pool.submit(work.do)
-                job = self._job(arrays)
-                shares = job.shares(number)
-                if job.file is None:
-                    work.do()
-                    self._one_by_one(job, shares, filled or _nobody)
-                    shares = []
-                futures = [work.add(partial(job, some)) for some in shares]
-                for _ in range(helpers if shares else 0):
-                    pool.submit(work.do)
-                if filled is None:
-                    work.do()
-                self._tell(shares, futures, filled or _nobody)
-                for future in first:
-                    future.result()
-            finally:
-                work.forget()
+        wanted, number = self._wanted(arrays), self.reader.bundles.number
+        with _Helpers(number, min(threads, max(number // _BUNDLES_A_THREAD, 2)) - 1, beside) as helpers:
+            file, share = self.reader.bundled_file(wanted), helpers.share
+            if file is None or share is None:
+                self._side_by_side(lambda bundles: self._by_numpy(bundles, wanted, arrays))
+            else:
+                share.open(file, wanted.sections, wanted.rotations, arrays, self.tables)
+                share.do()
+                for bundle in range(number):
+                    if self._went_beyond(share.wait(bundle)):
+                        self._by_numpy(range(bundle, bundle + 1), wanted, arrays)
+            helpers.finish()
 
-    def _one_by_one(self, job: Job, shares: list[range], filled: Callable[[int, int], None]) -> None:
-        for bundles in shares:
-            job(bundles)
-            filled(bundles.start * BUNDLE, min(bundles.stop * BUNDLE, self.header.splats))
+    def pack(
+        self, destination: BundleTaker, sh_count: int, threads: int, means: Callable[[], NDArray[np.float32]]
+    ) -> None:
+        """Hand the values of all bundles to a destination, packed and in their order, and the centres.
 
-    def _tell(self, shares: list[range], futures: list[Future[None]], filled: Callable[[int, int], None]) -> None:
-        """Wait for shares of the bundles, and tell of all that are done at a time."""
-        ready = done = 0
-        while done < len(futures):
-            futures[done].result()
-            while done < len(futures) and futures[done].done() and futures[done].exception() is None:
-                done += 1
-            stop = min(shares[done - 1].stop * BUNDLE, self.header.splats)
-            filled(ready, stop)
-            ready = stop
+        This thread hands them on; others decode.
+
+        Args:
+            destination: takes them.
+            sh_count: SH coefficients of a channel that are wanted.
+            threads: to decode with.
+            means: finds the centres; called by one of them.
+
+        Raises:
+            DataError: damaged; what ``means`` and the destination raise.
+        """
+        wanted, number = self._wanted_of(sh_count, True), self.reader.bundles.number
+        destination.expect_bundles()
+        threads = max(1, min(threads, -(-number // _BUNDLES_A_THREAD)))
+        with _Helpers(number, threads, means) as helpers:
+            file, share = self.reader.bundled_file(wanted), helpers.share
+            if file is None or share is None:
+                self._side_by_side(lambda bundles: self._pack_by_numpy(destination, sh_count, wanted, bundles))
+            else:
+                rooms = [PackedValues() for _ in range(min(number, _ROOMS_A_THREAD * threads))]
+                share.open(file, wanted.sections, wanted.rotations, rooms, self.tables)
+                taken = False
+                for bundle in range(number):
+                    room = bundle % len(rooms)
+                    if self._went_beyond(share.wait(bundle, helpers.look_after)):
+                        self._pack_by_numpy(destination, sh_count, wanted, range(bundle, bundle + 1))
+                    else:
+                        destination.take_bundle(bundle * BUNDLE, rooms[room], share.items(room))
+                    share.allow(bundle + 1 + len(rooms))
+                    if not taken and helpers.beside.done():
+                        destination.take_means(helpers.finish())
+                        taken = True
+                if taken:
+                    return
+            destination.take_means(helpers.finish())
+
+    def _side_by_side(self, do: Callable[[range], None]) -> None:
+        number = self.reader.bundles.number
+        for first in range(0, number, _SIDE_BY_SIDE):
+            do(range(first, min(first + _SIDE_BY_SIDE, number)))
 
     def hand_to(self, destination: Destination, sh_count: int, threads: int) -> None:
         """Hand all integers but those of the centres to a destination, with so many SH coefficients of a channel.
@@ -184,12 +192,51 @@ class BundledScene:
         alphabets = [fitted.alphabet for fitted in section.streams] if section is not None else [1]
         return min(largest_integer(max(alphabets) - 1), _TABLE - 1)
 
-    def _job(self, arrays: ValueArrays) -> Job:
-        wanted = self._wanted(arrays)
-        file = self.reader.bundled_file(wanted)
-        if file is not None:
-            _ = self.tables  # made once, before threads ask for them
-        return Job(self, arrays, wanted, file)
+    def _went_beyond(self, said: tuple[int, int]) -> bool:
+        """Whether the native path says of a bundle that its levels are beyond its tables.
+
+        Raises:
+            DataError: it says that the bundle is damaged.
+        """
+        if said[0] == BEYOND_TABLE:
+            return True
+        check_said(self.reader, *said)
+        return False
+
+    def _pack_by_numpy(self, destination: BundleTaker, sh_count: int, wanted: Wanted, bundles: range) -> None:
+        start, stop = bundles.start * BUNDLE, min(bundles.stop * BUNDLE, self.header.splats)
+        n = stop - start
+        arrays = ValueArrays(
+            np.empty((n, 3), np.float32),
+            np.empty((n, 4), np.float32),
+            np.empty(n, np.float32),
+            np.empty((sh_count, 3, n), np.float32),
+            begin=start,
+        )
+        self._by_numpy(bundles, wanted, arrays)
+        packed = PackedValues()
+        for first in range(start, stop, BUNDLE):
+            items = packed.take(arrays.part(first, min(first + BUNDLE, stop)))
+            destination.take_bundle(first, packed, items)
+
+    def _by_numpy(self, bundles: range, wanted: Wanted, arrays: ValueArrays) -> None:
+        """Fill arrays with the values of some bundles, which are decoded side by side.
+
+        Raises:
+            DataError: damaged.
+        """
+        header, activation = self.header, self.activation
+        levels = self.reader.levels(bundles.start, bundles.stop, wanted)
+        Dequantizer(header, VERSIONS[header.version]).of_levels(levels, self.reader.steps, arrays)
+        own = arrays.part(levels.start, levels.stop)
+        if activation is None:
+            return
+        if own.log_scales is not None:
+            own.log_scales[...] = activation.scales(own.log_scales)
+        if own.logits is not None:
+            own.logits[...] = activation.opacities(own.logits)
+        if own.quaternions is not None:
+            own.quaternions[...] = activation.rotations(own.quaternions)
 
     def _wanted(self, arrays: ValueArrays) -> Wanted:
         rotations = arrays.quaternions is not None
@@ -201,10 +248,6 @@ class BundledScene:
         degree = round(sh_count**0.5) - 1
         # To the end of the chain where all is asked for: so its end is checked.
         return Wanted(len(MAIN) if degree == self.header.sh_degree else 3 + degree, rotations)
-
-
-def _nobody(start: int, stop: int) -> None:
-    """Is told which values are there."""
 
 
 @dataclass(frozen=True)
@@ -239,51 +282,70 @@ def _wide(largest: int) -> type[np.generic]:
     return np.int32 if largest < 1 << 29 else np.int64
 
 
-@dataclass(frozen=True)
-class Job:
-    """What decodes bundles, by any thread."""
+class _Helpers:
+    """Threads that take part in decoding, and in what is to be done beside it.
 
-    scene: BundledScene
-    arrays: ValueArrays
-    wanted: Wanted
-    file: BundledFile | None
-    _works: list[NDArray[np.uint8]] = field(default_factory=list)
+    They begin at once, and wait in C until the bundles can be decoded: so they do not keep this thread from the
+    interpreter while it opens the file. By NumPy there are none: they would wait for the interpreter all the time, and
+    take memory meanwhile.
 
-    def shares(self, number: int) -> list[range]:
-        """The bundles of a file, as they are decoded at a time."""
-        at_once = 1 if self.file is not None else _SIDE_BY_SIDE
-        return [range(first, min(first + at_once, number)) for first in range(0, number, at_once)]
+    Args:
+        bundles: of the file.
+        threads: so many.
+        beside: what else is to be done, by one of them, or by this one where there are none.
 
-    def __call__(self, bundles: range) -> None:
-        """Decode one of the shares.
+    Attributes:
+        share: the bundles; None where NumPy is to be taken.
+        beside: what came of what is done beside.
+    """
+
+    def __init__(self, bundles: int, threads: int, beside: Callable[[], Any] | None) -> None:
+        functions = native()
+        self.share = None if functions is None else functions.bundle_share(bundles)
+        self._number = 0 if self.share is None else threads
+        self._do_beside = beside or (lambda: None)
+        self._pool = ThreadPoolExecutor(max(self._number, 1))
+        self._futures: list[Future[None]] = []
+        self.beside: Future[Any] = Future()
+
+    def __enter__(self) -> _Helpers:
+        try:
+            for number in range(self._number):
+                self._futures.append(self._pool.submit(self._do, number == 0))
+        except BaseException:
+            self.__exit__()
+            raise
+        return self
+
+    def __exit__(self, *error: object) -> None:
+        if self.share is not None:
+            self.share.give_up()
+        self._pool.shutdown(cancel_futures=True)
+
+    def _do(self, first: bool) -> None:
+        if first:
+            self._set_beside()
+        if self.share is not None:
+            self.share.do()
+
+    def _set_beside(self) -> None:
+        try:
+            self.beside.set_result(self._do_beside())
+        except BaseException as error:  # the one who asks for the result is told
+            self.beside.set_exception(error)
+
+    def look_after(self) -> None:
+        """Raise what has ended the threads, if none is left."""
+        if all(future.done() for future in self._futures):
+            for future in self._futures:
+                future.result()
+
+    def finish(self) -> Any:
+        """See to it that what was to be done beside is, and give what came of it.
 
         Raises:
-            DataError: damaged.
+            What it raises.
         """
-        if self.file is None:
-            self._by_numpy(bundles)
-            return
-        # What a thread has worked with the next one takes.
-        work = self._works.pop() if self._works else self.file.work()
-        said, section = self.file.values(
-            bundles.start, self.wanted.sections, self.wanted.rotations, work, self.arrays, self.scene.tables
-        )
-        self._works.append(work)
-        if said == BEYOND_TABLE:
-            self._by_numpy(bundles)
-        else:
-            check_said(self.scene.reader, said, section)
-
-    def _by_numpy(self, bundles: range) -> None:
-        header = self.scene.header
-        levels = self.scene.reader.levels(bundles.start, bundles.stop, self.wanted)
-        Dequantizer(header, VERSIONS[header.version]).of_levels(levels, self.scene.reader.steps, self.arrays)
-        activation, own = self.scene.activation, self.arrays.part(levels.start, levels.stop)
-        if activation is None:
-            return
-        if own.log_scales is not None:
-            own.log_scales[...] = activation.scales(own.log_scales)
-        if own.logits is not None:
-            own.logits[...] = activation.opacities(own.logits)
-        if own.quaternions is not None:
-            own.quaternions[...] = activation.rotations(own.quaternions)
+        if not self._number:
+            self._set_beside()
+        return self.beside.result()

@@ -20,7 +20,7 @@ from numpy.typing import NDArray
 from potr_cl.codec import container, metadata, octree, sections
 from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.blocks.table import FIXED_BYTES, header_bytes_of, is_of_blocks, read_table
-from potr_cl.codec.bundled_scene import SPLATS_A_THREAD, BundledScene
+from potr_cl.codec.bundled_scene import BundledScene
 from potr_cl.codec.byte_planes import IntegerStream, PlaneStream, unpack_integers
 from potr_cl.codec.colour_factors import ColourFactors, Once
 from potr_cl.codec.container import Header
@@ -28,9 +28,9 @@ from potr_cl.codec.context.decoder import Reader, Stream
 from potr_cl.codec.context.lanes import Lanes
 from potr_cl.codec.context.model import Sizes
 from potr_cl.codec.dequantizer import Dequantizer
-from potr_cl.codec.destination import Destination, Fillable, SceneArrays
-from potr_cl.codec.native.bundles import ValueArrays
+from potr_cl.codec.destination import BundleTaker, Destination, Fillable, SceneArrays
 from potr_cl.codec.native.library import native
+from potr_cl.codec.native.values import ValueArrays
 from potr_cl.codec.sections import Coder, Property, Section
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.codec.versions import VERSIONS, FormatVersion
@@ -45,6 +45,8 @@ _MOST_THREADS = 16
 _MOST_WAITING = 6
 #: Bytes of stored integers, for each splat, that all threads together may have unpacked: half a decoded splat.
 _MOST_UNPACKED = 120
+#: Splats for each thread, so that one more pays.
+_SPLATS_A_THREAD = 24576
 
 _EMPTY = np.empty(0, np.uint8)
 
@@ -231,7 +233,7 @@ class PotrFile:
         ]
         threads = min(threads or min(os.cpu_count() or 1, _MOST_THREADS), self._threads_in_memory())
         # With fewer splats for each, threads wait for the interpreter, and for memory, longer than they decode.
-        threads = min(threads, max(self.header.splats // SPLATS_A_THREAD, 2))
+        threads = min(threads, max(self.header.splats // _SPLATS_A_THREAD, 2))
         self._run(jobs, lambda run, parts: destination.take_means(self._means(run, parts)), threads)
 
     def sh_count(self, degree: int | None = None) -> int:
@@ -288,16 +290,15 @@ class PotrFile:
     def _decode_bundles(
         self, scene: BundledScene, destination: Destination, threads: int, sh_degree: int | None
     ) -> None:
-        def centres(run: Run, parts: int) -> None:
-            destination.take_means(self._means(run, parts))
-
-        if isinstance(destination, Fillable):
-            replace(scene, activation=destination.activation).fill(
-                destination.values, threads, centres, destination.filled if destination.is_told else None
-            )
-            return
-        scene.hand_to(destination, self.sh_count(sh_degree), threads)
-        centres(map, 1)
+        if isinstance(destination, BundleTaker):
+            count = self.sh_count(sh_degree)
+            replace(scene, activation=destination.activation).pack(destination, count, threads, self.means)
+        elif isinstance(destination, Fillable):
+            fill = replace(scene, activation=destination.activation).fill
+            fill(destination.values, threads, lambda: destination.take_means(self.means()))
+        else:
+            scene.hand_to(destination, self.sh_count(sh_degree), threads)
+            destination.take_means(self.means())
 
     # ------------------------------------------------------------------------------------------ inside
 

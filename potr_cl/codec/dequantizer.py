@@ -18,11 +18,11 @@ from potr_cl.codec.bundles.levels import Levels
 from potr_cl.codec.byte_planes import IntegerStream
 from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
-from potr_cl.codec.native.bundles import ValueArrays
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import native
-from potr_cl.codec.steps.prediction import from_residuals
-from potr_cl.codec.steps.rule import ColourSteps, factors
+from potr_cl.codec.native.values import ValueArrays
+from potr_cl.codec.steps.prediction import from_residuals, tables
+from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
 from potr_cl.codec.versions import FormatVersion
 
 F32 = NDArray[np.float32]
@@ -105,15 +105,15 @@ class Dequantizer:
             out: float32.
         """
         functions = native()
-        factors = fitting.ac if coefficient else fitting.dc
         if coefficient == 0 and self.version.colour_steps:
-            self._predicted(streams, fitting.classes, factors, out)
+            self._predicted(streams, fitting.classes, out)
             return
+        own = fitting.ac if coefficient else fitting.dc
         if functions is not None:
             levels = [stream.joined for stream in streams]
             if differences:
                 levels = [_summed(functions, level) for level in levels]
-            functions.colours(levels, factors, out)
+            functions.colours(levels, own, out)
             return
         last = [0, 0, 0]
         for block, parts in self._blocks(streams):
@@ -125,19 +125,20 @@ class Dequantizer:
                     last[c] = channel[-1]
             else:
                 channels = _wider(parts)
-            _to_rgb(channels, _part(factors, block), out[:, block])
+            _to_rgb(channels, _part(own, block), out[:, block])
 
-    def _predicted(self, streams: Sequence[IntegerStream], classes: I8, factors: F32, out: F32) -> None:
+    def _predicted(self, streams: Sequence[IntegerStream], classes: I8, out: F32) -> None:
         """DC from what the prediction has left of its levels."""
         splats = self.header.splats
-        levels = from_residuals(np.stack([stream.part(0, splats).astype(np.int64) for stream in streams]), classes)
         functions = native()
         if functions is not None:
-            functions.colours(list(levels), factors, out)
+            of_classes = factors(self.header.sf_dc, np.arange(-CLASSES, CLASSES).astype(np.int8))
+            functions.dc_colours([stream.joined for stream in streams], classes, *tables(), of_classes, out)
             return
+        levels = from_residuals(np.stack([stream.part(0, splats).astype(np.int64) for stream in streams]), classes)
         for start in range(0, splats, _BLOCK):
             block = slice(start, start + _BLOCK)
-            _to_rgb(list(levels[:, block]), _part(factors, block), out[:, block])
+            _to_rgb(list(levels[:, block]), factors(self.header.sf_dc, classes[block]), out[:, block])
 
     def of_levels(self, levels: Levels, steps: ColourSteps | None, arrays: ValueArrays) -> None:
         """The values of some splats' levels, by NumPy, into the arrays that there are, of all of the file's splats."""

@@ -18,7 +18,7 @@ from potr_cl.codec.byte_planes import IntegerStream
 from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
 from potr_cl.codec.dequantizer import Dequantizer
-from potr_cl.codec.native.bundles import ValueArrays
+from potr_cl.codec.native.values import PackedValues, ValueArrays
 from potr_cl.codec.versions import FormatVersion
 from potr_cl.model.scene import Scene
 
@@ -86,11 +86,32 @@ class Fillable(ABC):
     def take_means(self, means: F32) -> None:
         """Centres, (N, 3) float32, world units."""
 
-    #: Whether :meth:`filled` is called.
-    is_told = False
 
-    def filled(self, start: int, stop: int) -> None:  # noqa: B027 (most have nothing left to do)
-        """The arrays hold the values from one splat to another; told once of each, in their order."""
+class BundleTaker(ABC):
+    """A destination that takes values bundle by bundle, packed, as they are decoded."""
+
+    @property
+    def activation(self) -> Activation | None:
+        """Of these values; None: none."""
+        return None
+
+    @abstractmethod
+    def take_means(self, means: F32) -> None:
+        """Centres, (N, 3) float32, world units."""
+
+    @abstractmethod
+    def expect_bundles(self) -> None:
+        """Bundles will come."""
+
+    @abstractmethod
+    def take_bundle(self, first: int, packed: PackedValues, items: int) -> None:
+        """The values of a bundle; all from one thread, that of :meth:`expect_bundles`, and in their order.
+
+        Args:
+            first: the number of its first splat.
+            packed: the values; the memory is another bundle's afterwards.
+            items: how many it has.
+        """
 
 
 class SceneArrays(Fillable):

@@ -50,29 +50,53 @@ class Geometry:
     low_pass: float
     steps: ColourSteps | None = None
 
-    def decoded(self, sh: NDArray[np.float32]) -> Scene:
-        """What a decoder makes of it, bit for bit, in the order of the scene, with colours (N, M, 3) of that order."""
-        parameters, n = self.parameters, len(self.order)
-        log_scales, quaternions = np.empty((n, 3), np.float32), np.empty((n, 4), np.float32)
-        version = VERSIONS[parameters.version]
-        for axis, levels in enumerate(self.scales):
-            log_scales[self.order, axis] = version.dequantize_scales(levels, parameters.sf_scale)
-        turned = np.empty((n, 4), np.float32)
-        factors = version.rotation_factors(self.scales, parameters.sf_rotation)
-        quantize.dequantize_rotations(self.rotations, factors, turned)
-        quaternions[self.order] = turned
-        opacity_logits = np.empty(n, np.float32)
-        opacity_logits[self.order] = version.dequantize_opacities(self.opacities, parameters.sf_opacity)
-        means = np.empty((n, 3), np.float32)
-        means[self.order] = octree.parse(self.tree, n)
-        return Scene(means, log_scales, quaternions, opacity_logits, sh, self.antialiased, self.low_pass)
+    def decoded(self, sh: NDArray[np.float32], run: Run = map) -> Scene:
+        """What a decoder makes of it, bit for bit, in the order of the scene.
 
-    def colour_classes(self) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-        """(N,) classes of the steps of DC and of AC, in the order of the file: :class:`ColourSteps`; 0 without any."""
-        if self.steps is None:
-            none = np.zeros(len(self.order), np.int8)
-            return none, none
-        return self.steps.classes(self.scales, self.opacities)
+        Args:
+            sh: (N, M, 3) colours, in the order of the scene.
+            run: in place of :func:`map`, to work with several threads.
+        """
+        scene = undecoded(sh, self)
+        self.decode_to(scene, self.order, run)
+        return scene
+
+    def decode_to(self, scene: Scene, order: NDArray[np.int64], run: Run = map) -> None:
+        """Fill all but the colours of some splats of a scene; ``order`` (N,) are their numbers there."""
+        parameters, n = self.parameters, len(order)
+        version = VERSIONS[parameters.version]
+        centres = octree.parse(self.tree, n, run, -(-n // BLOCK))
+
+        def fill(start: int) -> None:
+            part = slice(start, min(start + BLOCK, n))
+            rows, scales = order[part], [axis[part] for axis in self.scales]
+            scene.means[rows] = centres[part]
+            log_scales = [version.dequantize_scales(levels, parameters.sf_scale) for levels in scales]
+            scene.log_scales[rows] = np.stack(log_scales, axis=1)
+            turned = np.empty((len(rows), 4), np.float32)
+            factors = version.rotation_factors(scales, parameters.sf_rotation)
+            quantize.dequantize_rotations([axis[part] for axis in self.rotations], factors, turned)
+            scene.quaternions[rows] = turned
+            scene.opacity_logits[rows] = version.dequantize_opacities(self.opacities[part], parameters.sf_opacity)
+
+        list(run(fill, range(0, n, BLOCK)))
+
+    def colour_classes(self, run: Run = map) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+        """(N,) classes of the steps of DC and of AC, in the order of the file: :class:`ColourSteps`; 0 without any.
+
+        ``run`` works with several threads.
+        """
+        n, steps = len(self.order), self.steps
+        classes = np.zeros((2, n), np.int8)
+
+        def find(start: int) -> None:
+            part = slice(start, start + BLOCK)
+            assert steps is not None
+            classes[:, part] = steps.classes([axis[part] for axis in self.scales], self.opacities[part], start)
+
+        if steps is not None:
+            list(run(find, range(0, n, BLOCK)))
+        return classes[0], classes[1]
 
     def with_steps(self, effects: NDArray[np.floating]) -> Geometry:
         """The same with steps of colours by what each splat shows.
@@ -87,6 +111,15 @@ class Geometry:
         """The same for parameters that differ in the steps of colours alone, which geometry does not depend on."""
         world = replace(self.parameters, sf_dc=parameters.sf_dc, sf_sh=parameters.sf_sh)
         return replace(self, asked=parameters, parameters=world)
+
+
+def undecoded(sh: NDArray[np.float32], like: Geometry) -> Scene:
+    """A scene with some colours, (N, M, 3), and nothing else yet, that is to be drawn as a file's scene is."""
+    n = len(sh)
+    return Scene(
+        np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty((n, 4), np.float32),
+        np.empty(n, np.float32), sh, like.antialiased, like.low_pass,
+    )  # fmt: skip
 
 
 def quantise_geometry(

@@ -1,4 +1,4 @@
-"""Arrays that lie in a temporary file and not in memory (:func:`mapped`).
+"""Arrays that lie in a temporary file and not in memory (:func:`mapped`), where memory is bounded (:func:`bounded`).
 
 The system keeps as many of their pages in memory as it has room for, and writes the others to the file. The file has
 no name: nothing is left of it, whatever ends the process.
@@ -11,6 +11,9 @@ import math
 import mmap
 import os
 import tempfile
+from collections.abc import Iterator
+from contextlib import contextmanager
+from contextvars import ContextVar
 from typing import Any
 
 import numpy as np
@@ -20,6 +23,57 @@ from potr_cl.host.leftovers import place_for_temporary_files
 
 #: What a file system says that cannot promise room.
 _NO_PROMISE = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)
+
+
+#: Bytes of the largest array that is not mapped where memory is bounded.
+_LARGEST: ContextVar[float] = ContextVar("largest", default=math.inf)
+#: It is this part of the memory.
+_PART = 1 / 16
+#: Rows that are copied at a time.
+_ROWS = 1 << 18
+
+
+@contextmanager
+def bounded(memory: float | None) -> Iterator[None]:
+    """Have :func:`array` and :func:`rows` map large arrays inside the block.
+
+    Args:
+        memory: bytes that the work may take about; None: as before.
+    """
+    token = _LARGEST.set(_LARGEST.get() if memory is None else _PART * memory)
+    try:
+        yield
+    finally:
+        _LARGEST.reset(token)
+
+
+def array(shape: tuple[int, ...], dtype: Any, what: str) -> np.ndarray[Any, Any]:
+    """A new array, not set: as :func:`numpy.empty`, or, if it is large and memory is bounded, as :func:`mapped`."""
+    large = math.prod(shape) * np.dtype(dtype).itemsize > _LARGEST.get()
+    return mapped(shape, dtype, what) if large else np.empty(shape, dtype)
+
+
+def rows(values: np.ndarray[Any, Any], numbers: np.ndarray[Any, Any] | None, what: str) -> np.ndarray[Any, Any] | None:
+    """Some rows of an array, if they are so large that they are mapped; else None: NumPy copies them faster.
+
+    Args:
+        values: (N, …).
+        numbers: (n,) of the rows, or (N,) bool; None: all.
+        what: they are, for the error's sake.
+
+    Raises:
+        As :func:`mapped`.
+    """
+    if values.nbytes <= _LARGEST.get():
+        return None
+    if numbers is not None and numbers.dtype == bool:
+        numbers = np.flatnonzero(numbers)
+    count = len(values) if numbers is None else len(numbers)
+    found = array((count, *values.shape[1:]), values.dtype, what)
+    for first in range(0, count, _ROWS):
+        some = slice(first, first + _ROWS)
+        found[some] = values[some if numbers is None else numbers[some]]
+    return found
 
 
 def mapped(shape: tuple[int, ...], dtype: Any, what: str) -> np.ndarray[Any, Any]:

@@ -29,14 +29,16 @@ class Box:
         """A box from the six numbers x0 y0 z0 x1 y1 z1, any of which may be infinite.
 
         Raises:
-            UsageError: there are not six, one is no number, or the corners are exchanged.
+            UsageError: there are not six, one is no number or NaN, or the corners are exchanged.
         """
         try:
             corners = [float(number) for number in numbers]
         except (TypeError, ValueError):
             raise UsageError("a box is six numbers: x0 y0 z0 x1 y1 z1") from None
-        if len(corners) != 6 or any(number != number for number in corners):
-            raise UsageError(f"a box is six numbers, x0 y0 z0 x1 y1 z1, not {len(corners)}, and none may be NaN")
+        if len(corners) != 6:
+            raise UsageError(f"a box is six numbers, x0 y0 z0 x1 y1 z1, not {len(corners)}")
+        if any(number != number for number in corners):
+            raise UsageError("one of a box's six numbers is NaN: give inf or -inf where the box has no end")
         low, high = (corners[0], corners[1], corners[2]), (corners[3], corners[4], corners[5])
         for axis, least, most in zip("xyz", low, high, strict=True):
             if least > most:

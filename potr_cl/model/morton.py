@@ -6,6 +6,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.host.threads import Run
+from potr_cl.model.order import ascending
 
 #: Of each coordinate, in a code of 64 bits.
 BITS = 21
@@ -13,9 +14,9 @@ BITS = 21
 _ROWS = 1 << 16
 
 
-def morton_order(means: NDArray[np.float32]) -> NDArray[np.int64]:
-    """(N,) the numbers of (N, 3) centres along a Morton curve (:func:`morton_codes`)."""
-    return np.argsort(morton_codes(means), kind="stable")
+def morton_order(means: NDArray[np.float32], run: Run = map) -> NDArray[np.int64]:
+    """(N,) the numbers of (N, 3) centres along a Morton curve (:func:`morton_codes`), those of one code by number."""
+    return ascending(morton_codes(means, run))
 
 
 def morton_codes(means: NDArray[np.float32], run: Run = map) -> NDArray[np.uint64]:

@@ -12,11 +12,15 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import DataError, UsageError
+from potr_cl.host import mapped
+from potr_cl.host.threads import thread_pool
 
 FloatArray = NDArray[np.float32]
 
 #: Splats looked at at a time where values are checked.
 _BLOCK = 1 << 14
+#: So many splats are copied by threads, an eighth of them at a time.
+_LARGE = 1 << 20
 
 #: The logit of an opacity that single precision cannot tell from 1.
 _OPAQUE = np.float32(20)
@@ -180,9 +184,16 @@ class Scene:
 
     def subset(self, index: NDArray[np.generic]) -> Scene:
         """The splats that ``index`` (integers or a boolean mask) selects, in its order."""
-        # Much quicker for whole rows than indexing.
         numbers = np.asarray(index)
+        if (sh := mapped.rows(self.sh, numbers, "SH coefficients")) is not None:
+            own = self.means[numbers], self.log_scales[numbers], self.quaternions[numbers], self.opacity_logits[numbers]
+            return dataclasses.replace(
+                self, means=own[0], log_scales=own[1], quaternions=own[2], opacity_logits=own[3], sh=sh
+            )
+        # Much quicker for whole rows than indexing.
         fast = numbers.dtype.kind in "iu" and self.sh.flags.c_contiguous
+        if fast and len(numbers) >= _LARGE and numbers.min() >= 0 and numbers.max() < len(self):
+            return self._rows(numbers.astype(np.intp, copy=False))
         return dataclasses.replace(
             self,
             means=self.means[index],
@@ -190,6 +201,28 @@ class Scene:
             quaternions=self.quaternions[index],
             opacity_logits=self.opacity_logits[index],
             sh=self.sh.take(numbers.astype(np.intp, copy=False), axis=0) if fast else self.sh[index],
+        )
+
+    def _rows(self, numbers: NDArray[np.intp]) -> Scene:
+        """:meth:`subset` of many splats: the memory that is new takes longer than the copy, and threads share it."""
+        given = (self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh)
+        taken = [np.empty((len(numbers), *each.shape[1:]), each.dtype) for each in given]
+
+        def take(first: int) -> None:
+            some = slice(first, first + _LARGE // 8)
+            for each, result in zip(given, taken, strict=True):
+                each.take(numbers[some], axis=0, out=result[some], mode="clip")  # without a copy in between
+
+        with thread_pool() as pool:
+            list(pool.map(take, range(0, len(numbers), _LARGE // 8)))
+        means, log_scales, quaternions, opacity_logits, sh = taken
+        return dataclasses.replace(
+            self,
+            means=means,
+            log_scales=log_scales,
+            quaternions=quaternions,
+            opacity_logits=opacity_logits,
+            sh=sh,
         )
 
     def put(self, first: int, part: Scene) -> None:
@@ -258,7 +291,7 @@ def joined(parts: Sequence[Scene]) -> Scene:
         np.empty((splats, 3), np.float32),
         np.empty((splats, 4), np.float32),
         np.empty(splats, np.float32),
-        np.empty((count, 3, splats), np.float32).transpose(2, 0, 1),
+        mapped.array((count, 3, splats), np.float32, "SH coefficients").transpose(2, 0, 1),
         parts[0].antialiased,
         parts[0].low_pass,
     )

@@ -14,6 +14,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.morton import morton_order
 from potr_cl.model.scene import Scene
@@ -23,6 +24,8 @@ F64 = NDArray[np.float64]
 
 #: Splats of a group.
 _GROUP = 1024
+#: Groups whose boxes are found at a time.
+_GROUPS = 256
 #: Splats that are so many times as large as the median have groups of their own: they can be seen from everywhere.
 _LARGE = 8.0
 #: A splat reaches so many of its largest standard deviations on screen, sqrt(2 ln 255) and LEVEL_SLACK of splat.clh,
@@ -33,6 +36,12 @@ _REACH, _PIXELS = 3.5, 3.0
 _LIMIT = 1.3
 #: Of a distance from the camera: more than single precision loses on the way to the screen.
 _ROUNDING = 1e-5
+
+
+def largest_scales(log_scales: NDArray[np.float32]) -> NDArray[np.float32]:
+    """(N,) the largest of each splat's three; several times as fast as a maximum along an axis."""
+    found: NDArray[np.float32] = np.maximum(np.maximum(log_scales[:, 0], log_scales[:, 1]), log_scales[:, 2])
+    return found
 
 
 @dataclass(frozen=True)
@@ -53,21 +62,37 @@ class SplatGroups:
     sizes: F64
 
     @staticmethod
-    def of(scene: Scene, group: int | None = None) -> SplatGroups:
-        """Group the splats of a scene, clean and with at least one; ``group`` of them are a group at most."""
+    def of(scene: Scene, group: int | None = None, run: Run = map) -> SplatGroups:
+        """Group the splats of a scene, clean and with at least one.
+
+        Args:
+            scene: whose splats.
+            group: so many of them are a group at most.
+            run: shares the work out.
+        """
         group = group or _GROUP
-        logarithms = scene.log_scales.max(axis=1)
+        logarithms = largest_scales(scene.log_scales)
         large = logarithms > np.median(logarithms) + math.log(_LARGE)
-        along = morton_order(scene.means)
+        along = morton_order(scene.means, run)
         order = np.concatenate([along[~large[along]], along[large[along]]])
         n, small = len(order), len(order) - int(np.count_nonzero(large))
         starts = np.concatenate([np.arange(0, small, group), np.arange(small, n, group), [n]])
         low, high = np.empty((2, len(starts) - 1, 3))
-        for axis in range(3):
-            column = scene.means[order, axis].astype(np.float64)
-            low[:, axis] = np.minimum.reduceat(column, starts[:-1])
-            high[:, axis] = np.maximum.reduceat(column, starts[:-1])
-        largest = np.maximum.reduceat(logarithms[order], starts[:-1]).astype(np.float64)
+        largest = np.empty(len(starts) - 1)
+
+        def bound(first: int) -> None:
+            """The boxes of some groups."""
+            some = slice(first, min(first + _GROUPS, len(starts) - 1))
+            begins = starts[some]
+            own = order[begins[0] : starts[some.stop]]
+            for axis in range(3):
+                column = scene.means[own, axis].astype(np.float64)
+                low[some, axis] = np.minimum.reduceat(column, begins - begins[0])
+                high[some, axis] = np.maximum.reduceat(column, begins - begins[0])
+            largest[some] = np.maximum.reduceat(logarithms[own], begins - begins[0])
+
+        for _ in run(bound, range(0, len(starts) - 1, _GROUPS)):
+            pass
         # Halved each first: the sum of two large numbers may be infinite.
         return SplatGroups(order, starts, low / 2 + high / 2, high / 2 - low / 2, np.exp(np.minimum(largest, 100)))
 

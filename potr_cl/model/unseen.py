@@ -12,26 +12,29 @@ from collections.abc import Sequence
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
-from potr_cl.model.splat_groups import SplatGroups
+from potr_cl.model.splat_groups import SplatGroups, largest_scales
 
 #: The renderer's near plane, world units: a splat whose centre is nearer is not drawn.
 _NEAR = 0.2
 #: How far splats reach, in standard deviations, and what a renderer adds to that, in pixels.
 _REACH, _PIXELS = 3.5, 2.0
 #: Splats looked at at a time.
-_BLOCK = 1 << 17
-#: Scenes of more splats are looked at group by group; of others it takes longer to group them.
-_LARGE = 1 << 21
+_BLOCK = 1 << 16
 
 
-def unseen_splats(scene: Scene, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
+def unseen_splats(
+    scene: Scene, cameras: Sequence[Camera], groups: SplatGroups | None = None, run: Run = map
+) -> NDArray[np.bool_]:
     """Which splats lie outside of every view's picture.
 
     Args:
         scene: clean.
         cameras: the views; without any, no splat is seen.
+        groups: of the scene, where they are known: most views show nothing of a neighbourhood of a large scene.
+        run: shares the work out.
 
     Returns:
         (N,) whether it is unseen. A splat of which any part may touch a picture is not, even if others hide it.
@@ -39,20 +42,22 @@ def unseen_splats(scene: Scene, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
     unseen = np.ones(len(scene), bool)
     # Views far from each other first: what one does not see the next one may.
     order = np.argsort((np.arange(len(cameras)) * (math.sqrt(5) - 1) / 2) % 1, kind="stable")
-    groups = SplatGroups.of(scene) if len(scene) > _LARGE and len(cameras) else None
     shown = [] if groups is None else [groups.visible(camera, _NEAR) for camera in cameras]
-    for start in range(0, len(scene), _BLOCK):
+
+    def look(start: int) -> None:
+        """Find out which of a block of splats are seen."""
         stop = min(start + _BLOCK, len(scene))
         left = np.arange(start, stop) if groups is None else groups.order[start:stop]
         among = None if groups is None else np.searchsorted(groups.starts, np.arange(start, stop), "right") - 1
         means = scene.means[left].astype(np.float64)
         with np.errstate(over="ignore"):
-            reach = _REACH * np.exp(np.minimum(scene.log_scales[left].max(axis=1), 80).astype(np.float64))
+            reach = _REACH * np.exp(np.minimum(largest_scales(scene.log_scales[left]), 80).astype(np.float64))
         for view in order:
             if among is None:
                 seen = _shows(cameras[view], means, reach)
             else:
-                # Most views show nothing of a neighbourhood of a large scene.
+                if not shown[view][among[0] : among[-1] + 1].any():
+                    continue
                 near = np.flatnonzero(shown[view][among])
                 if not len(near):
                     continue
@@ -63,6 +68,9 @@ def unseen_splats(scene: Scene, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
             among = None if among is None else among[~seen]
             if not len(left):
                 break
+
+    for _ in run(look, range(0, len(scene), _BLOCK)):
+        pass
     return unseen
 
 
@@ -71,7 +79,9 @@ def opacity_weighted_areas(scene: Scene) -> NDArray[np.float64]:
 
     The factor makes the largest of them 1, so that no scene's units are too large.
     """
-    largest_two = np.sort(scene.log_scales.astype(np.float64), axis=1)[:, 1:].sum(axis=1)
+    a, b, c = scene.log_scales.T.astype(np.float64)
+    low, high = np.minimum(a, b), np.maximum(a, b)
+    largest_two = np.maximum(low, np.minimum(high, c)) + np.maximum(high, c)
     areas: NDArray[np.float64] = np.exp(largest_two - largest_two.max(initial=-math.inf)) * scene.opacities
     return areas
 

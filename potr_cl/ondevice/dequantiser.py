@@ -3,14 +3,14 @@
 Devices need not divide, take roots or logarithms exactly, so nothing is computed there but sums of integers: what a
 level, or a sum of three, stands for is looked up in a table that the host has made. Where levels are too large for a
 table, and for rotations and colours whose steps differ from splat to splat, the host finds the values and uploads them.
-So it does for all of a file whose bundles become values while they are in a cache, which is quicker.
+So it does for all of a file whose bundles become values while they are in a cache: of these it packs what is not 0
+(:mod:`potr_cl.ondevice.staged_bundles`).
 """
 
 from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
-from functools import cached_property
 from typing import Any
 
 import numpy as np
@@ -21,11 +21,12 @@ from potr_cl.codec.byte_planes import IntegerStream
 from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
 from potr_cl.codec.dequantizer import Dequantizer
-from potr_cl.codec.destination import Fillable
-from potr_cl.codec.native.bundles import ValueArrays
+from potr_cl.codec.destination import BundleTaker
 from potr_cl.codec.native.library import native
+from potr_cl.codec.native.values import PackedValues
 from potr_cl.codec.versions import FormatVersion
 from potr_cl.errors import DataError
+from potr_cl.ondevice.staged_bundles import StagedBundles
 from potr_cl.opencl.memory import Memory
 from potr_cl.raster.activation import activated_scales, log2_opacities, unit_quaternions
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
@@ -52,7 +53,7 @@ class Activated:
         return unit_quaternions(quaternions).astype(np.float32)
 
 
-class DeviceDequantiser(Fillable):
+class DeviceDequantiser(BundleTaker):
     """Takes a file's splats (:class:`potr_cl.codec.destination.Destination`) into a device's buffers.
 
     Args:
@@ -69,6 +70,7 @@ class DeviceDequantiser(Fillable):
         self._activated = Activated()
         # Copies that the device has not made yet; while it makes them, threads go on decoding.
         self._pending: list[cl.Event] = []
+        self._staged: StagedBundles | None = None
 
     def finish(self) -> None:
         """Wait until everything that was taken is there.
@@ -77,9 +79,14 @@ class DeviceDequantiser(Fillable):
             DeviceError: the device failed.
         """
         device = self._buffers.device
-        with device.errors("failed while decoding"):
-            device.queue.finish()
-        self._pending.clear()
+        try:
+            with device.errors("failed while decoding"):
+                device.queue.finish()
+        finally:
+            self._pending.clear()
+            if self._staged is not None:
+                self._staged.close()
+                self._staged = None
 
     def take_means(self, means: F32) -> None:
         with self._lock:
@@ -113,30 +120,12 @@ class DeviceDequantiser(Fillable):
         """Standard deviations and logarithms of opacities, as the projection takes them."""
         return self._activated
 
-    @cached_property
-    def values(self) -> ValueArrays:
-        """Arrays of the host, for files whose integers become values as they are decoded."""
-        n = self._header.splats
-        shapes = {"log_scales": (3, n), "quaternions": (4, n), "logits": (n,), "sh": (self._buffers.sh_count, 3, n)}
-        return ValueArrays(**{name: np.empty(shape, np.float32) for name, shape in shapes.items()}, columns=True)
+    def expect_bundles(self) -> None:
+        self._staged = StagedBundles(self._buffers, self._lock)
 
-    is_told = True
-
-    def filled(self, start: int, stop: int) -> None:
-        """Upload these splats' values."""
-        arrays, buffers, own = self.values, self._buffers, slice(start, stop)
-        assert arrays.log_scales is not None
-        assert arrays.logits is not None
-        assert arrays.quaternions is not None
-        assert arrays.sh is not None
-        with self._lock:
-            for parameter, columns in (
-                (buffers.sh, arrays.sh.reshape(3 * buffers.sh_count, -1)),
-                (buffers.quaternions, arrays.quaternions),
-                (buffers.scales, arrays.log_scales),
-                (buffers.log2_opacities, arrays.logits[None]),
-            ):
-                buffers.write_columns(parameter, 0, columns, self._pending, own)
+    def take_bundle(self, first: int, packed: PackedValues, items: int) -> None:
+        assert self._staged is not None
+        self._staged.take(first, packed, items)
 
     def take_colours(
         self, streams: Sequence[IntegerStream], coefficient: int, differences: bool, factors: ColourFactors

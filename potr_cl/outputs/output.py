@@ -23,6 +23,7 @@ from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.encoder import Coded
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.formats.declaration import SceneFormat
+from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
@@ -72,8 +73,11 @@ class Rounded(Protocol):
     @property
     def order(self) -> NDArray[np.int64]: ...
 
-    def decoded(self, sh: FloatArray) -> Scene:
-        """What a reader makes of it, in the order of the scene, with colours (N, M, 3) of that order."""
+    def decoded(self, sh: FloatArray, run: Run = map) -> Scene:
+        """What a reader makes of it, in the order of the scene, with colours (N, M, 3) of that order.
+
+        ``run`` works with several threads.
+        """
         ...
 
 
@@ -92,7 +96,7 @@ class RoundedScene:
     scene: Scene
     ac: Any = None
 
-    def decoded(self, sh: FloatArray) -> Scene:
+    def decoded(self, sh: FloatArray, run: Run = map) -> Scene:
         """See :meth:`Rounded.decoded`."""
         return replace(self.scene, sh=sh)
 

@@ -18,6 +18,7 @@ from potr_cl.codec.encoder import Coded
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, PotrError
 from potr_cl.host.atomic_write import replacing
+from potr_cl.host.mapped import bounded
 from potr_cl.model.agreement import require_agreement
 from potr_cl.model.camera import Camera, train_views, within_photographs
 from potr_cl.model.scene import Scene
@@ -213,6 +214,7 @@ def encode(
     watch = Stopwatch(progress, tell)
     cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame)
     with ExitStack() as stack:
+        stack.enter_context(bounded(options.memory))
         if kept is None and cameras and options.look_at_views(scene):
             device = device or (Device() if pool is None else pool.first)
             kept = stack.enter_context(KeptScene(device, scene))

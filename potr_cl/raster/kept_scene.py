@@ -3,18 +3,23 @@
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
 from concurrent.futures import Future
-from contextlib import suppress
+from contextlib import contextmanager, suppress
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
 
 from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.host.threads import in_background
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
-from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, uploaded
+from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, gathered, uploaded
 
 #: A scene that takes more than this part of the device's memory is not kept: others may need the room.
-_PART = 16
+_PART = 10
 
 
 class KeptScene(Owner):
@@ -75,10 +80,37 @@ class KeptScene(Owner):
         self._buffers, self._elsewhere = None, {}
 
 
-def drawable_on(device: Device, scene: Scene | KeptScene) -> Drawable:
-    """What to give to a rasterizer on a device for a scene, which may be one that is kept on devices.
+@dataclass(frozen=True)
+class PartOfKept:
+    """Some splats of a scene that is kept on devices.
+
+    Attributes:
+        kept: the scene.
+        splats: (n,) int64, their numbers there.
+        scene: the same splats on the host.
+    """
+
+    kept: KeptScene
+    splats: NDArray[np.int64]
+    scene: Scene
+
+
+@contextmanager
+def lying_on(device: Device, scene: Scene | KeptScene | PartOfKept) -> Iterator[Drawable]:
+    """What to give to a rasterizer on a device for a scene, as long as the context lasts.
 
     Raises:
-        DeviceError: the device failed.
+        DeviceError: the device failed, or has no room for a part of what it keeps.
     """
-    return scene.on(device) if isinstance(scene, KeptScene) else scene
+    if isinstance(scene, PartOfKept):
+        whole = scene.kept.on(device)
+        if isinstance(whole, SceneBuffers):
+            # To gather them takes no time; to make ready and upload the splats of the host does.
+            with gathered(whole, scene.splats) as part:
+                yield part
+        else:
+            yield scene.scene
+    elif isinstance(scene, KeptScene):
+        yield scene.on(device)
+    else:
+        yield scene

@@ -37,6 +37,26 @@ from potr_cl.raster.view_set import View, ViewSet
 _FIRST_CAPACITY, _FIRST_CAPACITY_A_SPLAT = 1 << 16, 4
 
 
+class PreparingMemory(Owner):
+    """What preparing views takes besides what is left of them: rasterizers that take turns may share it.
+
+    Args:
+        device: whose memory it is.
+
+    Attributes:
+        bounds, counts, keys: the tiles that splats touch, the tiles' counters, and the lists while they are sorted.
+    """
+
+    def __init__(self, device: Device) -> None:
+        self.bounds = Scratch(device, "the projected splats' bounds")
+        self.counts = Scratch(device, "the tile counts")
+        self.keys = Scratch(device, "the tile lists' sort keys")
+
+    def close(self) -> None:
+        for scratch in (self.bounds, self.counts, self.keys):
+            scratch.close()
+
+
 class Rasterizer(Owner):
     """Renders one scene on one device, with the scene and all scratch memory kept there until it is closed.
 
@@ -46,6 +66,7 @@ class Rasterizer(Owner):
             already, which stays the caller's.
         rules: of the rasterizer to follow.
         background: R, G, B behind everything.
+        preparing: memory to prepare views in, which stays the caller's; None: its own.
 
     Attributes:
         device, rules, background: as given.
@@ -62,6 +83,7 @@ class Rasterizer(Owner):
         scene: Drawable,
         rules: RasterRules = INRIA,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        preparing: PreparingMemory | None = None,
     ) -> None:
         self.device = device
         self.rules = rules
@@ -89,9 +111,8 @@ class Rasterizer(Owner):
                 **self._filter_macros,
                 **self._scene.pick_macros,
             )
-        self._bounds = Scratch(device, "the projected splats' bounds")
-        self._counts = Scratch(device, "the tile counts")
-        self._keys = Scratch(device, "the tile lists' sort keys")
+        self._preparing = preparing or PreparingMemory(device)
+        self._shares = preparing is not None
         self._image = Scratch(device, "the image")
         self._transmittance = Scratch(device, "the transmittance")
         self._frame: ViewSet | None = None
@@ -150,7 +171,7 @@ class Rasterizer(Owner):
                     return self._image.buffer, self._transmittance.buffer
                 views.make_room([count + count // 4])
         except BaseException:
-            self._counts.close()  # maybe not zero
+            self._preparing.counts.close()  # maybe not zero
             raise
 
     def render_into(self, cameras: Sequence[Camera], target: cl.Buffer) -> None:
@@ -217,13 +238,12 @@ class Rasterizer(Owner):
             views.make_room(found)
             self._enqueue_lists(views, bounds, counts, for_frame=False)
         except BaseException:
-            self._counts.close()  # not zero
+            self._preparing.counts.close()  # not zero
             views.close()
             raise
         finally:
             if len(cameras) > 1:  # far more than a single view will need
-                for scratch in (self._keys, self._bounds, self._counts):
-                    scratch.close()
+                self._preparing.close()
         return views
 
     def prepare_again(self, views: ViewSet, cameras: Sequence[Camera]) -> bool:
@@ -253,7 +273,7 @@ class Rasterizer(Owner):
                 views.make_room([count + count // 4 for count in found])
             self._enqueue_lists(views, bounds, counts, for_frame=False)
         except BaseException:
-            self._counts.close()  # not zero
+            self._preparing.counts.close()  # not zero
             raise
         return True
 
@@ -293,14 +313,14 @@ class Rasterizer(Owner):
         return self._scene.release_sh() if self._owns else None
 
     def _room_for_bounds(self, views: ViewSet) -> cl.Buffer:
-        self._bounds.reserve(8 * self.stride * len(views.views))
-        return self._bounds.buffer
+        self._preparing.bounds.reserve(8 * self.stride * len(views.views))
+        return self._preparing.bounds.buffer
 
     def _zeroed_counts(self, views: ViewSet) -> cl.Buffer:
         """Counters for all tiles. They are zero, and the kernels that use them leave them zero."""
-        if self._counts.reserve(self._launcher.counter_bytes * views.tiles):
-            self.device.fill(self._counts.buffer, np.uint32(0), self._counts.nbytes)
-        return self._counts.buffer
+        if self._preparing.counts.reserve(self._launcher.counter_bytes * views.tiles):
+            self.device.fill(self._preparing.counts.buffer, np.uint32(0), self._preparing.counts.nbytes)
+        return self._preparing.counts.buffer
 
     def _enqueue_project(
         self,
@@ -323,8 +343,8 @@ class Rasterizer(Owner):
         self._projection.launch((self.stride // lanes, len(views.views)), (SPLAT_GROUP // lanes, 1))
 
     def _enqueue_lists(self, views: ViewSet, bounds: cl.Buffer, counts: cl.Buffer, for_frame: bool) -> None:
-        self._keys.reserve(self._launcher.key_bytes * views.capacity)
-        self._launcher.enqueue_lists(views, bounds, counts, self._keys.buffer, for_frame)
+        self._preparing.keys.reserve(self._launcher.key_bytes * views.capacity)
+        self._launcher.enqueue_lists(views, bounds, counts, self._preparing.keys.buffer, for_frame)
 
     def _enqueue_composite(self, views: ViewSet) -> None:
         """Enqueue the pictures, one behind the other into the rasterizer's own image."""
@@ -363,7 +383,9 @@ class Rasterizer(Owner):
         if self._frame is not None:
             self._frame.close()
             self._frame = None
-        for scratch in (self._bounds, self._counts, self._keys, self._image, self._transmittance):
+        if not self._shares:
+            self._preparing.close()
+        for scratch in (self._image, self._transmittance):
             scratch.close()
 
     def close(self) -> None:
@@ -372,9 +394,7 @@ class Rasterizer(Owner):
         for owner in (
             *([self._scene] if self._owns else []),
             self._other_sh,
-            self._bounds,
-            self._counts,
-            self._keys,
+            *([] if self._shares else [self._preparing]),
             self._image,
             self._transmittance,
         ):

@@ -246,9 +246,15 @@ class SceneBuffers(Owner):
             DeviceError: there is no room for them beside the scene.
         """
         self.write_rows(self.means, scene.means, "the centres")
-        self.write_rows(self.scales, activated_scales(scene.log_scales), "the scales")
-        self.write_rows(self.quaternions, unit_quaternions(scene.quaternions), "the rotations")
-        self.write_rows(self.log2_opacities, log2_opacities(scene.opacity_logits)[:, None], "the opacities")
+        # What is activated is there for some splats at a time: of all it would be as large as their geometry.
+        for start in range(0, self.splats, _UPLOADED):
+            some = slice(start, start + _UPLOADED)
+            for parameter, rows, what in (
+                (self.scales, activated_scales(scene.log_scales[some]), "the scales"),
+                (self.quaternions, unit_quaternions(scene.quaternions[some]), "the rotations"),
+                (self.log2_opacities, log2_opacities(scene.opacity_logits[some])[:, None], "the opacities"),
+            ):
+                self.write_rows(parameter, rows, what, start=start)
         self.write_sh(self.sh, scene.sh)
 
     def write_sh(self, parameter: cl.Buffer, sh: FloatArray) -> None:

@@ -14,6 +14,7 @@ from typing import Any, Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.signals import first_interrupt_asks
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.views_between import views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family
@@ -21,8 +22,17 @@ from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
-from potr_cl.stages.fitting.fit import FitOptions, FitProgress, Fitted, SupportsBool, fit_scene, held_out_error
+from potr_cl.stages.fitting.fit import (
+    FitOptions,
+    FitProgress,
+    Fitted,
+    SupportsBool,
+    fit_scene,
+    held_out_error,
+    kept_pictures,
+)
 from potr_cl.stages.fitting.photographs import fit_to_photographs
+from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
@@ -201,11 +211,16 @@ class Fit(Stage):
             source = bench.drawable(state.source)
             rasterizer = stack.enter_context(Rasterizer(bench.opened, source, background=bench.background))
             asked = stack.enter_context(first_interrupt_asks())
-            found = self._cycles(self._looking_between(state, bench), bench, rasterizer, asked)
+            seen = self._looking_between(state, bench)
+            rendered = RenderedTargets(rasterizer, seen.views)
+            targets: Targets | TargetPictures = rendered
+            if bench.memory is None:  # else pruning needs all that is allowed, between two fits
+                targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
+            found = self._cycles(seen, bench, targets, asked)
             found = dataclasses.replace(found, views=state.views, added=state.added)
-            return (
-                found if asked or bench.photographs is None else self._to_photographs(found, bench, rasterizer, asked)
-            )
+            if asked or bench.photographs is None:
+                return found
+            return self._to_photographs(found, bench, asked)
 
     def _looking_between(self, state: State, bench: Workbench) -> State:
         """The state with the views that the fit looks at."""
@@ -213,12 +228,12 @@ class Fit(Stage):
         each = self.views_on(bench.opened.family)
         if is_virtual(given) or each * len(given) <= state.added:
             return state
-        added = views_between(state.source, given, each)
+        with thread_pool(bench.threads) as pool:
+            added = views_between(state.source, given, each, run=pool.map)
         return dataclasses.replace(state, views=(*given, *added), added=len(added))
 
-    def _cycles(self, state: State, bench: Workbench, rasterizer: Rasterizer, asked: SupportsBool) -> State:
+    def _cycles(self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool) -> State:
         """Remove splats and fit by turns, each time up to a higher threshold, and keep what costs least."""
-        targets = RenderedTargets(rasterizer, state.views)
         price: float | None = state.learnt.get("price")
         worth = 0.0 if price is None else _WORTH * price
         without = held_out_error(bench.opened, state.scene, state.views, targets, state.added, bench.background)
@@ -259,7 +274,7 @@ class Fit(Stage):
         first = max(int(_FIRST * steps), 1)
         return [*[first] * (cycles - 1), max(steps - first * (cycles - 1), 1)]
 
-    def _to_photographs(self, state: State, bench: Workbench, source: Rasterizer, asked: SupportsBool) -> State:
+    def _to_photographs(self, state: State, bench: Workbench, asked: SupportsBool) -> State:
         """Go on with photographs as the targets, if others that are held out agree; and so do later stages."""
         assert bench.photographs is not None
         given = state.views[: len(state.views) - state.added]
@@ -268,8 +283,8 @@ class Fit(Stage):
         steps = PHOTOGRAPH_STEPS[bench.opened.family] if self.photograph_steps == "auto" else self.photograph_steps
         options = dataclasses.replace(options, steps=steps, rates=self._sparse(self.rates, state))
         found = fit_to_photographs(
-            bench.opened, state.scene, photographs.of(given), photographs, options, source, (), bench.background,
-            bench.tell, asked,
+            bench.opened, state.scene, photographs.of(given), photographs, options, bench.background, bench.tell,
+            asked,
         )  # fmt: skip
         told: Fitted | LeftOut = dataclasses.replace(state.learnt[self.name], photographs=found)
         then = state.having_learnt(self.name, told)
@@ -292,7 +307,7 @@ class Fit(Stage):
         self,
         state: State,
         bench: Workbench,
-        targets: Targets,
+        targets: Targets | TargetPictures,
         steps: int,
         progress: FitProgress,
         asked: SupportsBool,

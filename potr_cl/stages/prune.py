@@ -8,6 +8,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import thread_pool
 from potr_cl.raster.culling import Sights
 from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
@@ -22,7 +23,7 @@ from potr_cl.stages.pruning.unseen import (
     set_aside,
     without_directions,
 )
-from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, sights_worth_it
+from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, groups_of_large, sights_worth_it
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 
@@ -139,19 +140,20 @@ class Prune(Stage):
         And as "unseen" a :class:`potr_cl.stages.pruning.unseen.Unseen`; and as "price", where the number of splats is
         not given, the ΔMSE below which a splat has gone.
         """
-        hidden, area = find_unseen(state)
+        with thread_pool(bench.threads) as pool:
+            groups = groups_of_large(state.scene, pool.map)
+            hidden, area = find_unseen(state, groups, pool.map)
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
         told = state.having_learnt("unseen", Unseen(splats, len(state.scene), area, kept))
         if self.keep is None and self.count is None:
             told = told.having_learnt("price", bench.parameters.delta_mse_max)
-        if not (kept and splats):
-            return self._pruned(told, bench)
-        # A copy of a large scene without them would take as much memory as the scene.
         options = self._sweep_options(bench.memory)
-        alone = bench.pool is None and not bench.interludes and bench.parameters.delta_mse_max < LARGEST_LIMIT
-        sights = sights_worth_it(state.scene, state.views, options) if alone else None
-        if sights is not None:
+        sights = None if bench.pool else sights_worth_it(state.scene, state.views, options, groups)
+        if not (kept and splats):
+            return self._pruned(told, bench, sights)
+        # A copy of a large scene without them would take as much memory as the scene.
+        if sights is not None and not bench.interludes and bench.parameters.delta_mse_max < LARGEST_LIMIT:
             return without_directions(self._pruned(told, bench, sights, hidden), told.survivors[hidden])
         split = set_aside(told, hidden)
         if not len(split.seen_splats):
@@ -159,7 +161,9 @@ class Prune(Stage):
             return told.having_learnt(
                 self.name, Pruned(splats, np.full(splats, -1, np.int32), 0, lambda: Course(everything))
             )
-        left = self._pruned(split.seen, bench)
+        if sights is not None:
+            sights = sights_worth_it(split.seen.scene, state.views, options)
+        left = self._pruned(split.seen, bench, sights)
         return put_back(split, left).having_learnt(self.name, as_of_whole(split, left.learnt[self.name]))
 
     def _pruned(

@@ -9,6 +9,7 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.errors import UsageError
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.outputs.colour_grid import ColourGrid
@@ -102,7 +103,7 @@ class Refit(Stage):
     def __post_init__(self) -> None:
         for part in self.at:
             if not 0 <= part <= 1:
-                raise UsageError(f"refit_at is {part:g}, it must lie between 0 and 1")
+                raise UsageError(f"--refit-at is {part:g}, it must lie between 0 and 1")
         _ = RefitOptions(steps=self.steps), RefitOptions(steps=self.at_steps)
 
     @classmethod
@@ -135,7 +136,8 @@ class Refit(Stage):
         geometry = state.geometry
         if geometry is None or geometry.asked != parameters:
             geometry = bench.output.geometry(state.scene, bench.request(state))
-        rounded, decoded = geometry, geometry.decoded(state.scene.sh)
+        with thread_pool(bench.threads) as pool:
+            rounded, decoded = geometry, geometry.decoded(state.scene.sh, pool.map)
 
         def fitted(views: Sequence[Camera], targets: Targets, number: int) -> tuple[Refitted, Rounded]:
             geometry = rounded
@@ -158,7 +160,7 @@ class Refit(Stage):
                 bench.opened, decoded, views, targets, options, active, bench.background, progress,
                 fix_ac=None if on_grid or not bench.output.fixes_ac else fix_ac,
                 # Photographs lie where the master reads them.
-                help_from=HelpFrom(bench.pool, bench.shareable(state.source))
+                help_from=HelpFrom(bench.pool, bench.shared_source(state))
                 if bench.pool and isinstance(targets, RenderedTargets)
                 else None,
                 colour_grid=colour_grid if on_grid else None,
@@ -223,7 +225,7 @@ class RefitOnTheWay(Stage):
                 RefitOptions(steps=self.steps, memory=bench.memory),
                 background=bench.background,
                 progress=lambda done, steps: bench.progress("refit", 0.99 * done / steps),
-                help_from=None if bench.pool is None else HelpFrom(bench.pool, bench.shareable(state.source)),
+                help_from=None if bench.pool is None else HelpFrom(bench.pool, bench.shared_source(state)),
             )
         bench.progress("refit", 1.0)
         return state.recoloured(refitted.sh)

@@ -26,7 +26,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output, Request, Rounded
 from potr_cl.outputs.potr import Potr
-from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.kept_scene import KeptScene, PartOfKept
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.workers.pool import Pool
 
@@ -65,6 +65,7 @@ class State:
         views: the training views; empty if there are no cameras.
         added: how many of them, the last ones, a stage has put between those that were given.
         truth: what a stage has fitted to photographs, where it did; it may have fewer splats than ``source``.
+        cut: a scene that is these survivors of ``source`` as they are there; None: none is known to be.
         geometry: of ``scene`` as the file's readers will see it, once a stage has had it rounded. A stage that then
             changes anything but colours makes it None again.
         importances: of the splats in each view, for stages that work while splats are being removed; else None.
@@ -79,6 +80,7 @@ class State:
     importances: Importances | None = None
     learnt: Mapping[str, Any] = field(default_factory=dict)
     added: int = 0
+    cut: Scene | None = None
     truth: Scene | None = None
 
     @property
@@ -93,12 +95,18 @@ class State:
 
     def recoloured(self, sh: NDArray[np.float32]) -> State:
         """This state with other SH coefficients, (n, M, 3)."""
-        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, sh=sh))
+        return dataclasses.replace(self, scene=dataclasses.replace(self.scene, sh=sh), cut=None)
 
     def keeping(self, left: NDArray[np.int64]) -> State:
         """This state without the splats of ``scene`` whose numbers are not in ``left``: (n,) int64, ascending."""
         scene, survivors = self.scene.subset(left), self.survivors[left]
-        return dataclasses.replace(self, scene=scene, survivors=survivors, geometry=None)
+        cut = scene if self.is_cut else None
+        return dataclasses.replace(self, scene=scene, survivors=survivors, geometry=None, cut=cut)
+
+    @property
+    def is_cut(self) -> bool:
+        """Whether ``scene`` is known to be some splats of ``source`` as they are there."""
+        return self.scene is self.source or self.scene is self.cut
 
     def having_learnt(self, name: str, result: Any) -> State:
         """This state with what a stage has found out."""
@@ -143,10 +151,21 @@ class Workbench:
         """What to give to a rasterizer for a scene: it may lie on the device already."""
         return scene if self.kept is None else self.kept.drawable(self.opened, scene)
 
-    def shareable(self, scene: Scene) -> Scene | KeptScene:
-        """What to give to the pool's workers for a scene: threads of this process have it kept on their devices."""
+    def placed(self, state: State) -> Scene | KeptScene | PartOfKept:
+        """A state's scene, or where devices have it, for :func:`potr_cl.raster.kept_scene.lying_on`."""
+        kept = self.kept
+        if kept is None or not state.is_cut or kept.drawable(self.opened, state.source) is state.source:
+            return state.scene
+        return kept if state.scene is state.source else PartOfKept(kept, state.survivors, state.scene)
+
+    def shared(self, state: State) -> Scene | KeptScene | PartOfKept:
+        """The same for the pool's workers: threads of this process have it from what is kept on their devices."""
+        return self.placed(state) if self.pool is not None and self.pool.in_process else state.scene
+
+    def shared_source(self, state: State) -> Scene | KeptScene:
+        """A state's source for the pool's workers."""
         in_process = self.pool is not None and self.pool.in_process
-        return self.kept if self.kept is not None and in_process and self.kept.is_of(scene) else scene
+        return self.kept if self.kept is not None and in_process and self.kept.is_of(state.source) else state.source
 
     def request(self, state: State, metadata: bytes = b"", entropy: EntropyCoder | None = None) -> Request:
         """What the output is told besides the scene."""

@@ -140,6 +140,14 @@ def test_an_output_that_is_an_input(
     refused(capsys, folder, [word.format(out=out) for word in call.split()], *words)
 
 
+def test_a_name_that_leads_through_a_folder_that_is_not_there(
+    folder: Path, capsys: pytest.CaptureFixture[str], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The system finds no "missing/../i.ply", but a file of this name would be written over i.ply."""
+    monkeypatch.chdir(folder)
+    refused(capsys, folder, ["encode", "i.ply", "-o", "missing/../i.ply"], "would be replaced")
+
+
 @pytest.mark.parametrize(
     "call",
     [

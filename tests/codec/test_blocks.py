@@ -211,7 +211,7 @@ def test_a_box_reads_only_what_it_meets(data):
 def test_a_box_of_any_file(kind, scene, data, tmp_path):
     data = data if kind == "blocks" else b"".join(code_scene(scene, BEST).pieces)
     (tmp_path / "a.potr").write_bytes(data)
-    whole, box = decode(data), ["-0.5", "-90", "0", "0.25", "90", "2"]
+    whole, box = decode(data), ["-0.5", "-inf", "-1e-3", "0.25", "inf", "2"]
     command = ["decode", str(tmp_path / "a.potr"), "-o", str(tmp_path / "a.ply"), "--box", *box]
     assert cli.main(command) == 0
     found = ply.load(tmp_path / "a.ply")
@@ -225,8 +225,9 @@ def test_a_box_of_any_file(kind, scene, data, tmp_path):
 )
 def test_boxes_that_are_refused(box, data, scene):
     for file in (data, b"".join(code_scene(scene, BEST).pieces)):
-        with pytest.raises(UsageError, match="box"):
+        with pytest.raises(UsageError, match="box") as caught:
             potr_cl.decode(file, box=box)
+        assert ("NaN" in str(caught.value)) == (box[-1] != box[-1])
 
 
 @pytest.mark.parametrize("degree", range(4))

@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 
 from potr_cl.errors import DataError
+from potr_cl.model import scene as scene_module
 from potr_cl.reference.scenes import random_scene
 
 
@@ -99,3 +100,17 @@ def test_nothing_left_is_an_error():
     empty = random_scene(2).subset(np.arange(0))
     with pytest.raises(DataError, match="no splat"):
         empty.cleaned()
+
+
+def test_many_splats_are_taken_by_threads_as_few_are(monkeypatch):
+    scene = random_scene(1000, 3)
+    numbers = np.random.default_rng(3).integers(0, 1000, 700)
+    few = scene.subset(numbers)
+    monkeypatch.setattr(scene_module, "_LARGE", 64)
+    many = scene.subset(numbers)
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        assert np.array_equal(getattr(many, name), getattr(few, name))
+        assert getattr(many, name).flags.c_contiguous
+    assert len(scene.subset(np.arange(-700, 0))) == 700  # as NumPy counts
+    with pytest.raises(IndexError):
+        scene.subset(np.arange(301, 1001))

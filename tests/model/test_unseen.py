@@ -7,7 +7,9 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl.model import splat_groups, unseen
+from potr_cl.host.threads import thread_pool
+from potr_cl.model import morton, splat_groups, unseen
+from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
 from potr_cl.reference.scenes import plain_splats, random_splats, ring_of_cameras, straight_camera
 
@@ -65,6 +67,19 @@ def test_groups_of_neighbours_change_nothing(monkeypatch, plush_excerpt, plush_e
     wanted = unseen_splats(plush_excerpt, cameras)
     assert 0 < wanted.sum() < len(plush_excerpt)
     monkeypatch.setattr(unseen, "_BLOCK", 100)
-    monkeypatch.setattr(unseen, "_LARGE", 100)
-    monkeypatch.setattr(splat_groups, "_GROUP", 16)
-    assert np.array_equal(unseen_splats(plush_excerpt, cameras), wanted)
+    with thread_pool(3) as pool:
+        groups = SplatGroups.of(plush_excerpt, 16, pool.map)
+        assert np.array_equal(unseen_splats(plush_excerpt, cameras, groups, pool.map), wanted)
+
+
+def test_threads_make_the_same_groups(monkeypatch, plush_excerpt):
+    wanted = SplatGroups.of(plush_excerpt, 16)
+    monkeypatch.setattr(morton, "_ROWS", 1000)
+    monkeypatch.setattr(splat_groups, "_GROUPS", 7)
+    with thread_pool(3) as pool:
+        found = SplatGroups.of(plush_excerpt, 16, pool.map)
+    for name in ("order", "starts", "centres", "halves", "sizes"):
+        assert np.array_equal(getattr(found, name), getattr(wanted, name)), name
+    for group in range(len(found.starts) - 1):
+        own = found.order[found.starts[group] : found.starts[group + 1]]
+        assert np.array_equal(np.flatnonzero(found.group_of == group), np.sort(own))

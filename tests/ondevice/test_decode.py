@@ -3,22 +3,29 @@
 from __future__ import annotations
 
 import json
+import struct
 import threading
+import zlib
 from collections.abc import Iterator
 from dataclasses import replace
 from pathlib import Path
+from unittest.mock import patch
 
 import numpy as np
 import pytest
 
 import potr_cl
+from potr_cl.codec import bundled_scene, encoder
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import AnyFile, PotrFile, open_file, scene_of_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.library import native
+from potr_cl.codec.native.share import BundleShare
 from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.sections import Coder, Property
 from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, UsageError
 from potr_cl.ondevice.decode import decode_to_device
+from potr_cl.ondevice.staged_bundles import StagedBundles
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
@@ -56,6 +63,20 @@ def assert_as_uploaded(file: AnyFile, device: Device, sh_degree: int | None = No
 def coded(splats: int, preset: str, entropy: EntropyCoder | None = None, q: float = 0.5, degree: int = 3) -> bytes:
     parameters = HyperParameters.from_quality(q, preset)  # type: ignore[arg-type]
     return b"".join(code_scene(random_scene(splats, degree, seed=splats), parameters, entropy=entropy).pieces)
+
+
+def of_bundles(splats: int, degree: int, factor: float | None = None) -> bytes:
+    """Of coder BUNDLES, however few splats there are; with all scale factors the same, if one is given."""
+    parameters = HyperParameters.from_quality(0.5, "best")
+    if factor is not None:
+        names = ("sf_dc", "sf_sh", "sf_opacity", "sf_rotation", "sf_scale")
+        parameters = replace(parameters, **dict.fromkeys(names, factor))
+    with patch.object(encoder, "_FEW", 0):
+        data = b"".join(code_scene(random_scene(splats, degree, seed=splats), parameters).pieces)
+    section = PotrFile.from_bytes(data).header.find(Property.OPACITY)
+    assert section is not None
+    assert section.coder == Coder.BUNDLES
+    return data
 
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
@@ -198,36 +219,75 @@ def test_the_commands_say_the_same_of_a_file_and_of_its_scene(tmp_path, monkeypa
     assert told["potr"] == told["ply"]
 
 
-def test_parts_that_are_uploaded_while_others_are_decoded(device, monkeypatch):
-    """Several bundles, of which two threads decode some at a time; the last one waits for the first upload."""
-    from potr_cl.codec.native.bundles import BundledFile
-    from potr_cl.ondevice.dequantiser import DeviceDequantiser
-
+@pytest.fixture
+def compiled():
     if native() is None:
         pytest.skip("the compiled library is not there: python -m tools.make.native, or pip install -e .")
-    told: list[tuple[int, int]] = []
-    filled, values = DeviceDequantiser.filled, BundledFile.values
-    uploaded_some = threading.Event()
 
-    def noted(self, start, stop):
-        told.append((start, stop))
-        filled(self, start, stop)
-        uploaded_some.set()
 
-    def last_waits(self, bundle, *others):
-        if bundle == 9 and waits:
-            assert uploaded_some.wait(timeout=60)
-        return values(self, bundle, *others)
+@pytest.mark.parametrize(("rooms", "threads"), [(1, 1), (1, 3), (2, 2)])
+def test_memory_that_bundles_take_turns_in(rooms, threads, device, monkeypatch, compiled):
+    """Less of it than there are bundles: those that come late wait until others are on the device."""
+    monkeypatch.setattr(bundled_scene, "_ROOMS_A_THREAD", rooms)
+    file = PotrFile.from_bytes(of_bundles(9 * 8192 + 77, 2))
+    with uploaded(device, file.scene()) as wanted, decode_to_device(file, device, threads=threads) as got:
+        assert bits(wanted) == bits(got)
 
-    waits: list[bool] = []
-    monkeypatch.setattr(BundledFile, "values", last_waits)
-    monkeypatch.setattr(DeviceDequantiser, "filled", noted)
-    splats = 9 * 8192 + 77
-    file = PotrFile.from_bytes(coded(splats, "best", degree=1))
-    with uploaded(device, file.scene()) as wanted:
-        waits.append(True)
-        with decode_to_device(file, device, threads=2) as got:
-            assert bits(wanted) == bits(got)
-    assert len(told) > 1
-    assert [start for start, _ in told] == [0, *(stop for _, stop in told[:-1])]
-    assert told[-1][1] == splats
+
+def test_a_device_that_fails_among_bundles_ends_all_threads(device, monkeypatch, compiled):
+    taken: list[int] = []
+
+    def fail(self, first, packed, items):
+        taken.append(first)
+        if len(taken) == 2:
+            raise DeviceError("gone")
+
+    monkeypatch.setattr(bundled_scene, "_ROOMS_A_THREAD", 1)
+    monkeypatch.setattr(StagedBundles, "take", fail)
+    before = device.allocated, threading.active_count()
+    with pytest.raises(DeviceError, match="gone"):
+        decode_to_device(PotrFile.from_bytes(of_bundles(6 * 8192, 1)), device, threads=2)
+    assert taken == [0, 8192]
+    assert (device.allocated, threading.active_count()) == before
+
+
+def test_threads_that_get_no_memory_are_told_of(device, monkeypatch, compiled):
+    def no_memory(self):
+        raise MemoryError
+
+    monkeypatch.setattr(BundleShare, "do", no_memory)
+    with pytest.raises(DataError, match="more memory than the host has"):
+        decode_to_device(PotrFile.from_bytes(of_bundles(3 * 8192, 0)), device, threads=2)
+
+
+@pytest.mark.parametrize("native", ["0", ""])
+def test_bundles_beyond_all_tables_have_the_bits_of_the_host(native, device, monkeypatch):
+    monkeypatch.setenv("POTR_CL_NATIVE", native)
+    assert_as_uploaded(PotrFile.from_bytes(of_bundles(8192 + 700, 2, 1e5)), device)
+
+
+def test_a_damaged_bundle_among_good_ones_leaves_nothing(device, compiled):
+    """Words of the last bundle are changed, and their checksums made right."""
+    data = bytearray(of_bundles(4 * 8192 + 5, 1))
+    section = PotrFile.from_bytes(bytes(data)).header.find(Property.SH, 3)
+    assert section is not None
+    end = section.offset + section.stored_bytes
+    data[end - 20 : end] = bytes(20)
+    with_right_checksums(data)
+    before = device.allocated
+    with pytest.raises(DataError) as of_host:
+        PotrFile.from_bytes(bytes(data)).scene()
+    with pytest.raises(DataError) as of_device:
+        decode_to_device(PotrFile.from_bytes(bytes(data)), device, threads=3)
+    assert str(of_device.value) == str(of_host.value)
+    assert device.allocated == before
+
+
+def with_right_checksums(data: bytearray) -> None:
+    (count,) = struct.unpack_from("<H", data, 34)
+    at = 120 + 24 * count + 4
+    for entry in range(120, 120 + 24 * count, 24):
+        (size,) = struct.unpack_from("<Q", data, entry + 16)
+        struct.pack_into("<I", data, entry + 4, zlib.crc32(data[at : at + size]))
+        at += size
+    struct.pack_into("<I", data, 120 + 24 * count, zlib.crc32(data[: 120 + 24 * count]))

@@ -12,7 +12,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster import kept_scene, scene_buffers
-from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.reference.scenes import random_splats, straight_camera
@@ -119,3 +119,41 @@ def test_several_devices_are_given_it_once_each(device, plush_excerpt, plush_exc
         encode(plush_excerpt, plush_excerpt_cameras[:6], OPTIONS, device=device, pool=pool)
     assert sum(scenes) == 2
     assert devices[1].allocated == 0
+
+
+def test_a_part_of_what_is_kept_is_taken_on_the_device(device):
+    scene, camera = random_splats(700, seed=6), straight_camera()
+    numbers = np.flatnonzero(np.random.default_rng(7).random(700) < 0.4)
+    other = Device(device.info, family=device.family)
+    with KeptScene(device, scene) as kept, Rasterizer(device, scene.subset(numbers)) as wanted:
+        expected = wanted.render(camera)[0]
+        for place in (device, other):
+            with lying_on(place, PartOfKept(kept, numbers, scene.subset(numbers))) as part:
+                assert isinstance(part, SceneBuffers)
+                with Rasterizer(place, part) as rasterizer:
+                    assert np.array_equal(rasterizer.render(camera)[0], expected)
+    assert other.allocated == 0
+
+
+def test_without_what_no_view_sees_the_scene_is_still_uploaded_once(
+    device, plush_excerpt, plush_excerpt_cameras, monkeypatch
+):
+    """Splats behind all cameras are set aside, and the others taken from what is kept."""
+    means = plush_excerpt.means.copy()
+    means[::10] += 1e4
+    scene, cameras = replace(plush_excerpt, means=means), plush_excerpt_cameras[:6]
+    options = OPTIONS.changed(refit=False, compact=False)
+    splats = []
+    real = scene_buffers.SceneBuffers.write_sh
+
+    def counted(self, parameter, sh):
+        splats.append(len(sh))
+        real(self, parameter, sh)
+
+    monkeypatch.setattr(scene_buffers.SceneBuffers, "write_sh", counted)
+    found = encode(scene, cameras, options, device=device)
+    assert found.unseen is not None
+    assert found.unseen.splats > 0
+    assert splats == [len(scene)]
+    monkeypatch.setattr(kept_scene, "_PART", 1 << 40)
+    assert encode(scene, cameras, options, device=device).data == found.data

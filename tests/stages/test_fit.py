@@ -15,7 +15,7 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.refit_cases import Pictures
 from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.fit import Fit, LeftOut
-from potr_cl.stages.fitting.fit import FitOptions, Fitted, fit_scene
+from potr_cl.stages.fitting.fit import FitOptions, Fitted, fit_scene, held_out_error
 from potr_cl.stages.fitting.views import batches, share_out
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refitting.targets import RenderedTargets
@@ -58,6 +58,19 @@ def fitted_to(device, source, scene, cameras, options=STEPS, **more):
 def mean_error(device, source, scene, cameras):
     with Rasterizer(device, source) as one, Rasterizer(device, scene) as other:
         return np.mean([np.mean((one.render(c)[0] - other.render(c)[0]) ** 2) for c in cameras])
+
+
+def test_views_that_judge_find_the_mean_squared_error(device):
+    """Of views of several sizes, each counting the same; also of colours beyond 1."""
+    source = visible_scene(60, 2, seed=3)
+    scene = shaken(source)
+    bright = dataclasses.replace(source, sh=5 * source.sh)
+    cameras = [*ring_of_cameras(3, size=48), *ring_of_cameras(3, size=131)]
+    for targets in (source, bright):
+        with Rasterizer(device, targets) as rasterizer:
+            found = held_out_error(device, scene, cameras, RenderedTargets(rasterizer, cameras))
+        _, held_out = share_out(len(cameras), 0)
+        assert found == pytest.approx(mean_error(device, targets, scene, [cameras[k] for k in held_out]), rel=1e-5)
 
 
 @pytest.mark.parametrize("only", [*((name,) for name in PARAMETERS), PARAMETERS], ids=lambda names: "+".join(names))

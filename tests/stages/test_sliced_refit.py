@@ -7,6 +7,8 @@ import pytest
 
 from potr_cl.errors import UsageError
 from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.reference.refit_cases import Case
 from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.refitting import placement
@@ -120,3 +122,16 @@ def test_little_memory_is_enough(device, monkeypatch):
 def test_slices_of_nothing():
     with pytest.raises(UsageError, match="slices of 0 splats"):
         RefitOptions(slices=0)
+
+
+@pytest.mark.one_runtime
+def test_the_same_file(device, plush_excerpt, plush_excerpt_cameras, monkeypatch):
+    """Of a whole encode: with the vectors on the device, or with them and the target pictures on the host."""
+    small = plush_excerpt_cameras[:12]
+    options = EncodeOptions.for_preset("best", between=False).changed(prune={"iterations": 4})
+    whole = encode(plush_excerpt, small, options, device=device)
+    for name in ("_ANYWAY", "_OF_FREE", "_OF_GIVEN"):
+        monkeypatch.setattr(placement, name, 0)
+    sliced = encode(plush_excerpt, small, options, device=device)
+    assert sliced.data == whole.data
+    assert sliced.refitted.errors == whole.refitted.errors

@@ -26,10 +26,12 @@ from potr_cl.codec.bundles import sections
 from potr_cl.codec.bundles.decoder import Wanted
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.destination import SceneArrays
-from potr_cl.codec.native.bundles import BundledFile, ValueArrays
+from potr_cl.codec.native.bundles import BundledFile
 from potr_cl.codec.native.functions import Functions
-from potr_cl.codec.native.library import VARIABLE
+from potr_cl.codec.native.library import VARIABLE, native
 from potr_cl.codec.native.octree import OctreeFunctions, Walk
+from potr_cl.codec.native.share import BundleShare
+from potr_cl.codec.native.values import ValueArrays
 from tools.results import Column, Results
 
 #: What a clock is put around: where it is, its name there, what the table calls it.
@@ -39,8 +41,7 @@ _CLOCKS: tuple[tuple[Any, str, str], ...] = (
     (container, "stored_bytes", "sections of bundles: checksum"),
     (sections, "read_description", "descriptions of contexts"),
     (BundledFile, "__init__", "tables of contexts"),
-    (BundledFile, "work", "memory to work with"),
-    (BundledFile, "values", "bundles to values"),
+    (BundleShare, "do", "bundles to values"),
     (bundled_scene.BundledScene, "tables", "tables of values"),
     (decoder, "unpack_integers", "multiplicities"),
     (OctreeFunctions, "tree", "octree: levels"),
@@ -52,7 +53,7 @@ _CLOCKS: tuple[tuple[Any, str, str], ...] = (
     (Functions, "look_up", "scales, opacities"),
     (Functions, "rotations", "rotations"),
     (Functions, "colours", "colours"),
-    (Functions, "unpredicted", "prediction of DC"),
+    (Functions, "dc_colours", "DC from its prediction"),
 )
 #: Of bundles: parts of the chain, by the section that they end with.
 _CHAIN = ("opacities", "scales", "steps and DC", "AC of degree 1", "AC of degree 2", "AC of degree 3")
@@ -138,16 +139,17 @@ def _of_bundles(data: bytes, runs: int) -> dict[str, float]:
         return {}
     count = file.sh_count()
     destination = SceneArrays(file.header, file.rules, count)
-    tables, bundles = scene.tables, range(scene.reader.bundles.number)
+    tables, bundles, functions = scene.tables, scene.reader.bundles.number, native()
+    assert functions is not None
 
     def decoded(sections: int, rotations: bool, arrays: ValueArrays) -> Callable[[], None]:
         opened = scene.reader.bundled_file(Wanted(sections, rotations))
         assert opened is not None
-        work = opened.work()
 
         def run() -> None:
-            for bundle in bundles:
-                opened.values(bundle, sections, rotations, work, arrays, tables)
+            share = functions.bundle_share(bundles)
+            share.open(opened, sections, rotations, arrays, tables)
+            share.do()
 
         return run
 

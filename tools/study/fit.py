@@ -1,16 +1,18 @@
 """What a fit of all parameters buys: bytes and PSNR of whole encodes, by how far the scene is pruned before it.
 
-    python -m tools.study.fit SCENE … [--courses COURSE …] [--json FILE]
+    python -m tools.study.fit SCENE … [--courses COURSE … | --ladder Q …] [--json FILE]
 
 A SCENE is a folder with point_cloud.ply and cameras.json. A course says what is done to it before the re-fit and the
 coder: "q0.1/1000" prunes it as q = 0.1 would, and fits it in 1000 steps; "q0.3/500,q-0.1/1000" prunes, fits, prunes
 what is left and fits again. What follows, "@0.3@0.5", are the qualities of the re-fit and the coder: the work before
 them is done once for all. After a "+", options of the fit: "q0.1/1000+last=0.2@0.3", "+groups=means:dc" moves these
-parameters only, "+between=3" has it look at three views between for each training view, and at none that an encode
-adds. "encode/1000@0.3" is an encode as users have it, with --fit 1000: it removes more splats by itself and decides
-whether the fit pays; "encode/1000+cycles=2@0.3" has other options of the stage. PSNR is the mean over the test views
-against the uncompressed scene's renders; bytes at equal PSNR are against the scene without a fit at the --plain
-qualities, interpolated in the logarithm of the bytes. PSNR before and after the fit are of what is not yet coded.
+parameters only, "+between=3" has it look at three views between for each training view. "encode/1000@0.3" is an encode
+as users have it, with --fit 1000: it removes more splats by itself and decides whether the fit pays;
+"encode/1000+cycles=2@0.3" has other options of the stage. PSNR is the mean over the test views against the uncompressed
+scene's renders; bytes at equal PSNR are against the scene without a fit at the --plain qualities, interpolated in the
+logarithm of the bytes. PSNR before and after the fit are of what is not yet coded.
+
+--ladder Q … measures instead what each part of the fit brings: encodes with all of it, then each time without one part.
 
 --fraction F takes all pictures smaller, --every N takes every N-th training view, and --iterations N prunes in fewer
 iterations: for a CPU, not for publication. --limit S begins nothing new after so many seconds.
@@ -31,8 +33,7 @@ import numpy as np
 
 from potr_cl.codec.decoder import decode
 from potr_cl.codec.quantize import HyperParameters
-from potr_cl.model.camera import Camera, test_views, train_views
-from potr_cl.model.views_between import views_between
+from potr_cl.model.camera import test_views, train_views
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
 from potr_cl.pipeline.encode import Run, Stopwatch
@@ -79,14 +80,12 @@ class Course:
         text: as it was given, without the qualities.
         parts: by turns, the q whose threshold pruning takes, or None for that of the encode, and the steps of the fit.
         fit: further options of the fit.
-        between: for each training view, views between that only the fit looks at; None: those that all look at.
         qualities: of the re-fit and the coder.
     """
 
     text: str
     parts: tuple[tuple[float | None, int], ...]
     fit: dict[str, Any]
-    between: int | None
     qualities: tuple[float, ...]
 
     @staticmethod
@@ -105,9 +104,9 @@ class Course:
             if name == "groups":
                 options["rates"] = only(value.split(":"))
             else:
-                options[name] = float(value) if name in ("last", "further", "finer") else int(value)
+                options[name] = float(value) if "." in value else int(value)
         turns = tuple((None if q == "encode" else float(q.removeprefix("q")), int(n)) for q, n in parts)
-        return Course(text, turns, options, options.pop("between", None), tuple(map(float, qualities)))
+        return Course(text, turns, options, tuple(map(float, qualities)))
 
 
 def only(groups: Sequence[str]) -> Rates:
@@ -115,7 +114,32 @@ def only(groups: Sequence[str]) -> Rates:
     names = {each.name for each in dataclasses.fields(Rates)}
     if unknown := set(groups) - names:
         raise ValueError(f"the fit has no {', '.join(sorted(unknown))}: it has {', '.join(sorted(names))}")
-    return dataclasses.replace(RATES, **{name: 0.0 for name in names - set(groups)})
+    return _without(*(names - set(groups)))
+
+
+def _without(*groups: str) -> Rates:
+    """The fit's rates, but 0 for these parameters."""
+    return dataclasses.replace(RATES, **dict.fromkeys(groups, 0.0))
+
+
+#: Parts of the fit by what they are called: without them it has these options.
+_PARTS: dict[str, dict[str, Any]] = {
+    "everything": {},
+    "positions stay": {"rates": _without("means")},
+    "scales stay": {"rates": _without("log_scales")},
+    "rotations stay": {"rates": _without("quaternions")},
+    "opacities stay": {"rates": _without("opacity_logits")},
+    "colours stay": {"rates": _without("dc", "ac")},
+    "steps of the quantiser as without a fit": {"finer": 0.0},
+    "splats removed once, not twice": {"cycles": 1},
+    "no splats removed for it": {"further": 0.0},
+    "no views between of its own": {"between": 0},
+}
+
+
+def ladder(qualities: Sequence[float]) -> list[Course]:
+    """Encodes as users have them with a fit, and each time without one part of it."""
+    return [Course(part, ((None, STEPS),), options, tuple(qualities)) for part, options in _PARTS.items()]
 
 
 def usual_courses() -> list[Course]:
@@ -205,21 +229,10 @@ class Bench(Owner):
                 state = dataclasses.replace(state, learnt=learnt)
             if steps:
                 before = self._judge.psnr(state.scene)
-                views, added = self._seen(state, course.between)
-                seen = dataclasses.replace(state, views=views, added=added)
-                fitted, seconds = self._run(seen, options, [Fit])
-                state = dataclasses.replace(fitted, views=state.views, added=state.added)
+                state, seconds = self._run(state, options, [Fit])
                 fit += seconds
                 psnrs = [before, self._judge.psnr(state.scene)]
         return _Fitted(state, prune, fit, psnrs)
-
-    def _seen(self, state: State, between: int | None) -> tuple[tuple[Camera, ...], int]:
-        """What a fit looks at, and how many of these views lie between those that were given."""
-        if between is None:
-            return state.views, state.added
-        given = state.views[: len(state.views) - state.added]
-        added = views_between(self._scene, given, between)
-        return (*given, *added), len(added)
 
     def close(self) -> None:
         """Give the device's memory back."""
@@ -229,7 +242,9 @@ class Bench(Owner):
 
 def main() -> None:
     parser = scene_parser(__doc__)
-    parser.add_argument("--courses", nargs="+", type=Course.of, default=usual_courses())
+    chosen = parser.add_mutually_exclusive_group()
+    chosen.add_argument("--courses", nargs="+", type=Course.of, default=usual_courses())
+    chosen.add_argument("--ladder", nargs="+", type=float, metavar="Q")
     parser.add_argument("--plain", nargs="*", type=float, default=PLAIN, metavar="Q")
     parser.add_argument("--preset", default="best")
     parser.add_argument("--fraction", type=float, default=1.0, metavar="F")
@@ -238,12 +253,15 @@ def main() -> None:
     parser.add_argument("--limit", type=float, default=np.inf, metavar="SECONDS")
     args = parser.parse_args()
     device = Device(args.device)
-    table = Results(device.info, args.json).table("courses", "Whole encodes with a fit of all parameters", *COLUMNS)
+    name, title = "courses", "Whole encodes with a fit of all parameters"
+    if args.ladder:
+        name, title = "ladder", "What each part of the fit brings: whole encodes with all of it, and without one part"
+    table = Results(device.info, args.json).table(name, title, *COLUMNS)
     began = time.perf_counter()
     with ExitStack() as stack:
         benches = [stack.enter_context(Bench(folder, device, args)) for folder in args.scenes]
         plain = [Course.of(f"q{q:g}/0@{q:g}") for q in args.plain]
-        for course in [*plain, *args.courses]:
+        for course in [*plain, *(ladder(args.ladder) if args.ladder else args.courses)]:
             for bench in benches:
                 if time.perf_counter() - began > args.limit:
                     return

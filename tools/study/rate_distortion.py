@@ -8,9 +8,11 @@ the name it gets and the options of EncodeOptions in which it differs from the d
 as in exact:preset=best,prune.tolerance=0. ``measure`` writes its results after every encode and goes on where an
 existing file stops; with --seconds it begins no encode after that many. ``report`` prints Markdown and draws
 DIR/rate_distortion_SCENE.png; the points of other formats come from tools.study.compare_formats. With --json it keeps
-the tables of docs/benchmarks: the curves, the uncompressed scenes, and the seconds of each stage at quality 0.5. With
---against it prints instead how many bytes more or fewer each series takes at the PSNR that the series NAME has at
-quality Q, by interpolation, and how long its encodes take.
+the tables of docs/benchmarks: the curves, the uncompressed scenes, and the seconds of each stage at quality 0.5; with
+--losses NAME too, another one instead: what each other series loses on photographs, and what the series NAME loses at
+the same PSNR against the uncompressed renders, by interpolation. With --against it prints instead how many bytes more
+or fewer each series takes at the PSNR that the series NAME has at quality Q, by interpolation, and how long its encodes
+take.
 """
 
 from __future__ import annotations
@@ -213,6 +215,15 @@ def value_at(points: list[dict[str, Any]], key: str, size: float) -> float | Non
     return float(np.interp(np.log(size), sizes, [p[key] for p in ordered]))
 
 
+def along_psnr(points: list[dict[str, Any]], key: str, psnr: float) -> float | None:
+    """What a curve has of ``key`` at a PSNR against the uncompressed renders; None beyond its ends."""
+    ordered = sorted(points, key=lambda p: float(p["psnr"]))
+    psnrs = [p["psnr"] for p in ordered]
+    if not psnrs[0] <= psnr <= psnrs[-1]:
+        return None
+    return float(np.interp(psnr, psnrs, [p[key] for p in ordered]))
+
+
 def print_gaps(scenes: dict[str, Any], against: str, q: float) -> None:
     """Bytes at equal PSNR, a row a series."""
     print(
@@ -299,6 +310,32 @@ def keep_tables(measured: dict[str, Any], path: Path) -> None:
                     )  # fmt: skip
 
 
+def keep_losses(measured: dict[str, Any], against: str, path: Path) -> None:
+    """The table "losses": what each series loses on photographs, beside what one of them loses at the same PSNR."""
+    table = Results(None, path, measured).table(
+        "losses",
+        f"What files lose on photographs, and what those of {against} lose at the same PSNR, all test views",
+        Column("scene"),
+        Column("preset", default="{preset}"),
+        Column("q", default="{quality:g}"),
+        Column("bytes", format=","),
+        Column(f"bytes against {against} at this PSNR", "%", "+.1f"),
+        Column("PSNR against uncompressed", "dB", ".2f"),
+        Column("lost on photographs", "dB", ".3f"),
+        Column(f"{against} at this PSNR", "dB", ".3f"),
+        Column("SSIM against photographs", format=".4f"),
+        Column(f"{against} at this PSNR", format=".4f"),
+    )
+    for name, entry in measured["scenes"].items():
+        reference = entry["series"][against]["encodes"]
+        for series, curve in entry["series"].items():
+            for p in curve["encodes"] if series != against else ():
+                size = size_at(reference, "psnr", p["psnr"])
+                loss, ssim = (along_psnr(reference, key, p["psnr"]) for key in ("psnr_loss", "truth_ssim"))
+                gap = None if size is None else 100 * (p["bytes"] / size - 1)
+                table.add(name, series, p["q"], p["bytes"], gap, p["psnr"], p["psnr_loss"], loss, p["truth_ssim"], ssim)
+
+
 def _report(args: argparse.Namespace) -> None:
     results = json.loads(args.results.read_text())
     if args.against is not None:
@@ -307,6 +344,11 @@ def _report(args: argparse.Namespace) -> None:
             if args.at not in measured:
                 raise UsageError(f"{args.results}: {name} has no encode of '{args.against}' at quality {args.at:g}")
         print_gaps(results["scenes"], args.against, args.at)
+        return
+    if args.losses is not None:
+        if args.json is None:
+            raise UsageError("--losses makes a table: say with --json where to keep it")
+        keep_losses(results, args.losses, args.json)
         return
     if args.json is not None:
         keep_tables(results, args.json)
@@ -330,6 +372,7 @@ def main() -> None:
     report.add_argument("--images", type=Path, metavar="DIR", help="draw the curves too")
     report.add_argument("--json", type=Path, metavar="FILE", help="keep tables for docs/benchmarks")
     report.add_argument("--against", metavar="NAME")
+    report.add_argument("--losses", metavar="NAME")
     report.add_argument("--at", type=float, default=0.5, metavar="Q")
     args = parser.parse_args()
     args.run(args)

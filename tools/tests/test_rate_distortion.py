@@ -166,3 +166,23 @@ def test_ablation(monkeypatch, folder, tmp_path, capsys):
     results = json.loads((tmp_path / "results.json").read_text())
     assert [len(results[name]["rows"]) for name in ("excerpt", "bytes_excerpt")] == [13, 13]
     assert results["excerpt"]["machine"] == json.loads(out.read_text())["machine"]
+
+
+def test_losses_on_photographs_at_equal_psnr(monkeypatch, tmp_path):
+    def points(*rows):
+        names = ("q", "bytes", "psnr", "psnr_loss", "truth_ssim")
+        return {"encodes": [dict(zip(names, row, strict=True)) for row in rows]}
+
+    best = points((0.3, 1000, 40.0, 0.4, 0.90), (0.5, 4000, 44.0, 0.2, 0.94))
+    other = points((0.3, 1600, 42.0, 0.35, 0.91), (0.5, 9000, 45.0, 0.1, 0.95))
+    about = {"machine": "m", "date": "2026-01-31", "command": ["c"], "commit": "abc"}
+    measured = {**about, "scenes": {"s": {"series": {"best": best, "smallest": other}}}}
+    curves, kept = tmp_path / "curves.json", tmp_path / "kept.json"
+    curves.write_text(json.dumps(measured))
+    call(monkeypatch, rate_distortion, "report", curves, "--losses", "best", "--json", kept)
+    first, second = json.loads(kept.read_text())["losses"]["rows"]
+    assert first[:4] == ["s", "smallest", 0.3, 1600]
+    assert first[4:] == pytest.approx([-20, 42.0, 0.35, 0.3, 0.91, 0.92], rel=1e-4)
+    assert second == ["s", "smallest", 0.5, 9000, None, 45.0, 0.1, None, 0.95, None], "beyond the ends of best"
+    with pytest.raises(UsageError, match="--json"):
+        call(monkeypatch, rate_distortion, "report", curves, "--losses", "best")

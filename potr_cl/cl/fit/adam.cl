@@ -1,6 +1,9 @@
 /* A step of Adam (Kingma and Ba, 2015), one parameter of one splat a work-item: get_global_id(1) is the parameter's
    column. Both kernel families use it.
 
+   The columns from first_sh on are SH coefficients, which go to the rasterizer's `sh` as they are; for the others see
+   activate().
+
    A parameter whose gradient was always 0 stays what it was, whatever the limits are. The gradient becomes 0.
 
    Macros: none. */
@@ -13,8 +16,10 @@ kernel void adam(
     global float *gradient,
     global float *means,
     global float *squares,
+    global float *sh,
     uint splats,
     uint stride,
+    uint first_sh,
     global const float4 *steps,
     float part,
     float decay_mean,
@@ -36,8 +41,12 @@ kernel void adam(
     if (mean == 0.0f || !(square > 0.0f))
         return;
     const float value = parameters[i] - part * step.x * (mean * debias_mean) / sqrt(square * debias_square);
-    if (fabs(value) < 1e30f)
-        parameters[i] = fmin(fmax(value, step.y), step.z);
+    if (fabs(value) < 1e30f) {
+        const float kept = fmin(fmax(value, step.y), step.z);
+        parameters[i] = kept;
+        if (get_global_id(1) >= first_sh)
+            sh[i - first_sh * (size_t)stride] = kept;
+    }
 }
 
 /* Parameters as the projection takes them (raster/project.cl), one splat a work-item: the scales' exponentials, unit

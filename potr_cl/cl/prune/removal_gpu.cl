@@ -15,6 +15,9 @@
 #include "prune/removal.clh"
 #include "prune/staleness_gpu.clh"
 
+/* As first_time: store the target, and measure nothing. */
+#define ONLY_TARGET 2
+
 kernel __attribute__((reqd_work_group_size(ITEMS, 1, 1)))
 void removal(
     uint start,
@@ -100,7 +103,7 @@ void removal(
         behind_b[i] = blue;
         end = max(end, state.last[i] + 1);
     }
-    if (swept == 0)
+    if (swept == 0 || first_time == ONLY_TARGET)
         return;
 #if TIGHTEN
     end = INT_MAX; /* every intersection shows whether it touches a pixel */

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 
 from potr_cl.codec import quantize
 from potr_cl.codec.blocks.splitting import MOST_WHOLE, blocks_of
-from potr_cl.codec.geometry import Geometry, distances_to_views, quantise_geometry, quantise_in_world_units
+from potr_cl.codec.geometry import Geometry, distances_to_views, quantise_geometry, quantise_in_world_units, undecoded
 from potr_cl.codec.steps.fitting import fit_steps_of_blocks
 from potr_cl.codec.versions import VERSIONS
 from potr_cl.host.threads import Run
@@ -41,18 +41,11 @@ class GeometryOfBlocks:
         """(N,) index in the scene of each splat of the file."""
         return np.concatenate([rows[block.order] for rows, block in zip(self.rows, self.blocks, strict=True)])
 
-    def decoded(self, sh: FloatArray) -> Scene:
+    def decoded(self, sh: FloatArray, run: Run = map) -> Scene:
         """See :meth:`Geometry.decoded`."""
-        n = sum(map(len, self.rows))
-        first = self.blocks[0]
-        scene = Scene(
-            np.empty((n, 3), np.float32), np.empty((n, 3), np.float32), np.empty((n, 4), np.float32),
-            np.empty(n, np.float32), sh, first.antialiased, first.low_pass,
-        )  # fmt: skip
+        scene = undecoded(sh, self.blocks[0])
         for rows, block in zip(self.rows, self.blocks, strict=True):
-            part = block.decoded(_colourless(len(rows)))
-            scene.means[rows], scene.log_scales[rows] = part.means, part.log_scales
-            scene.quaternions[rows], scene.opacity_logits[rows] = part.quaternions, part.opacity_logits
+            block.decode_to(scene, rows[block.order], run)
         return scene
 
     def colour_classes(self) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
@@ -113,7 +106,3 @@ def quantise(
 def in_blocks(splats: int, parameters: quantize.HyperParameters) -> bool:
     """Whether a scene of so many splats is cut into blocks."""
     return VERSIONS[parameters.version].in_blocks and splats > MOST_WHOLE
-
-
-def _colourless(splats: int) -> FloatArray:
-    return np.broadcast_to(np.float32(0), (splats, 1, 3))

@@ -44,7 +44,7 @@ def encode(
     """
     report = progress or (lambda done: None)
     functions = native()
-    arrays = None if functions is None else narrow(values)
+    arrays = None if functions is None else narrow(values, run)
     if functions is not None and arrays is not None:
         return encode_natively(functions, arrays, classes, run, report)
     drafts = _Drafts(Bundles(len(classes)), classes)

@@ -63,37 +63,47 @@ def encode_natively(
     deque(run(encoder.count, range(bundles.number)), 0)
     report(0.6)
     alphabets = tokens_of(encoder.largest().astype(np.int64)).astype(int) + 1
-    contexts = zip(encoder.counts(), alphabets.tolist(), strict=True)
-    models = list(run(lambda job: _fitted_model(encoder, *job), contexts))
+    jobs = enumerate(alphabets.tolist())
+    models = list(run(lambda job: _fitted_model(encoder, *job), jobs))
     encoder.take_models(models)
     coded = list(run(encoder.code, range(bundles.number)))
     fitted = [
         Fitted(stream, some, Model(model.classes, model.frequencies.astype(np.int64)))
         for stream, some, model in zip(streams, numbers, models, strict=True)
     ]
-    stored: dict[Key, bytes] = {}
-    for number, key in enumerate(ORDER):
-        if key in values:
-            own = [each for each in fitted if each.stream in streams_of(*key)]
-            first = None
-            if key in (MAIN[0], ROTATION):
-                states = [bundle.states if key == MAIN[0] else bundle.rotation_states for bundle in coded]
-                first = np.concatenate([part[:lanes] for part, lanes in zip(states, bundles.lanes, strict=True)])
-            words = [bundle.words[number] for bundle in coded]
-            counts = np.array([len(part) for part in words])
-            stored[key] = stored_section(own, first, counts, np.concatenate(words))
+    states = {
+        MAIN[0]: [bundle.states for bundle in coded],
+        ROTATION: [bundle.rotation_states for bundle in coded],
+    }
+
+    def section(number: int) -> bytes:
+        key = ORDER[number]
+        own = [each for each in fitted if each.stream in streams_of(*key)]
+        first = None
+        if key in states:
+            first = np.concatenate([part[:lanes] for part, lanes in zip(states[key], bundles.lanes, strict=True)])
+        words = [bundle.words[number] for bundle in coded]
+        return stored_section(own, first, np.array([len(part) for part in words]), np.concatenate(words))
+
+    numbers_of = [number for number, key in enumerate(ORDER) if key in values]
+    stored = dict(zip([ORDER[number] for number in numbers_of], run(section, numbers_of), strict=True))
     report(1.0)
     return stored
 
 
-def narrow(values: Mapping[Key, Sequence[NDArray[np.integer]]]) -> dict[Key, list[I32]] | None:
+def narrow(values: Mapping[Key, Sequence[NDArray[np.integer]]], run: Run = map) -> dict[Key, list[I32]] | None:
     """The integers as the native path takes them; None if one is too large for it."""
-    for streams in values.values():
-        largest = max(max(int(stream.max()), -int(stream.min())) for stream in streams)
+
+    def narrowed(stream: NDArray[np.integer]) -> I32 | None:
         # Mapped to unsigned an integer has another bit.
-        if not fits(2 * largest + 1):
+        if not fits(2 * max(int(stream.max()), -int(stream.min())) + 1):
             return None
-    return {key: [np.ascontiguousarray(stream, np.int32) for stream in streams] for key, streams in values.items()}
+        return np.ascontiguousarray(stream, np.int32)
+
+    made = iter(list(run(narrowed, [stream for streams in values.values() for stream in streams])))
+    found = {key: [next(made) for _ in streams] for key, streams in values.items()}
+    arrays = {key: [stream for stream in streams if stream is not None] for key, streams in found.items()}
+    return arrays if all(len(arrays[key]) == len(values[key]) for key in values) else None
 
 
 def _solved(stream: Stream, gram: I64) -> I64:
@@ -104,5 +114,6 @@ def _solved(stream: Stream, gram: I64) -> I64:
     return solve(gram[np.ix_(used, used)])
 
 
-def _fitted_model(encoder: BundleEncoder, counts: NDArray[np.uint32], alphabet: int) -> NativeModel:
+def _fitted_model(encoder: BundleEncoder, number: int, alphabet: int) -> NativeModel:
+    counts = encoder.counts(number)
     return encoder.contexts(counts, alphabet, log_table()) if counts.any() else _NOTHING

@@ -7,6 +7,7 @@
 #include <string.h>
 
 #include "bundles_tokens.h"
+#include "bundles_values.h"
 #include "steps.h"
 
 /* A stream of some items: from w->expected, where the sums of terms, constant and bias stand in rows, to w->tokens, to
@@ -335,9 +336,12 @@ POTR_EXPORT size_t potr_bundles_work(void)
     return sizeof(work);
 }
 
-/* Makes it ready, once; it holds zeros. */
+/* Makes it ready, once, of any content. */
 POTR_EXPORT void potr_bundles_begin(work *w)
 {
+    /* Lanes that have no splat compute with what stands there, which must not be too large. */
+    memset(w, 0, offsetof(work, places));
+    memset(w->expected, 0, sizeof w->expected);
     for (unsigned mask = 0; mask < 128; mask++)
         list_bits(mask, &w->coefficient_bytes[mask]);
     list_logarithms(w->logarithms);

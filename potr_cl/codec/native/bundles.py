@@ -14,9 +14,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.native.arrays import address
-from potr_cl.codec.steps.rule import CLASSES, KNOTS, ColourSteps
+from potr_cl.codec.steps.rule import KNOTS, ColourSteps
 
-F32 = NDArray[np.float32]
 U8 = NDArray[np.uint8]
 U32 = NDArray[np.uint32]
 
@@ -86,28 +85,6 @@ class _Levels(ctypes.Structure):
     )
 
 
-class _Values(ctypes.Structure):
-    _fields_ = (
-        ("log_scales", _POINTER),
-        ("quaternions", _POINTER),
-        ("logits", _POINTER),
-        ("dc", _POINTER),
-        ("ac", _POINTER),
-        ("scale_table", _POINTER),
-        ("opacity_table", _POINTER),
-        ("scale_levels", _WORD),
-        ("opacity_levels", _WORD),
-        ("sf_dc", _POINTER),
-        ("sf_ac", _POINTER),
-        ("step", _POINTER),
-        ("inverse", _POINTER),
-        ("sf_rotation", ctypes.c_float),
-        ("coefficients", _NUMBER),
-        ("columns", _NUMBER),
-        ("units", _NUMBER),
-    )
-
-
 def native_steps(steps: ColourSteps, splats: int) -> _Steps:
     """What C takes of the steps of colours of N splats; the array of their groups must be kept."""
     # Both are checked where steps are read, and once more: C shifts by them.
@@ -165,58 +142,6 @@ class SectionWords:
 
 
 @dataclass(frozen=True)
-class ValueArrays:
-    """Where the values of a file's N splats go, float32 and contiguous; None for what is not asked for.
-
-    Attributes:
-        log_scales: (N, 3).
-        quaternions: (N, 4).
-        logits: (N,).
-        sh: (M, 3, N).
-        columns: whether log_scales is (3, N) instead, and quaternions (4, N).
-    """
-
-    log_scales: F32 | None = None
-    quaternions: F32 | None = None
-    logits: F32 | None = None
-    sh: F32 | None = None
-    columns: bool = False
-
-    def part(self, start: int, stop: int) -> ValueArrays:
-        """Those from one splat to another, as views in which a splat is a row."""
-        scales, turned = (self._rows(array, start, stop) for array in (self.log_scales, self.quaternions))
-        logits = None if self.logits is None else self.logits[start:stop]
-        return ValueArrays(scales, turned, logits, None if self.sh is None else self.sh[:, :, start:stop])
-
-    def _rows(self, array: F32 | None, start: int, stop: int) -> F32 | None:
-        if array is None:
-            return None
-        return array[:, start:stop].T if self.columns else array[start:stop]
-
-
-@dataclass(frozen=True)
-class Tables:
-    """What makes values of levels.
-
-    Attributes:
-        scales, opacities: value of each level from 0 on.
-        sf_dc, sf_ac: (64,) scale factors of each class of steps.
-        steps, inverses: (64,) int64 of each class of steps, of the prediction of DC.
-        sf_rotation: scale factor.
-        units: whether quaternions are made as long as 1 in double precision.
-    """
-
-    scales: F32
-    opacities: F32
-    sf_dc: F32
-    sf_ac: F32
-    steps: NDArray[np.int64]
-    inverses: NDArray[np.int64]
-    sf_rotation: float
-    units: bool = False
-
-
-@dataclass(frozen=True)
 class BundleIntegers:
     """Integers of a bundle's n splats, int32; the first ones only, where no others were asked for.
 
@@ -252,6 +177,9 @@ class BundledFile:
             least.
         steps: of colours, for files that have them.
         vectors: whether to look tokens up by vectors, where the processor can.
+
+    Attributes:
+        splats: as given.
     """
 
     def __init__(
@@ -264,7 +192,7 @@ class BundledFile:
     ) -> None:
         self._c = functions
         self._vectors = bool(vectors and functions["potr_bundles_vectors"]())
-        self._splats = splats
+        self.splats = splats
         self._kept: list[NDArray[Any]] = []
         self._file = _File()
         self._file.splats = splats
@@ -318,7 +246,7 @@ class BundledFile:
 
     def work(self) -> U8:
         """What a thread needs to decode bundles, one at a time."""
-        work = np.zeros(self._c["potr_bundles_work"]() + 64, np.uint8)
+        work = np.empty(self._c["potr_bundles_work"]() + 64, np.uint8)
         start = -work.ctypes.data % 64
         aligned = work[start : len(work) - 64 + start]
         self._c["potr_bundles_begin"](address(aligned, np.uint8, len(aligned), True))
@@ -336,7 +264,7 @@ class BundledFile:
         Returns:
             What C says, the section at fault, and the integers, if nothing is.
         """
-        n = self._size(bundle, sections, rotations)
+        n = self.check(bundle, sections, rotations)
         integers = [np.zeros((k, n), np.int32) for k in (1, 3, 3, 3)]
         splats, coefficients = np.empty(_COEFFICIENTS * n, np.uint16), np.empty(_COEFFICIENTS * n, np.uint8)
         channels = np.empty((3, _COEFFICIENTS * n), np.int32)
@@ -364,61 +292,24 @@ class BundledFile:
         )
         return said, section.value, found
 
-    def values(
-        self, bundle: int, sections: int, rotations: bool, work: U8, arrays: ValueArrays, tables: Tables
-    ) -> tuple[int, int]:
-        """Decode a bundle to values, as :meth:`integers` does to integers.
+    @property
+    def as_c(self) -> ctypes.Structure:
+        """What C takes; it lives as long as this object."""
+        return self._file
 
-        Returns:
-            What C says, and the section at fault. BEYOND_TABLE: values of the bundle are not whole.
+    def degree(self, sections: int) -> int:
+        """Of the AC coefficients in so many sections of the chain."""
+        return max((number - 2 for number in range(3, sections) if self._file.words[number]), default=0)
+
+    def check(self, bundle: int, sections: int, rotations: bool) -> int:
+        """Splats of a bundle, of which so much can be decoded.
+
+        Raises:
+            TypeError: it cannot.
         """
-        self._size(bundle, sections, rotations)
-        n = self._splats
-        planes = 0 if arrays.sh is None else len(arrays.sh)
-        bands = [number - 2 for number in range(3, sections) if self._file.words[number]]
-        if arrays.sh is not None and planes < (max(bands, default=0) + 1) ** 2:
-            raise TypeError("the native path was given no place for coefficients")
-        dc = 0 if arrays.sh is None or not planes else address(arrays.sh, np.float32, planes * 3 * n, True)
-        out = _Values(
-            _optional(arrays.log_scales, 3 * n),
-            _optional(arrays.quaternions, 4 * n),
-            _optional(arrays.logits, n),
-            dc or None,
-            dc + 12 * n if planes > 1 else None,
-            address(tables.scales, np.float32, len(tables.scales)),
-            address(tables.opacities, np.float32, len(tables.opacities)),
-            len(tables.scales),
-            len(tables.opacities),
-            address(tables.sf_dc, np.float32, 2 * CLASSES),
-            address(tables.sf_ac, np.float32, 2 * CLASSES),
-            address(tables.steps, np.int64, 2 * CLASSES),
-            address(tables.inverses, np.int64, 2 * CLASSES),
-            tables.sf_rotation,
-            max(planes - 1, 0),
-            arrays.columns,
-            tables.units,
-        )
-        section = ctypes.c_int()
-        said = self._c["potr_bundles_values"](
-            ctypes.byref(self._file),
-            bundle,
-            sections,
-            rotations,
-            address(work, np.uint8, len(work), True),
-            ctypes.byref(out),
-            ctypes.byref(section),
-        )
-        return said, section.value
-
-    def _size(self, bundle: int, sections: int, rotations: bool) -> int:
-        """Splats of a bundle."""
-        if not 0 <= bundle * _BUNDLE < self._splats or not 1 <= sections < SECTIONS or (rotations and sections < 2):
+        if not 0 <= bundle * _BUNDLE < self.splats or not 1 <= sections < SECTIONS or (rotations and sections < 2):
             raise TypeError("the native path was asked for what is not there")
-        return min(self._splats - bundle * _BUNDLE, _BUNDLE)
-
-
-def _optional(array: F32 | None, number: int) -> int | None:
-    return None if array is None else address(array, np.float32, number, True)
+        return min(self.splats - bundle * _BUNDLE, _BUNDLE)
 
 
 def fits(largest: int) -> bool:

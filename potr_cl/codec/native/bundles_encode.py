@@ -210,12 +210,13 @@ class BundleEncoder:
                 address(counts, np.uint32, counts.size, True),
             )
 
-    def counts(self) -> U32:
-        """(25, 256, 256) how often each expected size of each stream has each token."""
+    def counts(self, stream: int) -> U32:
+        """(256, 256) how often each expected size of a stream has each token."""
         first, *others = self._counts.all()
+        total: U32 = first[stream].copy()
         for other in others:
-            first += other
-        return first
+            total += other[stream]
+        return total
 
     def contexts(self, counts: U32, alphabet: int, logs: I64) -> Model:
         """Contexts of a stream and their frequencies.

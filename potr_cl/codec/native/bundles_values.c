@@ -5,24 +5,8 @@
 #include <math.h>
 #include <string.h>
 
-#include "bundles.h"
-
-/* Where the values of a file's splats go; NULL where they are not asked for. */
-typedef struct {
-    float *log_scales;  /* (N, 3), or (3, N) where `columns` says so */
-    float *quaternions; /* (N, 4) w, x, y, z, or (4, N) */
-    float *logits;      /* (N) */
-    float *dc;          /* (3, N) R, G, B */
-    float *ac;          /* (coefficients, 3, N), from coefficient 1 on */
-    const float *scale_table;   /* value of each level, */
-    const float *opacity_table; /* and so many levels each */
-    uint64_t scale_levels, opacity_levels;
-    const float *sf_dc, *sf_ac;      /* (64) scale factors of each class of steps */
-    const uint64_t *step, *inverse;  /* (64) of each class of steps, of the prediction of DC */
-    float sf_rotation;
-    int32_t coefficients;            /* from coefficient 1 on */
-    int32_t columns, units;          /* units: whether quaternions become as long as 1 in double precision */
-} scene_values;
+#include "bundles_values.h"
+#include "prediction.h"
 
 /* Values of a table for the levels in rows, every `stride`-th number of `out`; whether a level is beyond the table. */
 static int look_up(
@@ -91,59 +75,89 @@ static void rotations(
     }
 }
 
-/* DC from what its prediction has left (docs/format.md, "Prediction"). Sums and products wrap round. */
+static INLINE int32_t as_it_is(int32_t level)
+{
+    return level;
+}
+
+DC_OF(dc_runs, int32_t, as_it_is)
+
+/* DC of a bundle's splats. Lanes that are whole are runs of the prediction; where they are shorter, it goes on from lane
+ * to lane. */
 static void colours_of_dc(const work *w, const scene_values *out, size_t steps, size_t splats, float *to, uint64_t all)
 {
-    uint64_t last[4][3], total[3] = { 0, 0, 0 };
-    for (size_t splat = 0, place = 0, lane = 0, step = 0; splat < splats; splat++) {
-        if (splat % LANE == 0) {
-            memset(last, 0, sizeof last);
+    const dc_steps of = { out->step, out->inverse, out->sf_dc };
+    const int32_t *const *const dc = (const int32_t *const[]) { w->dc[0], w->dc[1], w->dc[2] };
+    if (steps == RUN) {
+        const size_t whole = splats / RUN, four = whole / SIDE_BY_SIDE * SIDE_BY_SIDE;
+        for (size_t lane = 0; lane < four; lane += SIDE_BY_SIDE) {
+            float *const red = to + lane * RUN;
+            dc_runs(&of, dc[0] + lane, dc[1] + lane, dc[2] + lane, w->dc_classes + lane, LANES, 1, SIDE_BY_SIDE, RUN, red,
+                red + all, red + 2 * all);
+        }
+        for (size_t lane = four; lane * RUN < splats; lane++) {
+            float *const red = to + lane * RUN;
+            const size_t left = splats - lane * RUN, number = left < RUN ? left : RUN;
+            dc_runs(&of, dc[0] + lane, dc[1] + lane, dc[2] + lane, w->dc_classes + lane, LANES, 1, 1, number, red,
+                red + all, red + 2 * all);
+        }
+        return;
+    }
+    uint64_t total[3] = { 0 }, last[4][3] = { { 0 } };
+    for (size_t splat = 0; splat < splats; splat++) {
+        if (splat % RUN == 0) {
             memset(total, 0, sizeof total);
+            memset(last, 0, sizeof last);
         }
+        const size_t place = splat % steps * LANES + splat / steps;
         const unsigned class = w->dc_classes[place];
-        const uint64_t inverse = out->inverse[class], one = out->step[class];
-        const float divisor = out->sf_dc[class];
-        uint64_t level[3];
-        for (size_t c = 0; c < 3; c++) {
-            const int64_t mean = (int64_t)(total[c] * inverse + (UINT64_C(1) << 33)) >> 34;
-            level[c] = (uint64_t)(int64_t)w->dc[c][place] + (uint64_t)mean;
-            const uint64_t value = level[c] * one;
-            total[c] += value - last[splat & 3][c];
-            last[splat & 3][c] = value;
-        }
-        const uint64_t rest = level[0] - level[2];
-        to[splat] = (float)(int64_t)(rest + level[1]) / divisor;
-        to[splat + all] = (float)(int64_t)(level[0] + level[2]) / divisor;
-        to[splat + 2 * all] = (float)(int64_t)(rest - level[1]) / divisor;
-        place += LANES;
-        if (++step == steps) {
-            step = 0;
-            place = ++lane;
-        }
+        const uint64_t residuals[3] = {
+            (uint64_t)(int64_t)dc[0][place], (uint64_t)(int64_t)dc[1][place], (uint64_t)(int64_t)dc[2][place]
+        };
+        float rgb[3];
+        next_dc(&of, class, residuals, total, last[splat & 3], rgb);
+        for (size_t c = 0; c < 3; c++)
+            to[splat + c * all] = rgb[c] / of.factors[class];
     }
 }
 
-static void colours_of_items(const work *w, size_t band, const float *divisors, size_t steps, float *out, uint64_t all)
+/* R, G, B of `number` items of a degree, from `begin` on. */
+static INLINE void colours_of_items(
+    const work *w, size_t band, const float *divisors, size_t begin, size_t number, float *red, float *green,
+    float *blue)
+{
+    const uint16_t *const places = w->places[band] + begin;
+    const int32_t *const y = w->channels[band][0] + begin, *const co = w->channels[band][1] + begin,
+                  *const cg = w->channels[band][2] + begin;
+    float divisor[LANE];
+    for (size_t i = 0; i < number; i++)
+        divisor[i] = divisors[w->ac_classes[places[i]]];
+    for (size_t i = 0; i < number; i++) {
+        const int32_t rest = y[i] - cg[i];
+        red[i] = (float)(rest + co[i]) / divisor[i];
+        green[i] = (float)(y[i] + cg[i]) / divisor[i];
+        blue[i] = (float)(rest - co[i]) / divisor[i];
+    }
+}
+
+static INLINE size_t splat_of(size_t place, size_t steps)
+{
+    return place % LANES * steps + place / LANES;
+}
+
+/* The items of a degree to the columns of their coefficients. */
+static void spread_items(const work *w, size_t band, const float *divisors, size_t steps, float *out, uint64_t all)
 {
     const uint16_t *const places = w->places[band];
     const uint8_t *const coefficients = w->coefficients[band];
-    const int32_t *const y = w->channels[band][0], *const co = w->channels[band][1], *const cg = w->channels[band][2];
     const size_t first = (band + 1) * (band + 1) - 1, items = w->items[band];
     for (size_t begin = 0; begin < items; begin += LANE) {
         const size_t number = items - begin < LANE ? items - begin : LANE;
-        float divisor[LANE], red[LANE], green[LANE], blue[LANE];
+        float red[LANE], green[LANE], blue[LANE];
         uint64_t at[LANE];
-        for (size_t i = 0; i < number; i++) {
-            const size_t place = places[begin + i];
-            divisor[i] = divisors[w->ac_classes[place]];
-            at[i] = 3 * (first + coefficients[begin + i]) * all + place % LANES * steps + place / LANES;
-        }
-        for (size_t i = 0; i < number; i++) {
-            const int32_t rest = y[begin + i] - cg[begin + i];
-            red[i] = (float)(rest + co[begin + i]) / divisor[i];
-            green[i] = (float)(y[begin + i] + cg[begin + i]) / divisor[i];
-            blue[i] = (float)(rest - co[begin + i]) / divisor[i];
-        }
+        colours_of_items(w, band, divisors, begin, number, red, green, blue);
+        for (size_t i = 0; i < number; i++)
+            at[i] = 3 * (first + coefficients[begin + i]) * all + splat_of(places[begin + i], steps);
         for (size_t i = 0; i < number; i++) {
             float *const to = out + at[i];
             to[0] = red[i];
@@ -153,17 +167,38 @@ static void colours_of_items(const work *w, size_t band, const float *divisors, 
     }
 }
 
+/* The items of a degree one after another. Returns their number. */
+static size_t list_values(const work *w, size_t band, const float *divisors, size_t steps, uint32_t *out)
+{
+    const uint16_t *const places = w->places[band];
+    const uint8_t *const coefficients = w->coefficients[band];
+    const size_t first = (band + 1) * (band + 1), items = w->items[band];
+    for (size_t begin = 0; begin < items; begin += LANE) {
+        const size_t number = items - begin < LANE ? items - begin : LANE;
+        float red[LANE], green[LANE], blue[LANE];
+        colours_of_items(w, band, divisors, begin, number, red, green, blue);
+        for (size_t i = 0; i < number; i++) {
+            uint32_t *const to = out + 4 * (begin + i);
+            to[0] = (uint32_t)((first + coefficients[begin + i]) * BUNDLE + splat_of(places[begin + i], steps));
+            memcpy(to + 1, &red[i], sizeof *red);
+            memcpy(to + 2, &green[i], sizeof *green);
+            memcpy(to + 3, &blue[i], sizeof *blue);
+        }
+    }
+    return items;
+}
+
 /* The values of a bundle. What potr_bundles_levels takes and returns; and 4 where a level is beyond its table: then
  * the bundle's values are not whole. */
 POTR_EXPORT int potr_bundles_values(
-    const bundled_file *file, uint64_t bundle, int sections, int rotating, work *w, const scene_values *out,
+    const bundled_file *file, uint64_t bundle, int sections, int rotating, work *w, scene_values *out,
     int *section)
 {
     const int wrong = decode_bundle(file, bundle, sections, rotating, w, section);
     if (wrong)
         return wrong;
     const size_t splats = splats_of(file, bundle), lanes = lanes_of(splats), steps = steps_of(splats);
-    const uint64_t first = bundle * BUNDLE, all = file->splats;
+    const uint64_t first = bundle * BUNDLE - out->begin, all = out->stride;
     int beyond = 0;
     if (out->logits)
         beyond |= look_up(
@@ -182,6 +217,11 @@ POTR_EXPORT int potr_bundles_values(
         memset(out->ac + (size_t)plane * all + first, 0, splats * sizeof *out->ac);
     if (out->ac)
         for (size_t band = 0; band < 3; band++)
-            colours_of_items(w, band, out->sf_ac, steps, out->ac + first, all);
+            spread_items(w, band, out->sf_ac, steps, out->ac + first, all);
+    uint64_t listed = 0;
+    for (size_t band = 0; out->items && band < 3; band++)
+        listed += list_values(w, band, out->sf_ac, steps, out->items + 4 * listed);
+    if (out->items)
+        out->listed = listed;
     return beyond ? BEYOND_TABLE : FINE;
 }

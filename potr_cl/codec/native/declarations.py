@@ -54,6 +54,8 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
     "potr_bundles_begin": (None, [_POINTER]),
     "potr_bundles_levels": (_NUMBER, [_POINTER, _WORD, _NUMBER, _NUMBER, *[_POINTER] * 3]),
     "potr_bundles_values": (_NUMBER, [_POINTER, _WORD, _NUMBER, _NUMBER, *[_POINTER] * 3]),
+    "potr_bundles_share": (_NUMBER, [_POINTER, _POINTER, _WORD]),
+    "potr_bundles_wait": (ctypes.c_int32, [_POINTER, _WORD]),
     "potr_bundles_encoding": (_SIZE, []),
     "potr_bundles_survey": (None, [_POINTER, _WORD, _POINTER, _POINTER, _WORD, _POINTER, _POINTER]),
     "potr_bundles_count": (None, [_POINTER, _WORD, *[_POINTER] * 3]),
@@ -81,7 +83,6 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
         [_POINTER, *[_SIZE] * 4, _POINTER, _SIZE, _POINTER, _POINTER, _SIZE, _SIZE, _POINTER],
     ),
     "potr_nonzero_levels": (_NUMBER, [_POINTER, _SIZE, _SIZE, ctypes.c_double, ctypes.c_double, _POINTER]),
-    "potr_unpredicted": (None, [_POINTER, _SIZE, _SIZE, _SIZE, *[_POINTER] * 4]),
     "potr_unit_factors": (None, [_POINTER, _SIZE, _SIZE, _SIZE, _SIZE, _REAL, _POINTER]),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),
 }
@@ -98,6 +99,7 @@ _OF_KINDS: dict[str, tuple[Any, list[Any], tuple[str, ...]]] = {
         [_POINTER, _POINTER, _POINTER, _SIZE, _POINTER, _NUMBER, _POINTER, _POINTER, _POINTER],
         ("narrow", "medium", "wide"),
     ),
+    "potr_dc_of_": (None, [_POINTER, _POINTER, _POINTER, _SIZE, *[_POINTER] * 7], ("narrow", "medium", "wide")),
     "potr_look_up_": (_WORD, [_POINTER, _SIZE, _POINTER, _SIZE, _POINTER, _SIZE], ("narrow", "medium", "wide")),
     "potr_rotations_of_": (
         None,

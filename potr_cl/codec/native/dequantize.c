@@ -7,7 +7,7 @@
 
 #include <math.h>
 
-#include "potr_native.h"
+#include "prediction.h"
 
 static INLINE int32_t from_zigzag(uint8_t u)
 {
@@ -70,32 +70,33 @@ COLOURS(narrow, uint8_t, from_zigzag, int32_t, int32_t)
 COLOURS(medium, int32_t, , int32_t, int32_t)
 COLOURS(wide, uint64_t, , uint64_t, int64_t)
 
-/* Levels from their differences to what the four splats before predict, in runs of some splats (docs/format.md,
- * "Prediction"). Sums and products wrap round.
- *
- * residuals, levels: (channels, n), each row by itself. classes: of n splats, -32 to 31. steps, inverses: (64,), of each
- * class. */
-POTR_EXPORT void potr_unpredicted(
-    const int64_t *restrict residuals, size_t channels, size_t n, size_t run, const int8_t *restrict classes,
-    const uint64_t *restrict steps, const uint64_t *restrict inverses, int64_t *restrict levels)
-{
-    for (size_t c = 0; c < channels; c++) {
-        const int64_t *const from = residuals + c * n;
-        int64_t *const to = levels + c * n;
-        for (size_t start = 0; start < n; start += run) {
-            const size_t stop = n - start < run ? n : start + run;
-            uint64_t last[4] = {0, 0, 0, 0}, total = 0;
-            for (size_t i = start; i < stop; i++) {
-                const unsigned k = (unsigned)(classes[i] + 32) & 63;
-                const int64_t mean = (int64_t)(total * inverses[k] + (UINT64_C(1) << 33)) >> 34;
-                const uint64_t level = (uint64_t)from[i] + (uint64_t)mean, value = level * steps[k];
-                to[i] = (int64_t)level;
-                total += value - last[i & 3];
-                last[i & 3] = value;
-            }
-        }
+/* DC of n splats: what its prediction has left of Y, Co, Cg to R, G, B. classes: from 0 on. steps, inverses, factors:
+ * (64,), of each class. */
+#define DC(kind, type, read) \
+    DC_OF(dc_runs_##kind, type, read) \
+    POTR_EXPORT void potr_dc_of_##kind( \
+        const type *restrict y, const type *restrict co, const type *restrict cg, size_t n, \
+        const uint8_t *restrict classes, const uint64_t *steps, const uint64_t *inverses, const float *factors, \
+        float *restrict red, float *restrict green, float *restrict blue) \
+    { \
+        const dc_steps of = { steps, inverses, factors }; \
+        const size_t four = n / (SIDE_BY_SIDE * RUN) * SIDE_BY_SIDE * RUN; \
+        for (size_t at = 0; at < four; at += SIDE_BY_SIDE * RUN) \
+            dc_runs_##kind(&of, y + at, co + at, cg + at, classes + at, 1, RUN, SIDE_BY_SIDE, RUN, red + at, green + at, \
+                blue + at); \
+        for (size_t at = four; at < n; at += RUN) \
+            dc_runs_##kind(&of, y + at, co + at, cg + at, classes + at, 1, RUN, 1, n - at < RUN ? n - at : RUN, \
+                red + at, green + at, blue + at); \
     }
+
+static INLINE int64_t whole(int64_t level)
+{
+    return level;
 }
+
+DC(narrow, uint8_t, from_zigzag)
+DC(medium, int32_t, whole)
+DC(wide, int64_t, whole)
 
 /* Values of n unsigned levels from a table, every `stride`-th number of `out`. Returns how many are beyond it: these
  * are left as they are. Tables have 256 entries at least, so that no narrow level is. */

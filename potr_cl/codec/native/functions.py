@@ -20,7 +20,8 @@ from potr_cl.codec.native.declarations import declared
 from potr_cl.codec.native.octree import OctreeFunctions
 from potr_cl.codec.native.octree_build import OctreeBuilding
 from potr_cl.codec.native.quantising import Quantising
-from potr_cl.codec.steps.rule import ColourSteps
+from potr_cl.codec.native.share import BundleShare
+from potr_cl.codec.steps.rule import CLASSES, ColourSteps
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -66,6 +67,10 @@ class Functions:
     ) -> BundledFile:
         """Sections of coder 4, as :class:`potr_cl.codec.native.bundles.BundledFile` takes them."""
         return BundledFile(self._c, splats, sections, steps, vectors)
+
+    def bundle_share(self, bundles: int) -> BundleShare:
+        """So many bundles to decode, as :class:`potr_cl.codec.native.share.BundleShare` takes them."""
+        return BundleShare(self._c, bundles)
 
     def bundle_encoder(self, *integers: Any) -> BundleEncoder:
         """Integers to code, as :class:`potr_cl.codec.native.bundles_encode.BundleEncoder` takes them."""
@@ -313,30 +318,32 @@ class Functions:
         red, green, blue = (address(row, np.float32, number, True) for row in out)
         self._c[f"potr_colours_of_{kind}"](*addresses(kind, alike, number), number, where, each, red, green, blue)
 
-    def unpredicted(self, residuals: I64, classes: I8, run: int, steps: I64, inverses: I64) -> I64:
-        """Undo the prediction of DC, :func:`potr_cl.codec.steps.prediction.from_residuals`.
+    def dc_colours(
+        self, residuals: Sequence[NDArray[Any]], classes: I8, steps: I64, inverses: I64, factors: F32, out: F32
+    ) -> None:
+        """DC from what its prediction has left (:func:`potr_cl.codec.steps.prediction.from_residuals`), as R, G, B.
 
         Args:
-            residuals: (channels, n).
+            residuals: of Y, Co, Cg, n each.
             classes: (n,), -32 to 31.
-            run: splats after which prediction begins anew, a multiple of 4, at least 4.
-            steps, inverses: (64,) of each class.
+            steps, inverses, factors: (64,) of each class.
+            out: (3, n).
         """
-        channels, number = residuals.shape
-        levels = np.empty((channels, number), np.int64)
-        if run < 4 or run % 4:
-            raise TypeError("the native path was given runs that do not begin where they must")
-        self._c["potr_unpredicted"](
-            address(residuals, np.int64, channels * number),
-            channels,
+        number = out.shape[1]
+        kind, alike = self._alike(residuals)
+        from_0_on = (classes + np.int8(CLASSES)).view(np.uint8)
+        red, green, blue = (address(row, np.float32, number, True) for row in out)
+        self._c[f"potr_dc_of_{kind}"](
+            *addresses(kind, alike, number),
             number,
-            run,
-            address(classes, np.int8, number),
-            address(steps, np.int64, 64),
-            address(inverses, np.int64, 64),
-            address(levels, np.int64, channels * number, True),
+            address(from_0_on, np.uint8, number),
+            address(steps, np.int64, 2 * CLASSES),
+            address(inverses, np.int64, 2 * CLASSES),
+            address(factors, np.float32, 2 * CLASSES),
+            red,
+            green,
+            blue,
         )
-        return levels
 
     def step_classes(self, steps: ColourSteps, scales: I32, opacities: I32) -> tuple[I8, I8]:
         """(N,) classes of the steps of DC, and of AC.

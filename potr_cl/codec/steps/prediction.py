@@ -11,7 +11,6 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.native.library import native
 from potr_cl.codec.steps.rule import CLASSES
 
 I64 = NDArray[np.int64]
@@ -62,10 +61,7 @@ def to_residuals(levels: I64, classes: I8) -> I64:
 
 def from_residuals(residuals: I64, classes: I8) -> I64:
     """Undo :func:`to_residuals`."""
-    functions = native()
     steps, inverses = tables()
-    if functions is not None:
-        return functions.unpredicted(residuals, classes, RUN, steps, inverses)
     channels, n = residuals.shape
     runs = -(-n // RUN)
     index = classes.astype(np.intp) + CLASSES

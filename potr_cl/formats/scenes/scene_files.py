@@ -18,6 +18,7 @@ from potr_cl.codec import octree
 from potr_cl.codec.logarithm import natural_logarithm
 from potr_cl.errors import DataError, PotrError, UsageError
 from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
+from potr_cl.host import mapped
 from potr_cl.model.scene import LOW_PASS, CleanReport, FloatArray, Scene
 
 #: Where somebody wants to know what was mended in files that are read.
@@ -119,7 +120,7 @@ def unfilled(splats: int, coefficients: int) -> Scene:
         np.empty((splats, 3), np.float32),
         np.empty((splats, 4), np.float32),
         np.empty(splats, np.float32),
-        np.empty((splats, coefficients, 3), np.float32),
+        mapped.array((splats, coefficients, 3), np.float32, "SH coefficients"),
     )
 
 

@@ -99,8 +99,10 @@ class Adam(Parameters):
             gradient=gradient,
             means=self._moments[0],
             squares=self._moments[1],
+            sh=buffers.sh,
             splats=buffers.splats,
             stride=buffers.stride,
+            first_sh=columns.dc.start,
             steps=self._steps,
             part=part,
             decay_mean=_DECAY_MEAN,
@@ -109,7 +111,7 @@ class Adam(Parameters):
             debias_square=1 / (1 - _DECAY_SQUARE**self._taken),
         )
         self._step.launch((buffers.stride, columns.count), (SPLAT_GROUP, 1))
-        self.give()
+        self.give(colours=False)
 
 
 def _steps(columns: Columns, rates: Rates, limits: Limits) -> FloatArray:

@@ -14,6 +14,7 @@ import dataclasses
 import logging
 import math
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, Protocol
 
@@ -21,12 +22,13 @@ import numpy as np
 
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
+from potr_cl.stages.fitting.judges import Judges
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import batches, share_out
 from potr_cl.stages.refitting.targets import Targets
@@ -156,7 +158,7 @@ def fit_scene(
     device: Device,
     scene: Scene,
     cameras: Sequence[Camera],
-    targets: Targets,
+    targets: Targets | TargetPictures,
     options: FitOptions | None = None,
     added: int = 0,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -172,7 +174,7 @@ def fit_scene(
         device: to compute on.
         scene: where the fit begins.
         cameras: the views.
-        targets: the picture that each of them should show.
+        targets: the picture that each of them should show; pictures that are kept already stay so.
         options: of the fit.
         added: how many of the views, the last ones, lie between those that were given: they are never held out.
         background: R, G, B behind the scene.
@@ -193,17 +195,18 @@ def fit_scene(
         fit_to = [number for number in range(len(cameras)) if number not in set(held_out)]
     if not held_out or not fit_to:
         raise UsageError("a fit needs two training views or more: one of them is held out and tells whether it helps")
-    free = device.info.memory - device.allocated
     with (
         PictureDerivatives(device, scene, background=background) as derivatives,
-        TargetPictures(
-            device, cameras, targets, free * _SHARE if options.memory is None else options.memory
-        ) as pictures,
+        _pictures_of(device, cameras, targets, options.memory) as pictures,
     ):
+        if options.memory is None and options.steps * options.batch >= len(fit_to):
+            pictures.prepare([*held_out, *(number for number in fit_to if number not in held_out)])
         rasterizer = derivatives.rasterizer
-        judges = _Judges(rasterizer, [cameras[number] for number in held_out], [pictures.download(n) for n in held_out])
         rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
-        with Adam(device, scene, rasterizer.parameters, derivatives.columns, rates, _limits(scene)) as adam:
+        with (
+            Judges(device, rasterizer, cameras, pictures, held_out) as judges,
+            Adam(device, scene, rasterizer.parameters, derivatives.columns, rates, _limits(scene)) as adam,
+        ):
             fit = _Fit(options, derivatives, adam, pictures, judges, cameras)
             return fit.run(fit_to, progress, tell or logger.debug, asked)
 
@@ -212,7 +215,7 @@ def held_out_error(
     device: Device,
     scene: Scene,
     cameras: Sequence[Camera],
-    targets: Targets,
+    targets: Targets | TargetPictures,
     added: int = 0,
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
 ) -> float:
@@ -224,34 +227,32 @@ def held_out_error(
     _, held_out = share_out(len(cameras) - added, added)
     with (
         Rasterizer(device, scene, background=background) as rasterizer,
-        TargetPictures(device, cameras, targets, 0) as pictures,
+        _pictures_of(device, cameras, targets, 0) as pictures,
+        Judges(device, rasterizer, cameras, pictures, held_out) as judges,
     ):
-        views = [cameras[number] for number in held_out]
-        return _Judges(rasterizer, views, [pictures.download(number) for number in held_out]).error()
+        return judges.error()
 
 
-class _Judges:
-    """The views that are held out.
+def kept_pictures(
+    device: Device, cameras: Sequence[Camera], targets: Targets, memory: int | None = None
+) -> TargetPictures:
+    """Target pictures for several fits to the same views, as many as there is room for; the caller closes them.
 
     Args:
-        rasterizer: of the scene that changes.
-        cameras: the views.
-        pictures: (H, W, 3) float32, what they should show.
+        device, cameras, targets: as of :func:`fit_scene`.
+        memory: bytes of device memory that they may take; None: a quarter of what is free.
     """
+    free = device.info.memory - device.allocated
+    return TargetPictures(device, cameras, targets, free * _SHARE if memory is None else memory)
 
-    def __init__(self, rasterizer: Rasterizer, cameras: Sequence[Camera], pictures: Sequence[FloatArray]) -> None:
-        self._rasterizer, self._cameras, self._pictures = rasterizer, cameras, pictures
 
-    def __len__(self) -> int:
-        return len(self._cameras)
-
-    def error(self) -> float:
-        """The mean squared error of the scene as it is now, all views the same."""
-        errors = []
-        for camera, picture in zip(self._cameras, self._pictures, strict=True):
-            difference = self._rasterizer.render(camera)[0].astype(np.float64) - picture
-            errors.append(float(np.mean(difference**2)))
-        return float(np.mean(errors))
+def _pictures_of(
+    device: Device, cameras: Sequence[Camera], targets: Targets | TargetPictures, memory: int | None
+) -> AbstractContextManager[TargetPictures]:
+    """The pictures, and if they are not the caller's, their end."""
+    if isinstance(targets, TargetPictures):
+        return nullcontext(targets)
+    return kept_pictures(device, cameras, targets, memory)
 
 
 class _Fit:
@@ -263,7 +264,7 @@ class _Fit:
         derivatives: PictureDerivatives,
         adam: Adam,
         pictures: TargetPictures,
-        judges: _Judges,
+        judges: Judges,
         cameras: Sequence[Camera],
     ) -> None:
         self._options, self._derivatives, self._adam = options, derivatives, adam

@@ -42,14 +42,18 @@ class Parameters(Owner):
             self.close()
             raise
 
-    def give(self) -> None:
-        """Write the parameters to the rasterizer's buffers, as its projection takes them."""
+    def give(self, colours: bool = True) -> None:
+        """Write the parameters to the rasterizer's buffers, as its projection takes them.
+
+        Args:
+            colours: whether also the SH coefficients, which lie there just as they do here.
+        """
         buffers = self.buffers
         self._activate.bind(
             parameters=self.values,
             splats=buffers.splats,
             stride=buffers.stride,
-            sh_columns=self.columns.sh,
+            sh_columns=self.columns.sh if colours else 0,
             largest_scale=LARGEST_SCALE,
             means=buffers.means,
             scales=buffers.scales,

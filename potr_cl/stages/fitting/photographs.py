@@ -13,17 +13,14 @@ from __future__ import annotations
 import dataclasses
 from collections.abc import Callable, Sequence
 
-import pyopencl as cl
-
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
-from potr_cl.stages.fitting.fit import FitOptions, FitProgress, Fitted, SupportsBool, fit_scene
+from potr_cl.stages.fitting.fit import FitOptions, FitProgress, SupportsBool, fit_scene, kept_pictures
 from potr_cl.stages.refitting.photographs import hold_out
-from potr_cl.stages.refitting.targets import GroundTruthTargets, Photographs, RenderedTargets
+from potr_cl.stages.refitting.targets import GroundTruthTargets, Photographs
 
 #: The trial: its steps, the parts after which held-out photographs are looked at, and its rates as parts of the fit's.
 _TRIAL_STEPS, _TRIAL_LOOKS, _TRIAL_RATES = 40, 4, 0.1
@@ -35,8 +32,6 @@ def fit_to_photographs(
     views: Sequence[Camera],
     photographs: Photographs,
     options: FitOptions,
-    source: Rasterizer,
-    between: Sequence[Camera] = (),
     background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     tell: Callable[[str], None] | None = None,
     asked: SupportsBool = False,
@@ -50,8 +45,6 @@ def fit_to_photographs(
         views: that have photographs.
         photographs: of these.
         options: of the fit; their rounds and patience mean nothing here.
-        source: of the uncompressed scene.
-        between: views that the fit looks at besides, which should show what the uncompressed scene shows.
         background: R, G, B behind the scene.
         tell: called with a line for each look at photographs.
         asked: whether to end before the next step.
@@ -63,31 +56,35 @@ def fit_to_photographs(
         DeviceError: the scene does not fit the device.
     """
     fit_to, judging = hold_out(views)
-    cameras = [*fit_to, *judging, *between]
-    judges = range(len(fit_to), len(views))
-    targets = _PhotographsAndRenders(
-        GroundTruthTargets(device, photographs, cameras), RenderedTargets(source, cameras), len(views)
-    )
-
-    def fitted(
-        options: FitOptions, to: Sequence[int], judged_by: Sequence[int], progress: FitProgress | None
-    ) -> Fitted:
-        return fit_scene(device, scene, cameras, targets, options, 0, background, progress, tell, asked, judged_by, to)
-
-    trial = fitted(
-        dataclasses.replace(
-            options, steps=min(_TRIAL_STEPS, options.steps), rounds=_TRIAL_LOOKS, patience=_TRIAL_LOOKS, last=1.0,
-            rates=slower(options.rates, _TRIAL_RATES),
-        ),
-        [number for number in range(len(cameras)) if number not in judges], judges, None,
-    )  # fmt: skip
-    if asked or not trial.kept:
-        return FittedToPhotographs(None, len(views), 0, len(judging), trial.errors, (), bool(asked))
+    cameras = [*fit_to, *judging]
+    every, judges = range(len(cameras)), range(len(fit_to), len(cameras))
     # Photographs that it looks at are no judges: these only see to it that nothing goes wrong.
-    some = range(0, len(views), max(len(views) // len(judging), 1))
-    found = fitted(dataclasses.replace(options, rounds=1, patience=1), range(len(cameras)), some, progress)
+    some = range(0, len(cameras), max(len(cameras) // len(judging), 1))
+    trial_options = dataclasses.replace(
+        options, steps=min(_TRIAL_STEPS, options.steps), rounds=_TRIAL_LOOKS, patience=_TRIAL_LOOKS, last=1.0,
+        rates=slower(options.rates, _TRIAL_RATES),
+    )  # fmt: skip
+    with kept_pictures(device, cameras, GroundTruthTargets(device, photographs, cameras), options.memory) as pictures:
+        trial = fit_scene(
+            device,
+            scene,
+            cameras,
+            pictures,
+            trial_options,
+            0,
+            background,
+            None,
+            tell,
+            asked,
+            judges,
+            range(len(fit_to)),
+        )
+        if asked or not trial.kept:
+            return FittedToPhotographs(None, len(cameras), 0, len(judges), trial.errors, (), bool(asked))
+        options = dataclasses.replace(options, rounds=1, patience=1)
+        found = fit_scene(device, scene, cameras, pictures, options, 0, background, progress, tell, asked, some, every)
     return FittedToPhotographs(
-        found.scene if found.kept else None, len(views), found.kept, len(judging), trial.errors, found.errors,
+        found.scene if found.kept else None, len(cameras), found.kept, len(judges), trial.errors, found.errors,
         found.ended_early,
     )  # fmt: skip
 
@@ -95,16 +92,3 @@ def fit_to_photographs(
 def slower(rates: Rates, part: float) -> Rates:
     """So large a part of all rates."""
     return Rates(**{each.name: part * getattr(rates, each.name) for each in dataclasses.fields(Rates)})
-
-
-class _PhotographsAndRenders:
-    """Photographs of the first views, and pictures of a scene for the others; one view at a time."""
-
-    def __init__(self, photographs: GroundTruthTargets, renders: RenderedTargets, count: int) -> None:
-        self._photographs, self._renders, self._count = photographs, renders, count
-
-    def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
-        """See :meth:`potr_cl.stages.refitting.targets.Targets.into`."""
-        (number,) = numbers
-        targets = self._photographs if number < self._count else self._renders
-        targets.into(numbers, buffer)

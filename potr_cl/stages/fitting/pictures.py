@@ -4,14 +4,15 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 
-import numpy as np
 import pyopencl as cl
 
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.stages.refitting.targets import Targets
+
+#: Pictures that are asked for together, and their bytes at the most: a GPU prepares several views in one go.
+_TOGETHER, _MOST_BYTES = 16, 1 << 28
 
 
 class TargetPictures(Owner):
@@ -31,25 +32,38 @@ class TargetPictures(Owner):
         self._device, self._cameras, self._targets, self._room = device, list(cameras), targets, room
         self._memory = Memory(device)
         self._kept: dict[int, cl.Buffer] = {}
-        self._one = Scratch(device, "a target image")
+        self._some = Scratch(device, "some target images")
         self._batch = Scratch(device, "the target images")
+
+    def prepare(self, numbers: Sequence[int]) -> None:
+        """Have pictures ready, several at a time, as far as they are kept: all will be asked for sooner or later."""
+        waiting: list[int] = []
+        room = self._room
+        for number in numbers:
+            if number in self._kept:
+                continue
+            room -= self._nbytes(number)
+            if room < 0:
+                break
+            if waiting and (len(waiting) == _TOGETHER or self._bytes_of([*waiting, number]) > _MOST_BYTES):
+                self._take(waiting)
+                waiting = []
+            waiting.append(number)
+        self._take(waiting)
+        self._some.close()
 
     def of(self, numbers: Sequence[int]) -> cl.Buffer:
         """(pixels, 3) float32, the pictures of some views, one behind the other; the next call overwrites them."""
-        sizes = [self._nbytes(number) for number in numbers]
-        self._batch.reserve(sum(sizes))
+        self._batch.reserve(self._bytes_of(numbers))
         start = 0
-        for number, nbytes in zip(numbers, sizes, strict=True):
-            picture = self._picture(number)
+        for number in numbers:
+            picture, nbytes = self._picture(number), self._nbytes(number)
             cl.enqueue_copy(self._device.queue, self._batch.buffer, picture, byte_count=nbytes, dst_offset=start)
             start += nbytes
         return self._batch.buffer
 
-    def download(self, number: int) -> FloatArray:
-        """(H, W, 3) float32, the picture of one view."""
-        camera = self._cameras[number]
-        picture: FloatArray = self._device.download(self.of([number]), (camera.height, camera.width, 3), np.float32)
-        return picture
+    def _bytes_of(self, numbers: Sequence[int]) -> int:
+        return sum(self._nbytes(number) for number in numbers)
 
     def _nbytes(self, number: int) -> int:
         camera = self._cameras[number]
@@ -60,17 +74,34 @@ class TargetPictures(Owner):
             return self._kept[number]
         nbytes = self._nbytes(number)
         if nbytes > self._room:
-            self._one.reserve(nbytes)
-            self._targets.into([number], self._one.buffer)
-            return self._one.buffer
-        buffer = self._memory.allocate(nbytes, "a target image")
-        self._room -= buffer.size
+            self._some.reserve(nbytes)
+            self._targets.into([number], self._some.buffer)
+            return self._some.buffer
+        buffer = self._keep(number)
         self._targets.into([number], buffer)
+        return buffer
+
+    def _take(self, numbers: Sequence[int]) -> None:
+        """Keep pictures, for which there is room."""
+        if not numbers:
+            return
+        self._some.reserve(self._bytes_of(numbers))
+        self._targets.into(numbers, self._some.buffer)
+        start = 0
+        for number in numbers:
+            nbytes, buffer = self._nbytes(number), self._keep(number)
+            cl.enqueue_copy(self._device.queue, buffer, self._some.buffer, byte_count=nbytes, src_offset=start)
+            start += nbytes
+
+    def _keep(self, number: int) -> cl.Buffer:
+        """Memory for a picture that is kept."""
+        buffer = self._memory.allocate(self._nbytes(number), "a target image")
+        self._room -= buffer.size
         self._kept[number] = buffer
         return buffer
 
     def close(self) -> None:
         """Give all device memory back."""
-        for owner in (self._memory, self._one, self._batch):
+        for owner in (self._memory, self._some, self._batch):
             owner.close()
         self._kept = {}

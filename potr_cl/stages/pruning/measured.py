@@ -10,6 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.raster.culling import Sights
+from potr_cl.raster.kept_scene import lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.pruning.part import RemovalPart
@@ -17,7 +18,7 @@ from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.shared_removal import SharedRemoval
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView
-from potr_cl.stages.pruning.visible_parts import PartedRemoval, first_totals, sights_worth_it, whole_on_device
+from potr_cl.stages.pruning.visible_parts import PartedRemoval, first_totals, whole_on_device
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.workers.dealing import shares
 from potr_cl.workers.parts import Parts
@@ -38,7 +39,7 @@ def measurement(
 
     Args:
         state, bench, options: of the stage.
-        sights: of the views, where these were found before to be worth it.
+        sights: what the views see, where one device had better look at each with what it sees.
         spared: as of :class:`~potr_cl.stages.pruning.visible_parts.PartedRemoval`; only with ``sights``.
 
     Raises:
@@ -53,33 +54,29 @@ def measurement(
     share = None if pool is None or options.sample < 1 else shares(pool, len(views))
     with ExitStack() as stack:
         if pool is None or share is None or not share.others:
-            if sights is None:
-                sights = sights_worth_it(state.scene, views, options)
             if sights is not None:
                 whole = stack.enter_context(whole_on_device(device, bench.drawable(state.scene)))
                 given = (options, bench.background, progress)
                 if isinstance(whole, SceneBuffers) and device.family == "gpu" and options.only_by_tolerance:
-                    first = first_totals(len(state.scene), spared)
+                    first = None if spared is None else first_totals(len(state.scene), spared)
                     yield stack.enter_context(ViewByView(device, whole, views, sights, *given, first))
                 else:
                     parts = sights.parts()
                     yield stack.enter_context(PartedRemoval(device, state.scene, whole, views, parts, *given, spared))
                 return
-            rasterizer = stack.enter_context(
-                Rasterizer(device, bench.drawable(state.scene), background=bench.background)
-            )
+            drawable = stack.enter_context(lying_on(device, bench.placed(state)))
+            rasterizer = stack.enter_context(Rasterizer(device, drawable, background=bench.background))
             yield stack.enter_context(RemovalSweep(rasterizer, views, options, progress))
             return
-        scene = stack.enter_context(pool.shared(bench.shareable(state.scene)))
+        scene = stack.enter_context(pool.shared(bench.shared(state)))
         each = [(scene, views, options, bench.background, numbers) for numbers in share.others]
         others = stack.enter_context(
             Parts(pool, RemovalPart, each, options.memory, [len(each) for each in share.others])
         )
         own, stride = None, len(state.scene)
         if share.own:
-            rasterizer = stack.enter_context(
-                Rasterizer(device, bench.drawable(state.scene), background=bench.background)
-            )
+            drawable = stack.enter_context(lying_on(device, bench.placed(state)))
+            rasterizer = stack.enter_context(Rasterizer(device, drawable, background=bench.background))
             own = stack.enter_context(RemovalSweep(rasterizer, views, options, progress, share.own))
             stride = rasterizer.stride
         others.ready()

@@ -12,12 +12,13 @@ import numpy as np
 import pyopencl as cl
 
 from potr_cl.host.threads import in_background
+from potr_cl.model.order import ascending
 from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.opencl.structs import bytes_before, struct_dtype
 from potr_cl.raster.macros import totals_limits
 from potr_cl.stages.pruning.measured import Removal
-from potr_cl.stages.pruning.schedule import Course, Indices, Iteration, Pruned, PruningOptions, ascending, prune
+from potr_cl.stages.pruning.schedule import Course, Indices, Iteration, Pruned, PruningOptions, prune
 from potr_cl.stages.pruning.steering import Steered
 
 _SOURCE = "prune/choose_gpu.cl"
@@ -62,7 +63,8 @@ class _Controller(Owner):
         with device.all_or_nothing():
             self._smoothed = memory.allocate(4 * self._splats, "the smoothed effects")
             self._keys = memory.allocate(4 * self._splats, "the splats' scores")
-            self._removed = memory.upload(np.zeros(self._splats, _REMOVED), "the removed splats")
+            self._removed = memory.allocate(_REMOVED.itemsize * self._splats, "the removed splats")
+            device.fill(self._removed, np.uint32(0))
             self._state = memory.allocate(_STATE.itemsize, "the pruning's state")
             macros = totals_limits(device)
             self._rank, self._refine, self._mark = (

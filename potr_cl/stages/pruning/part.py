@@ -14,7 +14,7 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Scratch, Staging
 from potr_cl.opencl.relay import Lent
-from potr_cl.raster.kept_scene import KeptScene, drawable_on
+from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.survivors import Bits
@@ -44,7 +44,7 @@ class RemovalPart(Part):
         self,
         device: Device,
         memory: int | None,
-        scene: Scene | KeptScene,
+        scene: Scene | KeptScene | PartOfKept,
         cameras: Sequence[Camera],
         options: SweepOptions,
         background: tuple[float, float, float],
@@ -52,7 +52,8 @@ class RemovalPart(Part):
     ) -> None:
         options = SweepOptions(**{**vars(options), "memory": memory})
         with ExitStack() as owned:
-            rasterizer = owned.enter_context(Rasterizer(device, drawable_on(device, scene), background=background))
+            drawable = owned.enter_context(lying_on(device, scene))
+            rasterizer = owned.enter_context(Rasterizer(device, drawable, background=background))
             self._sweep = owned.enter_context(RemovalSweep(rasterizer, cameras, options, numbers=numbers))
             self._staging = owned.enter_context(Staging(device))
             self._totals = owned.enter_context(Scratch(device, "the removal effects"))

@@ -9,6 +9,9 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host import mapped
+from potr_cl.host.threads import Run
+from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
 from potr_cl.stages.pruning.schedule import Course, Pruned
 from potr_cl.stages.stage import State
@@ -58,12 +61,17 @@ class Split:
     unseen_splats: NDArray[np.int64]
 
 
-def find_unseen(state: State) -> tuple[NDArray[np.bool_], float]:
+def find_unseen(state: State, groups: SplatGroups | None = None, run: Run = map) -> tuple[NDArray[np.bool_], float]:
     """Which splats of a state no given training view sees, and their part of the opacity-weighted area.
 
     Added views do not count: the one that happens to see a splat, perhaps from afar, cannot say what it is worth.
+
+    Args:
+        state: whose scene and views.
+        groups: of the scene, where they are known.
+        run: shares the work out.
     """
-    unseen = unseen_splats(state.scene, state.views[: len(state.views) - state.added])
+    unseen = unseen_splats(state.scene, state.views[: len(state.views) - state.added], groups, run)
     if not unseen.any():  # as usual
         return unseen, 0.0
     areas = opacity_weighted_areas(state.scene)
@@ -96,7 +104,7 @@ def put_back(split: Split, pruned: State) -> State:
         opacity_logits=np.concatenate([left.opacity_logits, scene.opacity_logits])[order],
         sh=np.concatenate([left.sh, scene.sh])[order],
     )
-    return dataclasses.replace(pruned, scene=together, survivors=numbers[order], geometry=None)
+    return dataclasses.replace(pruned, scene=together, survivors=numbers[order], geometry=None, cut=None)
 
 
 def without_directions(state: State, unseen: NDArray[np.int64]) -> State:
@@ -107,7 +115,8 @@ def without_directions(state: State, unseen: NDArray[np.int64]) -> State:
         unseen: their numbers in the source, ascending; those that are not left do not matter.
     """
     own = np.isin(state.survivors, unseen, assume_unique=True)
-    sh = state.scene.sh.copy()
+    copied = mapped.rows(state.scene.sh, None, "SH coefficients")
+    sh = state.scene.sh.copy() if copied is None else copied
     sh[own, 1:] = 0
     return state.recoloured(sh)
 

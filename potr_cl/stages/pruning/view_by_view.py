@@ -28,10 +28,10 @@ from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.picked_splats import PickedSplats, Picker
-from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rasterizer import PreparingMemory, Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.raster.view_set import TILE
-from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
+from potr_cl.stages.pruning.fixed_point import FixedPoint
 from potr_cl.stages.pruning.launcher import SetKernels, launcher_for
 from potr_cl.stages.pruning.prepared_views import PreparedSet
 from potr_cl.stages.pruning.queues import Queues
@@ -180,11 +180,11 @@ class ViewByView(Owner):
                 owned.enter_context(Scratch(device, what))
                 for what in ("a view's effects", "a view's splats that are left", "a view's tiles", "their staleness")
             ]
-            first = zero_totals(whole.stride)
+            self._preparing = owned.enter_context(PreparingMemory(device))
+            self.totals = memory.allocate(16 * whole.stride, "the removal effects")
+            self._first: cl.Buffer | None = None
             if first_totals is not None:
-                first[: self.splats] = first_totals.view(np.uint32)
-            self._first = memory.upload(first, "the removal effects to begin with")
-            self.totals = memory.allocate(first.nbytes, "the removal effects")
+                self._first = memory.upload(first_totals, "the removal effects to begin with")
             self.marks = memory.upload(np.full(whole.stride, SplatState.ALIVE, np.uint8), "the splats that are left")
             self._prepare_all(sights, progress)
             self._owned = owned.pop_all()
@@ -264,7 +264,7 @@ class ViewByView(Owner):
         picked = PickedSplats(self._whole, view.numbers, view.splats)
         if self._sh is not None:
             picked.sh = self._sh
-        return Rasterizer(self.device, picked, background=self._background)
+        return Rasterizer(self.device, picked, background=self._background, preparing=self._preparing)
 
     def _prepared(self, view: _View, rasterizer: Rasterizer) -> PreparedSet:
         views = rasterizer.prepare_set([view.camera])
@@ -292,8 +292,11 @@ class ViewByView(Owner):
     def measure_on_device(self) -> None:
         """Bring the totals up to date."""
         self._sweep_listed()
-        with self.device.errors("failed while computing"):
-            cl.enqueue_copy(self.device.queue, self.totals, self._first, byte_count=16 * self._whole.stride)
+        if self._first is None:
+            self.device.fill(self.totals, np.int64(0))
+        else:
+            with self.device.errors("failed while computing"):
+                cl.enqueue_copy(self.device.queue, self.totals, self._first, byte_count=16 * self.splats)
         for kept in self._kept:
             kept.add()
         if self._unkept:
@@ -382,9 +385,8 @@ class ViewByView(Owner):
                     if self._sh is not None:
                         rasterizer.project(prepared.views, self._whole.sh)
                     device.fill(marks.buffer, np.uint8(SplatState.ALIVE), stride)
-                    kernels.sweep(0, count)  # for the target only
+                    kernels.store_target()
                     prepared.zero_sums()
-                    kernels.target_is_known()
                     if self._sh is not None:
                         rasterizer.project(prepared.views)
                 device.fill(own_totals.buffer, np.uint32(0), 16 * stride)

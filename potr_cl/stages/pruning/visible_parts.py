@@ -18,6 +18,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.errors import DeviceMemoryError
+from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.splat_groups import SplatGroups
@@ -48,6 +49,11 @@ _SOURCE = "prune/parts.cl"
 _GROUP = 64
 
 
+def groups_of_large(scene: Scene, run: Run = map) -> SplatGroups | None:
+    """The groups of a scene's splats, if it is so large that they are worth their time; ``run`` shares the work out."""
+    return SplatGroups.of(scene, run=run) if len(scene) >= LEAST_SPLATS else None
+
+
 def sights_worth_it(
     scene: Scene, cameras: Sequence[Camera], options: SweepOptions, groups: SplatGroups | None = None
 ) -> Sights | None:
@@ -60,7 +66,7 @@ def sights_worth_it(
         groups: of the scene, where they are known.
     """
     # A sample of the tiles is drawn from all of them in turn.
-    if len(scene) < LEAST_SPLATS or options.sample < 1:
+    if len(scene) < LEAST_SPLATS or options.sample < 1 or not cameras:
         return None
     sights = Sights.of(scene, cameras, INRIA.near, groups)
     return sights if sights.totals.sum() <= _WORTH_IT * len(scene) * len(cameras) else None

@@ -15,7 +15,7 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Staging
 from potr_cl.opencl.relay import Lent
-from potr_cl.raster.kept_scene import KeptScene, drawable_on
+from potr_cl.raster.kept_scene import KeptScene, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients
@@ -79,7 +79,8 @@ class ColourPart(Part):
         self._device = device
         with ExitStack() as owned:
             rasterizer = owned.enter_context(Rasterizer(device, scene, rules))
-            of_source = owned.enter_context(Rasterizer(device, drawable_on(device, source), background=background))
+            pictured = owned.enter_context(lying_on(device, source))
+            of_source = owned.enter_context(Rasterizer(device, pictured, background=background))
             launcher = launcher_for(device, rules)
             layout = Layout(len(scene), rasterizer.stride, sh_count, launcher.lanes)
             self._coefficients = owned.enter_context(Coefficients(device, layout))

@@ -5,7 +5,7 @@ splats, all columns of them. Sums and dot products do one value after the other:
 as it lies in memory, and each is added to where the slice before it left the sums. So all bits are those of vectors in
 the device's memory.
 
-The vectors lie in temporary files that are mapped to memory (:mod:`potr_cl.host.mapped`): the system may write to the
+Where memory is bounded, large vectors lie in temporary files (:mod:`potr_cl.host.mapped`): the system may write to the
 disk what is not in use.
 """
 
@@ -19,7 +19,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from potr_cl.host.mapped import mapped
+from potr_cl.host import mapped
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory
@@ -84,8 +84,8 @@ class SlicedCoefficients(VectorSpace):
     # ------------------------------------------------------------------------------------------ vectors
 
     def columns(self, number: int, what: str) -> HostColumns:
-        """So many new columns of zeros."""
-        return HostColumns(mapped((number, self.layout.stride), np.float32, what))
+        """So many new columns that stand for zeros."""
+        return HostColumns(mapped.array((number, self.layout.stride), np.float32, what))
 
     def vector(self) -> HostColumns:
         """A new vector."""
@@ -170,7 +170,7 @@ class SlicedCoefficients(VectorSpace):
     def read_sh(self, x: HostColumns) -> FloatArray:
         """(N, M, 3) float32, a vector in R, G, B; each coefficient contiguous in memory, which may be a file's."""
         layout = self.layout
-        sh = mapped((layout.columns, layout.splats), np.float32, "SH coefficients")
+        sh = mapped.array((layout.columns, layout.splats), np.float32, "SH coefficients")
         for part in self.parts():
             self.own.to_rgb(self.give(x, part, 0), self._slices[1])
             self._rectangle(sh, range(part.start, min(part.stop, layout.splats)), self._slices[1], to_device=False)

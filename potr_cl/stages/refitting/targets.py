@@ -8,7 +8,7 @@ from typing import Protocol
 import numpy as np
 import pyopencl as cl
 
-from potr_cl.host.mapped import mapped
+from potr_cl.host import mapped
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
@@ -52,7 +52,7 @@ class RenderedTargets:
 class RememberedTargets:
     """The pictures of others, asked for once and kept on the host: what made them can go.
 
-    They lie in a temporary file that is mapped to memory (:mod:`potr_cl.host.mapped`).
+    Where memory is bounded, many of them lie in a temporary file (:mod:`potr_cl.host.mapped`).
 
     Args:
         device: that computes.
@@ -67,7 +67,7 @@ class RememberedTargets:
     def __init__(self, device: Device, targets: Targets, cameras: Sequence[Camera]) -> None:
         self._device = device
         self._ends = np.cumsum([0, *(_nbytes(camera) // 4 for camera in cameras)])
-        self._pictures = mapped((int(self._ends[-1]),), np.float32, "pictures")
+        self._pictures = mapped.array((int(self._ends[-1]),), np.float32, "pictures")
         with Memory(device) as memory:
             buffer = memory.allocate(max(map(_nbytes, cameras)), "the target images")
             for number in range(len(cameras)):

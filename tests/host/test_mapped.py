@@ -1,0 +1,108 @@
+"""Arrays in temporary files: where they lie, what is left of them, and what a full disk does."""
+
+from __future__ import annotations
+
+import os
+import re
+import subprocess
+import sys
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from potr_cl.errors import PotrError
+from potr_cl.formats import load_scene
+from potr_cl.host import mapped
+from potr_cl.reference.scenes import random_scene
+
+linux = pytest.mark.skipif(not Path("/proc/self/maps").exists(), reason="looks at /proc")
+
+
+def in_a_file(array: np.ndarray) -> bool:
+    """Whether an array's first byte lies in a mapped file."""
+    place = array.__array_interface__["data"][0]
+    for line in Path("/proc/self/maps").read_text().splitlines():
+        first, last = (int(part, 16) for part in line.split()[0].split("-"))
+        if first <= place < last:
+            return len(line.split()) > 5 and line.split()[5].startswith("/")
+    raise AssertionError("the array lies nowhere")
+
+
+@linux
+def test_an_array_lies_in_a_file_without_a_name(tmp_path, monkeypatch):
+    monkeypatch.setenv("TMPDIR", str(tmp_path))
+    array = mapped.mapped((3, 50_000), np.float32, "numbers")
+    assert array.shape == (3, 50_000)
+    assert not array.any()
+    array[:] = 7
+    assert in_a_file(array)
+    assert not list(tmp_path.iterdir())
+
+
+@linux
+def test_only_large_arrays_and_only_where_memory_is_bounded():
+    def place(nbytes: int) -> bool:
+        return in_a_file(mapped.array((nbytes,), np.uint8, "bytes"))
+
+    assert not place(10_000_000)
+    with mapped.bounded(16_000_000):
+        assert place(1_000_001)
+        with mapped.bounded(None):
+            assert place(1_000_001)
+        with mapped.bounded(320_000_000):
+            assert not place(1_000_001)
+    assert not place(10_000_000)
+
+
+@pytest.mark.parametrize("kind", ["numbers", "mask"])
+def test_rows_are_those_that_numpy_takes(kind):
+    values = np.random.default_rng(0).random((1000, 4, 3)).astype(np.float32)
+    mask = np.random.default_rng(1).random(1000) < 0.3
+    numbers = mask if kind == "mask" else np.flatnonzero(mask)[::-1]
+    assert mapped.rows(values, numbers, "numbers") is None
+    with mapped.bounded(1000):
+        assert np.array_equal(mapped.rows(values, numbers, "numbers"), values[numbers])
+        assert np.array_equal(mapped.rows(values, None, "numbers"), values)
+
+
+@linux
+def test_a_scene_that_is_read_and_what_is_taken_of_it(tmp_path):
+    scene = random_scene(500, 3)
+    scene.save(tmp_path / "scene.ply")
+    with mapped.bounded(1_000_000):
+        read = load_scene(tmp_path / "scene.ply")
+        part = read.subset(np.arange(0, 500)[::-1])
+        assert in_a_file(read.sh)
+        assert in_a_file(part.sh)
+    assert np.array_equal(read.sh, scene.sh)
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        assert np.array_equal(getattr(part, name), getattr(scene, name)[::-1])
+
+
+@linux
+def test_a_folder_without_room_is_an_error_of_one_line():
+    """And not the end of the process, as a page without room would be."""
+    with pytest.raises(PotrError, match=re.escape("no room for 4611686018.4 GB of numbers")) as error:
+        mapped.mapped((1 << 62,), np.uint8, "numbers")
+    assert "TMPDIR" in str(error.value)
+    assert "\n" not in str(error.value)
+
+
+@linux
+def test_a_full_disk_is_told_before_anything_is_written(tmp_path):
+    """A file system of a limited size is not at hand: a limit on files stands for it."""
+    code = (
+        "import resource, signal, numpy as np\n"
+        "signal.signal(signal.SIGXFSZ, signal.SIG_IGN)\n"
+        "resource.setrlimit(resource.RLIMIT_FSIZE, (1 << 20, 1 << 20))\n"
+        "from potr_cl.host.mapped import mapped\n"
+        "try:\n    mapped((1 << 21,), np.uint8, 'numbers')\n"
+        "except Exception as error:\n    print(type(error).__name__, error)\n"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, "TMPDIR": str(tmp_path)}
+    )
+    assert done.returncode == 0, done.stderr
+    assert done.stdout.startswith("PotrError no room for 0.0 GB of numbers")
+    assert not list(tmp_path.iterdir())
