@@ -26,6 +26,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Adam, Limits, Rates
+from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.judges import Judges
 from potr_cl.stages.fitting.pictures import TargetPictures
@@ -99,7 +100,7 @@ class Fitted:
         ended_early: whether someone has asked it to end.
         spared: how many splats were removed before it for it to make up for.
         without: the error of these views before those were removed; None where none were.
-        photographs: what a further fit did that had photographs as its targets; None if there was none.
+        photographs: what a further fit to photographs did; None if there were none.
     """
 
     scene: Scene
@@ -110,7 +111,7 @@ class Fitted:
     ended_early: bool = False
     spared: int = 0
     without: float | None = None
-    photographs: Fitted | None = None
+    photographs: FittedToPhotographs | None = None
 
     @property
     def error(self) -> float:
@@ -139,7 +140,7 @@ class Fitted:
         if self.spared and self.without is not None:
             said += f"; {_decibels(self.without):.2f} dB with {self.spared:,} splats more, without it"
         if self.photographs is not None:
-            said += f"; to photographs {self.photographs}"
+            said += f"; {self.photographs}"
         return said
 
 
@@ -165,6 +166,7 @@ def fit_scene(
     tell: Callable[[str], None] | None = None,
     asked: SupportsBool = False,
     held_out: Sequence[int] | None = None,
+    fit_to: Sequence[int] | None = None,
 ) -> Fitted:
     """Fit all parameters of a scene to pictures of some views.
 
@@ -180,6 +182,7 @@ def fit_scene(
         tell: called with a line for each round.
         asked: whether to end before the next step, with the best of the whole rounds; looked at after each.
         held_out: numbers of the views to judge by; None: some of the given ones.
+        fit_to: numbers of the views to look at, where the judges are given; None: all others.
 
     Raises:
         UsageError: there are fewer than two given views, so that none can be held out.
@@ -188,7 +191,7 @@ def fit_scene(
     options = options or FitOptions()
     if held_out is None:
         fit_to, held_out = share_out(len(cameras) - added, added)
-    else:
+    elif fit_to is None:
         fit_to = [number for number in range(len(cameras)) if number not in set(held_out)]
     if not held_out or not fit_to:
         raise UsageError("a fit needs two training views or more: one of them is held out and tells whether it helps")
@@ -197,7 +200,7 @@ def fit_scene(
         _pictures_of(device, cameras, targets, options.memory) as pictures,
     ):
         if options.memory is None and options.steps * options.batch >= len(fit_to):
-            pictures.prepare([*held_out, *fit_to])
+            pictures.prepare([*held_out, *(number for number in fit_to if number not in held_out)])
         rasterizer = derivatives.rasterizer
         rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
         with (
