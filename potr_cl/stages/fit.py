@@ -33,6 +33,7 @@ from potr_cl.stages.fitting.fit import (
 )
 from potr_cl.stages.fitting.photographs import fit_to_photographs
 from potr_cl.stages.fitting.pictures import TargetPictures
+from potr_cl.stages.fitting.settling import Looking, Settling, settle
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
@@ -119,6 +120,8 @@ class Fit(Stage):
             many as pay on the device.
         photograph_steps: in which what came of it is fitted to photographs, where the re-fit has some. "auto": as many
             as pay on the device.
+        choosing, rounding, gentle: how far what is left is fitted once more after the choice of coefficients and the
+            rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`); not where photographs follow.
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -151,6 +154,9 @@ class Fit(Stage):
     patience: int = option(FitOptions.patience)
     rates: Rates = option(FitOptions.rates)
     last: float = option(FitOptions.last)
+    choosing: float = option(0.3)
+    rounding: float = option(0.15)
+    gentle: float = option(0.1)
     seed: int = option(FitOptions.seed)
 
     def __post_init__(self) -> None:
@@ -218,9 +224,12 @@ class Fit(Stage):
                 targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
             found = self._cycles(seen, bench, targets, asked)
             found = dataclasses.replace(found, views=state.views, added=state.added)
-            if asked or bench.photographs is None:
+            if asked or bench.photographs is not None:
+                return found if asked else self._to_photographs(found, bench, asked)
+            if not isinstance(found.learnt[self.name], Fitted):
                 return found
-            return self._to_photographs(found, bench, asked)
+            looking = Looking(seen.views, seen.added, targets, rasterizer)
+            return self._settled(found, bench, looking, asked)
 
     def _looking_between(self, state: State, bench: Workbench) -> State:
         """The state with the views that the fit looks at."""
@@ -266,6 +275,14 @@ class Fit(Stage):
             why = _INTERRUPTED if asked else _NO_GAIN if len(steps_of) > 1 else _LITTLE_GAIN
             return state.having_learnt(self.name, LeftOut(why, bool(asked)))
         return best.having_learnt(self.name, taken)
+
+    def _settled(self, state: State, bench: Workbench, looking: Looking, asked: SupportsBool) -> State:
+        """Choose coefficients and round geometry, with what is left fitted once more in between."""
+        options = self._options(bench.opened.family, bench.memory)
+        settling = Settling(self.choosing, self.rounding, self.gentle)
+        then, errors = settle(state, bench, looking, settling, options, asked)
+        told = dataclasses.replace(state.learnt[self.name], settled=errors)
+        return then.having_learnt(self.name, told)
 
     def _steps_of_cycles(self, family: Family, removing: bool) -> list[int]:
         """The steps of the fit in each cycle."""
