@@ -160,6 +160,16 @@ def test_decoding_imports_what_decoding_needs(potr_path, tmp_path):
     assert "pyopencl" not in modules
 
 
+def test_the_driver_loads_while_other_modules_are_imported():
+    """So nothing may come before it that takes long; and an encode without pictures does without Pillow."""
+    program = (
+        "import sys, potr_cl.cli; heavy = {'numpy', 'pyopencl', 'PIL'}; print(sorted(heavy & set(sys.modules)));"
+        "import potr_cl.cli.encode; print(sorted(heavy & set(sys.modules)))"
+    )
+    said = subprocess.run([sys.executable, "-c", program], check=True, capture_output=True, text=True).stdout
+    assert said.splitlines() == ["[]", "['numpy', 'pyopencl']"]
+
+
 def test_every_command_has_its_help(capsys):
     with pytest.raises(SystemExit) as left:
         cli.main(["--help"])
