@@ -51,7 +51,7 @@ def family(request):
 @pytest.mark.parametrize(
     "options",
     [
-        OPTIONS,
+        pytest.param(OPTIONS, marks=pytest.mark.slow),
         OPTIONS.changed(memory=0),  # nothing is kept of any view
         OPTIONS.changed(prune={"keep": None}),  # a GPU decides itself
     ],
