@@ -238,7 +238,9 @@ def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) 
     if start != MAGIC:
         if start[:4] == MAGIC[:4]:
             raise DataError("the file was changed in transfer (line ends were converted): copy it again as binary")
-        raise DataError("not a .potr file (its first bytes are not 'POTR'); scenes of other formats are read by convert")
+        raise DataError(
+            "not a .potr file (its first bytes are not 'POTR'); scenes of other formats are read by convert"
+        )
     if len(data) < _FIXED.size:
         raise DataError(f"truncated: {file_bytes} bytes do not even hold the header")
     version = int.from_bytes(data[8:10], "little")

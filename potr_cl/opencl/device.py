@@ -289,7 +289,7 @@ class Device:
             for start in range(0, nbytes, _FILLED):
                 count = min(_FILLED, nbytes - start)
                 # NVIDIA's driver (quirks.SHORT_FILLS) writes elsewhere where the offset is large.
-                some = buffer.get_sub_region(start, count) if start else buffer
+                some = _region(buffer, start, count) if start else buffer
                 cl.enqueue_fill_buffer(self.queue, some, value, 0, count)
 
     def download(self, buffer: cl.Buffer, shape: tuple[int, ...], dtype: Any, start: int = 0) -> np.ndarray[Any, Any]:
@@ -393,6 +393,14 @@ class Device:
                 if not np.array_equal(mark, back):
                     raise DeviceError(f"device {self.info} fails the self-check: a large buffer loses its content")
         self.free(big)
+
+
+def _region(buffer: cl.Buffer, start: int, nbytes: int) -> cl.Buffer:
+    """A part of a buffer, which may be a part of another one itself."""
+    whole = buffer.get_info(cl.mem_info.ASSOCIATED_MEMOBJECT)
+    if whole is None:
+        return buffer.get_sub_region(start, nbytes)
+    return whole.get_sub_region(buffer.get_info(cl.mem_info.OFFSET) + start, nbytes)
 
 
 def _literal(value: str | int | float) -> str:
