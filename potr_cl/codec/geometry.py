@@ -81,22 +81,16 @@ class Geometry:
 
         list(run(fill, range(0, n, BLOCK)))
 
-    def colour_classes(self, run: Run = map) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-        """(N,) classes of the steps of DC and of AC, in the order of the file: :class:`ColourSteps`; 0 without any.
-
-        ``run`` works with several threads.
-        """
-        n, steps = len(self.order), self.steps
-        classes = np.zeros((2, n), np.int8)
-
-        def find(start: int) -> None:
-            part = slice(start, start + BLOCK)
-            assert steps is not None
-            classes[:, part] = steps.classes([axis[part] for axis in self.scales], self.opacities[part], start)
-
-        if steps is not None:
-            list(run(find, range(0, n, BLOCK)))
-        return classes[0], classes[1]
+    def colour_classes(self) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+        """(N,) classes of the steps of DC and of AC, in the order of the file: :class:`ColourSteps`; 0 without any."""
+        if self.steps is None:
+            none = np.zeros(len(self.order), np.int8)
+            return none, none
+        functions = native()
+        if functions is not None and all(levels.dtype == np.int16 for levels in (*self.scales, self.opacities)):
+            scales = np.stack(self.scales, dtype=np.int32)
+            return functions.step_classes(self.steps, scales, self.opacities.astype(np.int32))
+        return self.steps.classes(self.scales, self.opacities)
 
     def with_steps(self, effects: NDArray[np.floating]) -> Geometry:
         """The same with steps of colours by what each splat shows.
