@@ -14,7 +14,7 @@ from numpy.typing import NDArray
 
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import Scene, opacities_of
 from potr_cl.model.splat_groups import SplatGroups, largest_scales
 
 #: The renderer's near plane, world units: a splat whose centre is nearer is not drawn.
@@ -26,7 +26,11 @@ _BLOCK = 1 << 16
 
 
 def unseen_splats(
-    scene: Scene, cameras: Sequence[Camera], groups: SplatGroups | None = None, run: Run = map
+    scene: Scene,
+    cameras: Sequence[Camera],
+    groups: SplatGroups | None = None,
+    run: Run = map,
+    shown: NDArray[np.bool_] | None = None,
 ) -> NDArray[np.bool_]:
     """Which splats lie outside of every view's picture.
 
@@ -35,6 +39,7 @@ def unseen_splats(
         cameras: the views; without any, no splat is seen.
         groups: of the scene, where they are known: most views show nothing of a neighbourhood of a large scene.
         run: shares the work out.
+        shown: (views, G) the groups of which each view may draw a splat, where that is known too.
 
     Returns:
         (N,) whether it is unseen. A splat of which any part may touch a picture is not, even if others hide it.
@@ -42,7 +47,9 @@ def unseen_splats(
     unseen = np.ones(len(scene), bool)
     # Views far from each other first: what one does not see the next one may.
     order = np.argsort((np.arange(len(cameras)) * (math.sqrt(5) - 1) / 2) % 1, kind="stable")
-    shown = [] if groups is None else [groups.visible(camera, _NEAR) for camera in cameras]
+    near_by = shown
+    if groups is not None and near_by is None:
+        near_by = groups.visible_by(cameras, _NEAR, run)
 
     def look(start: int) -> None:
         """Find out which of a block of splats are seen."""
@@ -53,12 +60,12 @@ def unseen_splats(
         with np.errstate(over="ignore"):
             reach = _REACH * np.exp(np.minimum(largest_scales(scene.log_scales[left]), 80).astype(np.float64))
         for view in order:
-            if among is None:
+            if among is None or near_by is None:
                 seen = _shows(cameras[view], means, reach)
             else:
-                if not shown[view][among[0] : among[-1] + 1].any():
+                if not near_by[view, among[0] : among[-1] + 1].any():
                     continue
-                near = np.flatnonzero(shown[view][among])
+                near = np.flatnonzero(near_by[view][among])
                 if not len(near):
                     continue
                 seen = np.zeros(len(left), bool)
@@ -74,15 +81,29 @@ def unseen_splats(
     return unseen
 
 
-def opacity_weighted_areas(scene: Scene) -> NDArray[np.float64]:
+def opacity_weighted_areas(scene: Scene, run: Run = map) -> NDArray[np.float64]:
     """(N,) area of each splat's largest cross-section times its opacity, up to a common factor; for shares of a scene.
 
-    The factor makes the largest of them 1, so that no scene's units are too large.
+    The factor makes the largest of them 1, so that no scene's units are too large. ``run`` shares the work out.
     """
-    a, b, c = scene.log_scales.T.astype(np.float64)
-    low, high = np.minimum(a, b), np.maximum(a, b)
-    largest_two = np.maximum(low, np.minimum(high, c)) + np.maximum(high, c)
-    areas: NDArray[np.float64] = np.exp(largest_two - largest_two.max(initial=-math.inf)) * scene.opacities
+    areas = np.empty(len(scene))
+
+    def logarithms(start: int) -> float:
+        some = slice(start, start + _BLOCK)
+        a, b, c = scene.log_scales[some].T.astype(np.float64)
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        areas[some] = np.maximum(low, np.minimum(high, c)) + np.maximum(high, c)
+        return float(areas[some].max())
+
+    def weigh(start: int) -> None:
+        some = slice(start, start + _BLOCK)
+        # As a scene's own opacities are.
+        areas[some] = np.exp(areas[some] - most) * opacities_of(scene.opacity_logits[some])
+
+    starts = range(0, len(scene), _BLOCK)
+    most = max(run(logarithms, starts), default=-math.inf)
+    for _ in run(weigh, starts):
+        pass
     return areas
 
 

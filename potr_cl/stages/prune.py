@@ -23,7 +23,7 @@ from potr_cl.stages.pruning.unseen import (
     set_aside,
     without_directions,
 )
-from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, groups_of_large, sights_worth_it
+from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, sights_of_large, worth_it
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 
@@ -141,15 +141,15 @@ class Prune(Stage):
         not given, the ΔMSE below which a splat has gone.
         """
         with thread_pool(bench.threads) as pool:
-            groups = groups_of_large(state.scene, pool.map)
-            hidden, area = find_unseen(state, groups, pool.map)
+            sights = sights_of_large(state.scene, state.views, pool.map)
+            hidden, area = find_unseen(state, sights, pool.map)
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
         told = state.having_learnt("unseen", Unseen(splats, len(state.scene), area, kept))
         if self.keep is None and self.count is None:
             told = told.having_learnt("price", bench.parameters.delta_mse_max)
         options = self._sweep_options(bench.memory)
-        sights = None if bench.pool else sights_worth_it(state.scene, state.views, options, groups)
+        sights = None if bench.pool else worth_it(sights, options)
         if not (kept and splats):
             return self._pruned(told, bench, sights)
         # A copy of a large scene without them would take as much memory as the scene.
@@ -162,7 +162,7 @@ class Prune(Stage):
                 self.name, Pruned(splats, np.full(splats, -1, np.int32), 0, lambda: Course(everything))
             )
         if sights is not None:
-            sights = sights_worth_it(split.seen.scene, state.views, options)
+            sights = worth_it(sights_of_large(split.seen.scene, state.views), options)
         left = self._pruned(split.seen, bench, sights)
         return put_back(split, left).having_learnt(self.name, as_of_whole(split, left.learnt[self.name]))
 

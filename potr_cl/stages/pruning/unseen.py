@@ -11,8 +11,8 @@ from numpy.typing import NDArray
 
 from potr_cl.host import mapped
 from potr_cl.host.threads import Run
-from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
+from potr_cl.raster.culling import Sights
 from potr_cl.stages.pruning.schedule import Course, Pruned
 from potr_cl.stages.stage import State
 
@@ -61,20 +61,24 @@ class Split:
     unseen_splats: NDArray[np.int64]
 
 
-def find_unseen(state: State, groups: SplatGroups | None = None, run: Run = map) -> tuple[NDArray[np.bool_], float]:
+def find_unseen(state: State, sights: Sights | None = None, run: Run = map) -> tuple[NDArray[np.bool_], float]:
     """Which splats of a state no given training view sees, and their part of the opacity-weighted area.
 
     Added views do not count: the one that happens to see a splat, perhaps from afar, cannot say what it is worth.
 
     Args:
         state: whose scene and views.
-        groups: of the scene, where they are known.
+        sights: what its views see, where that is known.
         run: shares the work out.
     """
-    unseen = unseen_splats(state.scene, state.views[: len(state.views) - state.added], groups, run)
+    given = state.views[: len(state.views) - state.added]
+    if sights is None:
+        unseen = unseen_splats(state.scene, given, run=run)
+    else:
+        unseen = unseen_splats(state.scene, given, sights.groups, run, sights.seen[: len(given)])
     if not unseen.any():  # as usual
         return unseen, 0.0
-    areas = opacity_weighted_areas(state.scene)
+    areas = opacity_weighted_areas(state.scene, run)
     return unseen, float(areas[unseen].sum() / max(float(areas.sum()), 1e-300))
 
 
