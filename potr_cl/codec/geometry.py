@@ -107,6 +107,26 @@ class Geometry:
         steps = fit_steps(self.scales, self.opacities, self.parameters.sf_opacity, effects[self.order])
         return replace(self, steps=steps)
 
+    def with_centres_of(self, scene: Scene, views: Sequence[Camera], run: Run = map) -> Geometry:
+        """The same splats at other places, with the same steps.
+
+        Args:
+            scene: has the centres, not rounded yet. Its scales, rotations and opacities are taken too: where they are
+                those of :meth:`decoded`, they become the same levels again.
+            views, run: as of :func:`quantise_geometry`.
+
+        Raises:
+            DataError: a splat is too far from the others to keep them exact.
+        """
+        nearest = distances_to_views(scene.means, views, run)
+        return quantise_in_world_units(scene, None, self.asked, self.parameters, nearest, run)[0]
+
+    def with_opacities_of(self, scene: Scene) -> Geometry:
+        """The same with the opacities of a scene, not rounded yet."""
+        logits = scene.opacity_logits[self.order].astype(np.float64)
+        levels = VERSIONS[self.parameters.version].quantize_opacities(logits, self.parameters.sf_opacity)
+        return replace(self, opacities=levels)
+
     def with_colour_steps(self, parameters: quantize.HyperParameters) -> Geometry:
         """The same for parameters that differ in the steps of colours alone, which geometry does not depend on."""
         world = replace(self.parameters, sf_dc=parameters.sf_dc, sf_sh=parameters.sf_sh)

@@ -20,7 +20,7 @@ FloatArray = NDArray[np.float32]
 #: Splats looked at at a time where values are checked.
 _BLOCK = 1 << 14
 #: So many splats are copied by threads, an eighth of them at a time.
-_LARGE = 1 << 20
+_LARGE = 1 << 19
 
 #: The logit of an opacity that single precision cannot tell from 1.
 _OPAQUE = np.float32(20)
@@ -300,7 +300,7 @@ def joined(parts: Sequence[Scene]) -> Scene:
 
 
 def opacities_of(logits: FloatArray) -> FloatArray:
-    """(N,) float32 opacities in (0, 1) that have these logits."""
+    """(N,) opacities in (0, 1) that have these logits."""
     # exp of a non-positive number only: a logit of -100 must not overflow.
     e = np.exp(-np.abs(logits))
     return np.where(logits >= 0, 1 / (1 + e), e / (1 + e)).astype(np.float32)

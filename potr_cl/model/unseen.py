@@ -18,19 +18,15 @@ from potr_cl.model.scene import Scene, opacities_of
 from potr_cl.model.splat_groups import SplatGroups, largest_scales
 
 #: The renderer's near plane, world units: a splat whose centre is nearer is not drawn.
-_NEAR = 0.2
+NEAR = 0.2
 #: How far splats reach, in standard deviations, and what a renderer adds to that, in pixels.
-_REACH, _PIXELS = 3.5, 2.0
+REACH, _PIXELS = 3.5, 2.0
 #: Splats looked at at a time.
 _BLOCK = 1 << 16
 
 
 def unseen_splats(
-    scene: Scene,
-    cameras: Sequence[Camera],
-    groups: SplatGroups | None = None,
-    run: Run = map,
-    shown: NDArray[np.bool_] | None = None,
+    scene: Scene, cameras: Sequence[Camera], groups: SplatGroups | None = None, run: Run = map
 ) -> NDArray[np.bool_]:
     """Which splats lie outside of every view's picture.
 
@@ -39,17 +35,13 @@ def unseen_splats(
         cameras: the views; without any, no splat is seen.
         groups: of the scene, where they are known: most views show nothing of a neighbourhood of a large scene.
         run: shares the work out.
-        shown: (views, G) the groups of which each view may draw a splat, where that is known too.
 
     Returns:
         (N,) whether it is unseen. A splat of which any part may touch a picture is not, even if others hide it.
     """
     unseen = np.ones(len(scene), bool)
-    # Views far from each other first: what one does not see the next one may.
-    order = np.argsort((np.arange(len(cameras)) * (math.sqrt(5) - 1) / 2) % 1, kind="stable")
-    near_by = shown
-    if groups is not None and near_by is None:
-        near_by = groups.visible_by(cameras, _NEAR, run)
+    order = views_in_turn(len(cameras))
+    shown = np.zeros((0, 0), bool) if groups is None else groups.visible_by(cameras, NEAR, run)
 
     def look(start: int) -> None:
         """Find out which of a block of splats are seen."""
@@ -58,14 +50,14 @@ def unseen_splats(
         among = None if groups is None else np.searchsorted(groups.starts, np.arange(start, stop), "right") - 1
         means = scene.means[left].astype(np.float64)
         with np.errstate(over="ignore"):
-            reach = _REACH * np.exp(np.minimum(largest_scales(scene.log_scales[left]), 80).astype(np.float64))
+            reach = REACH * np.exp(np.minimum(largest_scales(scene.log_scales[left]), 80).astype(np.float64))
         for view in order:
-            if among is None or near_by is None:
+            if among is None:
                 seen = _shows(cameras[view], means, reach)
             else:
-                if not near_by[view, among[0] : among[-1] + 1].any():
+                if not shown[view][among[0] : among[-1] + 1].any():
                     continue
-                near = np.flatnonzero(near_by[view][among])
+                near = np.flatnonzero(shown[view][among])
                 if not len(near):
                     continue
                 seen = np.zeros(len(left), bool)
@@ -81,28 +73,45 @@ def unseen_splats(
     return unseen
 
 
+def views_in_turn(count: int) -> NDArray[np.int64]:
+    """The numbers of views, those far from each other first: what one does not see the next one may."""
+    return np.argsort((np.arange(count) * (math.sqrt(5) - 1) / 2) % 1, kind="stable")
+
+
+def bounds(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The planes left and right of a view's picture, and above and below it, as positions at a depth of 1."""
+    x, y = (
+        ((-_PIXELS - centre) / focal, (pixels + _PIXELS - centre) / focal)
+        for focal, centre, pixels in (
+            (camera.fx, camera.cx, camera.width),
+            (camera.fy, camera.cy, camera.height),
+        )
+    )
+    return x, y
+
+
 def opacity_weighted_areas(scene: Scene, run: Run = map) -> NDArray[np.float64]:
     """(N,) area of each splat's largest cross-section times its opacity, up to a common factor; for shares of a scene.
 
     The factor makes the largest of them 1, so that no scene's units are too large. ``run`` shares the work out.
     """
     areas = np.empty(len(scene))
-
-    def logarithms(start: int) -> float:
-        some = slice(start, start + _BLOCK)
-        a, b, c = scene.log_scales[some].T.astype(np.float64)
-        low, high = np.minimum(a, b), np.maximum(a, b)
-        areas[some] = np.maximum(low, np.minimum(high, c)) + np.maximum(high, c)
-        return float(areas[some].max())
-
-    def weigh(start: int) -> None:
-        some = slice(start, start + _BLOCK)
-        # As a scene's own opacities are.
-        areas[some] = np.exp(areas[some] - most) * opacities_of(scene.opacity_logits[some])
-
     starts = range(0, len(scene), _BLOCK)
-    most = max(run(logarithms, starts), default=-math.inf)
-    for _ in run(weigh, starts):
+
+    def largest_two(start: int) -> float:
+        a, b, c = scene.log_scales[start : start + _BLOCK].T.astype(np.float64)
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        some = areas[start : start + _BLOCK]
+        some[:] = np.maximum(low, np.minimum(high, c)) + np.maximum(high, c)
+        return float(some.max())
+
+    largest = max(run(largest_two, starts), default=-math.inf)
+
+    def area(start: int) -> None:
+        some = areas[start : start + _BLOCK]
+        some[:] = np.exp(some - largest) * opacities_of(scene.opacity_logits[start : start + _BLOCK])
+
+    for _ in run(area, starts):
         pass
     return areas
 
@@ -111,12 +120,8 @@ def _shows(camera: Camera, means: NDArray[np.float64], reach: NDArray[np.float64
     """Which spheres touch the pyramid that a view sees; their centres in front of the near plane."""
     with np.errstate(over="ignore", invalid="ignore"):
         x, y, depth = camera.rotation @ means.T + camera.translation[:, None]
-        shown = depth > _NEAR
-        for along, focal, centre, pixels in (
-            (x, camera.fx, camera.cx, camera.width),
-            (y, camera.fy, camera.cy, camera.height),
-        ):
-            low, high = (-_PIXELS - centre) / focal, (pixels + _PIXELS - centre) / focal
+        shown = depth > NEAR
+        for along, (low, high) in zip((x, y), bounds(camera), strict=True):
             shown &= along - low * depth > -reach * math.hypot(1, low)
             shown &= along - high * depth < reach * math.hypot(1, high)
     return np.asarray(shown)

@@ -17,10 +17,10 @@ import pyopencl as cl
 from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.host.threads import in_background
 from potr_cl.opencl import compiler, program_cache, quirks
+from potr_cl.opencl.ahead import context_of
 from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, compiler_fault, compiles_nothing
 from potr_cl.opencl.foresight import Foresight, Wanted
 from potr_cl.opencl.kernel import Kernel, declared_parameters
-from potr_cl.opencl.loader import new_context
 from potr_cl.opencl.source import kernel_source
 
 logger = logging.getLogger("potr_cl")
@@ -96,7 +96,7 @@ class Device:
         self._foresight: Foresight | None = None
         self._of_this_thread = threading.local()
         with self.errors("cannot be opened"):
-            self.context = new_context(self.info.handle)
+            self.context = context_of(self.info)
             flags = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
             self.queue = cl.CommandQueue(self.context, self.info.handle, properties=flags)
         if self.info.max_work_group < 256 and self.family == "gpu":

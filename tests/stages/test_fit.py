@@ -311,7 +311,7 @@ def test_splats_are_removed_for_the_fit_to_make_up_for(family_device, plush_exce
 def priced_fit(further, **options):
     """A fit that removes splats up to so many times the price."""
     at_price = further / math.sqrt(PRICE / 10**-9.3)
-    fit = Fit(**{"steps": 50, "further": at_price, "between": 0, **options})
+    fit = Fit(**{"steps": 50, "further": at_price, "between": 0, "choosing": 0, "rounding": 0, **options})
     assert fit.limit(PRICE) == pytest.approx(further * PRICE)
     return fit
 

@@ -21,6 +21,7 @@ from potr_cl.errors import DeviceMemoryError
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.culling import Sights, ViewPart, work
@@ -48,22 +49,32 @@ _SOURCE = "prune/parts.cl"
 _GROUP = 64
 
 
-def sights_of_large(scene: Scene, cameras: Sequence[Camera], run: Run = map) -> Sights | None:
-    """What views see of a scene, if that is so large that it is worth the time; ``run`` shares the work out."""
-    return Sights.of(scene, cameras, INRIA.near, run=run) if len(scene) >= LEAST_SPLATS and cameras else None
+def groups_of_large(scene: Scene, run: Run = map) -> SplatGroups | None:
+    """The groups of a scene's splats, if it is so large that they are worth their time; ``run`` shares the work out."""
+    return SplatGroups.of(scene, run=run) if len(scene) >= LEAST_SPLATS else None
 
 
-def worth_it(sights: Sights | None, options: SweepOptions) -> Sights | None:
+def sights_worth_it(
+    scene: Scene,
+    cameras: Sequence[Camera],
+    options: SweepOptions,
+    groups: SplatGroups | None = None,
+    run: Run = map,
+) -> Sights | None:
     """What the views see; None where they had better share one scene.
 
     Args:
-        sights: of all views.
+        scene: clean.
+        cameras: the views.
         options: of the sweep.
+        groups: of the scene, where they are known.
+        run: shares the work out.
     """
     # A sample of the tiles is drawn from all of them in turn.
-    if sights is None or options.sample < 1:
+    if len(scene) < LEAST_SPLATS or options.sample < 1 or not cameras:
         return None
-    return sights if sights.totals.sum() <= _WORTH_IT * sights.seen.shape[0] * len(sights.groups.order) else None
+    sights = Sights.of(scene, cameras, INRIA.near, groups, run)
+    return sights if sights.totals.sum() <= _WORTH_IT * len(scene) * len(cameras) else None
 
 
 def first_totals(splats: int, spared: NDArray[np.bool_] | None) -> NDArray[np.int64]:
