@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.signals import first_interrupt_asks
-from potr_cl.host.threads import thread_pool
 from potr_cl.model.views_between import views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family
@@ -233,8 +232,7 @@ class Fit(Stage):
         each = self.views_on(bench.opened.family)
         if is_virtual(given) or each * len(given) <= state.added:
             return state
-        with thread_pool(bench.threads) as pool:
-            added = views_between(state.source, given, each, run=pool.map)
+        added = views_between(state.source, given, each)  # with threads it takes twice as long
         return dataclasses.replace(state, views=(*given, *added), added=len(added))
 
     def _cycles(self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool) -> State:
