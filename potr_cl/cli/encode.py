@@ -325,7 +325,7 @@ def add_encode(commands: Commands) -> None:
     add_from_option(p)
     add_trust_option(p)
     add_antialiased_option(p)
-    add_memory_option(p)
+    add_memory_option(p, ", and for the re-fit; the host's arrays of a scene too large for it lie in temporary files")
     add_device_options(
         p, "; of several the views are shared out: all (of the best one's kind), or indices with commas, 0,1"
     )

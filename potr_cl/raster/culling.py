@@ -61,16 +61,20 @@ class Sights:
         """(views,) the splats that each view may draw."""
         return np.array([int(self.groups.counts[row].sum()) for row in self.seen])
 
+    def order(self) -> NDArray[np.int64]:
+        """(views,) the views along a curve through the middles of what they see: neighbours see much of the same."""
+        counts = self.groups.counts.astype(np.float64)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            middles = np.nan_to_num((self.seen * counts) @ self.groups.centres / (self.seen @ counts)[:, None])
+        return morton_order(middles.astype(np.float32))
+
     def parts(self) -> list[ViewPart]:
         """All views, dealt out to parts that see much of the same, so that the splats of all parts are few."""
         groups, seen = self.groups, self.seen
         counts = groups.counts.astype(np.float64)
         totals = seen @ counts
         most = max(_SPREAD * float(np.quantile(totals, _QUANTILE)), _LEAST_PART * len(groups.order))
-        # Along a curve through the middles of what they see, neighbours see much of the same.
-        with np.errstate(invalid="ignore", divide="ignore"):
-            middles = np.nan_to_num((seen * counts) @ groups.centres / totals[:, None])
-        order = morton_order(middles.astype(np.float32))
+        order = self.order()
         dealt: list[list[int]] = []
         together = np.zeros(len(counts), bool)
         for number in order[totals[order] <= most].tolist():

@@ -20,6 +20,7 @@ from potr_cl.opencl.discovery import Family
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
+from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
 from potr_cl.stages.fitting.fit import (
     FitOptions,
     FitProgress,
@@ -29,11 +30,11 @@ from potr_cl.stages.fitting.fit import (
     held_out_error,
     kept_pictures,
 )
+from potr_cl.stages.fitting.photographs import fit_to_photographs
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
 from potr_cl.stages.prune import Prune
-from potr_cl.stages.refitting.photographs import hold_out
-from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
+from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
 #: Times the threshold of pruning up to which a fit makes up for splats, about (docs/benchmarks/fit.md): for this
@@ -46,6 +47,8 @@ FINER = 0.18
 STEPS: dict[Family, int] = {"cpu": 800, "gpu": 1000}
 #: Views between for each given one that a fit looks at: they keep it from fitting the given ones too closely.
 BETWEEN: dict[Family, float] = {"cpu": 1.0, "gpu": 3.0}
+#: Steps of a fit to photographs that "auto" stands for.
+PHOTOGRAPH_STEPS: dict[Family, int] = {"cpu": 250, "gpu": 500}
 #: Part of the steps in each cycle but the last.
 _FIRST = 0.25
 #: What a splat costs as a multiple of the error for which pruning would have let it go: what it adds to the error when
@@ -70,12 +73,12 @@ class LeftOut:
     Attributes:
         why: as people are told it.
         ended_early: whether someone has asked it to end.
-        photographs: what a fit did that had photographs as its targets; None if there was none.
+        photographs: what a fit to photographs did; None if there were none.
     """
 
     why: str
     ended_early: bool = False
-    photographs: Fitted | None = None
+    photographs: FittedToPhotographs | None = None
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -84,7 +87,7 @@ class LeftOut:
         return {"left_out": self.why, "ended_early": self.ended_early, "photographs": photographs}
 
     def __str__(self) -> str:
-        more = "" if self.photographs is None else f"; to photographs {self.photographs}"
+        more = "" if self.photographs is None else f"; {self.photographs}"
         return f"the fit was left out: {self.why}{more}"
 
 
@@ -114,9 +117,10 @@ class Fit(Stage):
         iterations: of the pruning in each of them.
         between: views between that the fit looks at, for each given view, unless there are more already. "auto": as
             many as pay on the device.
+        photograph_steps: in which what came of it is fitted to photographs, where the re-fit has some. "auto": as many
+            as pay on the device.
         choosing, rounding, gentle: how far what is left is fitted once more after the choice of coefficients and the
             rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`); not where photographs follow.
-        to_photographs: part of the rates with which the fit goes on to photographs, where the re-fit has some.
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -143,7 +147,7 @@ class Fit(Stage):
     cycles: int = option(2)
     iterations: int = option(16)
     between: float | Literal["auto"] = option("auto")
-    to_photographs: float = option(0.3)
+    photograph_steps: int | Literal["auto"] = option("auto")
     batch: int = option(FitOptions.batch)
     rounds: int = option(FitOptions.rounds)
     patience: int = option(FitOptions.patience)
@@ -300,22 +304,22 @@ class Fit(Stage):
         return [*[first] * (cycles - 1), max(steps - first * (cycles - 1), 1)]
 
     def _to_photographs(self, state: State, bench: Workbench, asked: SupportsBool) -> State:
-        """Go on with photographs as the targets, as long as others that are held out are matched better."""
+        """Go on with photographs as the targets, if others that are held out agree; and so do later stages."""
         assert bench.photographs is not None
         given = state.views[: len(state.views) - state.added]
         photographs = GroundTruth(bench.photographs, given, bench.background)
-        fit_to, judging = hold_out(photographs.of(given))
-        views = [*fit_to, *judging]
         options = self._options(bench.opened.family, bench.memory)
-        rates = {each.name: self.to_photographs * getattr(self.rates, each.name) for each in dataclasses.fields(Rates)}
-        fitted = fit_scene(
-            bench.opened, state.scene, views, GroundTruthTargets(bench.opened, photographs, views),
-            dataclasses.replace(options, rates=self._sparse(Rates(**rates), state)), 0, bench.background, None,
-            bench.tell, asked, range(len(fit_to), len(views)),
+        steps = PHOTOGRAPH_STEPS[bench.opened.family] if self.photograph_steps == "auto" else self.photograph_steps
+        options = dataclasses.replace(options, steps=steps, rates=self._sparse(self.rates, state))
+        found = fit_to_photographs(
+            bench.opened, state.scene, photographs.of(given), photographs, options, bench.background, bench.tell,
+            asked,
         )  # fmt: skip
-        told: Fitted | LeftOut = dataclasses.replace(state.learnt[self.name], photographs=fitted)
-        scene = fitted.scene if fitted.kept else state.scene
-        return dataclasses.replace(state, scene=scene, geometry=None).having_learnt(self.name, told)
+        told: Fitted | LeftOut = dataclasses.replace(state.learnt[self.name], photographs=found)
+        then = state.having_learnt(self.name, told)
+        if found.scene is None:
+            return then
+        return dataclasses.replace(then, scene=found.scene, truth=found.scene, geometry=None)
 
     def _sparse(self, rates: Rates, state: State) -> Rates:
         """The rates, without those that would change coefficients which compaction has chosen."""

@@ -58,8 +58,10 @@ def test_a_solution(device, degree, memory):
 
 
 @pytest.mark.parametrize("way", ["colour_grid", "fix_ac"])
-def test_what_a_file_holds(device, way):
+@pytest.mark.parametrize("resident", [0, 1, 3, 7], ids="{} vectors on the device".format)
+def test_what_a_file_holds(device, way, resident, monkeypatch):
     """Rounded in rounds, and rounded by somebody who asks what coefficients are worth."""
+    monkeypatch.setattr(placement, "_FEWEST", resident)
     with case_of(device) as case:
         rounding = {"colour_grid": lambda effects: grid_of(SPLATS)} if way == "colour_grid" else {"fix_ac": coarse}
 

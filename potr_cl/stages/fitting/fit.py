@@ -26,6 +26,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Adam, Limits, Rates
+from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.judges import Judges
 from potr_cl.stages.fitting.pictures import TargetPictures
@@ -103,7 +104,7 @@ class Fitted:
         spared: how many splats were removed before it for it to make up for.
         without: the error of these views before those were removed; None where none were.
         settled: mean squared error of these views after each fit that followed a choice of coefficients or a rounding.
-        photographs: what a further fit did that had photographs as its targets; None if there was none.
+        photographs: what a further fit to photographs did; None if there were none.
     """
 
     scene: Scene
@@ -115,7 +116,7 @@ class Fitted:
     spared: int = 0
     without: float | None = None
     settled: tuple[float, ...] = ()
-    photographs: Fitted | None = None
+    photographs: FittedToPhotographs | None = None
 
     @property
     def error(self) -> float:
@@ -147,7 +148,7 @@ class Fitted:
         if self.settled:
             said += f"; {_decibels(self.settled[-1]):.2f} dB with geometry and coefficients as in the file"
         if self.photographs is not None:
-            said += f"; to photographs {self.photographs}"
+            said += f"; {self.photographs}"
         return said
 
 
@@ -173,6 +174,7 @@ def fit_scene(
     tell: Callable[[str], None] | None = None,
     asked: SupportsBool = False,
     held_out: Sequence[int] | None = None,
+    fit_to: Sequence[int] | None = None,
 ) -> Fitted:
     """Fit all parameters of a scene to pictures of some views.
 
@@ -188,6 +190,7 @@ def fit_scene(
         tell: called with a line for each round.
         asked: whether to end before the next step, with the best of the whole rounds; looked at after each.
         held_out: numbers of the views to judge by; None: some of the given ones.
+        fit_to: numbers of the views to look at, where the judges are given; None: all others.
 
     Raises:
         UsageError: there are fewer than two given views, so that none can be held out.
@@ -196,7 +199,7 @@ def fit_scene(
     options = options or FitOptions()
     if held_out is None:
         fit_to, held_out = share_out(len(cameras) - added, added)
-    else:
+    elif fit_to is None:
         fit_to = [number for number in range(len(cameras)) if number not in set(held_out)]
     if not held_out or not fit_to:
         raise UsageError("a fit needs two training views or more: one of them is held out and tells whether it helps")
@@ -205,7 +208,7 @@ def fit_scene(
         _pictures_of(device, cameras, targets, options.memory) as pictures,
     ):
         if options.memory is None and options.steps * options.batch >= len(fit_to):
-            pictures.prepare([*held_out, *fit_to])
+            pictures.prepare([*held_out, *(number for number in fit_to if number not in held_out)])
         rasterizer = derivatives.rasterizer
         rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
         with (

@@ -9,7 +9,7 @@ from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
 from potr_cl.stages.refitting.blocks import SplatBlocks
-from potr_cl.stages.refitting.sliced_coefficients import HostColumns, SlicedCoefficients
+from potr_cl.stages.refitting.sliced_coefficients import AnyVector, HostColumns, SlicedCoefficients
 from potr_cl.stages.refitting.vector_space import Ridge
 
 
@@ -65,7 +65,7 @@ class SlicedBlocks(Owner):
         self._coefficients.copy_part(self._columns, part, self.own.buffer)
         return self.own
 
-    def precondition(self, residual: HostColumns, ridge: Ridge, result: HostColumns) -> None:
+    def precondition(self, residual: AnyVector, ridge: Ridge, result: AnyVector) -> None:
         """See :meth:`potr_cl.stages.refitting.blocks.SplatBlocks.precondition`."""
         vectors = self._coefficients
         for part in vectors.parts():
@@ -73,9 +73,10 @@ class SlicedBlocks(Owner):
             some, found = vectors.give(residual, part, 0), vectors.place(1)
             self.give(part).precondition(some, ridge, found)
             vectors.take(result, part, found)
-        result.changed()
+        if isinstance(result, HostColumns):
+            result.changed()
 
-    def give_up(self, x: HostColumns, prior: float, least: float) -> None:
+    def give_up(self, x: AnyVector, prior: float, least: float) -> None:
         """See :meth:`potr_cl.stages.refitting.blocks.SplatBlocks.give_up`."""
         self._coefficients.each(x, lambda part, some: self.give(part).give_up(some, prior, least))
 
