@@ -101,25 +101,35 @@ class Geometry:
         steps = fit_steps(self.scales, self.opacities, self.parameters.sf_opacity, effects[self.order])
         return replace(self, steps=steps)
 
-    def with_centres_of(self, scene: Scene, views: Sequence[Camera], run: Run = map) -> Geometry:
-        """The same splats at other places, with the same steps.
+    def with_centres_of(self, means: NDArray[np.float32], views: Sequence[Camera], run: Run = map) -> Geometry:
+        """The same splats at other places: all their other levels stay.
 
         Args:
-            scene: has the centres, not rounded yet. Its scales, rotations and opacities are taken too: where they are
-                those of :meth:`decoded`, they become the same levels again.
+            means: (N, 3) in the order of the scene, not rounded yet.
             views, run: as of :func:`quantise_geometry`.
 
         Raises:
             DataError: a splat is too far from the others to keep them exact.
         """
-        nearest = distances_to_views(scene.means, views, run)
-        return quantise_in_world_units(scene, None, self.asked, self.parameters, nearest, run)[0]
+        world = self.parameters
+        tolerance = np.maximum(world.gamma, world.beta * distances_to_views(means, views, run))
+        tree, order = octree.build(means, tolerance, absolute=VERSIONS[world.version].absolute_leaf_levels)
+        place = np.empty(len(order), np.int64)
+        place[self.order] = np.arange(len(order))
+        was = place[order]
+        moved = replace(
+            self, tree=tree, order=order, scales=[levels[was] for levels in self.scales],
+            rotations=[levels[was] for levels in self.rotations], opacities=self.opacities[was], steps=None,
+        )  # fmt: skip
+        if may_be_coarse(tree):
+            log_scales = moved.decoded(np.empty((len(order), 1, 3), np.float32)).log_scales
+            check_positions(means, log_scales, tolerance, tree, order)
+        return moved
 
-    def with_opacities_of(self, scene: Scene) -> Geometry:
-        """The same with the opacities of a scene, not rounded yet."""
-        logits = scene.opacity_logits[self.order].astype(np.float64)
-        levels = VERSIONS[self.parameters.version].quantize_opacities(logits, self.parameters.sf_opacity)
-        return replace(self, opacities=levels)
+    def with_opacities_of(self, logits: NDArray[np.float32]) -> Geometry:
+        """The same with other opacities: (N,) logits in the order of the scene, not rounded yet."""
+        version, factor = VERSIONS[self.parameters.version], self.parameters.sf_opacity
+        return replace(self, opacities=version.quantize_opacities(logits[self.order].astype(np.float64), factor))
 
     def with_colour_steps(self, parameters: quantize.HyperParameters) -> Geometry:
         """The same for parameters that differ in the steps of colours alone, which geometry does not depend on."""

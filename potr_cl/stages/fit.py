@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.signals import first_interrupt_asks
-from potr_cl.host.threads import thread_pool
 from potr_cl.model.views_between import views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family
@@ -167,6 +166,9 @@ class Fit(Stage):
             raise UsageError(f"the fit's views between are {self.between:g}, they must be from 0 to 100")
         if not 0 <= self.finer <= 1:
             raise UsageError(f"the fit's finer quality is {self.finer:g}, it must be from 0 to 1")
+        for name, least, most in (("choosing", 0, 10), ("rounding", 0, 10), ("gentle", 1e-6, 1)):
+            if not least <= getattr(self, name) <= most:
+                raise UsageError(f"the fit's {name} is {getattr(self, name):g}, it must be from {least:g} to {most}")
         for name in ("cycles", "iterations"):
             if not 1 <= getattr(self, name) <= 1000:
                 raise UsageError(f"the fit's {name} are {getattr(self, name)}, they must be from 1 to 1000")
@@ -181,6 +183,10 @@ class Fit(Stage):
     def steps_on(self, family: Family) -> int:
         """The most steps on a device of a family."""
         return STEPS[family] if self.steps == "auto" else self.steps
+
+    def further_steps_on(self, family: Family) -> int:
+        """The most steps after the choice of coefficients and the roundings."""
+        return round((self.choosing + 2 * self.rounding) * self.steps_on(family))
 
     def views_on(self, family: Family) -> float:
         """Views between that it looks at on a device of a family, for each given one."""
@@ -237,8 +243,7 @@ class Fit(Stage):
         each = self.views_on(bench.opened.family)
         if is_virtual(given) or each * len(given) <= state.added:
             return state
-        with thread_pool(bench.threads) as pool:
-            added = views_between(state.source, given, each, run=pool.map)
+        added = views_between(state.source, given, each)  # with threads it takes twice as long
         return dataclasses.replace(state, views=(*given, *added), added=len(added))
 
     def _cycles(self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool) -> State:
@@ -254,7 +259,7 @@ class Fit(Stage):
         last = best = state
         taken: Fitted | None = None
         steps_of = self._steps_of_cycles(bench.opened.family, price is not None and further > 1)
-        total, done = sum(steps_of), 0
+        total, done = sum(steps_of) + self.further_steps_on(bench.opened.family), 0
         for number, steps in enumerate(steps_of):
             part = number / (len(steps_of) - 1) if len(steps_of) > 1 else 1.0
             if price is not None and further > 1 and part > 0:
@@ -280,7 +285,14 @@ class Fit(Stage):
         """Choose coefficients and round geometry, with what is left fitted once more in between."""
         options = self._options(bench.opened.family, bench.memory)
         settling = Settling(self.choosing, self.rounding, self.gentle)
-        then, errors = settle(state, bench, looking, settling, options, asked)
+        done, total = options.steps, options.steps + self.further_steps_on(bench.opened.family)
+
+        def progress(steps: int) -> None:
+            nonlocal done
+            done += steps
+            bench.progress("fit", min(done / total, 1.0) * 0.99)
+
+        then, errors = settle(state, bench, looking, settling, options, asked, progress)
         told = dataclasses.replace(state.learnt[self.name], settled=errors)
         return then.having_learnt(self.name, told)
 
