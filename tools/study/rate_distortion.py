@@ -5,14 +5,14 @@
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photographs in images. A series is a curve:
 the name it gets and the options of EncodeOptions in which it differs from the defaults, those of a stage with its name,
-as in exact:preset=best,prune.tolerance=0; photos=True stands for --photos with the folder images. ``measure`` writes its results after every encode and goes on where an
-existing file stops; with --seconds it begins no encode after that many. ``report`` prints Markdown and draws
-DIR/rate_distortion_SCENE.png; the points of other formats come from tools.study.compare_formats. With --json it keeps
-the tables of docs/benchmarks: the curves, the uncompressed scenes, and the seconds of each stage at quality 0.5; with
---losses NAME too, another one instead: what each other series loses on photographs, and what the series NAME loses at
-the same PSNR against the uncompressed renders, by interpolation. With --against it prints instead how many bytes more
-or fewer each series takes at the PSNR that the series NAME has at quality Q, by interpolation, and how long its encodes
-take.
+as in exact:preset=best,prune.tolerance=0; photos=True stands for --photos with the folder images. ``measure`` writes
+its results after every encode and goes on where an existing file stops; with --seconds it begins no encode after that
+many. ``report`` prints Markdown and draws DIR/rate_distortion_SCENE.png; the points of other formats come from
+tools.study.compare_formats. With --json it keeps the tables of docs/benchmarks: the curves, the uncompressed scenes,
+and the seconds of each stage at quality 0.5; with --losses NAME too, another one instead: what each other series loses
+on photographs, and what the series NAME loses at the same PSNR against the uncompressed renders, by interpolation. With
+--against it prints instead how many bytes more or fewer each series takes at the PSNR that the series NAME has at
+quality Q, by interpolation, and how long its encodes take.
 """
 
 from __future__ import annotations
