@@ -117,8 +117,8 @@ class Fit(Stage):
         iterations: of the pruning in each of them.
         between: views between that the fit looks at, for each given view, unless there are more already. "auto": as
             many as pay on the device.
-        photograph_steps: in which what came of it is fitted to photographs, where the re-fit has some. "auto": as many
-            as pay on the device.
+        photograph_steps: in which what came of it is fitted to photographs, where the re-fit has some; 0: it is not.
+            "auto": as many as pay on the device.
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -154,7 +154,7 @@ class Fit(Stage):
     seed: int = option(FitOptions.seed)
 
     def __post_init__(self) -> None:
-        _ = self._options("gpu", None)
+        _ = self._options("gpu", None), FitOptions(steps=self.photograph_steps_on("gpu"))
         if not 0 <= self.further <= 1e6:
             raise UsageError(f"the fit's further pruning is {self.further:g}, it must be from 0 to 1,000,000")
         if self.between != "auto" and not 0 <= self.between <= 100:
@@ -175,6 +175,10 @@ class Fit(Stage):
     def steps_on(self, family: Family) -> int:
         """The most steps on a device of a family."""
         return STEPS[family] if self.steps == "auto" else self.steps
+
+    def photograph_steps_on(self, family: Family) -> int:
+        """The steps of the fit to photographs on a device of a family."""
+        return PHOTOGRAPH_STEPS[family] if self.photograph_steps == "auto" else self.photograph_steps
 
     def views_on(self, family: Family) -> float:
         """Views between that it looks at on a device of a family, for each given one."""
@@ -218,7 +222,7 @@ class Fit(Stage):
                 targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
             found = self._cycles(seen, bench, targets, asked)
             found = dataclasses.replace(found, views=state.views, added=state.added)
-            if asked or bench.photographs is None:
+            if asked or bench.photographs is None or self.photograph_steps == 0:
                 return found
             return self._to_photographs(found, bench, asked)
 
@@ -280,12 +284,15 @@ class Fit(Stage):
         given = state.views[: len(state.views) - state.added]
         photographs = GroundTruth(bench.photographs, given, bench.background)
         options = self._options(bench.opened.family, bench.memory)
-        steps = PHOTOGRAPH_STEPS[bench.opened.family] if self.photograph_steps == "auto" else self.photograph_steps
-        options = dataclasses.replace(options, steps=steps, rates=self._sparse(self.rates, state))
+        options = dataclasses.replace(
+            options, steps=self.photograph_steps_on(bench.opened.family), rates=self._sparse(self.rates, state)
+        )
+        bench.progress("fit to photographs", 0.0)
         found = fit_to_photographs(
             bench.opened, state.scene, photographs.of(given), photographs, options, bench.background, bench.tell,
-            asked,
+            asked, lambda done, steps: bench.progress("fit to photographs", done / steps),
         )  # fmt: skip
+        bench.progress("fit to photographs", 1.0)
         told: Fitted | LeftOut = dataclasses.replace(state.learnt[self.name], photographs=found)
         then = state.having_learnt(self.name, told)
         if found.scene is None:
