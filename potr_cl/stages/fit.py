@@ -47,8 +47,10 @@ FINER = 0.18
 STEPS: dict[Family, int] = {"cpu": 800, "gpu": 1000}
 #: Views between for each given one that a fit looks at: they keep it from fitting the given ones too closely.
 BETWEEN: dict[Family, float] = {"cpu": 1.0, "gpu": 3.0}
-#: Steps of a fit to photographs that "auto" stands for.
-PHOTOGRAPH_STEPS: dict[Family, int] = {"cpu": 250, "gpu": 500}
+#: Steps of a fit to photographs that "auto" stands for: so many for each of them, because more follow few photographs
+#: too closely; and the most.
+_STEPS_EACH = 5
+_MOST_STEPS: dict[Family, int] = {"cpu": 250, "gpu": 500}
 #: Part of the steps in each cycle but the last.
 _FIRST = 0.25
 #: What a splat costs as a multiple of the error for which pruning would have let it go: what it adds to the error when
@@ -154,7 +156,7 @@ class Fit(Stage):
     seed: int = option(FitOptions.seed)
 
     def __post_init__(self) -> None:
-        _ = self._options("gpu", None), FitOptions(steps=self.photograph_steps_on("gpu"))
+        _ = self._options("gpu", None), FitOptions(steps=self.photograph_steps_on("gpu", 1))
         if not 0 <= self.further <= 1e6:
             raise UsageError(f"the fit's further pruning is {self.further:g}, it must be from 0 to 1,000,000")
         if self.between != "auto" and not 0 <= self.between <= 100:
@@ -176,9 +178,11 @@ class Fit(Stage):
         """The most steps on a device of a family."""
         return STEPS[family] if self.steps == "auto" else self.steps
 
-    def photograph_steps_on(self, family: Family) -> int:
-        """The steps of the fit to photographs on a device of a family."""
-        return PHOTOGRAPH_STEPS[family] if self.photograph_steps == "auto" else self.photograph_steps
+    def photograph_steps_on(self, family: Family, photographs: int) -> int:
+        """The steps of the fit to so many photographs on a device of a family."""
+        if self.photograph_steps == "auto":
+            return min(_STEPS_EACH * photographs, _MOST_STEPS[family])
+        return self.photograph_steps
 
     def views_on(self, family: Family) -> float:
         """Views between that it looks at on a device of a family, for each given one."""
@@ -283,13 +287,15 @@ class Fit(Stage):
         assert bench.photographs is not None
         given = state.views[: len(state.views) - state.added]
         photographs = GroundTruth(bench.photographs, given, bench.background)
-        options = self._options(bench.opened.family, bench.memory)
+        views, family = photographs.of(given), bench.opened.family
         options = dataclasses.replace(
-            options, steps=self.photograph_steps_on(bench.opened.family), rates=self._sparse(self.rates, state)
+            self._options(family, bench.memory),
+            steps=self.photograph_steps_on(family, len(views)),
+            rates=self._sparse(self.rates, state),
         )
         bench.progress("fit to photographs", 0.0)
         found = fit_to_photographs(
-            bench.opened, state.scene, photographs.of(given), photographs, options, bench.background, bench.tell,
+            bench.opened, state.scene, views, photographs, options, bench.background, bench.tell,
             asked, lambda done, steps: bench.progress("fit to photographs", done / steps),
         )  # fmt: skip
         bench.progress("fit to photographs", 1.0)
