@@ -41,7 +41,7 @@ def unseen_splats(
     """
     unseen = np.ones(len(scene), bool)
     order = views_in_turn(len(cameras))
-    shown = [] if groups is None else [groups.visible(camera, NEAR) for camera in cameras]
+    shown = np.zeros((0, 0), bool) if groups is None else groups.visible_by(cameras, NEAR, run)
 
     def look(start: int) -> None:
         """Find out which of a block of splats are seen."""

@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.morton import morton_order
 from potr_cl.model.scene import Scene
@@ -44,7 +45,9 @@ class Sights:
     seen: NDArray[np.bool_]
 
     @staticmethod
-    def of(scene: Scene, cameras: Sequence[Camera], near: float, groups: SplatGroups | None = None) -> Sights:
+    def of(
+        scene: Scene, cameras: Sequence[Camera], near: float, groups: SplatGroups | None = None, run: Run = map
+    ) -> Sights:
         """What some views may draw.
 
         Args:
@@ -52,9 +55,10 @@ class Sights:
             cameras: the views, at least one.
             near: as in the rasterizer's rules.
             groups: of the scene, where they are known.
+            run: shares the work out.
         """
-        groups = groups or SplatGroups.of(scene)
-        return Sights(groups, np.stack([groups.visible(camera, near) for camera in cameras]))
+        groups = groups or SplatGroups.of(scene, run=run)
+        return Sights(groups, groups.visible_by(cameras, near, run))
 
     @property
     def totals(self) -> NDArray[np.int64]:

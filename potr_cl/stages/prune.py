@@ -149,13 +149,13 @@ class Prune(Stage):
             # Several devices share all views.
             groups = None if bench.pool and quick else groups_of_large(state.scene, pool.map)
             hidden, area = find_unseen(state, groups, pool.map, quick)
+            options = self._sweep_options(bench.memory)
+            sights = None if bench.pool else sights_worth_it(state.scene, state.views, options, groups, pool.map)
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
         told = state.having_learnt("unseen", Unseen(splats, len(state.scene), area, kept))
         if self.keep is None and self.count is None:
             told = told.having_learnt("price", bench.parameters.delta_mse_max)
-        options = self._sweep_options(bench.memory)
-        sights = None if bench.pool else sights_worth_it(state.scene, state.views, options, groups)
         if not (kept and splats):
             return self._pruned(told, bench, sights)
         # A copy of a large scene without them would take as much memory as the scene.
