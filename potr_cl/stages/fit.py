@@ -47,8 +47,10 @@ FINER = 0.18
 STEPS: dict[Family, int] = {"cpu": 800, "gpu": 1000}
 #: Views between for each given one that a fit looks at: they keep it from fitting the given ones too closely.
 BETWEEN: dict[Family, float] = {"cpu": 1.0, "gpu": 3.0}
-#: Steps of a fit to photographs that "auto" stands for.
-PHOTOGRAPH_STEPS: dict[Family, int] = {"cpu": 250, "gpu": 500}
+#: Steps of a fit to photographs that "auto" stands for: so many for each of them, because more follow few photographs
+#: too closely; and the most.
+_STEPS_EACH = 5
+_MOST_STEPS: dict[Family, int] = {"cpu": 250, "gpu": 500}
 #: Part of the steps in each cycle but the last.
 _FIRST = 0.25
 #: What a splat costs as a multiple of the error for which pruning would have let it go: what it adds to the error when
@@ -117,8 +119,8 @@ class Fit(Stage):
         iterations: of the pruning in each of them.
         between: views between that the fit looks at, for each given view, unless there are more already. "auto": as
             many as pay on the device.
-        photograph_steps: in which what came of it is fitted to photographs, where the re-fit has some. "auto": as many
-            as pay on the device.
+        photograph_steps: in which what came of it is fitted to photographs, where the re-fit has some; 0: it is not.
+            "auto": as many as pay on the device.
         choosing, rounding, gentle: how far what is left is fitted once more after the choice of coefficients and the
             rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`); not where photographs follow.
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
@@ -159,7 +161,7 @@ class Fit(Stage):
     seed: int = option(FitOptions.seed)
 
     def __post_init__(self) -> None:
-        _ = self._options("gpu", None)
+        _ = self._options("gpu", None), FitOptions(steps=self.photograph_steps_on("gpu", 1))
         if not 0 <= self.further <= 1e6:
             raise UsageError(f"the fit's further pruning is {self.further:g}, it must be from 0 to 1,000,000")
         if self.between != "auto" and not 0 <= self.between <= 100:
@@ -187,6 +189,12 @@ class Fit(Stage):
     def further_steps_on(self, family: Family) -> int:
         """The most steps after the choice of coefficients and the roundings."""
         return round((self.choosing + 2 * self.rounding) * self.steps_on(family))
+
+    def photograph_steps_on(self, family: Family, photographs: int) -> int:
+        """The steps of the fit to so many photographs on a device of a family."""
+        if self.photograph_steps == "auto":
+            return min(_STEPS_EACH * photographs, _MOST_STEPS[family])
+        return self.photograph_steps
 
     def views_on(self, family: Family) -> float:
         """Views between that it looks at on a device of a family, for each given one."""
@@ -230,8 +238,10 @@ class Fit(Stage):
                 targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
             found = self._cycles(seen, bench, targets, asked)
             found = dataclasses.replace(found, views=state.views, added=state.added)
-            if asked or bench.photographs is not None:
-                return found if asked else self._to_photographs(found, bench, asked)
+            if asked:
+                return found
+            if bench.photographs is not None and self.photograph_steps != 0:
+                return self._to_photographs(found, bench, asked)
             if not isinstance(found.learnt[self.name], Fitted):
                 return found
             looking = Looking(seen.views, seen.added, targets, rasterizer)
@@ -308,13 +318,18 @@ class Fit(Stage):
         assert bench.photographs is not None
         given = state.views[: len(state.views) - state.added]
         photographs = GroundTruth(bench.photographs, given, bench.background)
-        options = self._options(bench.opened.family, bench.memory)
-        steps = PHOTOGRAPH_STEPS[bench.opened.family] if self.photograph_steps == "auto" else self.photograph_steps
-        options = dataclasses.replace(options, steps=steps, rates=self._sparse(self.rates, state))
+        views, family = photographs.of(given), bench.opened.family
+        options = dataclasses.replace(
+            self._options(family, bench.memory),
+            steps=self.photograph_steps_on(family, len(views)),
+            rates=self._sparse(self.rates, state),
+        )
+        bench.progress("fit to photographs", 0.0)
         found = fit_to_photographs(
-            bench.opened, state.scene, photographs.of(given), photographs, options, bench.background, bench.tell,
-            asked,
+            bench.opened, state.scene, views, photographs, options, bench.background, bench.tell,
+            asked, lambda done, steps: bench.progress("fit to photographs", done / steps),
         )  # fmt: skip
+        bench.progress("fit to photographs", 1.0)
         told: Fitted | LeftOut = dataclasses.replace(state.learnt[self.name], photographs=found)
         then = state.having_learnt(self.name, told)
         if found.scene is None:
