@@ -26,7 +26,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.kernel import Kernel
-from potr_cl.opencl.memory import Arena, Memory, Owner, Scratch
+from potr_cl.opencl.memory import Memory, Owner, Reused, Scratch
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.picked_splats import PickedSplats, Picker
@@ -236,7 +236,7 @@ class ViewByView(Owner):
                 for what in ("some views' effects", "some views' tiles", "their staleness", "their targets")
             ]
             #: Of views that are not kept, one after the other.
-            self._passing = Arena(device, "some views")
+            self._passing = Reused(device)
             owned.callback(self._passing.give_back)
             self._preparing = owned.enter_context(PreparingMemory(device))
             self.totals = memory.allocate(16 * whole.stride, "the removal effects")
