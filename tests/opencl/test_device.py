@@ -470,8 +470,8 @@ def test_the_same_memory_is_taken_again(device: Device) -> None:
         words = np.arange(50 + turn, dtype=np.uint32)
         assert np.array_equal(device.download(memory.upload(words, "a test"), words.shape, np.uint32), words)
         memory.close()
-    assert 24_000 <= taken[0] < taken[1] < 31_000
-    assert taken[2] == taken[3] < 42_000
+    assert 24_000 <= taken[0] <= taken[1] < 31_000
+    assert 32_000 <= taken[2] <= taken[3] < 42_000
     memory.give_back()
     assert device.allocated == before
 
