@@ -498,9 +498,10 @@ class ViewByView(Owner):
         """
         device, cameras = self.device, [self._cameras[number] for number in batch.numbers]
         own_totals, tiles, stale, _ = self._scratch
-        with Memory(device) as memory, ExitStack() as stack:
+        with ExitStack() as stack:
+            stack.callback(self._passing.close)
             states = None if whole else self.marks
-            numbers, splats = self._picker.pick(memory, batch.wanted, states, SplatState.ALIVE)
+            numbers, splats = self._picker.pick(self._passing, batch.wanted, states, SplatState.ALIVE)
             if not splats:
                 yield None
                 return
