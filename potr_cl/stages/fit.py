@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.signals import first_interrupt_asks
-from potr_cl.host.threads import thread_pool
 from potr_cl.model.views_between import views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family
@@ -48,8 +47,10 @@ FINER = 0.18
 STEPS: dict[Family, int] = {"cpu": 800, "gpu": 1000}
 #: Views between for each given one that a fit looks at: they keep it from fitting the given ones too closely.
 BETWEEN: dict[Family, float] = {"cpu": 1.0, "gpu": 3.0}
-#: Steps of a fit to photographs that "auto" stands for.
-PHOTOGRAPH_STEPS: dict[Family, int] = {"cpu": 250, "gpu": 500}
+#: Steps of a fit to photographs that "auto" stands for: so many for each of them, because more follow few photographs
+#: too closely; and the most.
+_STEPS_EACH = 5
+_MOST_STEPS: dict[Family, int] = {"cpu": 250, "gpu": 500}
 #: Part of the steps in each cycle but the last.
 _FIRST = 0.25
 #: What a splat costs as a multiple of the error for which pruning would have let it go: what it adds to the error when
@@ -118,8 +119,8 @@ class Fit(Stage):
         iterations: of the pruning in each of them.
         between: views between that the fit looks at, for each given view, unless there are more already. "auto": as
             many as pay on the device.
-        photograph_steps: in which what came of it is fitted to photographs, where the re-fit has some. "auto": as many
-            as pay on the device.
+        photograph_steps: in which what came of it is fitted to photographs, where the re-fit has some; 0: it is not.
+            "auto": as many as pay on the device.
         choosing, rounding, gentle: how far what is left is fitted once more after the choice of coefficients and the
             rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`); not where photographs follow.
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
@@ -160,13 +161,16 @@ class Fit(Stage):
     seed: int = option(FitOptions.seed)
 
     def __post_init__(self) -> None:
-        _ = self._options("gpu", None)
+        _ = self._options("gpu", None), FitOptions(steps=self.photograph_steps_on("gpu", 1))
         if not 0 <= self.further <= 1e6:
             raise UsageError(f"the fit's further pruning is {self.further:g}, it must be from 0 to 1,000,000")
         if self.between != "auto" and not 0 <= self.between <= 100:
             raise UsageError(f"the fit's views between are {self.between:g}, they must be from 0 to 100")
         if not 0 <= self.finer <= 1:
             raise UsageError(f"the fit's finer quality is {self.finer:g}, it must be from 0 to 1")
+        for name, least, most in (("choosing", 0, 10), ("rounding", 0, 10), ("gentle", 1e-6, 1)):
+            if not least <= getattr(self, name) <= most:
+                raise UsageError(f"the fit's {name} is {getattr(self, name):g}, it must be from {least:g} to {most}")
         for name in ("cycles", "iterations"):
             if not 1 <= getattr(self, name) <= 1000:
                 raise UsageError(f"the fit's {name} are {getattr(self, name)}, they must be from 1 to 1000")
@@ -181,6 +185,16 @@ class Fit(Stage):
     def steps_on(self, family: Family) -> int:
         """The most steps on a device of a family."""
         return STEPS[family] if self.steps == "auto" else self.steps
+
+    def further_steps_on(self, family: Family) -> int:
+        """The most steps after the choice of coefficients and the roundings."""
+        return round((self.choosing + 2 * self.rounding) * self.steps_on(family))
+
+    def photograph_steps_on(self, family: Family, photographs: int) -> int:
+        """The steps of the fit to so many photographs on a device of a family."""
+        if self.photograph_steps == "auto":
+            return min(_STEPS_EACH * photographs, _MOST_STEPS[family])
+        return self.photograph_steps
 
     def views_on(self, family: Family) -> float:
         """Views between that it looks at on a device of a family, for each given one."""
@@ -224,8 +238,10 @@ class Fit(Stage):
                 targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
             found = self._cycles(seen, bench, targets, asked)
             found = dataclasses.replace(found, views=state.views, added=state.added)
-            if asked or bench.photographs is not None:
-                return found if asked else self._to_photographs(found, bench, asked)
+            if asked:
+                return found
+            if bench.photographs is not None and self.photograph_steps != 0:
+                return self._to_photographs(found, bench, asked)
             if not isinstance(found.learnt[self.name], Fitted):
                 return found
             looking = Looking(seen.views, seen.added, targets, rasterizer)
@@ -237,8 +253,7 @@ class Fit(Stage):
         each = self.views_on(bench.opened.family)
         if is_virtual(given) or each * len(given) <= state.added:
             return state
-        with thread_pool(bench.threads) as pool:
-            added = views_between(state.source, given, each, run=pool.map)
+        added = views_between(state.source, given, each)  # with threads it takes twice as long
         return dataclasses.replace(state, views=(*given, *added), added=len(added))
 
     def _cycles(self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool) -> State:
@@ -254,7 +269,7 @@ class Fit(Stage):
         last = best = state
         taken: Fitted | None = None
         steps_of = self._steps_of_cycles(bench.opened.family, price is not None and further > 1)
-        total, done = sum(steps_of), 0
+        total, done = sum(steps_of) + self.further_steps_on(bench.opened.family), 0
         for number, steps in enumerate(steps_of):
             part = number / (len(steps_of) - 1) if len(steps_of) > 1 else 1.0
             if price is not None and further > 1 and part > 0:
@@ -280,7 +295,14 @@ class Fit(Stage):
         """Choose coefficients and round geometry, with what is left fitted once more in between."""
         options = self._options(bench.opened.family, bench.memory)
         settling = Settling(self.choosing, self.rounding, self.gentle)
-        then, errors = settle(state, bench, looking, settling, options, asked)
+        done, total = options.steps, options.steps + self.further_steps_on(bench.opened.family)
+
+        def progress(steps: int) -> None:
+            nonlocal done
+            done += steps
+            bench.progress("fit", min(done / total, 1.0) * 0.99)
+
+        then, errors = settle(state, bench, looking, settling, options, asked, progress)
         told = dataclasses.replace(state.learnt[self.name], settled=errors)
         return then.having_learnt(self.name, told)
 
@@ -296,13 +318,18 @@ class Fit(Stage):
         assert bench.photographs is not None
         given = state.views[: len(state.views) - state.added]
         photographs = GroundTruth(bench.photographs, given, bench.background)
-        options = self._options(bench.opened.family, bench.memory)
-        steps = PHOTOGRAPH_STEPS[bench.opened.family] if self.photograph_steps == "auto" else self.photograph_steps
-        options = dataclasses.replace(options, steps=steps, rates=self._sparse(self.rates, state))
+        views, family = photographs.of(given), bench.opened.family
+        options = dataclasses.replace(
+            self._options(family, bench.memory),
+            steps=self.photograph_steps_on(family, len(views)),
+            rates=self._sparse(self.rates, state),
+        )
+        bench.progress("fit to photographs", 0.0)
         found = fit_to_photographs(
-            bench.opened, state.scene, photographs.of(given), photographs, options, bench.background, bench.tell,
-            asked,
+            bench.opened, state.scene, views, photographs, options, bench.background, bench.tell,
+            asked, lambda done, steps: bench.progress("fit to photographs", done / steps),
         )  # fmt: skip
+        bench.progress("fit to photographs", 1.0)
         told: Fitted | LeftOut = dataclasses.replace(state.learnt[self.name], photographs=found)
         then = state.having_learnt(self.name, told)
         if found.scene is None:

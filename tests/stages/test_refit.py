@@ -151,8 +151,8 @@ def test_errors_are_those_of_the_pictures(case):
 
 @pytest.mark.parametrize(
     ("degree", "lam", "prior", "background"),
-    [(0, 0.0, 3.0, (0.0, 0.0, 0.0)), (1, 30.0, 3.0, (1.0, 0.5, 0.0)), (2, 30.0, 10.0, (0.0, 0.0, 0.0)),
-     (3, 100.0, 10.0, (0.0, 0.0, 0.0))],
+    [pytest.param(0, 0.0, 3.0, (0.0, 0.0, 0.0), marks=pytest.mark.slow), (1, 30.0, 3.0, (1.0, 0.5, 0.0)),
+     pytest.param(2, 30.0, 10.0, (0.0, 0.0, 0.0), marks=pytest.mark.slow), (3, 100.0, 10.0, (0.0, 0.0, 0.0))],
 )  # fmt: skip
 def test_the_solution_is_the_least_squares_one(device, degree, lam, prior, background):
     other = visible_scene(60, 2, seed=7)
@@ -213,7 +213,7 @@ def test_it_stops_when_a_step_gains_too_little(case):
     assert case.solve(RefitOptions(steps=0)).steps == 0
 
 
-@pytest.mark.parametrize("degree", [0, 2])
+@pytest.mark.parametrize("degree", [pytest.param(0, marks=pytest.mark.slow), 2])
 def test_it_stops_where_single_precision_ends(device, degree):
     other = visible_scene(60, 2, seed=7)
     with Case(device, visible_scene(40, degree), other, ring_of_cameras(3, size=40)) as case:

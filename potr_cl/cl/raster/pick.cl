@@ -1,5 +1,6 @@
-/* The numbers of the splats of some groups that are in a given state, ascending. A work-group looks at CHUNK splats: count finds how many of them
-   are wanted, and write puts their numbers behind those of the work-groups before it. Both kernel families use it.
+/* The numbers of the splats of some groups that are in a given state, ascending. A work-group looks at CHUNK splats:
+   count_wanted finds how many of them are wanted, and write_wanted puts their numbers behind those of the work-groups
+   before it. Both kernel families use it.
 
    Macros: none. */
 
@@ -7,10 +8,15 @@
 #define ROUNDS 16
 #define CHUNK (GROUP * ROUNDS)
 
-/* Whether a splat is wanted: groups[i] is the group of splat i, wanted[g] is 1 if the splats of group g are, and states[i]
-   must be `state`, if `by_state` says so. */
+/* Whether a splat is wanted: groups[i] is the group of splat i, wanted[g] is 1 if the splats of group g are, and
+   states[i] must be `state`, if `by_state` says so. */
 inline uint is_wanted(
-    global const uint *groups, global const uchar *wanted, global const uchar *states, int by_state, uint state, size_t i)
+    global const uint *groups,
+    global const uchar *wanted,
+    global const uchar *states,
+    int by_state,
+    uint state,
+    size_t i)
 {
     return wanted[groups[i]] && (!by_state || states[i] == state);
 }

@@ -232,7 +232,6 @@ class BundledFile:
         classes = np.concatenate([model.classes for model in models.values()])
         at_slots = self._keep(slots, np.uint8, len(slots), True)
         at_intervals = self._keep(intervals, np.uint32, len(intervals), True)
-        at_sizes, at_classes = self._keep(sizes, np.int16, sizes.size), self._keep(classes, np.uint8, 256 * number)
         for row, model in zip(sizes, models.values(), strict=True):
             alphabet = model.frequencies.shape[1]
             if alphabet > min(len(model.sizes), _TOKENS):
@@ -240,6 +239,7 @@ class BundledFile:
             row[:alphabet] = model.sizes[:alphabet]
         if (classes.reshape(number, 256).max(axis=1) >= contexts).any():
             raise TypeError("the native path was given contexts without frequencies")
+        at_sizes, at_classes = self._keep(sizes, np.int16, sizes.size), self._keep(classes, np.uint8, 256 * number)
         small = (sizes.max(axis=1) < _TOKENS) & self._vectors
         for k, (place, model) in enumerate(models.items()):
             if len(model.terms) > _WEIGHTS or len(model.biases) > _BIASES:

@@ -24,6 +24,8 @@ from potr_cl.stages.refitting.targets import GroundTruthTargets, Photographs
 
 #: The trial: its steps, the parts after which held-out photographs are looked at, and its rates as parts of the fit's.
 _TRIAL_STEPS, _TRIAL_LOOKS, _TRIAL_RATES = 40, 4, 0.1
+#: Whole rounds of the fit, of which someone who ends it early keeps the last.
+_ROUNDS = 5
 
 
 def fit_to_photographs(
@@ -81,7 +83,7 @@ def fit_to_photographs(
         )
         if asked or not trial.kept:
             return FittedToPhotographs(None, len(cameras), 0, len(judges), trial.errors, (), bool(asked))
-        options = dataclasses.replace(options, rounds=1, patience=1)
+        options = dataclasses.replace(options, rounds=_ROUNDS, patience=_ROUNDS)
         found = fit_scene(device, scene, cameras, pictures, options, 0, background, progress, tell, asked, some, every)
     return FittedToPhotographs(
         found.scene if found.kept else None, len(cameras), found.kept, len(judges), trial.errors, found.errors,

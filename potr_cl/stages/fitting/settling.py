@@ -123,10 +123,10 @@ def settle(
     scene = dataclasses.replace(decoded, means=state.scene.means, opacity_logits=state.scene.opacity_logits)
     scene = fitted(scene, settling.rounding, still)
     with thread_pool(bench.threads) as pool:
-        rounded = rounded.with_centres_of(scene, state.views, pool.map)
+        rounded = rounded.with_centres_of(scene.means, state.views, pool.map)
     scene = dataclasses.replace(rounded.decoded(scene.sh), opacity_logits=scene.opacity_logits)
     scene = fitted(scene, settling.rounding, [*still, "means"])
-    then = dataclasses.replace(state.recoloured(scene.sh), geometry=rounded.with_opacities_of(scene))
+    then = dataclasses.replace(state.recoloured(scene.sh), geometry=rounded.with_opacities_of(scene.opacity_logits))
     return then, tuple(errors)
 
 

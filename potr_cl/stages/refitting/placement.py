@@ -69,7 +69,7 @@ def placed(device: Device, splats: int, sh_count: int, memory: int | None, slice
         slices: splats of a slice, if the vectors are to lie on the host in any case.
     """
     vector, triangle = 12 * sh_count, sh_count * (sh_count + 1) // 2
-    one_piece = splats * (_VECTORS * vector + 2 * vector + 12 * triangle)
+    one_piece = _one_piece(splats, sh_count)
     free = max(device.info.memory - device.allocated, 0)
     fits = one_piece <= max(_OF_FREE * free if memory is None else min(_OF_GIVEN * memory, _OF_FREE * free), _ANYWAY)
     if slices is None and fits:
@@ -84,6 +84,22 @@ def placed(device: Device, splats: int, sh_count: int, memory: int | None, slice
     resident = min(max(room, _FEWEST), _MOST) if slices is None else _FEWEST
     besides = splats * ((3 + resident) * vector + _SWEEP) + some * of_slice + 8 * triangle * min(blocks, splats)
     return Place(some, blocks, max(int(total - besides), 0), resident)
+
+
+def left_for_views(splats: int, sh_count: int, memory: int | None) -> int | None:
+    """Bytes of the device's memory that views may take, where the vectors lie there in one piece.
+
+    Args:
+        splats, sh_count, memory: as of :func:`placed`, which found that they fit.
+    """
+    one_piece = _one_piece(splats, sh_count)
+    return memory if memory is None or one_piece <= _ANYWAY else max(memory - one_piece, 0)
+
+
+def _one_piece(splats: int, sh_count: int) -> int:
+    """Bytes of all vectors, sums and blocks."""
+    vector, triangle = 12 * sh_count, sh_count * (sh_count + 1) // 2
+    return splats * (_VECTORS * vector + 2 * vector + 12 * triangle)
 
 
 def vectors_of(device: Device, layout: Layout, place: Place | None) -> VectorSpace:
