@@ -77,6 +77,20 @@ def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options):
         assert [device.allocated for device in devices] == [0] * count
 
 
+def test_steps_by_a_part_of_the_views_give_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, monkeypatch):
+    """Every device knows which of its views these are, and whether there are any."""
+    cameras = few(plush_excerpt_cameras)
+    options = OPTIONS.changed(prune={"iterations": 2}, compact=False)
+    every = encode(plush_excerpt, cameras, options, device=open_device(family)).data
+    monkeypatch.setattr("potr_cl.stages.refitting.colour_map.ENOUGH", 2)
+    expected = encode(plush_excerpt, cameras, options, device=open_device(family)).data
+    assert expected != every
+    for count in (2, 4):
+        devices = [open_device(family) for _ in range(count)]
+        with HostPool(devices) as pool:
+            assert encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).data == expected
+
+
 def test_more_devices_than_views(plush_excerpt, plush_excerpt_cameras, family):
     cameras = few(plush_excerpt_cameras)[:2]
     expected = encode(plush_excerpt, cameras, OPTIONS, device=open_device(family)).data
