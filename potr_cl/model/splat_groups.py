@@ -9,6 +9,7 @@ whether splats of such groups are there.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -23,7 +24,7 @@ Indices = NDArray[np.int64]
 F64 = NDArray[np.float64]
 
 #: Splats of a group.
-_GROUP = 1024
+LARGEST = 1024
 #: Groups whose boxes are found at a time.
 _GROUPS = 256
 #: Splats that are so many times as large as the median have groups of their own: they can be seen from everywhere.
@@ -70,7 +71,7 @@ class SplatGroups:
             group: so many of them are a group at most.
             run: shares the work out.
         """
-        group = group or _GROUP
+        group = group or LARGEST
         logarithms = largest_scales(scene.log_scales)
         large = logarithms > np.median(logarithms) + math.log(_LARGE)
         along = morton_order(scene.means, run)
@@ -111,6 +112,17 @@ class SplatGroups:
     def splats(self, groups: NDArray[np.bool_]) -> Indices:
         """The numbers of the splats of some groups, ascending; ``groups``: (G,)."""
         return np.sort(self.order[np.repeat(groups, self.counts)])
+
+    def visible_by(self, cameras: Sequence[Camera], near: float, run: Run = map) -> NDArray[np.bool_]:
+        """(views, G) :meth:`visible` of some views; ``run`` shares the work out."""
+        found = np.zeros((len(cameras), len(self.starts) - 1), bool)
+
+        def look(view: int) -> None:
+            found[view] = self.visible(cameras[view], near)
+
+        for _ in run(look, range(len(cameras))):
+            pass
+        return found
 
     def visible(self, camera: Camera, near: float) -> NDArray[np.bool_]:
         """(G,) the groups of which a view may draw a splat; ``near`` as in the rasterizer's rules."""

@@ -124,7 +124,12 @@ def forecast(
     if isinstance(prune := parts.get(Prune.name), Prune):
         pictures += views * (units.prune + units.iteration * prune.iterations)
     if isinstance(fit := parts.get(Fit.name), Fit):
-        pictures += fit.steps_on(device.family) * fit.batch * units.fit
+        steps = fit.steps_on(device.family)
+        if isinstance(refit := parts.get(Refit.name), Refit) and refit.ground_truth is not None:
+            steps += fit.photograph_steps_on(device.family, len(cameras))
+        else:
+            steps += fit.further_steps_on(device.family)
+        pictures += steps * fit.batch * units.fit
         pictures += views * (fit.views_on(device.family) + units.prepare + units.iteration * fit.iterations)
     if Compact.name in parts:
         pictures += views * units.compact

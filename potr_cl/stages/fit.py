@@ -14,13 +14,13 @@ from typing import Any, Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.signals import first_interrupt_asks
-from potr_cl.host.threads import thread_pool
 from potr_cl.model.views_between import views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
+from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
 from potr_cl.stages.fitting.fit import (
     FitOptions,
     FitProgress,
@@ -30,10 +30,11 @@ from potr_cl.stages.fitting.fit import (
     held_out_error,
     kept_pictures,
 )
+from potr_cl.stages.fitting.photographs import fit_to_photographs
 from potr_cl.stages.fitting.pictures import TargetPictures
+from potr_cl.stages.fitting.settling import Looking, Settling, settle
 from potr_cl.stages.prune import Prune
-from potr_cl.stages.refitting.photographs import hold_out
-from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
+from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
 #: Times the threshold of pruning up to which a fit makes up for splats, about (docs/benchmarks/fit.md): for this
@@ -46,6 +47,10 @@ FINER = 0.18
 STEPS: dict[Family, int] = {"cpu": 800, "gpu": 1000}
 #: Views between for each given one that a fit looks at: they keep it from fitting the given ones too closely.
 BETWEEN: dict[Family, float] = {"cpu": 1.0, "gpu": 3.0}
+#: Steps of a fit to photographs that "auto" stands for: so many for each of them, because more follow few photographs
+#: too closely; and the most.
+_STEPS_EACH = 5
+_MOST_STEPS: dict[Family, int] = {"cpu": 250, "gpu": 500}
 #: Part of the steps in each cycle but the last.
 _FIRST = 0.25
 #: What a splat costs as a multiple of the error for which pruning would have let it go: what it adds to the error when
@@ -70,12 +75,12 @@ class LeftOut:
     Attributes:
         why: as people are told it.
         ended_early: whether someone has asked it to end.
-        photographs: what a fit did that had photographs as its targets; None if there was none.
+        photographs: what a fit to photographs did; None if there were none.
     """
 
     why: str
     ended_early: bool = False
-    photographs: Fitted | None = None
+    photographs: FittedToPhotographs | None = None
 
     @property
     def facts(self) -> dict[str, Any]:
@@ -84,7 +89,7 @@ class LeftOut:
         return {"left_out": self.why, "ended_early": self.ended_early, "photographs": photographs}
 
     def __str__(self) -> str:
-        more = "" if self.photographs is None else f"; to photographs {self.photographs}"
+        more = "" if self.photographs is None else f"; {self.photographs}"
         return f"the fit was left out: {self.why}{more}"
 
 
@@ -114,7 +119,10 @@ class Fit(Stage):
         iterations: of the pruning in each of them.
         between: views between that the fit looks at, for each given view, unless there are more already. "auto": as
             many as pay on the device.
-        to_photographs: part of the rates with which the fit goes on to photographs, where the re-fit has some.
+        photograph_steps: in which what came of it is fitted to photographs, where the re-fit has some; 0: it is not.
+            "auto": as many as pay on the device.
+        choosing, rounding, gentle: how far what is left is fitted once more after the choice of coefficients and the
+            rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`); not where photographs follow.
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -141,22 +149,28 @@ class Fit(Stage):
     cycles: int = option(2)
     iterations: int = option(16)
     between: float | Literal["auto"] = option("auto")
-    to_photographs: float = option(0.3)
+    photograph_steps: int | Literal["auto"] = option("auto")
     batch: int = option(FitOptions.batch)
     rounds: int = option(FitOptions.rounds)
     patience: int = option(FitOptions.patience)
     rates: Rates = option(FitOptions.rates)
     last: float = option(FitOptions.last)
+    choosing: float = option(0.3)
+    rounding: float = option(0.15)
+    gentle: float = option(0.1)
     seed: int = option(FitOptions.seed)
 
     def __post_init__(self) -> None:
-        _ = self._options("gpu", None)
+        _ = self._options("gpu", None), FitOptions(steps=self.photograph_steps_on("gpu", 1))
         if not 0 <= self.further <= 1e6:
             raise UsageError(f"the fit's further pruning is {self.further:g}, it must be from 0 to 1,000,000")
         if self.between != "auto" and not 0 <= self.between <= 100:
             raise UsageError(f"the fit's views between are {self.between:g}, they must be from 0 to 100")
         if not 0 <= self.finer <= 1:
             raise UsageError(f"the fit's finer quality is {self.finer:g}, it must be from 0 to 1")
+        for name, least, most in (("choosing", 0, 10), ("rounding", 0, 10), ("gentle", 1e-6, 1)):
+            if not least <= getattr(self, name) <= most:
+                raise UsageError(f"the fit's {name} is {getattr(self, name):g}, it must be from {least:g} to {most}")
         for name in ("cycles", "iterations"):
             if not 1 <= getattr(self, name) <= 1000:
                 raise UsageError(f"the fit's {name} are {getattr(self, name)}, they must be from 1 to 1000")
@@ -171,6 +185,16 @@ class Fit(Stage):
     def steps_on(self, family: Family) -> int:
         """The most steps on a device of a family."""
         return STEPS[family] if self.steps == "auto" else self.steps
+
+    def further_steps_on(self, family: Family) -> int:
+        """The most steps after the choice of coefficients and the roundings."""
+        return round((self.choosing + 2 * self.rounding) * self.steps_on(family))
+
+    def photograph_steps_on(self, family: Family, photographs: int) -> int:
+        """The steps of the fit to so many photographs on a device of a family."""
+        if self.photograph_steps == "auto":
+            return min(_STEPS_EACH * photographs, _MOST_STEPS[family])
+        return self.photograph_steps
 
     def views_on(self, family: Family) -> float:
         """Views between that it looks at on a device of a family, for each given one."""
@@ -214,7 +238,14 @@ class Fit(Stage):
                 targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
             found = self._cycles(seen, bench, targets, asked)
             found = dataclasses.replace(found, views=state.views, added=state.added)
-            return found if asked or bench.photographs is None else self._to_photographs(found, bench, asked)
+            if asked:
+                return found
+            if bench.photographs is not None and self.photograph_steps != 0:
+                return self._to_photographs(found, bench, asked)
+            if not isinstance(found.learnt[self.name], Fitted):
+                return found
+            looking = Looking(seen.views, seen.added, targets, rasterizer)
+            return self._settled(found, bench, looking, asked)
 
     def _looking_between(self, state: State, bench: Workbench) -> State:
         """The state with the views that the fit looks at."""
@@ -222,8 +253,7 @@ class Fit(Stage):
         each = self.views_on(bench.opened.family)
         if is_virtual(given) or each * len(given) <= state.added:
             return state
-        with thread_pool(bench.threads) as pool:
-            added = views_between(state.source, given, each, run=pool.map)
+        added = views_between(state.source, given, each)  # with threads it takes twice as long
         return dataclasses.replace(state, views=(*given, *added), added=len(added))
 
     def _cycles(self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool) -> State:
@@ -239,7 +269,7 @@ class Fit(Stage):
         last = best = state
         taken: Fitted | None = None
         steps_of = self._steps_of_cycles(bench.opened.family, price is not None and further > 1)
-        total, done = sum(steps_of), 0
+        total, done = sum(steps_of) + self.further_steps_on(bench.opened.family), 0
         for number, steps in enumerate(steps_of):
             part = number / (len(steps_of) - 1) if len(steps_of) > 1 else 1.0
             if price is not None and further > 1 and part > 0:
@@ -261,6 +291,21 @@ class Fit(Stage):
             return state.having_learnt(self.name, LeftOut(why, bool(asked)))
         return best.having_learnt(self.name, taken)
 
+    def _settled(self, state: State, bench: Workbench, looking: Looking, asked: SupportsBool) -> State:
+        """Choose coefficients and round geometry, with what is left fitted once more in between."""
+        options = self._options(bench.opened.family, bench.memory)
+        settling = Settling(self.choosing, self.rounding, self.gentle)
+        done, total = options.steps, options.steps + self.further_steps_on(bench.opened.family)
+
+        def progress(steps: int) -> None:
+            nonlocal done
+            done += steps
+            bench.progress("fit", min(done / total, 1.0) * 0.99)
+
+        then, errors = settle(state, bench, looking, settling, options, asked, progress)
+        told = dataclasses.replace(state.learnt[self.name], settled=errors)
+        return then.having_learnt(self.name, told)
+
     def _steps_of_cycles(self, family: Family, removing: bool) -> list[int]:
         """The steps of the fit in each cycle."""
         steps = self.steps_on(family)
@@ -269,22 +314,27 @@ class Fit(Stage):
         return [*[first] * (cycles - 1), max(steps - first * (cycles - 1), 1)]
 
     def _to_photographs(self, state: State, bench: Workbench, asked: SupportsBool) -> State:
-        """Go on with photographs as the targets, as long as others that are held out are matched better."""
+        """Go on with photographs as the targets, if others that are held out agree; and so do later stages."""
         assert bench.photographs is not None
         given = state.views[: len(state.views) - state.added]
         photographs = GroundTruth(bench.photographs, given, bench.background)
-        fit_to, judging = hold_out(photographs.of(given))
-        views = [*fit_to, *judging]
-        options = self._options(bench.opened.family, bench.memory)
-        rates = {each.name: self.to_photographs * getattr(self.rates, each.name) for each in dataclasses.fields(Rates)}
-        fitted = fit_scene(
-            bench.opened, state.scene, views, GroundTruthTargets(bench.opened, photographs, views),
-            dataclasses.replace(options, rates=self._sparse(Rates(**rates), state)), 0, bench.background, None,
-            bench.tell, asked, range(len(fit_to), len(views)),
+        views, family = photographs.of(given), bench.opened.family
+        options = dataclasses.replace(
+            self._options(family, bench.memory),
+            steps=self.photograph_steps_on(family, len(views)),
+            rates=self._sparse(self.rates, state),
+        )
+        bench.progress("fit to photographs", 0.0)
+        found = fit_to_photographs(
+            bench.opened, state.scene, views, photographs, options, bench.background, bench.tell,
+            asked, lambda done, steps: bench.progress("fit to photographs", done / steps),
         )  # fmt: skip
-        told: Fitted | LeftOut = dataclasses.replace(state.learnt[self.name], photographs=fitted)
-        scene = fitted.scene if fitted.kept else state.scene
-        return dataclasses.replace(state, scene=scene, geometry=None).having_learnt(self.name, told)
+        bench.progress("fit to photographs", 1.0)
+        told: Fitted | LeftOut = dataclasses.replace(state.learnt[self.name], photographs=found)
+        then = state.having_learnt(self.name, told)
+        if found.scene is None:
+            return then
+        return dataclasses.replace(then, scene=found.scene, truth=found.scene, geometry=None)
 
     def _sparse(self, rates: Rates, state: State) -> Rates:
         """The rates, without those that would change coefficients which compaction has chosen."""

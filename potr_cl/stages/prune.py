@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,9 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.raster.culling import Sights
+from potr_cl.raster.kept_scene import lying_on
+from potr_cl.raster.scene_buffers import SceneBuffers
+from potr_cl.raster.surely_seen import surely_seen
 from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
@@ -23,7 +27,7 @@ from potr_cl.stages.pruning.unseen import (
     set_aside,
     without_directions,
 )
-from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, groups_of_large, sights_worth_it
+from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, LIKELY, groups_of_large, seen_part, sights_worth_it
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 
@@ -140,20 +144,27 @@ class Prune(Stage):
         And as "unseen" a :class:`potr_cl.stages.pruning.unseen.Unseen`; and as "price", where the number of splats is
         not given, the ΔMSE below which a splat has gone.
         """
-        with thread_pool(bench.threads) as pool:
-            groups = groups_of_large(state.scene, pool.map)
-            hidden, area = find_unseen(state, groups, pool.map)
+        with thread_pool(bench.threads) as pool, lying_on(bench.opened, bench.placed(state)) as placed:
+            quick = partial(surely_seen, placed) if isinstance(placed, SceneBuffers) else None
+            likely = seen_part(state.scene, state.views) <= LIKELY
+            groups = groups_of_large(state.scene, pool.map) if likely or not quick else None
+            hidden, area = find_unseen(state, groups, pool.map, quick)
+            options = self._sweep_options(bench.memory)
+            sights = sights_worth_it(state.scene, state.views, options, groups, pool.map) if likely else None
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
         told = state.having_learnt("unseen", Unseen(splats, len(state.scene), area, kept))
         if self.keep is None and self.count is None:
             told = told.having_learnt("price", bench.parameters.delta_mse_max)
-        options = self._sweep_options(bench.memory)
-        sights = None if bench.pool else sights_worth_it(state.scene, state.views, options, groups)
         if not (kept and splats):
             return self._pruned(told, bench, sights)
         # A copy of a large scene without them would take as much memory as the scene.
-        if sights is not None and not bench.interludes and bench.parameters.delta_mse_max < LARGEST_LIMIT:
+        if (
+            sights is not None
+            and not bench.pool
+            and not bench.interludes
+            and bench.parameters.delta_mse_max < LARGEST_LIMIT
+        ):
             return without_directions(self._pruned(told, bench, sights, hidden), told.survivors[hidden])
         split = set_aside(told, hidden)
         if not len(split.seen_splats):

@@ -51,7 +51,7 @@ class Refit(Stage):
         at_steps: steps of each of these.
         ground_truth: folder of the views' photographs, named after the views. The colours are then fitted to the
             photographs instead of the uncompressed scene's pictures, if photographs that are held out agree that this
-            is better.
+            is better; but not if a fit of all parameters has come near to them before.
 
     Raises:
         UsageError: a value is out of range.
@@ -129,7 +129,9 @@ class Refit(Stage):
         active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
         options = RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory)
         on_grid = bench.output.on_grid(bench.request(state))
-        fits = 1 if self.ground_truth is None else 2
+        # What has been fitted to photographs already is what the colours should show again once all else is rounded.
+        folder = self.ground_truth if state.truth is None else None
+        fits = 1 if folder is None else 2
 
         geometry = state.geometry
         if geometry is None or geometry.asked != parameters:
@@ -169,9 +171,9 @@ class Refit(Stage):
             stack.callback(bench.progress, "refit", 1.0)
             refitted, geometry = fitted(state.views, stack.enter_context(_pictures_of_source(state, bench)), 0)
             choice = None
-            if self.ground_truth is not None:
+            if folder is not None:
                 given = state.views[: len(state.views) - state.added]
-                photographs = GroundTruth(self.ground_truth, given, bench.background)
+                photographs = GroundTruth(folder, given, bench.background)
                 fit_to, judging = hold_out(photographs.of(given))
                 # Nobody photographed added views. Renders of them beside photographs would ask for colours that leap
                 # from one view to the next, and SH can do that: held-out photographs were matched 7 to 13 dB worse.

@@ -59,11 +59,12 @@ class State:
     """A scene on its way to a file.
 
     Attributes:
-        source: the uncompressed scene; colours are re-fitted to its pictures.
+        source: the uncompressed scene.
         scene: what is left of it.
         survivors: (n,) int64, ascending: the number in ``source`` of each splat of ``scene``.
         views: the training views; empty if there are no cameras.
         added: how many of them, the last ones, a stage has put between those that were given.
+        truth: what a stage has fitted to photographs, where it did; it may have fewer splats than ``source``.
         cut: a scene that is these survivors of ``source`` as they are there; None: none is known to be.
         geometry: of ``scene`` as the file's readers will see it, once a stage has had it rounded. A stage that then
             changes anything but colours makes it None again.
@@ -80,6 +81,12 @@ class State:
     learnt: Mapping[str, Any] = field(default_factory=dict)
     added: int = 0
     cut: Scene | None = None
+    truth: Scene | None = None
+
+    @property
+    def goal(self) -> Scene:
+        """Whose pictures colours are re-fitted to: the uncompressed scene's, or those of what is nearer to truth."""
+        return self.source if self.truth is None else self.truth
 
     @staticmethod
     def of(scene: Scene, views: Sequence[Camera] = ()) -> State:

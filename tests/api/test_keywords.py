@@ -69,7 +69,7 @@ VALUES: dict[str, tuple[list[str], Any]] = {
     "--weighting": (["visibility"], "visibility"),
     "--one-pass": ([], True),
     "--refit": (["off"], "off"),
-    "--fit": (["10"], 10),
+    "--fit": (["80"], 80),
     "--drop": (["1e-5"], 1e-5),
     "--refit-at": (["0.3", "0.6"], [0.3, 0.6]),
     "--photos": (["{photos}"], "{photos}"),

@@ -13,7 +13,6 @@ from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
@@ -106,46 +105,3 @@ def test_held_out_photographs_are_spread(number):
 def test_the_choice_says_what_it_is():
     assert "1 photograph held out" in str(PhotographChoice(1, 20.0, 21.0))
     assert not PhotographChoice(1, 20.0, 20.0).kept
-
-
-def moved(scene):
-    """What a trained scene is to the truth: near, but not the same."""
-    rng = np.random.default_rng(3)
-    return dataclasses.replace(
-        scene, means=scene.means + rng.normal(scale=0.02, size=scene.means.shape).astype(np.float32)
-    )
-
-
-def against_photographs(device, folder, scene, cameras):
-    views = [camera for camera in cameras if camera.split == "test"]
-    with Rasterizer(device, scene) as rasterizer:
-        return GroundTruth(folder, views).psnr(rasterizer, views)
-
-
-@pytest.mark.parametrize("prune", [True, False])
-def test_all_parameters_are_fitted_to_photographs_too(tmp_path, scene, device, prune):
-    """Which test photographs, that nobody has seen, confirm."""
-    cameras = ring_of_cameras(32, size=48)
-    folder = photographs(tmp_path, device, scene, cameras)
-    source = moved(scene)
-    colours, everything = (
-        encoded(source, cameras, device, folder, prune={"on": prune}, fit={"steps": steps}) for steps in (0, 150)
-    )
-    told = everything.fitted
-    assert told.photographs.kept > 0
-    assert told.photographs.held_out == everything.photographs.held_out
-    assert "to photographs" in str(told)
-    before, by_colours, by_all = (
-        against_photographs(device, folder, each, cameras) for each in (source, colours.scene, everything.scene)
-    )
-    assert by_all > by_colours + 1
-    assert by_all > before + 0.3
-
-
-def test_photographs_that_lead_elsewhere_are_not_fitted_to(tmp_path, scene, cameras, device):
-    """Those that judge show the scene, all others its negative."""
-    fit_to, judging = hold_out(train_views(cameras))
-    for views, factor in ((fit_to, -1.0), (judging, 1.0)):
-        photographs(tmp_path, device, dataclasses.replace(scene, sh=factor * scene.sh), views)
-    told = encoded(scene, cameras, device, tmp_path, fit={"steps": 30}).fitted
-    assert told.photographs.kept == 0

@@ -5,14 +5,14 @@
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photographs in images. A series is a curve:
 the name it gets and the options of EncodeOptions in which it differs from the defaults, those of a stage with its name,
-as in exact:preset=best,prune.tolerance=0. ``measure`` writes its results after every encode and goes on where an
-existing file stops; with --seconds it begins no encode after that many. ``report`` prints Markdown and draws
-DIR/rate_distortion_SCENE.png; the points of other formats come from tools.study.compare_formats. With --json it keeps
-the tables of docs/benchmarks: the curves, the uncompressed scenes, and the seconds of each stage at quality 0.5; with
---losses NAME too, another one instead: what each other series loses on photographs, and what the series NAME loses at
-the same PSNR against the uncompressed renders, by interpolation. With --against it prints instead how many bytes more
-or fewer each series takes at the PSNR that the series NAME has at quality Q, by interpolation, and how long its encodes
-take.
+as in exact:preset=best,prune.tolerance=0; photos=True stands for --photos with the folder images. ``measure`` writes
+its results after every encode and goes on where an existing file stops; with --seconds it begins no encode after that
+many. ``report`` prints Markdown and draws DIR/rate_distortion_SCENE.png; the points of other formats come from
+tools.study.compare_formats. With --json it keeps the tables of docs/benchmarks: the curves, the uncompressed scenes,
+and the seconds of each stage at quality 0.5; with --losses NAME too, another one instead: what each other series loses
+on photographs, and what the series NAME loses at the same PSNR against the uncompressed renders, by interpolation. With
+--against it prints instead how many bytes more or fewer each series takes at the PSNR that the series NAME has at
+quality Q, by interpolation, and how long its encodes take.
 """
 
 from __future__ import annotations
@@ -61,7 +61,7 @@ def parse_series(text: str) -> tuple[str, dict[str, Any]]:
     """
     name, _, rest = text.partition(":")
     options: dict[str, Any] = {}
-    known = {field.name for field in dataclasses.fields(EncodeOptions)} - {"q", "stages"}
+    known = {"photos"} | {field.name for field in dataclasses.fields(EncodeOptions)} - {"q", "stages"}
     for stage in EncodeOptions().stages:
         known |= {stage.name, *(f"{stage.name}.{field.name}" for field in dataclasses.fields(stage))}
     for part in filter(None, rest.split(",")):
@@ -75,9 +75,16 @@ def parse_series(text: str) -> tuple[str, dict[str, Any]]:
     return name, options
 
 
-def encode_options(changes: dict[str, Any]) -> EncodeOptions:
-    """The options of a series, quality included."""
+def encode_options(changes: dict[str, Any], images: Path | None = None) -> EncodeOptions:
+    """The options of a series, quality included.
+
+    Args:
+        changes: to the defaults; "photos" is whether ``images``, the scene's photographs, are fitted to.
+    """
     nested: dict[str, Any] = {}
+    changes = dict(changes)
+    if changes.pop("photos", False):
+        changes["refit.ground_truth"] = images
     for key, value in changes.items():
         stage, _, option = key.partition(".")
         if option:
@@ -118,7 +125,7 @@ def _measure(args: argparse.Namespace) -> None:
                 for q in args.qualities:
                     if q in done or time.perf_counter() - began > args.seconds:
                         continue
-                    point = measure_encode(evaluator, encode_options({**options, "q": q}), device)
+                    point = measure_encode(evaluator, encode_options({**options, "q": q}, folder / "images"), device)
                     curve["encodes"].append(point)
                     curve["encodes"].sort(key=lambda p: p["q"])
                     write_json(args.json, results)

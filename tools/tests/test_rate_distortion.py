@@ -5,6 +5,7 @@ from __future__ import annotations
 import json
 import shutil
 import sys
+from pathlib import Path
 
 import numpy as np
 import pytest
@@ -36,6 +37,9 @@ def test_series():
     chosen = rate_distortion.encode_options(options)
     assert (chosen.refit.on, chosen.prune.iterations, chosen.compact.colour_model) == (False, 8, "rgb")
     assert rate_distortion.encode_options({}) == EncodeOptions()
+    _, options = rate_distortion.parse_series("near:preset=smallest,photos=True")
+    for images in (Path("a"), Path("b")):
+        assert rate_distortion.encode_options(options, images).refit.ground_truth == images
     with pytest.raises(UsageError, match="'speed' is no option"):
         rate_distortion.parse_series("a:speed=1")
 

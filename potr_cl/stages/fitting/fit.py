@@ -26,6 +26,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Adam, Limits, Rates
+from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.judges import Judges
 from potr_cl.stages.fitting.pictures import TargetPictures
@@ -60,7 +61,8 @@ class FitOptions:
         patience: the fit ends after so many rounds in which they did not become better.
         rates: of the first step, if the scene is far from the targets; smaller where it is near to them. ``means`` in
             parts of a usual splat's size.
-        last: part of the rates that is left at the end; they fall by the same factor in each step.
+        start: part of the rates that it begins with.
+        last: part of these that is left at the end; they fall by the same factor in each step.
         seed: of the order of the views.
         memory: bytes of device memory that target pictures may take; None: a quarter of what is free.
 
@@ -73,6 +75,7 @@ class FitOptions:
     rounds: int = 10
     patience: int = 3
     rates: Rates = RATES
+    start: float = 1.0
     last: float = 0.1
     seed: int = 0
     memory: int | None = None
@@ -83,8 +86,9 @@ class FitOptions:
         for name in ("batch", "rounds", "patience"):
             if not 1 <= getattr(self, name) <= 1000:
                 raise UsageError(f"the fit's {name} is {getattr(self, name)}, it must be from 1 to 1000")
-        if not 0 < self.last <= 1:
-            raise UsageError(f"the fit's last rate is {self.last:g}, it must be above 0 and at most 1")
+        for name in ("start", "last"):
+            if not 0 < getattr(self, name) <= 1:
+                raise UsageError(f"the fit's {name} rate is {getattr(self, name):g}, it must be above 0 and at most 1")
 
 
 @dataclass(frozen=True)
@@ -99,7 +103,8 @@ class Fitted:
         ended_early: whether someone has asked it to end.
         spared: how many splats were removed before it for it to make up for.
         without: the error of these views before those were removed; None where none were.
-        photographs: what a further fit did that had photographs as its targets; None if there was none.
+        settled: mean squared error of these views after each fit that followed a choice of coefficients or a rounding.
+        photographs: what a further fit to photographs did; None if there were none.
     """
 
     scene: Scene
@@ -110,7 +115,8 @@ class Fitted:
     ended_early: bool = False
     spared: int = 0
     without: float | None = None
-    photographs: Fitted | None = None
+    settled: tuple[float, ...] = ()
+    photographs: FittedToPhotographs | None = None
 
     @property
     def error(self) -> float:
@@ -126,7 +132,8 @@ class Fitted:
     def facts(self) -> dict[str, Any]:
         """All but the scene, by name."""
         names = ("steps", "kept", "held_out", "ended_early", "spared", "without")
-        facts = {name: getattr(self, name) for name in names} | {"errors": list(self.errors)}
+        facts = {name: getattr(self, name) for name in names}
+        facts |= {"errors": list(self.errors), "settled": list(self.settled)}
         return facts | {"photographs": None if self.photographs is None else self.photographs.facts}
 
     def __str__(self) -> str:
@@ -138,8 +145,10 @@ class Fitted:
         said = f"{steps}: PSNR {before:.2f} dB before, {after:.2f} dB after, {views}"
         if self.spared and self.without is not None:
             said += f"; {_decibels(self.without):.2f} dB with {self.spared:,} splats more, without it"
+        if self.settled:
+            said += f"; {_decibels(self.settled[-1]):.2f} dB with geometry and coefficients as in the file"
         if self.photographs is not None:
-            said += f"; to photographs {self.photographs}"
+            said += f"; {self.photographs}"
         return said
 
 
@@ -165,6 +174,7 @@ def fit_scene(
     tell: Callable[[str], None] | None = None,
     asked: SupportsBool = False,
     held_out: Sequence[int] | None = None,
+    fit_to: Sequence[int] | None = None,
 ) -> Fitted:
     """Fit all parameters of a scene to pictures of some views.
 
@@ -180,6 +190,7 @@ def fit_scene(
         tell: called with a line for each round.
         asked: whether to end before the next step, with the best of the whole rounds; looked at after each.
         held_out: numbers of the views to judge by; None: some of the given ones.
+        fit_to: numbers of the views to look at, where the judges are given; None: all others.
 
     Raises:
         UsageError: there are fewer than two given views, so that none can be held out.
@@ -188,7 +199,7 @@ def fit_scene(
     options = options or FitOptions()
     if held_out is None:
         fit_to, held_out = share_out(len(cameras) - added, added)
-    else:
+    elif fit_to is None:
         fit_to = [number for number in range(len(cameras)) if number not in set(held_out)]
     if not held_out or not fit_to:
         raise UsageError("a fit needs two training views or more: one of them is held out and tells whether it helps")
@@ -197,7 +208,7 @@ def fit_scene(
         _pictures_of(device, cameras, targets, options.memory) as pictures,
     ):
         if options.memory is None and options.steps * options.batch >= len(fit_to):
-            pictures.prepare([*held_out, *fit_to])
+            pictures.prepare([*held_out, *(number for number in fit_to if number not in held_out)])
         rasterizer = derivatives.rasterizer
         rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
         with (
@@ -272,7 +283,7 @@ class _Fit:
     ) -> Fitted:
         options = self._options
         errors = [self._judges.error()]
-        pace = min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
+        pace = options.start * min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
         slowing = options.last ** (1 / max(options.steps - 1, 1))
         kept = done = since = 0
         order = batches(fit_to, options.batch, options.seed)
@@ -287,14 +298,15 @@ class _Fit:
                     progress(done, options.steps)
             if done < end:
                 break
-            errors.append(self._judges.error())
+            with self._adam.averaged():
+                errors.append(self._judges.error())
+                if errors[-1] < min(errors[:-1]):
+                    self._adam.keep()
+                    kept, since = done, 0
+                else:
+                    since += 1
             now, first = _decibels(errors[-1]), _decibels(errors[0])
             tell(f"fit: {done} steps, held-out views {now:.2f} dB, {first:.2f} dB at first")
-            if errors[-1] < min(errors[:-1]):
-                self._adam.keep()
-                kept, since = done, 0
-            else:
-                since += 1
             if since >= options.patience:
                 break
         return Fitted(self._adam.kept(), done, kept, tuple(errors), len(self._judges), bool(asked))

@@ -19,6 +19,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.host.threads import Run
+from potr_cl.model import splat_groups
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.splat_groups import SplatGroups
@@ -38,6 +39,8 @@ from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
 LEAST_SPLATS = 1 << 21
 #: Parts must save this much of the splats that views project, for their own copies and for what each part costs.
 _WORTH_IT = 0.5
+#: Few of the splats, one in so many, tell whether it may be worth it; then a view sees no more than this part of them.
+_SAMPLED, LIKELY = 64, 0.6
 #: The parts' scenes stay on the device if they take no more than this part of the memory.
 _SCENES = 1 / 2
 #: The whole scene is on the device too where that has so many times as much memory.
@@ -49,13 +52,26 @@ _SOURCE = "prune/parts.cl"
 _GROUP = 64
 
 
+def seen_part(scene: Scene, cameras: Sequence[Camera]) -> float:
+    """Which part of a scene a view may draw on the average, told from few of its splats; 1 for a small scene."""
+    if len(scene) < LEAST_SPLATS or not cameras:
+        return 1.0
+    few = scene.subset(np.arange(0, len(scene), _SAMPLED))
+    groups = SplatGroups.of(few, max(splat_groups.LARGEST // _SAMPLED, 1))
+    return float((groups.visible_by(cameras, INRIA.near) @ groups.counts).mean() / len(few))
+
+
 def groups_of_large(scene: Scene, run: Run = map) -> SplatGroups | None:
     """The groups of a scene's splats, if it is so large that they are worth their time; ``run`` shares the work out."""
     return SplatGroups.of(scene, run=run) if len(scene) >= LEAST_SPLATS else None
 
 
 def sights_worth_it(
-    scene: Scene, cameras: Sequence[Camera], options: SweepOptions, groups: SplatGroups | None = None
+    scene: Scene,
+    cameras: Sequence[Camera],
+    options: SweepOptions,
+    groups: SplatGroups | None = None,
+    run: Run = map,
 ) -> Sights | None:
     """What the views see; None where they had better share one scene.
 
@@ -64,11 +80,12 @@ def sights_worth_it(
         cameras: the views.
         options: of the sweep.
         groups: of the scene, where they are known.
+        run: shares the work out.
     """
     # A sample of the tiles is drawn from all of them in turn.
     if len(scene) < LEAST_SPLATS or options.sample < 1 or not cameras:
         return None
-    sights = Sights.of(scene, cameras, INRIA.near, groups)
+    sights = Sights.of(scene, cameras, INRIA.near, groups, run)
     return sights if sights.totals.sum() <= _WORTH_IT * len(scene) * len(cameras) else None
 
 
