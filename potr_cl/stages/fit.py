@@ -31,7 +31,7 @@ from potr_cl.stages.fitting.fit import (
     held_out_error,
     kept_pictures,
 )
-from potr_cl.stages.fitting.photographs import fit_to_photographs
+from potr_cl.stages.fitting.photographs import fit_to_photographs, times
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
@@ -121,6 +121,8 @@ class Fit(Stage):
             many as pay on the device.
         photograph_steps: in which what came of it is fitted to photographs, where the re-fit has some; 0: it is not.
             "auto": as many as pay on the device.
+        photograph_rate: by what the rates are multiplied for photographs, which pictures are farther from than from the
+            uncompressed scene's.
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -148,6 +150,7 @@ class Fit(Stage):
     iterations: int = option(16)
     between: float | Literal["auto"] = option("auto")
     photograph_steps: int | Literal["auto"] = option("auto")
+    photograph_rate: float = option(3.0)
     batch: int = option(FitOptions.batch)
     rounds: int = option(FitOptions.rounds)
     patience: int = option(FitOptions.patience)
@@ -161,6 +164,8 @@ class Fit(Stage):
             raise UsageError(f"the fit's further pruning is {self.further:g}, it must be from 0 to 1,000,000")
         if self.between != "auto" and not 0 <= self.between <= 100:
             raise UsageError(f"the fit's views between are {self.between:g}, they must be from 0 to 100")
+        if not 0 < self.photograph_rate <= 100:
+            raise UsageError(f"the fit's photograph rate is {self.photograph_rate:g}, it must be above 0, at most 100")
         if not 0 <= self.finer <= 1:
             raise UsageError(f"the fit's finer quality is {self.finer:g}, it must be from 0 to 1")
         for name in ("cycles", "iterations"):
@@ -291,7 +296,7 @@ class Fit(Stage):
         options = dataclasses.replace(
             self._options(family, bench.memory),
             steps=self.photograph_steps_on(family, len(views)),
-            rates=self._sparse(self.rates, state),
+            rates=times(self._sparse(self.rates, state), self.photograph_rate),
         )
         bench.progress("fit to photographs", 0.0)
         found = fit_to_photographs(
