@@ -25,7 +25,7 @@ from potr_cl.codec.context.tokens import largest_integer
 from potr_cl.codec.dequantizer import Dequantizer
 from potr_cl.codec.native.bundles import BEYOND_TABLE
 from potr_cl.codec.native.library import native
-from potr_cl.codec.native.values import PackedValues, Tables, ValueArrays, packing_rooms
+from potr_cl.codec.native.values import PackedValues, Tables, ValueArrays
 from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
 from potr_cl.codec.versions import VERSIONS
@@ -41,8 +41,8 @@ _SIDE_BY_SIDE = 32
 _HANDED = 4
 #: Bundles for each thread, so that one more pays.
 _BUNDLES_A_THREAD = 2
-#: Bundles for each thread that may be packed, or wait to be taken, at a time.
-_ROOMS_A_THREAD = 2
+#: Bundles that may wait to be taken, beside those that threads are packing.
+_ROOMS_BESIDE = 8
 #: Bytes of a file whose checksums take long enough for several threads.
 _LARGE = 1 << 20
 #: Levels whose values are looked up.
@@ -147,7 +147,7 @@ class BundledScene:
             if not taken:
                 destination.take_means(helpers.finish())
 
-        with packing_rooms(0 if native() is None else min(number, _ROOMS_A_THREAD * threads)) as rooms:
+        with destination.rooms(0 if native() is None else min(number, threads + _ROOMS_BESIDE)) as rooms:
             self._helped(threads, wanted, means, work)
 
     def _helped(
