@@ -30,7 +30,7 @@ from potr_cl.stages.fitting.fit import (
     held_out_error,
     kept_pictures,
 )
-from potr_cl.stages.fitting.photographs import fit_to_photographs
+from potr_cl.stages.fitting.photographs import fit_to_photographs, times
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
 from potr_cl.stages.prune import Prune
@@ -123,6 +123,8 @@ class Fit(Stage):
             "auto": as many as pay on the device.
         choosing, rounding, gentle: how far what is left is fitted once more after the choice of coefficients and the
             rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`); not where photographs follow.
+        photograph_rate: by what the rates are multiplied for photographs, which pictures are farther from than from the
+            uncompressed scene's.
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -150,6 +152,7 @@ class Fit(Stage):
     iterations: int = option(16)
     between: float | Literal["auto"] = option("auto")
     photograph_steps: int | Literal["auto"] = option("auto")
+    photograph_rate: float = option(3.0)
     batch: int = option(FitOptions.batch)
     rounds: int = option(FitOptions.rounds)
     patience: int = option(FitOptions.patience)
@@ -166,6 +169,8 @@ class Fit(Stage):
             raise UsageError(f"the fit's further pruning is {self.further:g}, it must be from 0 to 1,000,000")
         if self.between != "auto" and not 0 <= self.between <= 100:
             raise UsageError(f"the fit's views between are {self.between:g}, they must be from 0 to 100")
+        if not 0 < self.photograph_rate <= 100:
+            raise UsageError(f"the fit's photograph rate is {self.photograph_rate:g}, it must be above 0, at most 100")
         if not 0 <= self.finer <= 1:
             raise UsageError(f"the fit's finer quality is {self.finer:g}, it must be from 0 to 1")
         for name, least, most in (("choosing", 0, 10), ("rounding", 0, 10), ("gentle", 1e-6, 1)):
@@ -322,7 +327,7 @@ class Fit(Stage):
         options = dataclasses.replace(
             self._options(family, bench.memory),
             steps=self.photograph_steps_on(family, len(views)),
-            rates=self._sparse(self.rates, state),
+            rates=times(self._sparse(self.rates, state), self.photograph_rate),
         )
         bench.progress("fit to photographs", 0.0)
         found = fit_to_photographs(

@@ -160,7 +160,7 @@ class Refit(Stage):
                 bench.opened, decoded, views, targets, options, active, bench.background, progress,
                 fix_ac=None if on_grid or not bench.output.fixes_ac else fix_ac,
                 # Photographs lie where the master reads them.
-                help_from=HelpFrom(bench.pool, bench.shared_source(state))
+                help_from=HelpFrom(bench.pool, bench.shared_source(state) if state.truth is None else state.truth)
                 if bench.pool and isinstance(targets, RenderedTargets)
                 else None,
                 colour_grid=colour_grid if on_grid else None,
@@ -169,7 +169,7 @@ class Refit(Stage):
 
         with ExitStack() as stack:
             stack.callback(bench.progress, "refit", 1.0)
-            refitted, geometry = fitted(state.views, stack.enter_context(_pictures_of_source(state, bench)), 0)
+            refitted, geometry = fitted(state.views, stack.enter_context(_pictures_of_goal(state, bench)), 0)
             choice = None
             if folder is not None:
                 given = state.views[: len(state.views) - state.added]
@@ -191,11 +191,11 @@ class Refit(Stage):
 
 
 @contextmanager
-def _pictures_of_source(state: State, bench: Workbench) -> Iterator[Targets]:
-    """The pictures of the uncompressed scene; where the re-fit needs its room, they are rendered before."""
+def _pictures_of_goal(state: State, bench: Workbench) -> Iterator[Targets]:
+    """The pictures that colours are re-fitted to; where the re-fit needs its room, they are rendered before."""
     device, views = bench.opened, state.views
     in_one_piece = placed(device, len(state.scene), state.scene.sh.shape[1], bench.memory) is None
-    with Rasterizer(device, bench.drawable(state.source), background=bench.background) as rasterizer:
+    with Rasterizer(device, bench.drawable(state.goal), background=bench.background) as rasterizer:
         targets = RenderedTargets(rasterizer, views)
         if in_one_piece or bench.pool is not None:
             yield targets

@@ -23,7 +23,7 @@ from potr_cl.stages.refitting.photographs import hold_out
 from potr_cl.stages.refitting.targets import GroundTruthTargets, Photographs
 
 #: The trial: its steps, the parts after which held-out photographs are looked at, and its rates as parts of the fit's.
-_TRIAL_STEPS, _TRIAL_LOOKS, _TRIAL_RATES = 40, 4, 0.1
+_TRIAL_STEPS, _TRIAL_LOOKS, _TRIAL_RATES = 40, 4, 1 / 30
 #: Whole rounds of the fit, of which someone who ends it early keeps the last.
 _ROUNDS = 5
 
@@ -64,7 +64,7 @@ def fit_to_photographs(
     some = range(0, len(cameras), max(len(cameras) // len(judging), 1))
     trial_options = dataclasses.replace(
         options, steps=min(_TRIAL_STEPS, options.steps), rounds=_TRIAL_LOOKS, patience=_TRIAL_LOOKS, last=1.0,
-        rates=slower(options.rates, _TRIAL_RATES),
+        rates=times(options.rates, _TRIAL_RATES),
     )  # fmt: skip
     with kept_pictures(device, cameras, GroundTruthTargets(device, photographs, cameras), options.memory) as pictures:
         trial = fit_scene(
@@ -91,6 +91,6 @@ def fit_to_photographs(
     )  # fmt: skip
 
 
-def slower(rates: Rates, part: float) -> Rates:
-    """So large a part of all rates."""
-    return Rates(**{each.name: part * getattr(rates, each.name) for each in dataclasses.fields(Rates)})
+def times(rates: Rates, factor: float) -> Rates:
+    """All rates multiplied."""
+    return Rates(**{each.name: factor * getattr(rates, each.name) for each in dataclasses.fields(Rates)})

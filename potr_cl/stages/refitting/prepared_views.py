@@ -24,6 +24,7 @@ class PreparedViews(Owner):
         cameras: the views.
         most_views: how many views a launch can do.
         nbytes: bytes that a view takes in a sweep's own buffers.
+        breaks: numbers of views at which a launch begins, whatever came before.
         memory: bytes that the kept views, and what else is taken from :attr:`budget`, may take; None: a quarter of what
             is free.
 
@@ -36,10 +37,17 @@ class PreparedViews(Owner):
     """
 
     def __init__(
-        self, rasterizer: Rasterizer, cameras: Sequence[Camera], most_views: int, nbytes: int, memory: int | None
+        self,
+        rasterizer: Rasterizer,
+        cameras: Sequence[Camera],
+        most_views: int,
+        nbytes: int,
+        memory: int | None,
+        breaks: Sequence[int] = (),
     ) -> None:
         self._rasterizer = rasterizer
         self._cameras = list(cameras)
+        self._breaks = sorted({*breaks, len(cameras)})
         device = rasterizer.device
         free = device.info.memory - device.allocated
         self.budget = ViewCache(rasterizer, free * _SHARE if memory is None else memory)
@@ -56,7 +64,8 @@ class PreparedViews(Owner):
     def _prepare_all(self, most: int) -> None:
         number = 0
         while number < len(self._cameras):
-            numbers = range(number, min(number + most, len(self._cameras)))
+            stop = next(each for each in self._breaks if each > number)
+            numbers = range(number, min(number + most, stop))
             try:
                 views = self._prepare_again(numbers)
             except DeviceMemoryError:
