@@ -247,7 +247,8 @@ class Fit(Stage):
                 return found
             if bench.photographs is not None and self.photograph_steps != 0:
                 return self._to_photographs(found, bench, asked)
-            if not isinstance(found.learnt[self.name], Fitted):
+            told = found.learnt[self.name]
+            if not (isinstance(told, Fitted) and told.spared):  # others do not round as finely then as is known here
                 return found
             looking = Looking(seen.views, seen.added, targets, rasterizer)
             return self._settled(found, bench, looking, asked)
