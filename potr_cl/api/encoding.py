@@ -104,7 +104,8 @@ def encode(
         report: a page of HTML to write: sizes, quality by view, pictures before and after, and the course of pruning.
         report_view: a view to show there besides the worst and the median one.
         background: R, G, B from 0 to 1, or a colour's name; black by default.
-        memory: GiB of device memory to keep views in; by default half of it, 0.3 of a CPU's.
+        memory: GiB of device memory to keep views in, and for the re-fit; by default half of it, 0.3 of a CPU's. If it
+            is given, large arrays of the host lie in temporary files (docs/large_scenes.md).
         threads: on the host; one for each processor by default.
         trust, antialiased: as of :func:`potr_cl.load_scene`.
         cameras_anyway: take the cameras even if they do not seem to be in the scene's frame.

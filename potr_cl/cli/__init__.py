@@ -14,11 +14,9 @@ from potr_cl import __version__
 from potr_cl.cli import guard, outputs
 from potr_cl.cli.completion import SHELLS, PrintCompletion
 from potr_cl.cli.parser import CommandParser
-from potr_cl.cli.scenes import standard_input
 from potr_cl.cli.terminal import note, speak
 from potr_cl.errors import PotrError
 from potr_cl.host.signals import unwinding
-from potr_cl.host.threads import in_background
 from potr_cl.plain_text import plain
 
 #: The commands, and who adds them, in the order of the help.
@@ -36,7 +34,7 @@ COMMANDS = {
     "view": "view",
     "devices": "devices",
 }
-#: Those that need an OpenCL device.
+#: Those that need an OpenCL device, or tell of them.
 _ON_A_DEVICE = {"encode", "prune", "compact", "refit", "fit", "render", "compare", "view", "devices"}
 #: Set to anything, it has errors that nobody foresaw shown with where they come from.
 TRACEBACK_VARIABLE = "POTR_CL_TRACEBACK"
@@ -70,8 +68,10 @@ def main(argv: Sequence[str] | None = None) -> int:
 
 def _run(argv: Sequence[str]) -> None:
     if argv and argv[0] in _ON_A_DEVICE and not {"-h", "--help"} & set(argv):
-        # Drivers take as long to load as the command's modules to be imported.
-        in_background(import_module("potr_cl.opencl.discovery").list_devices)
+        # Drivers take as long to load, and to open a device, as the command's modules to be imported.
+        import_module("potr_cl.opencl.ahead").begin_to_open(_named_device(argv), whole=argv[0] != "devices")
+    from potr_cl.cli.scenes import standard_input  # on use: it brings much that can wait for the lines above
+
     args = command_parser(argv).parse_args(argv)
     args.typed = shlex.join(["potr-cl", *argv])
     speak(args.loudness)
@@ -81,6 +81,13 @@ def _run(argv: Sequence[str]) -> None:
     outputs.check(args)
     with unwinding(), standard_input(args), outputs.standard_output(args):
         args.run(args)
+
+
+def _named_device(argv: Sequence[str]) -> str | None:
+    """What a call will probably say of its device, once somebody parses it."""
+    given = [argv[at + 1] for at, word in enumerate(argv[:-1]) if word == "--device"]
+    given += [word.partition("=")[2] for word in argv if word.startswith("--device=")]
+    return given[-1] if given else None
 
 
 def command_parser(argv: Sequence[str] = ()) -> argparse.ArgumentParser:

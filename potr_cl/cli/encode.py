@@ -46,7 +46,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output
 from potr_cl.outputs.registry import OUTPUTS, encoded_suffix, output_of, output_of_suffix, suffixes_encoded
-from potr_cl.pipeline.encode import Encoded, Stopwatch, check_frame, encode, proved
+from potr_cl.pipeline.encode import Encoded, Stopwatch, encode, frame_checked_beside, proved
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT, PRESETS, PURPOSE
 from potr_cl.pipeline.search import encode_to_target
@@ -151,11 +151,10 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
     with contextlib.ExitStack() as stack:
         stack.enter_context(bounded(options.memory))
         scene = read_scene(args, args.scene)
-        # Drivers take as long to open a device.
-        check_frame(scene, cameras, options.cameras_anyway)
-        workers = opened.result() if opened is not None and options.look_at_views(scene) else None
-        device, pool = (None, None) if workers is None else (workers.device, workers.pool)
-        kept = None if device is None or target is not None else stack.enter_context(KeptScene(device, scene))
+        with frame_checked_beside(scene, cameras, options.cameras_anyway):
+            workers = opened.result() if opened is not None and options.look_at_views(scene) else None
+            device, pool = (None, None) if workers is None else (workers.device, workers.pool)
+            kept = None if device is None or target is not None else stack.enter_context(KeptScene(device, scene))
         progress = stack.enter_context(contextlib.closing(Progress()))
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None
         placing = Stopwatch(progress)
@@ -325,7 +324,7 @@ def add_encode(commands: Commands) -> None:
     add_from_option(p)
     add_trust_option(p)
     add_antialiased_option(p)
-    add_memory_option(p)
+    add_memory_option(p, ", and for the re-fit; the host's arrays of a scene too large for it lie in temporary files")
     add_device_options(
         p, "; of several the views are shared out: all (of the best one's kind), or indices with commas, 0,1"
     )

@@ -13,12 +13,16 @@ Commands: TypeAlias = "argparse._SubParsersAction[argparse.ArgumentParser]"
 CAMERAS_HELP = "cameras.json, transforms.json, or a COLMAP model's folder"
 
 
-def add_memory_option(p: argparse._ActionsContainer) -> None:
+def add_memory_option(p: argparse._ActionsContainer, besides: str = "") -> None:
+    """
+    Args:
+        besides: what else of memory a command bounds.
+    """
     p.add_argument(
         "--memory",
         type=float,
         metavar="GB",
-        help="GiB of device memory to keep views in; default: half of it, 0.3 of a CPU's",
+        help=f"GiB of device memory to keep views in{besides}; default: half of it, 0.3 of a CPU's",
     )
 
 

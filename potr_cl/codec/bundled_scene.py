@@ -5,10 +5,10 @@ Threads share the bundles out. Integers of a bundle become values while they are
 
 from __future__ import annotations
 
-from collections.abc import Callable
-from concurrent.futures import Future, ThreadPoolExecutor
-from dataclasses import dataclass
-from functools import cached_property
+from collections.abc import Callable, Sequence
+from concurrent.futures import Future, ThreadPoolExecutor, wait
+from dataclasses import dataclass, replace
+from functools import cached_property, partial
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
@@ -29,6 +29,7 @@ from potr_cl.codec.native.values import PackedValues, Tables, ValueArrays
 from potr_cl.codec.steps import prediction
 from potr_cl.codec.steps.rule import CLASSES, ColourSteps, factors
 from potr_cl.codec.versions import VERSIONS
+from potr_cl.errors import DataError
 from potr_cl.host.threads import thread_pool
 
 if TYPE_CHECKING:
@@ -42,6 +43,8 @@ _HANDED = 4
 _BUNDLES_A_THREAD = 2
 #: Bundles for each thread that may be packed, or wait to be taken, at a time.
 _ROOMS_A_THREAD = 2
+#: Bytes of a file whose checksums take long enough for several threads.
+_LARGE = 1 << 20
 #: Levels whose values are looked up.
 _TABLE = 1 << 16
 
@@ -55,12 +58,14 @@ class BundledScene:
         data: the whole file.
         open_steps: gives the steps of its colours.
         activation: what is stored instead of logarithms of scales and logits of opacities; None: these.
+        checked: whether sections are compared with their checksums when they are opened.
     """
 
     header: Header
     data: bytes
     open_steps: Callable[[], ColourSteps | None]
     activation: Activation | None = None
+    checked: bool = True
 
     @cached_property
     def reader(self) -> Reader:
@@ -69,7 +74,8 @@ class BundledScene:
 
     def _stored(self, key: Key) -> tuple[memoryview, str] | None:
         section = self.header.find(*key)
-        return None if section is None else (container.stored_bytes(self.data, section), section.name)
+        open_bytes = container.stored_bytes if self.checked else container.unchecked_bytes
+        return None if section is None else (open_bytes(self.data, section), section.name)
 
     def fill(self, arrays: ValueArrays, threads: int = 1, beside: Callable[[], None] | None = None) -> None:
         """Fill some arrays; sections of others are not looked at.
@@ -82,18 +88,23 @@ class BundledScene:
         Raises:
             DataError: damaged; and what ``beside`` raises.
         """
-        wanted, number = self._wanted(arrays), self.reader.bundles.number
-        with _Helpers(number, min(threads, max(number // _BUNDLES_A_THREAD, 2)) - 1, beside) as helpers:
-            file, share = self.reader.bundled_file(wanted), helpers.share
+        wanted = self._wanted(arrays)
+        number = -(-self.header.splats // BUNDLE)
+        helpers = min(threads, max(number // _BUNDLES_A_THREAD, 2)) - 1
+
+        def work(scene: BundledScene, helpers: _Helpers) -> None:
+            file, share = scene.reader.bundled_file(wanted), helpers.share
             if file is None or share is None:
-                self._side_by_side(lambda bundles: self._by_numpy(bundles, wanted, arrays))
+                scene._side_by_side(lambda bundles: scene._by_numpy(bundles, wanted, arrays))
             else:
-                share.open(file, wanted.sections, wanted.rotations, arrays, self.tables)
+                share.open(file, wanted.sections, wanted.rotations, arrays, scene.tables)
                 share.do()
                 for bundle in range(number):
-                    if self._went_beyond(share.wait(bundle)):
-                        self._by_numpy(range(bundle, bundle + 1), wanted, arrays)
+                    if scene._went_beyond(share.wait(bundle)):
+                        scene._by_numpy(range(bundle, bundle + 1), wanted, arrays)
             helpers.finish()
+
+        self._helped(helpers, wanted, beside, work)
 
     def pack(
         self, destination: BundleTaker, sh_count: int, threads: int, means: Callable[[], NDArray[np.float32]]
@@ -111,30 +122,59 @@ class BundledScene:
         Raises:
             DataError: damaged; what ``means`` and the destination raise.
         """
-        wanted, number = self._wanted_of(sh_count, True), self.reader.bundles.number
-        destination.expect_bundles()
+        wanted = self._wanted_of(sh_count, True)
+        number = -(-self.header.splats // BUNDLE)
         threads = max(1, min(threads, -(-number // _BUNDLES_A_THREAD)))
-        with _Helpers(number, threads, means) as helpers:
-            file, share = self.reader.bundled_file(wanted), helpers.share
+        destination.expect_bundles()
+
+        def work(scene: BundledScene, helpers: _Helpers) -> None:
+            file, share = scene.reader.bundled_file(wanted), helpers.share
+            taken = False
             if file is None or share is None:
-                self._side_by_side(lambda bundles: self._pack_by_numpy(destination, sh_count, wanted, bundles))
+                scene._side_by_side(lambda bundles: scene._pack_by_numpy(destination, sh_count, wanted, bundles))
             else:
                 rooms = [PackedValues() for _ in range(min(number, _ROOMS_A_THREAD * threads))]
-                share.open(file, wanted.sections, wanted.rotations, rooms, self.tables)
-                taken = False
+                share.open(file, wanted.sections, wanted.rotations, rooms, scene.tables)
                 for bundle in range(number):
                     room = bundle % len(rooms)
-                    if self._went_beyond(share.wait(bundle, helpers.look_after)):
-                        self._pack_by_numpy(destination, sh_count, wanted, range(bundle, bundle + 1))
+                    if scene._went_beyond(share.wait(bundle, helpers.look_after)):
+                        scene._pack_by_numpy(destination, sh_count, wanted, range(bundle, bundle + 1))
                     else:
                         destination.take_bundle(bundle * BUNDLE, rooms[room], share.items(room))
                     share.allow(bundle + 1 + len(rooms))
                     if not taken and helpers.beside.done():
                         destination.take_means(helpers.finish())
                         taken = True
-                if taken:
-                    return
-            destination.take_means(helpers.finish())
+            if not taken:
+                destination.take_means(helpers.finish())
+
+        self._helped(threads, wanted, means, work)
+
+    def _helped(
+        self,
+        threads: int,
+        wanted: Wanted,
+        beside: Callable[[], Any] | None,
+        work: Callable[[BundledScene, _Helpers], None],
+    ) -> None:
+        """Do a work with the help of threads, of which some look after the checksums of large files meanwhile."""
+        bundles = -(-self.header.splats // BUNDLE)
+        if threads < 2 or len(self.data) < _LARGE or native() is None:
+            with _Helpers(bundles, threads, beside) as helpers:
+                work(self, helpers)
+            return
+        found = [section for key in wanted.keys if (section := self.header.find(*key)) is not None]
+        checks = [partial(container.is_sound, self.data, section) for section in found]
+        try:
+            with _Helpers(bundles, threads, beside, checks) as helpers:
+                work(replace(self, checked=False), helpers)
+                sound = helpers.all_true()
+        except DataError:
+            # What is wrong with sections comes first, in their order, and with their checksums before all else.
+            self.reader.bundled_file(wanted)
+            raise
+        if not sound:
+            self.reader.bundled_file(wanted)
 
     def _side_by_side(self, do: Callable[[range], None]) -> None:
         number = self.reader.bundles.number
@@ -293,17 +333,22 @@ class _Helpers:
         bundles: of the file.
         threads: so many.
         beside: what else is to be done, by one of them, or by this one where there are none.
+        checks: what others ask before they decode.
 
     Attributes:
         share: the bundles; None where NumPy is to be taken.
         beside: what came of what is done beside.
     """
 
-    def __init__(self, bundles: int, threads: int, beside: Callable[[], Any] | None) -> None:
+    def __init__(
+        self, bundles: int, threads: int, beside: Callable[[], Any] | None, checks: Sequence[Callable[[], bool]] = ()
+    ) -> None:
         functions = native()
         self.share = None if functions is None else functions.bundle_share(bundles)
         self._number = 0 if self.share is None else threads
         self._do_beside = beside or (lambda: None)
+        self._checks = checks
+        self._answers: list[bool] = []
         self._pool = ThreadPoolExecutor(max(self._number, 1))
         self._futures: list[Future[None]] = []
         self.beside: Future[Any] = Future()
@@ -311,7 +356,7 @@ class _Helpers:
     def __enter__(self) -> _Helpers:
         try:
             for number in range(self._number):
-                self._futures.append(self._pool.submit(self._do, number == 0))
+                self._futures.append(self._pool.submit(self._do, number))
         except BaseException:
             self.__exit__()
             raise
@@ -322,9 +367,11 @@ class _Helpers:
             self.share.give_up()
         self._pool.shutdown(cancel_futures=True)
 
-    def _do(self, first: bool) -> None:
-        if first:
+    def _do(self, number: int) -> None:
+        if number == 0:
             self._set_beside()
+        else:
+            self._answers.extend(check() for check in self._checks[number - 1 :: self._number - 1])
         if self.share is not None:
             self.share.do()
 
@@ -333,6 +380,11 @@ class _Helpers:
             self.beside.set_result(self._do_beside())
         except BaseException as error:  # the one who asks for the result is told
             self.beside.set_exception(error)
+
+    def all_true(self) -> bool:
+        """Whether all checks were made, once threads are done, and all of them said so."""
+        wait(self._futures)
+        return len(self._answers) == len(self._checks) and all(self._answers)
 
     def look_after(self) -> None:
         """Raise what has ended the threads, if none is left."""

@@ -146,16 +146,26 @@ def most_integers(coder: Coder, stored: bytes) -> int:
     return _MOST_EXPANSION[coder] * len(stored)
 
 
+def unchecked_bytes(data: bytes | memoryview, section: Section) -> memoryview:
+    """A section's bytes as they are stored, whatever their checksum."""
+    return memoryview(data)[section.offset : section.offset + section.stored_bytes]
+
+
+def is_sound(data: bytes | memoryview, section: Section) -> bool:
+    """Whether a section's stored bytes are all there, and have its checksum."""
+    stored = unchecked_bytes(data, section)
+    return len(stored) == section.stored_bytes and zlib.crc32(stored) == section.crc
+
+
 def stored_bytes(data: bytes | memoryview, section: Section) -> memoryview:
     """A section's bytes as they are stored.
 
     Raises:
         DataError: they are damaged.
     """
-    stored = memoryview(data)[section.offset : section.offset + section.stored_bytes]
-    if len(stored) != section.stored_bytes or zlib.crc32(stored) != section.crc:
+    if not is_sound(data, section):
         raise DataError(f"section '{section.name}' is damaged (its checksum does not match): get the file again")
-    return stored
+    return unchecked_bytes(data, section)
 
 
 def read_section(data: bytes | memoryview, section: Section) -> NDArray[np.uint8]:
@@ -185,6 +195,12 @@ def read_section(data: bytes | memoryview, section: Section) -> NDArray[np.uint8
     if len(raw) != size:
         raise DataError(f"section '{section.name}' decompresses to another size than the header says")
     return np.frombuffer(raw, np.uint8)
+
+
+def raw_bytes(header: Header, data: bytes | memoryview, prop: Property, index: int = 0) -> NDArray[np.uint8]:
+    """As :func:`read_section`, of the section of a property; empty where the file has none."""
+    section = header.find(prop, index)
+    return np.empty(0, np.uint8) if section is None else read_section(data, section)
 
 
 # ------------------------------------------------------------------------------------------------ container

@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import os
 import stat
-from collections.abc import Callable, Iterator, Sequence
-from concurrent.futures import Future
+from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
@@ -17,38 +16,25 @@ from typing import Any, TypeAlias
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec import container, metadata, octree, sections
+from potr_cl.codec import container, metadata, octree
 from potr_cl.codec.blocks.file import BlockedFile
 from potr_cl.codec.blocks.table import FIXED_BYTES, header_bytes_of, is_of_blocks, read_table
 from potr_cl.codec.bundled_scene import BundledScene
-from potr_cl.codec.byte_planes import IntegerStream, PlaneStream, unpack_integers
-from potr_cl.codec.colour_factors import ColourFactors, Once
+from potr_cl.codec.byte_planes import unpack_integers
 from potr_cl.codec.container import Header
-from potr_cl.codec.context.decoder import Reader, Stream
-from potr_cl.codec.context.lanes import Lanes
-from potr_cl.codec.context.model import Sizes
-from potr_cl.codec.dequantizer import Dequantizer
 from potr_cl.codec.destination import BundleTaker, Destination, Fillable, SceneArrays
-from potr_cl.codec.native.library import native
 from potr_cl.codec.native.values import ValueArrays
-from potr_cl.codec.sections import Coder, Property, Section
+from potr_cl.codec.sectioned_scene import SectionedScene
+from potr_cl.codec.sections import Coder, Property
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
-from potr_cl.host.threads import Run, SharedWork, first_error, thread_pool
+from potr_cl.host.threads import Run
 from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene, most_coefficients
 
 #: More threads would find nothing to do.
 _MOST_THREADS = 16
-#: Coefficients and other properties whose integers may wait for a thread to make values of them.
-_MOST_WAITING = 6
-#: Bytes of stored integers, for each splat, that all threads together may have unpacked: half a decoded splat.
-_MOST_UNPACKED = 120
-#: Splats for each thread, so that one more pays.
-_SPLATS_A_THREAD = 24576
-
-_EMPTY = np.empty(0, np.uint8)
 
 
 @dataclass(frozen=True)
@@ -112,7 +98,8 @@ class PotrFile:
 
     def _means(self, run: Run, parts: int) -> NDArray[np.float32]:
         header = self.header
-        planes = self._planes(Property.MULTIPLICITY)
+        section = header.find(Property.MULTIPLICITY)
+        planes = 0 if section is None else section.planes
         raw = self._raw(Property.MULTIPLICITY)
         count = len(raw) // planes if planes else 0
         if planes and len(raw) != planes * count:
@@ -136,7 +123,7 @@ class PotrFile:
         if self._bundled:
             self._bundled.fill(ValueArrays(log_scales=out))
             return out
-        self._dequantizer.scales(self._streams(Property.SCALE), out)
+        self._sectioned.scales(out)
         return out
 
     def quaternions(self) -> NDArray[np.float32]:
@@ -145,8 +132,7 @@ class PotrFile:
         if self._bundled:
             self._bundled.fill(ValueArrays(quaternions=out))
             return out
-        scales = self._streams(Property.SCALE) if self.rules.rotations_need_scales else []
-        self._dequantizer.rotations(self._streams(Property.ROTATION), scales, out)
+        self._sectioned.rotations(out)
         return out
 
     def opacity_logits(self) -> NDArray[np.float32]:
@@ -155,7 +141,7 @@ class PotrFile:
         if self._bundled:
             self._bundled.fill(ValueArrays(logits=out))
             return out
-        self._dequantizer.opacities(self._streams(Property.OPACITY)[0], out)
+        self._sectioned.opacities(out)
         return out
 
     def sh(self, degree: int | None = None) -> NDArray[np.float32]:
@@ -173,8 +159,7 @@ class PotrFile:
         if self._bundled:
             self._bundled.fill(ValueArrays(sh=arrays.values.sh))
             return arrays.sh
-        for _, job in self._sh_jobs(arrays, count, _Shared(self)):
-            job(_now)
+        self._sectioned.colours(arrays, count)
         return arrays.sh
 
     def colour_steps(self) -> ColourSteps | None:
@@ -216,25 +201,12 @@ class PotrFile:
         Raises:
             As :meth:`scene`, and what the destination raises.
         """
+        threads = threads or min(os.cpu_count() or 1, _MOST_THREADS)
         _ = self.metadata  # it takes no part in the scene, but damage anywhere is damage
         if self._bundled:
-            self._decode_bundles(
-                self._bundled, destination, threads or min(os.cpu_count() or 1, _MOST_THREADS), sh_degree
-            )
+            self._decode_bundles(self._bundled, destination, threads, sh_degree)
             return
-        shared = _Shared(self)
-        shapes: _Job = partial(self._decode_shapes, destination, shared)
-        opacities: _Job = partial(self._decode_opacities, destination, shared)
-        # The longest first: a pool that ends with a long one ends late.
-        jobs = [
-            *self._sh_jobs(destination, self.sh_count(sh_degree), shared),
-            (self._contextual(Property.SCALE) or self._contextual(Property.ROTATION), shapes),
-            (self._contextual(Property.OPACITY), opacities),
-        ]
-        threads = min(threads or min(os.cpu_count() or 1, _MOST_THREADS), self._threads_in_memory())
-        # With fewer splats for each, threads wait for the interpreter, and for memory, longer than they decode.
-        threads = min(threads, max(self.header.splats // _SPLATS_A_THREAD, 2))
-        self._run(jobs, lambda run, parts: destination.take_means(self._means(run, parts)), threads)
+        self._sectioned.decode_into(destination, self.sh_count(sh_degree), threads, self._means)
 
     def sh_count(self, degree: int | None = None) -> int:
         """How many SH coefficients of a channel there are up to a degree, which need not be in the file; None: all.
@@ -248,44 +220,6 @@ class PotrFile:
     def rules(self) -> FormatVersion:
         """Those of the file's version."""
         return VERSIONS[self.header.version]
-
-    def _run(self, jobs: list[tuple[bool, _Job]], centres: Callable[[Run, int], None], threads: int) -> None:
-        """Do some jobs, each with whether it takes the context coder, and decode the centres.
-
-        By NumPy the context coder makes many short calls, in which threads would only wait for each other: one makes
-        them all, and leaves what else is to be done with the integers to others.
-        """
-        alone = native() is None
-        left: list[Future[None]] = []
-        work = SharedWork()
-
-        def leave(what: Callable[[], None]) -> None:
-            # What waits holds memory; where much does, threads are not what is missing.
-            if sum(not future.done() for future in left) < _MOST_WAITING:
-                left.append(work.add(what))
-                pool.submit(work.do)
-            else:
-                what()
-
-        submit: _Submit = _now if threads == 1 else leave
-
-        def in_turn(some: list[_Job]) -> None:
-            for job in some:
-                job(submit)
-
-        contextual = [job for takes_coder, job in jobs if takes_coder]
-        with thread_pool(threads) as pool:
-            try:
-                coded = [partial(in_turn, some) for some in ([contextual] if alone else [[job] for job in contextual])]
-                others = [partial(job, _now) for takes_coder, job in jobs if not takes_coder]
-                first = [work.add(what) for what in (*coded, partial(centres, work.run, threads), *others)]
-                for _ in range(min(threads, len(first))):
-                    pool.submit(work.do)
-                for futures in (first, left):
-                    if (error := first_error(futures)) is not None:
-                        raise error
-            finally:
-                work.forget()
 
     def _decode_bundles(
         self, scene: BundledScene, destination: Destination, threads: int, sh_degree: int | None
@@ -310,122 +244,13 @@ class PotrFile:
             return None
         return BundledScene(self.header, self.data, self.colour_steps)
 
-    def _raw(self, prop: Property, index: int = 0) -> NDArray[np.uint8]:
-        section = self.header.find(prop, index)
-        return _EMPTY if section is None else container.read_section(self.data, section)
-
-    def _planes(self, prop: Property, index: int = 0) -> int:
-        section = self.header.find(prop, index)
-        return 0 if section is None else section.planes
-
-    def _contextual(self, prop: Property, index: int = 0) -> bool:
-        section = self.header.find(prop, index)
-        return section is not None and section.coder == Coder.CONTEXT
-
-    def _context_streams(self, section: Section, history: Sizes | None = None) -> Iterator[Stream]:
-        """The streams of a section of coder CONTEXT, one after another."""
-        yield from Reader(
-            container.stored_bytes(self.data, section),
-            section.integers // section.streams,
-            section.streams,
-            sections.is_signed(section.kind),
-            sections.is_predicted(section.kind, section.index) and not self.rules.colour_steps,
-            history,
-            section.name,
-        )
-
-    def _threads_in_memory(self) -> int:
-        """How many threads may unpack three streams each: real files' integers are narrow enough for all threads."""
-        widest = max((section.planes for section in self.header.sections), default=0)
-        return max(1, _MOST_UNPACKED // (3 * max(widest, 1)))
-
-    def _streams(self, prop: Property, indices: range | None = None) -> list[IntegerStream]:
-        """Some streams of one integer a splat, all of a property's by default."""
-        indices = range(sections.stream_count(prop)) if indices is None else indices
-        section = self.header.find(prop, indices[0])
-        if section is not None and section.coder == Coder.CONTEXT:
-            return list(self._context_streams(section))
-        signed, splats = sections.is_signed(prop), self.header.splats
-        return [PlaneStream(self._raw(prop, index), self._planes(prop, index), signed, splats) for index in indices]
-
     @property
-    def _dequantizer(self) -> Dequantizer:
-        return Dequantizer(self.header, self.rules)
+    def _sectioned(self) -> SectionedScene:
+        """The splats of a file of other coders."""
+        return SectionedScene(self.header, self.data, self.rules, self.colour_steps)
 
-    def _decode_shapes(self, destination: Destination, shared: _Shared, submit: _Submit) -> None:
-        scales = shared.scales.get()
-        submit(partial(destination.take_scales, scales))
-        submit(partial(destination.take_rotations, self._streams(Property.ROTATION), scales))
-
-    def _decode_opacities(self, destination: Destination, shared: _Shared, submit: _Submit) -> None:
-        submit(partial(destination.take_opacities, shared.opacities.get()))
-
-    def _sh_jobs(self, destination: Destination, count: int, shared: _Shared) -> list[tuple[bool, _Job]]:
-        """What decodes so many SH coefficients of a channel, and whether it takes the context coder."""
-        stop = 3 * count
-        contextual = [s for s in self.header.sections if s.kind == Property.SH and s.coder == Coder.CONTEXT]
-        chained = [s for s in contextual if 0 < s.index < stop]
-        in_chain = {s.index // 3 + m for s in chained for m in range(s.streams // 3)}
-        alone = [m for m in range(count) if m not in in_chain]
-        jobs: list[tuple[bool, _Job]] = (
-            [(True, partial(self._decode_chain, chained, destination, shared))] if chained else []
-        )
-        return jobs + [
-            (self._contextual(Property.SH, 3 * m), partial(self._decode_coefficient, m, destination, shared))
-            for m in alone
-        ]
-
-    def _decode_chain(self, chain: list[Section], destination: Destination, shared: _Shared, submit: _Submit) -> None:
-        """AC coefficients whose contexts are made of those before."""
-        history = Sizes(Lanes(self.header.splats))
-        for section in sorted(chain, key=lambda s: s.index):
-            streams = self._context_streams(section, history)
-            for m, channels in enumerate(zip(streams, streams, streams, strict=True), start=section.index // 3):
-                submit(partial(_take_colours, destination, channels, m, False, shared))
-
-    def _decode_coefficient(self, m: int, destination: Destination, shared: _Shared, submit: _Submit) -> None:
-        """The three channels of one SH coefficient."""
-        streams = self._streams(Property.SH, range(3 * m, 3 * m + 3))
-        differences = m == 0 and not self.rules.colour_steps and not self._contextual(Property.SH)
-        submit(partial(_take_colours, destination, streams, m, differences, shared))
-
-
-class _Shared:
-    """What more than one of a file's properties is made of; any thread may ask for it.
-
-    Args:
-        file: that is decoded.
-
-    Attributes:
-        scales, opacities: their streams.
-        factors: what colours are made with.
-    """
-
-    def __init__(self, file: PotrFile) -> None:
-        self.scales = Once(lambda: file._streams(Property.SCALE))
-        self.opacities = Once(lambda: file._streams(Property.OPACITY)[0])
-        self.factors = Once(self._find_factors)
-        self._file = file
-
-    def _find_factors(self) -> ColourFactors:
-        header, steps = self._file.header, self._file.colour_steps()
-        return ColourFactors.of(header, steps, self.scales.get, self.opacities.get)
-
-
-def _take_colours(
-    destination: Destination, streams: Sequence[IntegerStream], m: int, differences: bool, shared: _Shared
-) -> None:
-    destination.take_colours(streams, m, differences, shared.factors.get())
-
-
-#: Takes what needs no more than what is at hand, to be done now or by another thread.
-_Submit = Callable[[Callable[[], None]], None]
-#: Decodes some of a file.
-_Job = Callable[[_Submit], None]
-
-
-def _now(work: Callable[[], None]) -> None:
-    work()
+    def _raw(self, prop: Property, index: int = 0) -> NDArray[np.uint8]:
+        return container.raw_bytes(self.header, self.data, prop, index)
 
 
 #: A .potr file, opened: of a scene in one piece, or in blocks.

@@ -160,9 +160,12 @@ class Dequantizer:
         if own.sh is None or levels.dc is None or levels.opacities is None:
             return
         own.sh[1:] = 0
-        dc, ac = np.zeros((2, levels.stop - levels.start), np.int8)
-        if steps is not None:
+        if levels.classes is not None:
+            dc, ac = levels.classes
+        elif steps is not None:
             dc, ac = steps.classes(scales, levels.opacities, levels.start)
+        else:
+            dc, ac = np.zeros((2, levels.stop - levels.start), np.int8)
         residuals = np.stack(levels.dc, dtype=np.int64)
         _to_rgb(list(from_residuals(residuals, dc)), factors(header.sf_dc, dc), own.sh[0])
         divisors = factors(header.sf_ac, ac)

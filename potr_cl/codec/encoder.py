@@ -21,16 +21,14 @@ from potr_cl.codec.container import EntropyCoder, Header
 from potr_cl.codec.context import encoder as context_encoder
 from potr_cl.codec.geometry import Geometry, quantise_geometry
 from potr_cl.codec.sections import Coder, Property, Section
-from potr_cl.codec.steps.prediction import RUN, to_residuals
+from potr_cl.codec.steps.prediction import to_residuals
 from potr_cl.codec.versions import VERSIONS, FormatVersion
-from potr_cl.host.threads import Run, thread_pool
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 
 #: Of fewer splats the models of the context coder may weigh more than they save.
 _FEW = 1 << 15
-#: Splats whose constant coefficients are predicted at a time.
-_PREDICTED = 64 * RUN
 
 
 @dataclass(frozen=True)
@@ -93,9 +91,9 @@ def code_scene(
         if geometry.steps is not None:
             groups.append(_Group(Property.STEPS, 0, [np.frombuffer(geometry.steps.to_bytes(), np.uint8)]))
         plain = pool.map(partial(_plain_sections, coder=coder), groups)
-        classes = geometry.colour_classes(pool.map)
+        classes = geometry.colour_classes()
         coefficients = colour_levels(scene.sh, order, parameters, classes, pool.map)
-        chains = _chains(geometry, coefficients, classes[0] if version.colour_steps else None, pool.map)
+        chains = _chains(geometry, coefficients, classes[0] if version.colour_steps else None)
         report(stage, 0.2)
         coded = _code_chains(chains, coder, version, classes[0], pool, lambda done: report(stage, 0.2 + 0.7 * done))
         coded += [pair for pairs in plain for pair in pairs]
@@ -266,7 +264,7 @@ def _octree_groups(tree: octree.OctreeStreams) -> list[_Group]:
 
 
 def _chains(
-    geometry: Geometry, coefficients: NDArray[np.signedinteger], classes: NDArray[np.int8] | None, run: Run
+    geometry: Geometry, coefficients: NDArray[np.signedinteger], classes: NDArray[np.int8] | None
 ) -> list[list[_Group]]:
     """All integers of splats; the groups of a chain tell each other's contexts, the longest chain comes first.
 
@@ -276,7 +274,8 @@ def _chains(
     if classes is None:
         dc = _Group(Property.SH, 0, list(coefficients[0]))
     else:
-        dc = _Group(Property.SH, 0, [_narrowed(row) for row in _residuals(coefficients[0], classes, run)], final=True)
+        residuals = to_residuals(coefficients[0].astype(np.int64), classes)
+        dc = _Group(Property.SH, 0, [_narrowed(row) for row in residuals], final=True)
     bands = [
         _Group(Property.SH, 3 * first, list(coefficients[first:end].reshape(-1, coefficients.shape[2])))
         for first, end in ((band**2, (band + 1) ** 2) for band in range(1, degree + 1))
@@ -288,18 +287,6 @@ def _chains(
         [dc],
         [_Group(Property.OPACITY, 0, [geometry.opacities])],
     ]
-
-
-def _residuals(levels: NDArray[np.signedinteger], classes: NDArray[np.int8], run: Run) -> NDArray[np.int64]:
-    """:func:`to_residuals` of (channels, N) levels of any type, in parts that know nothing of each other."""
-    residuals = np.empty(levels.shape, np.int64)
-
-    def predict(start: int) -> None:
-        part = slice(start, start + _PREDICTED)
-        residuals[:, part] = to_residuals(levels[:, part].astype(np.int64), classes[part])
-
-    list(run(predict, range(0, levels.shape[1], _PREDICTED)))
-    return residuals
 
 
 def _narrowed(integers: NDArray[np.int64]) -> NDArray[np.signedinteger]:

@@ -81,22 +81,16 @@ class Geometry:
 
         list(run(fill, range(0, n, BLOCK)))
 
-    def colour_classes(self, run: Run = map) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
-        """(N,) classes of the steps of DC and of AC, in the order of the file: :class:`ColourSteps`; 0 without any.
-
-        ``run`` works with several threads.
-        """
-        n, steps = len(self.order), self.steps
-        classes = np.zeros((2, n), np.int8)
-
-        def find(start: int) -> None:
-            part = slice(start, start + BLOCK)
-            assert steps is not None
-            classes[:, part] = steps.classes([axis[part] for axis in self.scales], self.opacities[part], start)
-
-        if steps is not None:
-            list(run(find, range(0, n, BLOCK)))
-        return classes[0], classes[1]
+    def colour_classes(self) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
+        """(N,) classes of the steps of DC and of AC, in the order of the file: :class:`ColourSteps`; 0 without any."""
+        if self.steps is None:
+            none = np.zeros(len(self.order), np.int8)
+            return none, none
+        functions = native()
+        if functions is not None and all(levels.dtype == np.int16 for levels in (*self.scales, self.opacities)):
+            scales = np.stack(self.scales, dtype=np.int32)
+            return functions.step_classes(self.steps, scales, self.opacities.astype(np.int32))
+        return self.steps.classes(self.scales, self.opacities)
 
     def with_steps(self, effects: NDArray[np.floating]) -> Geometry:
         """The same with steps of colours by what each splat shows.
@@ -106,6 +100,36 @@ class Geometry:
         """
         steps = fit_steps(self.scales, self.opacities, self.parameters.sf_opacity, effects[self.order])
         return replace(self, steps=steps)
+
+    def with_centres_of(self, means: NDArray[np.float32], views: Sequence[Camera], run: Run = map) -> Geometry:
+        """The same splats at other places: all their other levels stay.
+
+        Args:
+            means: (N, 3) in the order of the scene, not rounded yet.
+            views, run: as of :func:`quantise_geometry`.
+
+        Raises:
+            DataError: a splat is too far from the others to keep them exact.
+        """
+        world = self.parameters
+        tolerance = np.maximum(world.gamma, world.beta * distances_to_views(means, views, run))
+        tree, order = octree.build(means, tolerance, absolute=VERSIONS[world.version].absolute_leaf_levels)
+        place = np.empty(len(order), np.int64)
+        place[self.order] = np.arange(len(order))
+        was = place[order]
+        moved = replace(
+            self, tree=tree, order=order, scales=[levels[was] for levels in self.scales],
+            rotations=[levels[was] for levels in self.rotations], opacities=self.opacities[was], steps=None,
+        )  # fmt: skip
+        if may_be_coarse(tree):
+            log_scales = moved.decoded(np.empty((len(order), 1, 3), np.float32)).log_scales
+            check_positions(means, log_scales, tolerance, tree, order)
+        return moved
+
+    def with_opacities_of(self, logits: NDArray[np.float32]) -> Geometry:
+        """The same with other opacities: (N,) logits in the order of the scene, not rounded yet."""
+        version, factor = VERSIONS[self.parameters.version], self.parameters.sf_opacity
+        return replace(self, opacities=version.quantize_opacities(logits[self.order].astype(np.float64), factor))
 
     def with_colour_steps(self, parameters: quantize.HyperParameters) -> Geometry:
         """The same for parameters that differ in the steps of colours alone, which geometry does not depend on."""

@@ -278,6 +278,8 @@ def _octahedral_rotations() -> tuple[F64, NDArray[np.intp]]:
 
 _GROUP, _PERMUTATIONS = _octahedral_rotations()
 _CONJUGATES = np.ascontiguousarray((_GROUP * (1, -1, -1, -1)).T)
+#: (4, 24) and (24, 3): the same, and the axes, as the compiled library takes them.
+AXIS_ROTATIONS = _CONJUGATES, _PERMUTATIONS.astype(np.uint8)
 
 
 def canonical_rotations(quaternions: F32, log_scales: F32, order: NDArray[np.int64] | None = None) -> tuple[F64, F32]:
@@ -303,8 +305,7 @@ def canonical_rotations(quaternions: F32, log_scales: F32, order: NDArray[np.int
             np.ascontiguousarray(quaternions, np.float32),
             np.ascontiguousarray(log_scales, np.float32),
             np.ascontiguousarray(order, np.int64),
-            _CONJUGATES,
-            _PERMUTATIONS.astype(np.uint8),
+            *AXIS_ROTATIONS,
             imaginary,
             turned,
         )

@@ -16,6 +16,8 @@ from potr_cl.model.scene import Scene
 
 #: Splats worked on at a time: a few arrays of them fit a second-level cache.
 BLOCK = 1 << 14
+#: The same for what takes little of a thread's time.
+_MANY = 1 << 16
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -65,28 +67,30 @@ def _natively(
     functions: Functions, scene: Scene, order: I64, world: quantize.HyperParameters, run: Run
 ) -> SplatLevels | None:
     """The same; None where a level has more than 32 bits, which NumPy has to say or to hold."""
-    quaternions, log_scales, logits = (
-        np.ascontiguousarray(each, np.float32) for each in (scene.quaternions, scene.log_scales, scene.opacity_logits)
-    )
+    quaternions, logits = (np.ascontiguousarray(each, np.float32) for each in (scene.quaternions, scene.opacity_logits))
     factors = (world.sf_scale, world.sf_rotation, world.sf_opacity)
-    levels = np.empty((7, len(order)), np.int32)
+    levels, sizes = np.empty((7, len(order)), np.int32), np.empty((len(order), 3))
+
+    def exponentials(start: int) -> None:
+        # The one function here whose last digit another library could round otherwise.
+        part = slice(start, start + _MANY)
+        with np.errstate(over="ignore"):
+            np.exp(scene.log_scales.take(order[part], axis=0).astype(np.float64), out=sizes[part])
 
     def quantise(start: int) -> NDArray[np.int32] | None:
         rows = order[start : start + BLOCK]
-        imaginary, turned = quantize.canonical_rotations(quaternions, log_scales, rows)
-        # The one function here whose last digit another library could round otherwise.
-        with np.errstate(over="ignore"):
-            sizes = np.exp(turned.astype(np.float64))
+        own = sizes[start : start + BLOCK]
         return functions.quantising.splat_levels(
-            sizes, imaginary, logits, rows, factors, quantize.RANGE_OF_LOGITS, start, levels
+            quaternions, own, logits, rows, *quantize.AXIS_ROTATIONS, factors, quantize.RANGE_OF_LOGITS, start, levels
         )
 
+    list(run(exponentials, range(0, len(order), _MANY)))
     found = list(run(quantise, range(0, len(order), BLOCK)))
     largest = [each for each in found if each is not None]
     if len(largest) < len(found):
         return None
     types = [quantize.level_type(float(most)) for most in np.max(largest, axis=0)]
-    columns = list(run(lambda k: levels[k].astype(types[k]), range(7)))
+    columns = [levels[k].astype(dtype) for k, dtype in enumerate(types)]
     return SplatLevels(columns[:3], columns[3:6], columns[6])
 
 

@@ -9,15 +9,18 @@ import stat
 import warnings
 from collections.abc import Iterator
 from pathlib import Path
-from typing import Any, BinaryIO
+from typing import TYPE_CHECKING, Any, BinaryIO
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageColor, PngImagePlugin, UnidentifiedImageError
 
 from potr_cl.errors import DataError, PotrError, UsageError
 from potr_cl.formats.lfs_pointer import refuse_lfs_pointer
 from potr_cl.model.scene import FloatArray
+
+# Pillow takes a tenth of the time that a command needs to begin, and few commands see a picture.
+if TYPE_CHECKING:
+    from PIL import Image
 
 Colour = tuple[float, float, float]
 
@@ -25,6 +28,8 @@ Colour = tuple[float, float, float]
 _FORMATS = ("PNG", "JPEG", "WEBP")
 #: Photographs with more pixels would take gigabytes each, however small their files are.
 _MOST_PIXELS = 1 << 27
+#: Colours that are known without Pillow.
+_COMMON: dict[str, Colour] = {"black": (0.0, 0.0, 0.0), "white": (1.0, 1.0, 1.0)}
 #: More than 8 bits in one channel: Pillow would clip them on the way to R, G, B.
 _DEEP_MODES = ("I", "F", "I;16", "I;16B", "I;16L", "I;16N")
 
@@ -39,6 +44,10 @@ def parse_colour(text: str) -> Colour:
         values = [float(value) for value in text.split(",")]
         if len(values) == 3 and all(0 <= value <= 1 for value in values):
             return values[0], values[1], values[2]
+    if text.strip().lower() in _COMMON:
+        return _COMMON[text.strip().lower()]
+    from PIL import ImageColor
+
     with contextlib.suppress(ValueError):
         red, green, blue = ImageColor.getrgb(text.strip())[:3]
         return red / 255, green / 255, blue / 255
@@ -56,6 +65,8 @@ def opened_image(source: Any, formats: tuple[str, ...]) -> Image.Image:
         UnidentifiedImageError: it is of no such format.
         ValueError: it has several frames.
     """
+    from PIL import Image
+
     with warnings.catch_warnings():
         # A size that Pillow would warn of is checked by whoever calls this.
         warnings.simplefilter("ignore", Image.DecompressionBombWarning)
@@ -82,6 +93,8 @@ class _File(io.BufferedReader):
 @contextlib.contextmanager
 def _opened_photograph(path: Path) -> Iterator[Image.Image]:
     """A photograph whose pixels fit the memory; Pillow's many errors for a bad file become ours."""
+    from PIL import UnidentifiedImageError
+
     try:
         # Before it is opened: a pipe would be waited for.
         if not stat.S_ISREG(os.stat(path).st_mode):
@@ -153,6 +166,8 @@ def to_8_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
 
 def write_png(file: BinaryIO, pixels: NDArray[np.uint8], description: str = "") -> None:
     """Write (H, W, 3) 8-bit colours as PNG, with ``description`` as the text that PNG files can carry."""
+    from PIL import Image, PngImagePlugin
+
     text = PngImagePlugin.PngInfo()
     if description:
         text.add_text("Description", description)

@@ -20,7 +20,7 @@ FloatArray = NDArray[np.float32]
 #: Splats looked at at a time where values are checked.
 _BLOCK = 1 << 14
 #: So many splats are copied by threads, an eighth of them at a time.
-_LARGE = 1 << 20
+_LARGE = 1 << 19
 
 #: The logit of an opacity that single precision cannot tell from 1.
 _OPAQUE = np.float32(20)
@@ -139,10 +139,7 @@ class Scene:
     @property
     def opacities(self) -> FloatArray:
         """(N,) opacities in (0, 1)."""
-        logits = self.opacity_logits
-        # exp of a non-positive number only: a logit of -100 must not overflow.
-        e = np.exp(-np.abs(logits))
-        return np.where(logits >= 0, 1 / (1 + e), e / (1 + e)).astype(np.float32)
+        return opacities_of(self.opacity_logits)
 
     def __repr__(self) -> str:
         low, high = (self.means.min(axis=0), self.means.max(axis=0)) if len(self) else (np.zeros(3), np.zeros(3))
@@ -300,3 +297,10 @@ def joined(parts: Sequence[Scene]) -> Scene:
         whole.put(first, part)
         first += len(part)
     return whole
+
+
+def opacities_of(logits: FloatArray) -> FloatArray:
+    """(N,) opacities in (0, 1) that have these logits."""
+    # exp of a non-positive number only: a logit of -100 must not overflow.
+    e = np.exp(-np.abs(logits))
+    return np.where(logits >= 0, 1 / (1 + e), e / (1 + e)).astype(np.float32)

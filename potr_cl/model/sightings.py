@@ -37,6 +37,9 @@ _DEPTHS, _COVERS = 32, 16
 _BEHIND, _DEEPER = 0.05, 1.05
 #: Directions in which colours are looked at to know how much they vary at all.
 _DIRECTIONS = 96
+#: Splats for which that is done at a time: few enough that a BLAS does not wake its threads, which take longer to come
+#: to rest again than all of the work takes.
+_AT_ONCE = 48
 #: Splats with coefficients to speak of that a view must see, for the colours to tell whether they know it.
 _INFORMATIVE = 30
 #: Coefficients a channel but DC, from which on colours tell one side from the other: those of two degrees.
@@ -148,7 +151,11 @@ def sample(scene: Scene) -> Sample:
     chosen = _spread(len(means), _TARGETS)
     colours = unit_coefficients(scene.sh[chosen, 1:])
     around = ac_basis(spiral(_DIRECTIONS))[:, : colours.shape[1]]
-    overall = np.einsum("dm,kmc->dkc", around, colours, optimize=True) ** 2
+    overall = [
+        np.matmul(around, some.transpose(1, 0, 2).reshape(around.shape[1], 3 * len(some))).reshape(-1, len(some), 3)
+        ** 2
+        for some in (colours[first : first + _AT_ONCE] for first in range(0, len(colours), _AT_ONCE))
+    ]
     # Within one standard deviation, on the spiral's directions in an order that is not the splats'.
     local = spiral(_POINTS)[(np.arange(_POINTS) * 2741) % _POINTS]
     quaternions, opacities = scene.quaternions.astype(np.float64), scene.opacities.astype(np.float64)
@@ -159,7 +166,7 @@ def sample(scene: Scene) -> Sample:
         means[chosen],
         scales[chosen].max(axis=1),
         colours,
-        overall.sum(axis=2),
+        np.concatenate(overall, axis=1).sum(axis=2),
         np.asarray(colours.any(axis=(1, 2))),
         points,
         areas,
@@ -209,7 +216,8 @@ def look(at: Sample, world: Poses) -> Sights:
             rays = at.targets[now] - camera_centre
             own = energy(rays, at.colours[now])
             known = np.bincount(now, minlength=shape[1])
-            best = float(np.quantile(at.overall @ known / len(now), 0.95))
+            # Without BLAS, whose threads would go on waiting for more at full speed.
+            best = float(np.quantile(np.einsum("dk,k->d", at.overall, known) / len(now), 0.95))
             remembered[view] = float(own.mean()) / max(best, 1e-12)
     return Sights(seen, covered, sizes, remembered)
 

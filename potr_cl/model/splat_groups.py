@@ -9,6 +9,7 @@ whether splats of such groups are there.
 from __future__ import annotations
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -111,6 +112,17 @@ class SplatGroups:
     def splats(self, groups: NDArray[np.bool_]) -> Indices:
         """The numbers of the splats of some groups, ascending; ``groups``: (G,)."""
         return np.sort(self.order[np.repeat(groups, self.counts)])
+
+    def visible_by(self, cameras: Sequence[Camera], near: float, run: Run = map) -> NDArray[np.bool_]:
+        """(views, G) :meth:`visible` of some views; ``run`` shares the work out."""
+        found = np.zeros((len(cameras), len(self.starts) - 1), bool)
+
+        def look(view: int) -> None:
+            found[view] = self.visible(cameras[view], near)
+
+        for _ in run(look, range(len(cameras))):
+            pass
+        return found
 
     def visible(self, camera: Camera, near: float) -> NDArray[np.bool_]:
         """(G,) the groups of which a view may draw a splat; ``near`` as in the rasterizer's rules."""

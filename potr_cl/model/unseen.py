@@ -14,13 +14,13 @@ from numpy.typing import NDArray
 
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import Scene, opacities_of
 from potr_cl.model.splat_groups import SplatGroups, largest_scales
 
 #: The renderer's near plane, world units: a splat whose centre is nearer is not drawn.
-_NEAR = 0.2
+NEAR = 0.2
 #: How far splats reach, in standard deviations, and what a renderer adds to that, in pixels.
-_REACH, _PIXELS = 3.5, 2.0
+REACH, _PIXELS = 3.5, 2.0
 #: Splats looked at at a time.
 _BLOCK = 1 << 16
 
@@ -40,9 +40,8 @@ def unseen_splats(
         (N,) whether it is unseen. A splat of which any part may touch a picture is not, even if others hide it.
     """
     unseen = np.ones(len(scene), bool)
-    # Views far from each other first: what one does not see the next one may.
-    order = np.argsort((np.arange(len(cameras)) * (math.sqrt(5) - 1) / 2) % 1, kind="stable")
-    shown = [] if groups is None else [groups.visible(camera, _NEAR) for camera in cameras]
+    order = views_in_turn(len(cameras))
+    shown = np.zeros((0, 0), bool) if groups is None else groups.visible_by(cameras, NEAR, run)
 
     def look(start: int) -> None:
         """Find out which of a block of splats are seen."""
@@ -51,7 +50,7 @@ def unseen_splats(
         among = None if groups is None else np.searchsorted(groups.starts, np.arange(start, stop), "right") - 1
         means = scene.means[left].astype(np.float64)
         with np.errstate(over="ignore"):
-            reach = _REACH * np.exp(np.minimum(largest_scales(scene.log_scales[left]), 80).astype(np.float64))
+            reach = REACH * np.exp(np.minimum(largest_scales(scene.log_scales[left]), 80).astype(np.float64))
         for view in order:
             if among is None:
                 seen = _shows(cameras[view], means, reach)
@@ -74,15 +73,46 @@ def unseen_splats(
     return unseen
 
 
-def opacity_weighted_areas(scene: Scene) -> NDArray[np.float64]:
+def views_in_turn(count: int) -> NDArray[np.int64]:
+    """The numbers of views, those far from each other first: what one does not see the next one may."""
+    return np.argsort((np.arange(count) * (math.sqrt(5) - 1) / 2) % 1, kind="stable")
+
+
+def bounds(camera: Camera) -> tuple[tuple[float, float], tuple[float, float]]:
+    """The planes left and right of a view's picture, and above and below it, as positions at a depth of 1."""
+    x, y = (
+        ((-_PIXELS - centre) / focal, (pixels + _PIXELS - centre) / focal)
+        for focal, centre, pixels in (
+            (camera.fx, camera.cx, camera.width),
+            (camera.fy, camera.cy, camera.height),
+        )
+    )
+    return x, y
+
+
+def opacity_weighted_areas(scene: Scene, run: Run = map) -> NDArray[np.float64]:
     """(N,) area of each splat's largest cross-section times its opacity, up to a common factor; for shares of a scene.
 
-    The factor makes the largest of them 1, so that no scene's units are too large.
+    The factor makes the largest of them 1, so that no scene's units are too large. ``run`` shares the work out.
     """
-    a, b, c = scene.log_scales.T.astype(np.float64)
-    low, high = np.minimum(a, b), np.maximum(a, b)
-    largest_two = np.maximum(low, np.minimum(high, c)) + np.maximum(high, c)
-    areas: NDArray[np.float64] = np.exp(largest_two - largest_two.max(initial=-math.inf)) * scene.opacities
+    areas = np.empty(len(scene))
+    starts = range(0, len(scene), _BLOCK)
+
+    def largest_two(start: int) -> float:
+        a, b, c = scene.log_scales[start : start + _BLOCK].T.astype(np.float64)
+        low, high = np.minimum(a, b), np.maximum(a, b)
+        some = areas[start : start + _BLOCK]
+        some[:] = np.maximum(low, np.minimum(high, c)) + np.maximum(high, c)
+        return float(some.max())
+
+    largest = max(run(largest_two, starts), default=-math.inf)
+
+    def area(start: int) -> None:
+        some = areas[start : start + _BLOCK]
+        some[:] = np.exp(some - largest) * opacities_of(scene.opacity_logits[start : start + _BLOCK])
+
+    for _ in run(area, starts):
+        pass
     return areas
 
 
@@ -90,12 +120,8 @@ def _shows(camera: Camera, means: NDArray[np.float64], reach: NDArray[np.float64
     """Which spheres touch the pyramid that a view sees; their centres in front of the near plane."""
     with np.errstate(over="ignore", invalid="ignore"):
         x, y, depth = camera.rotation @ means.T + camera.translation[:, None]
-        shown = depth > _NEAR
-        for along, focal, centre, pixels in (
-            (x, camera.fx, camera.cx, camera.width),
-            (y, camera.fy, camera.cy, camera.height),
-        ):
-            low, high = (-_PIXELS - centre) / focal, (pixels + _PIXELS - centre) / focal
+        shown = depth > NEAR
+        for along, (low, high) in zip((x, y), bounds(camera), strict=True):
             shown &= along - low * depth > -reach * math.hypot(1, low)
             shown &= along - high * depth < reach * math.hypot(1, high)
     return np.asarray(shown)

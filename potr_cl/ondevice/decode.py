@@ -1,7 +1,8 @@
 """From the bytes of a .potr file to a scene on a device: :func:`decode_to_device`.
 
-The host undoes the entropy coding. The integers go to the device as they are, in one or two bytes each where they fit,
-and become values there, where a rasterizer takes them.
+The host undoes the entropy coding. Of files whose splats come in bundles it makes values too, while they are in a
+cache, and uploads them without the AC coefficients that are 0 (:mod:`potr_cl.ondevice.staged_bundles`). Of others the
+integers go to the device as they are, in one or two bytes each where they fit, and become values there.
 """
 
 from __future__ import annotations

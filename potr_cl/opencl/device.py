@@ -17,10 +17,10 @@ import pyopencl as cl
 from potr_cl.errors import DeviceError, DeviceMemoryError
 from potr_cl.host.threads import in_background
 from potr_cl.opencl import compiler, program_cache, quirks
+from potr_cl.opencl.ahead import context_of
 from potr_cl.opencl.discovery import DeviceInfo, Family, choose_device, compiler_fault, compiles_nothing
 from potr_cl.opencl.foresight import Foresight, Wanted
 from potr_cl.opencl.kernel import Kernel, declared_parameters
-from potr_cl.opencl.loader import new_context
 from potr_cl.opencl.source import kernel_source
 
 logger = logging.getLogger("potr_cl")
@@ -96,7 +96,7 @@ class Device:
         self._foresight: Foresight | None = None
         self._of_this_thread = threading.local()
         with self.errors("cannot be opened"):
-            self.context = new_context(self.info.handle)
+            self.context = context_of(self.info)
             flags = cl.command_queue_properties.PROFILING_ENABLE if profiling else 0
             self.queue = cl.CommandQueue(self.context, self.info.handle, properties=flags)
         if self.info.max_work_group < 256 and self.family == "gpu":
@@ -289,7 +289,7 @@ class Device:
             for start in range(0, nbytes, _FILLED):
                 count = min(_FILLED, nbytes - start)
                 # NVIDIA's driver (quirks.SHORT_FILLS) writes elsewhere where the offset is large.
-                some = buffer.get_sub_region(start, count) if start else buffer
+                some = _region(buffer, start, count) if start else buffer
                 cl.enqueue_fill_buffer(self.queue, some, value, 0, count)
 
     def download(self, buffer: cl.Buffer, shape: tuple[int, ...], dtype: Any, start: int = 0) -> np.ndarray[Any, Any]:
@@ -393,6 +393,14 @@ class Device:
                 if not np.array_equal(mark, back):
                     raise DeviceError(f"device {self.info} fails the self-check: a large buffer loses its content")
         self.free(big)
+
+
+def _region(buffer: cl.Buffer, start: int, nbytes: int) -> cl.Buffer:
+    """A part of a buffer, which may be a part of another one itself."""
+    whole = buffer.get_info(cl.mem_info.ASSOCIATED_MEMOBJECT)
+    if whole is None:
+        return buffer.get_sub_region(start, nbytes)
+    return whole.get_sub_region(buffer.get_info(cl.mem_info.OFFSET) + start, nbytes)
 
 
 def _literal(value: str | int | float) -> str:

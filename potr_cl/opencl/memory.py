@@ -82,6 +82,57 @@ class Memory(Owner):
         self.free(*self._buffers)
 
 
+class Arena(Memory):
+    """Buffers that are parts of one large one: what is taken and given back again and again, always together.
+
+    To give a driver hundreds of megabytes back and to take them again can take longer than the work in between.
+    :meth:`close` only makes room for the next ones; :meth:`give_back` gives the large buffer back.
+
+    Args:
+        device: whose memory it is.
+        what: the buffers hold, for errors.
+    """
+
+    def __init__(self, device: Device, what: str) -> None:
+        super().__init__(device)
+        self._block = Scratch(device, what)
+        self._parts: list[cl.Buffer] = []
+        self._used = self._wanted = 0
+        self._grain = max(device.info.handle.mem_base_addr_align // 8, 1)
+
+    def allocate(self, nbytes: int, what: str) -> cl.Buffer:
+        nbytes = -(-max(int(nbytes), 16) // self._grain) * self._grain
+        if not self._parts and not self._buffers:
+            self._block.reserve(min(max(self._wanted, self._grain), self._device.info.largest_buffer))
+            self._wanted = 0
+        self._wanted += nbytes
+        if self._used + nbytes > self._block.nbytes:
+            return super().allocate(nbytes, what)  # next time there will be room
+        part = self._block.buffer.get_sub_region(self._used, nbytes)
+        self._used += nbytes
+        self._parts.append(part)
+        return part
+
+    def free(self, *buffers: cl.Buffer) -> None:
+        for buffer in buffers:
+            if buffer in self._parts:
+                self._parts.remove(buffer)
+                buffer.release()
+            else:
+                super().free(buffer)
+
+    def close(self) -> None:
+        self.free(*self._parts)
+        super().close()
+        self._used = 0
+
+    def give_back(self) -> None:
+        """Give all memory back."""
+        self.close()
+        self._block.close()
+        self._wanted = 0
+
+
 class Scratch(Owner):
     """A buffer that grows when asked to, and loses its content then.
 

@@ -16,7 +16,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner, Staging
 
 #: Bytes of a slice, and slices that the host has room for.
-_SLICE, _SLOTS = 1 << 23, 4
+_SLICE, _SLOTS = 1 << 22, 4
 
 
 class Lent:
@@ -56,7 +56,10 @@ class Relay(Owner):
     def __init__(self, device: Device) -> None:
         self._device = device
         self._queue = _queue_beside(device)
-        self._ways: dict[int, _Way] = {}
+        self._queues: dict[Device, Any] = {}
+        # Taken now: a device that computes would be waited for. Any driver copies fast to and from memory of another.
+        self._staging = Staging(device)
+        self._slots = self._staging.array((_SLOTS, _SLICE), np.uint8)
 
     def fetch(self, target: cl.Buffer, lent: Lent, start: int = 0, nbytes: int | None = None) -> None:
         """Copy what is lent, or a part of it, to the beginning of a buffer; it is there when the method returns.
@@ -87,8 +90,9 @@ class Relay(Owner):
                 self._through_host(target, lent, start, nbytes, free)
 
     def _through_host(self, target: cl.Buffer, lent: Lent, start: int, nbytes: int, free: cl.Event) -> None:
-        way = self._ways.setdefault(id(lent.device), _Way(lent.device))
-        slots = way.staging.array((_SLOTS, _SLICE), np.uint8)
+        if lent.device not in self._queues:
+            self._queues[lent.device] = _queue_beside(lent.device)
+        departing, slots = self._queues[lent.device], self._slots
         sizes = [min(_SLICE, nbytes - first) for first in range(0, nbytes, _SLICE)]
         down: list[cl.Event] = []
         up: list[cl.Event] = []
@@ -99,9 +103,9 @@ class Relay(Owner):
             slot, first = slots[number % _SLOTS][: sizes[number]], start + number * _SLICE
             waits = None if number else [lent.ready]
             down.append(
-                cl.enqueue_copy(way.queue, slot, lent.buffer, src_offset=first, is_blocking=False, wait_for=waits)
+                cl.enqueue_copy(departing, slot, lent.buffer, src_offset=first, is_blocking=False, wait_for=waits)
             )
-            way.queue.flush()
+            departing.flush()
 
         def land(number: int) -> None:
             down[number].wait()
@@ -120,23 +124,14 @@ class Relay(Owner):
                     land(number - ahead)
         finally:
             # What is on its way uses memory that must not be given up.
-            way.queue.finish()
+            departing.finish()
             self._queue.finish()
 
     def close(self) -> None:
-        """Give the host's memory back."""
-        for way in self._ways.values():
-            way.staging.close()
-        self._ways = {}
-
-
-class _Way:
-    """From another device to the host."""
-
-    def __init__(self, device: Device) -> None:
-        self.device = device  # is kept, so that its number is nobody else's
-        self.queue = _queue_beside(device)
-        self.staging = Staging(device)
+        """Give the host's memory back; the relay is of no use afterwards."""
+        self._staging.close()
+        self._slots = np.empty((0, 0), np.uint8)
+        self._queues = {}
 
 
 def _queue_beside(device: Device) -> Any:

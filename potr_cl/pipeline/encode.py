@@ -19,6 +19,7 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.errors import DataError, PotrError
 from potr_cl.host.atomic_write import replacing
 from potr_cl.host.mapped import bounded
+from potr_cl.host.threads import in_background
 from potr_cl.model.agreement import require_agreement
 from potr_cl.model.camera import Camera, train_views, within_photographs
 from potr_cl.model.scene import Scene
@@ -212,12 +213,13 @@ def encode(
     scene = scene.rendered(antialiased)
     tell_losses(scene, options)
     watch = Stopwatch(progress, tell)
-    cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame)
     with ExitStack() as stack:
         stack.enter_context(bounded(options.memory))
-        if kept is None and cameras and options.look_at_views(scene):
-            device = device or (Device() if pool is None else pool.first)
-            kept = stack.enter_context(KeptScene(device, scene))
+        with frame_checked_beside(scene, cameras, options.cameras_anyway or in_frame):
+            cameras = cameras_or_virtual(scene, cameras, options, watch, in_frame=True)
+            if kept is None and cameras and options.look_at_views(scene):
+                device = device or (Device() if pool is None else pool.first)
+                kept = stack.enter_context(KeptScene(device, scene))
         run = Run(options, watch, device, kept, pool)
         encoded = run.finished(run.stages(State.of(scene, train_views(cameras) if cameras else [])))
     tell_left_out(scene, encoded)
@@ -265,6 +267,20 @@ def cameras_or_virtual(
     if cameras is not None and any(getattr(stage, "ground_truth", None) is not None for stage in options.stages):
         return within_photographs(cameras)
     return cameras
+
+
+@contextmanager
+def frame_checked_beside(scene: Scene, cameras: Sequence[Camera] | None, anyway: bool) -> Iterator[None]:
+    """:func:`check_frame` in another thread, while this one opens and fills a device; a wrong frame is told first.
+
+    Raises:
+        As :func:`check_frame`, when the context ends.
+    """
+    checked = in_background(check_frame, scene, cameras, anyway)
+    try:
+        yield
+    finally:
+        checked.result()
 
 
 def check_frame(scene: Scene, cameras: Sequence[Camera] | None, anyway: bool) -> None:

@@ -127,6 +127,8 @@ def forecast(
         steps = fit.steps_on(device.family)
         if isinstance(refit := parts.get(Refit.name), Refit) and refit.ground_truth is not None:
             steps += fit.photograph_steps_on(device.family, len(cameras))
+        else:
+            steps += fit.further_steps_on(device.family)
         pictures += steps * fit.batch * units.fit
         pictures += views * (fit.views_on(device.family) + units.prepare + units.iteration * fit.iterations)
     if Compact.name in parts:

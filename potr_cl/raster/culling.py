@@ -8,6 +8,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.morton import morton_order
 from potr_cl.model.scene import Scene
@@ -44,7 +45,9 @@ class Sights:
     seen: NDArray[np.bool_]
 
     @staticmethod
-    def of(scene: Scene, cameras: Sequence[Camera], near: float, groups: SplatGroups | None = None) -> Sights:
+    def of(
+        scene: Scene, cameras: Sequence[Camera], near: float, groups: SplatGroups | None = None, run: Run = map
+    ) -> Sights:
         """What some views may draw.
 
         Args:
@@ -52,14 +55,22 @@ class Sights:
             cameras: the views, at least one.
             near: as in the rasterizer's rules.
             groups: of the scene, where they are known.
+            run: shares the work out.
         """
-        groups = groups or SplatGroups.of(scene)
-        return Sights(groups, np.stack([groups.visible(camera, near) for camera in cameras]))
+        groups = groups or SplatGroups.of(scene, run=run)
+        return Sights(groups, groups.visible_by(cameras, near, run))
 
     @property
     def totals(self) -> NDArray[np.int64]:
         """(views,) the splats that each view may draw."""
         return np.array([int(self.groups.counts[row].sum()) for row in self.seen])
+
+    def order(self) -> NDArray[np.int64]:
+        """(views,) the views along a curve through the middles of what they see: neighbours see much of the same."""
+        counts = self.groups.counts.astype(np.float64)
+        with np.errstate(invalid="ignore", divide="ignore"):
+            middles = np.nan_to_num((self.seen * counts) @ self.groups.centres / (self.seen @ counts)[:, None])
+        return morton_order(middles.astype(np.float32))
 
     def parts(self) -> list[ViewPart]:
         """All views, dealt out to parts that see much of the same, so that the splats of all parts are few."""
@@ -67,10 +78,7 @@ class Sights:
         counts = groups.counts.astype(np.float64)
         totals = seen @ counts
         most = max(_SPREAD * float(np.quantile(totals, _QUANTILE)), _LEAST_PART * len(groups.order))
-        # Along a curve through the middles of what they see, neighbours see much of the same.
-        with np.errstate(invalid="ignore", divide="ignore"):
-            middles = np.nan_to_num((seen * counts) @ groups.centres / totals[:, None])
-        order = morton_order(middles.astype(np.float32))
+        order = self.order()
         dealt: list[list[int]] = []
         together = np.zeros(len(counts), bool)
         for number in order[totals[order] <= most].tolist():

@@ -67,12 +67,16 @@ class Picker(Owner):
             self._groups = self._memory.upload(groups, "the splats' groups")
             self._count, self._write = (device.kernel(_SOURCE, name) for name in ("count_wanted", "write_wanted"))
 
-    def pick(self, memory: Memory, wanted: NDArray[np.bool_]) -> tuple[cl.Buffer, int]:
+    def pick(
+        self, memory: Memory, wanted: NDArray[np.bool_], states: cl.Buffer | None = None, state: int = 0
+    ) -> tuple[cl.Buffer, int]:
         """The numbers of the splats of some groups.
 
         Args:
             memory: that owns them.
             wanted: (G,) the groups.
+            states: (N,) uint8 in the device's memory, each splat's state; None: whatever it is.
+            state: that the splats must be in.
 
         Returns:
             The numbers, uint32, ascending, and how many they are.
@@ -85,7 +89,14 @@ class Picker(Owner):
         with Memory(device) as own:
             flags = own.upload(wanted.astype(np.uint8), "the groups that are wanted")
             counts = own.allocate(4 * chunks, "the numbers of splats that are wanted")
-            arguments = {"groups": self._groups, "wanted": flags, "splats": self._splats}
+            arguments = {
+                "groups": self._groups,
+                "wanted": flags,
+                "states": flags if states is None else states,
+                "by_state": states is not None,
+                "state": state,
+                "splats": self._splats,
+            }
             self._count.bind(**arguments, counts=counts).launch(items, (_GROUP,))
             found = device.download(counts, (chunks,), np.uint32)
             ends = np.cumsum(found, dtype=np.uint32)

@@ -217,8 +217,12 @@ class Rasterizer(Owner):
         """
         return self.prepare_set([camera]).views[0]
 
-    def prepare_set(self, cameras: Sequence[Camera]) -> ViewSet:
+    def prepare_set(self, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
         """:meth:`prepare` several views, and wait for the device only once. CPU kernels take one view at a time.
+
+        Args:
+            cameras: of the views.
+            memory: to take the views' buffers from, which is closed with them; None: memory of their own.
 
         Returns:
             The views; the caller closes them.
@@ -227,7 +231,7 @@ class Rasterizer(Owner):
             DeviceMemoryError: they do not fit the device, or not all in buffers of the size that it allows.
             DeviceError: one view alone has too many intersections, or the device failed.
         """
-        views = ViewSet(self.device, cameras, self.stride, self._launcher.subtile_bytes)
+        views = ViewSet(self.device, cameras, self.stride, self._launcher.subtile_bytes, memory)
         try:
             counts, bounds = self._zeroed_counts(views), self._room_for_bounds(views)
             self._enqueue_project(views, bounds)

@@ -40,6 +40,7 @@ class ViewSet(Owner):
         cameras: whose views they are.
         stride: splats of the scene, padded.
         subtile_bytes: of an element of ``subtiles``.
+        memory: to take the buffers from, which is closed with the views; None: memory of their own.
 
     Attributes:
         views: each with the parts of the buffers that are its own.
@@ -63,9 +64,11 @@ class ViewSet(Owner):
     intersections: cl.Buffer
     subtiles: cl.Buffer
 
-    def __init__(self, device: Device, cameras: Sequence[Camera], stride: int, subtile_bytes: int) -> None:
+    def __init__(
+        self, device: Device, cameras: Sequence[Camera], stride: int, subtile_bytes: int, memory: Memory | None = None
+    ) -> None:
         self._device = device
-        self._memory = Memory(device)
+        self._memory = memory or Memory(device)
         self._subtile_bytes = subtile_bytes
         self.stride = stride
         self.views = [View(self, camera) for camera in cameras]

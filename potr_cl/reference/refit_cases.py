@@ -78,6 +78,7 @@ class Linearised:
     def normal(self, direction: Array) -> Array:
         """A transposed W A times a direction."""
         vectors = self._refit.coefficients
+        assert isinstance(vectors, Coefficients)
         x, result = vectors.vector(), vectors.vector()
         vectors.write(x, direction)
         vectors.zero(result)

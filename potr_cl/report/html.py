@@ -16,7 +16,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, features
 
 from potr_cl.formats.images import to_8_bits
 from potr_cl.model.scene import FloatArray
@@ -172,6 +171,8 @@ def _photograph(pair: PicturePair, name: str, size: str) -> str:
 
 def _data_uri(picture: FloatArray) -> str:
     """The picture without loss: what is to be compared may differ by little."""
+    from PIL import Image, features  # most encodes make no page
+
     pixels: NDArray[np.uint8] = to_8_bits(picture)
     fits = max(pixels.shape[:2]) <= _WIDEST_WEBP and features.check("webp")
     kind, options = ("webp", {"lossless": True, "method": 2}) if fits else ("png", {})

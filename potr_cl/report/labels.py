@@ -14,7 +14,6 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, ImageDraw, ImageFont
 
 from potr_cl.formats.images import to_8_bits
 from potr_cl.plain_text import plain
@@ -101,6 +100,8 @@ def contact_sheet(pictures: Sequence[tuple[U8, Words]], heading: Words = "", row
         heading: above all of them.
         row: pictures beside each other.
     """
+    from PIL import Image  # on use: what is encoded without a page needs the words alone
+
     longest = max(max(picture.shape[:2]) for picture, _ in pictures)
     factor = min(1.0, _THUMBNAIL / longest)
     # All cells are of one size, so that the rows are straight.
@@ -125,17 +126,23 @@ def shrunk(pixels: U8, width: int) -> U8:
     """A picture, (H, W, 3) 8-bit, made smaller where it is wider than so many pixels."""
     if pixels.shape[1] <= width:
         return pixels
+    from PIL import Image
+
     height = max(1, round(pixels.shape[0] * width / pixels.shape[1]))
     return np.asarray(Image.fromarray(pixels).resize((width, height), Image.Resampling.LANCZOS))
 
 
 @lru_cache(maxsize=16)
 def _font(size: int) -> Any:
+    from PIL import ImageFont
+
     return ImageFont.load_default(size)
 
 
 def _strip(words: Words, width: int, size: int) -> U8:
     """One line of text on a strip of a width."""
+    from PIL import Image, ImageDraw
+
     texts = [_drawable(text) for text in ([words] if isinstance(words, str) else words)]
     edge = max(3, size // 3)
     room = width - 2 * edge

@@ -72,7 +72,7 @@ class Compact(Stage):
 
     def __post_init__(self) -> None:
         if not 0 <= self.at <= 1:
-            raise UsageError(f"compact_at is {self.at:g}, it must lie between 0 and 1")
+            raise UsageError(f"--compact-at is {self.at:g}, it must lie between 0 and 1")
         _ = CompactionOptions(colour_model=self.colour_model, weighting=self.weighting)
 
     def looks_at(self, scene: Scene) -> bool:

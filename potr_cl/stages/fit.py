@@ -14,7 +14,6 @@ from typing import Any, Literal
 
 from potr_cl.errors import UsageError
 from potr_cl.host.signals import first_interrupt_asks
-from potr_cl.host.threads import thread_pool
 from potr_cl.model.views_between import views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.discovery import Family
@@ -33,6 +32,7 @@ from potr_cl.stages.fitting.fit import (
 )
 from potr_cl.stages.fitting.photographs import fit_to_photographs, times
 from potr_cl.stages.fitting.pictures import TargetPictures
+from potr_cl.stages.fitting.settling import Looking, Settling, settle
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
@@ -123,6 +123,8 @@ class Fit(Stage):
             "auto": as many as pay on the device.
         photograph_rate: by what the rates are multiplied for photographs, which pictures are farther from than from the
             uncompressed scene's.
+        choosing, rounding, gentle: how far what is left is fitted once more after the choice of coefficients and the
+            rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`).
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -156,6 +158,9 @@ class Fit(Stage):
     patience: int = option(FitOptions.patience)
     rates: Rates = option(FitOptions.rates)
     last: float = option(FitOptions.last)
+    choosing: float = option(0.3)
+    rounding: float = option(0.15)
+    gentle: float = option(0.1)
     seed: int = option(FitOptions.seed)
 
     def __post_init__(self) -> None:
@@ -168,6 +173,9 @@ class Fit(Stage):
             raise UsageError(f"the fit's photograph rate is {self.photograph_rate:g}, it must be above 0, at most 100")
         if not 0 <= self.finer <= 1:
             raise UsageError(f"the fit's finer quality is {self.finer:g}, it must be from 0 to 1")
+        for name, least, most in (("choosing", 0, 10), ("rounding", 0, 10), ("gentle", 1e-6, 1)):
+            if not least <= getattr(self, name) <= most:
+                raise UsageError(f"the fit's {name} is {getattr(self, name):g}, it must be from {least:g} to {most}")
         for name in ("cycles", "iterations"):
             if not 1 <= getattr(self, name) <= 1000:
                 raise UsageError(f"the fit's {name} are {getattr(self, name)}, they must be from 1 to 1000")
@@ -182,6 +190,10 @@ class Fit(Stage):
     def steps_on(self, family: Family) -> int:
         """The most steps on a device of a family."""
         return STEPS[family] if self.steps == "auto" else self.steps
+
+    def further_steps_on(self, family: Family) -> int:
+        """The most steps after the choice of coefficients and the roundings."""
+        return round((self.choosing + 2 * self.rounding) * self.steps_on(family))
 
     def photograph_steps_on(self, family: Family, photographs: int) -> int:
         """The steps of the fit to so many photographs on a device of a family."""
@@ -231,9 +243,14 @@ class Fit(Stage):
                 targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
             found = self._cycles(seen, bench, targets, asked)
             found = dataclasses.replace(found, views=state.views, added=state.added)
-            if asked or bench.photographs is None or self.photograph_steps == 0:
+            if bench.photographs is not None and self.photograph_steps != 0 and not asked:
+                found = self._to_photographs(found, bench, asked)
+            if asked or not isinstance(found.learnt[self.name], Fitted):
                 return found
-            return self._to_photographs(found, bench, asked)
+            if found.truth is not None:
+                rasterizer = stack.enter_context(Rasterizer(bench.opened, found.truth, background=bench.background))
+                targets = RenderedTargets(rasterizer, seen.views)
+            return self._settled(found, bench, Looking(seen.views, seen.added, targets, rasterizer), asked)
 
     def _looking_between(self, state: State, bench: Workbench) -> State:
         """The state with the views that the fit looks at."""
@@ -241,8 +258,7 @@ class Fit(Stage):
         each = self.views_on(bench.opened.family)
         if is_virtual(given) or each * len(given) <= state.added:
             return state
-        with thread_pool(bench.threads) as pool:
-            added = views_between(state.source, given, each, run=pool.map)
+        added = views_between(state.source, given, each)  # with threads it takes twice as long
         return dataclasses.replace(state, views=(*given, *added), added=len(added))
 
     def _cycles(self, state: State, bench: Workbench, targets: Targets | TargetPictures, asked: SupportsBool) -> State:
@@ -258,7 +274,7 @@ class Fit(Stage):
         last = best = state
         taken: Fitted | None = None
         steps_of = self._steps_of_cycles(bench.opened.family, price is not None and further > 1)
-        total, done = sum(steps_of), 0
+        total, done = sum(steps_of) + self.further_steps_on(bench.opened.family), 0
         for number, steps in enumerate(steps_of):
             part = number / (len(steps_of) - 1) if len(steps_of) > 1 else 1.0
             if price is not None and further > 1 and part > 0:
@@ -279,6 +295,21 @@ class Fit(Stage):
             why = _INTERRUPTED if asked else _NO_GAIN if len(steps_of) > 1 else _LITTLE_GAIN
             return state.having_learnt(self.name, LeftOut(why, bool(asked)))
         return best.having_learnt(self.name, taken)
+
+    def _settled(self, state: State, bench: Workbench, looking: Looking, asked: SupportsBool) -> State:
+        """Choose coefficients and round geometry, with what is left fitted once more in between."""
+        options = self._options(bench.opened.family, bench.memory)
+        settling = Settling(self.choosing, self.rounding, self.gentle)
+        done, total = options.steps, options.steps + self.further_steps_on(bench.opened.family)
+
+        def progress(steps: int) -> None:
+            nonlocal done
+            done += steps
+            bench.progress("fit", min(done / total, 1.0) * 0.99)
+
+        then, errors = settle(state, bench, looking, settling, options, asked, progress)
+        told = dataclasses.replace(state.learnt[self.name], settled=errors)
+        return then.having_learnt(self.name, told)
 
     def _steps_of_cycles(self, family: Family, removing: bool) -> list[int]:
         """The steps of the fit in each cycle."""

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
+from functools import partial
 
 import numpy as np
 from numpy.typing import NDArray
@@ -10,6 +11,9 @@ from numpy.typing import NDArray
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.raster.culling import Sights
+from potr_cl.raster.kept_scene import lying_on
+from potr_cl.raster.scene_buffers import SceneBuffers
+from potr_cl.raster.surely_seen import surely_seen
 from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
@@ -140,16 +144,18 @@ class Prune(Stage):
         And as "unseen" a :class:`potr_cl.stages.pruning.unseen.Unseen`; and as "price", where the number of splats is
         not given, the ΔMSE below which a splat has gone.
         """
-        with thread_pool(bench.threads) as pool:
-            groups = groups_of_large(state.scene, pool.map)
-            hidden, area = find_unseen(state, groups, pool.map)
+        with thread_pool(bench.threads) as pool, lying_on(bench.opened, bench.placed(state)) as placed:
+            quick = partial(surely_seen, placed) if isinstance(placed, SceneBuffers) else None
+            # Several devices share all views.
+            groups = None if bench.pool and quick else groups_of_large(state.scene, pool.map)
+            hidden, area = find_unseen(state, groups, pool.map, quick)
+            options = self._sweep_options(bench.memory)
+            sights = None if bench.pool else sights_worth_it(state.scene, state.views, options, groups, pool.map)
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
         told = state.having_learnt("unseen", Unseen(splats, len(state.scene), area, kept))
         if self.keep is None and self.count is None:
             told = told.having_learnt("price", bench.parameters.delta_mse_max)
-        options = self._sweep_options(bench.memory)
-        sights = None if bench.pool else sights_worth_it(state.scene, state.views, options, groups)
         if not (kept and splats):
             return self._pruned(told, bench, sights)
         # A copy of a large scene without them would take as much memory as the scene.

@@ -30,6 +30,8 @@ if TYPE_CHECKING:
 _CONNECT, _HELLO = 10.0, 120.0
 #: Seconds between two looks at whether a worker that has not answered yet is alive, and at whether to go on waiting.
 _ALIVE, _POLL = 3.0, 0.1
+#: The second of them grows by this factor from look to look, up to so much: each look wakes the client's event loop.
+_POLL_GROWS, _MOST_POLL = 1.5, 1.0
 #: Seconds in which the handle of a part arrives once it is made.
 _FETCH = 30.0
 #: Threads that wait for workers.
@@ -107,7 +109,9 @@ class ClusterPool(Pool):
             WorkerLost: it is gone. Whatever the worker raises.
         """
         began = looked = time.monotonic()
-        while not self._answered(answer):
+        poll = _POLL
+        while not self._answered(answer, poll):
+            poll = min(_POLL_GROWS * poll, _MOST_POLL)
             if time.monotonic() - began > most:
                 raise WorkerLost(f"{address} does not answer")
             if self._closing.is_set():
@@ -127,7 +131,7 @@ class ClusterPool(Pool):
                 raise WorkerLost(f"{address} is gone ({_first_line(error)})") from None
             raise DeviceError(f"worker {address} failed ({_first_line(error)})") from error
 
-    def _answered(self, answer: Any) -> bool:
+    def _answered(self, answer: Any, seconds: float) -> bool:
         """Whether an answer is there, after waiting a little for it."""
         if answer.done():
             return True
@@ -136,9 +140,9 @@ class ClusterPool(Pool):
                 # What is on its way already must not be cut short.
                 done = threading.Event()
                 answer.add_done_callback(lambda _: done.set())
-                done.wait(_POLL)
+                done.wait(seconds)
             else:
-                answer.result(timeout=_POLL)
+                answer.result(timeout=seconds)
         return bool(answer.done())
 
     def begin(self, work: Callable[[], Any]) -> Future[Any]:

@@ -85,9 +85,9 @@ def test_refused_in_one_line_before_any_work(
     [
         "decode a.potr -o",
         "convert a.ply",
-        "prune a.ply --iterations 2 --virtual-views 8 -o",
+        pytest.param("prune a.ply --iterations 2 --virtual-views 8 -o", marks=pytest.mark.slow),
         "compact a.ply --virtual-views 8 -o",
-        "refit a.ply --reference a.ply --steps 1 --virtual-views 8 -o",
+        pytest.param("refit a.ply --reference a.ply --steps 1 --virtual-views 8 -o", marks=pytest.mark.slow),
     ],
 )
 def test_a_scene_is_written_as_its_name_says(folder: Path, command: str, suffix: str) -> None:

@@ -47,6 +47,28 @@ def test_decoded_before_it_is_coded(kind, preset, cameras):
     assert seen.sh is scene.sh
 
 
+@pytest.mark.parametrize("kind", ["any", "balls", "coincident", "one splat"])
+def test_centres_and_opacities_move_while_the_rest_stays_rounded(kind):
+    scene = some_scene(kind)
+    parameters = EncodeOptions(q=0.3).parameters
+    views = train_views(ring_of_cameras(8))
+    first = quantise_geometry(scene, parameters, views)
+    decoded = first.decoded(scene.sh)
+    rng = np.random.default_rng(0)
+    means = scene.means + rng.normal(0, 0.01, scene.means.shape).astype(np.float32)
+    second = first.with_centres_of(means, views)
+    seen = second.decoded(scene.sh)
+    for name in ("log_scales", "quaternions", "opacity_logits"):
+        assert np.array_equal(getattr(seen, name), getattr(decoded, name)), name
+    at_once = quantise_geometry(dataclasses.replace(scene, means=means), parameters, views).decoded(scene.sh)
+    errors = [np.linalg.norm(each.means - means, axis=1) for each in (seen, at_once)]
+    assert errors[0].max() == pytest.approx(errors[1].max(), rel=0.1)
+    third = second.with_opacities_of(scene.opacity_logits - 1).decoded(scene.sh)
+    expected = quantise_geometry(dataclasses.replace(scene, opacity_logits=scene.opacity_logits - 1), parameters, views)
+    assert np.array_equal(third.opacity_logits, expected.decoded(scene.sh).opacity_logits)
+    assert np.array_equal(third.means, seen.means)
+
+
 @pytest.mark.parametrize("entropy", ["context", "zstd"])
 def test_a_file_of_geometry_that_was_there_is_the_same_file(entropy):
     scene = random_scene(700, 2)

@@ -13,13 +13,14 @@ import pytest
 from hypothesis import HealthCheck, given, settings
 from hypothesis import strategies as st
 
-from potr_cl.codec import encoder, octree
+from potr_cl.codec import bundled_scene, encoder, octree
 from potr_cl.codec.container import EntropyCoder
 from potr_cl.codec.decoder import PotrFile, decode
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.functions import Functions
 from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, native
 from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.sections import Property
 from potr_cl.errors import DataError, UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import Scene
@@ -168,6 +169,45 @@ def resealed(data: bytearray) -> bytes:
         at += size
     struct.pack_into("<I", data, 120 + 24 * count, zlib.crc32(data[: 120 + 24 * count]))
     return bytes(data)
+
+
+@pytest.mark.parametrize(
+    "what", ["checksum of one", "contexts of one, checksum of the next", "words, checksum of another"]
+)
+def test_checksums_that_threads_look_at_come_first(what, choose, monkeypatch):
+    """As if sections were opened one after the other: what is wrong with the first of them is told."""
+    choose("native")
+    monkeypatch.setattr(bundled_scene, "_LARGE", 1)
+    good = coded(random_scene(5 * 8192, 1, seed=4))
+    header = PotrFile.from_bytes(good).header
+    opacity, scale, ac = (header.find(*key) for key in ((Property.OPACITY, 0), (Property.SCALE, 0), (Property.SH, 3)))
+    data = bytearray(good)
+    if what.startswith("contexts"):
+        data[opacity.offset + 8] ^= 0xFF
+    elif what.startswith("words"):
+        data[opacity.offset + opacity.stored_bytes // 2] ^= 0xFF
+    data = bytearray(resealed(data))
+    data[(scale if what.startswith("contexts") else ac).offset + 30] ^= 0xFF
+    said = {outcome(bytes(data), threads) for threads in (1, 3, 4)}
+    assert len(said) == 1
+    wanted = {"c": "section 'sh 3' is damaged", "o": "section 'opacity'"}
+    assert said.pop().startswith(wanted["o" if what.startswith("contexts") else "c"])
+
+
+def test_threads_name_the_damage_that_one_thread_finds_first(choose):
+    """Several bundles are damaged, in sections that are decoded early and late."""
+    choose("native")
+    good = coded(random_scene(9 * 8192, 1, seed=3))
+    header = PotrFile.from_bytes(good).header
+    data = bytearray(good)
+    for prop, index, part in ((Property.SH, 3, 0.5), (Property.OPACITY, 0, 0.9), (Property.ROTATION, 0, 0.95)):
+        section = header.find(prop, index)
+        at = section.offset + int(section.stored_bytes * part)
+        data[at : at + 8] = bytes(value ^ 0x5A for value in data[at : at + 8])
+    data = resealed(data)
+    said = {outcome(data, threads) for threads in (1, 1, 2, 3, 4, 4, 4, 4)}
+    assert len(said) == 1
+    assert said.pop().startswith("section 'sh 3'")  # half of its words are before the damage
 
 
 def files_to_change() -> list[bytes]:

@@ -203,8 +203,9 @@ def test_what_does_not_fit_is_refused_before_c_sees_it():
     for order, start, columns in ((numbers + 1, 0, 7), (numbers, 1, 7), (numbers, -1, 7), (numbers, 0, 6)):
         with pytest.raises(TypeError):
             quantising.splat_levels(
-                doubles, doubles, logits, order, (1.0, 1.0, 1.0), (0.0, 1.0), start, np.empty((columns, 4), np.int32)
-            )
+                np.ones((4, 4), np.float32), doubles, logits, order, *quantize.AXIS_ROTATIONS, (1.0, 1.0, 1.0),
+                (0.0, 1.0), start, np.empty((columns, 4), np.int32),
+            )  # fmt: skip
     with pytest.raises(TypeError):
         quantising.nearest(ones.astype(np.float64), np.ones((2, 3)), np.empty(4))  # type: ignore[arg-type]
     order, factors, levels = np.arange(4), np.ones(4), np.empty((1, 3, 4), np.int16)

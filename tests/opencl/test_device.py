@@ -17,7 +17,7 @@ from potr_cl.opencl import device as opencl_device
 from potr_cl.opencl import discovery, loader
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, choose_device, compiler_fault, list_devices
-from potr_cl.opencl.memory import Scratch
+from potr_cl.opencl.memory import Arena, Scratch
 from potr_cl.opencl.source import kernel_source
 from potr_cl.report.devices import device_report, format_devices
 
@@ -450,6 +450,27 @@ def test_a_buffer_is_filled_piece_by_piece(device: Device, values: int, monkeypa
     device.fill(buffer, np.uint32(3))
     assert (device.download(buffer, (values + 8,), np.uint32) == 3).all()
     device.free(buffer)
+
+
+def test_an_arena_gives_the_same_memory_again(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(opencl_device, "_FILLED", 4096)
+    before = device.allocated
+    arena = Arena(device, "a test")
+    taken = []
+    for turn, counts in enumerate([(1000, 5000), (1000, 5000), (300, 7000), (300, 7000, 10)]):
+        buffers = [arena.allocate(4 * count, "a test") for count in counts]
+        for value, (buffer, count) in enumerate(zip(buffers, counts, strict=True)):
+            device.fill(buffer, np.uint32(10 * turn + value), 4 * count)
+        for value, (buffer, count) in enumerate(zip(buffers, counts, strict=True)):
+            assert (device.download(buffer, (count,), np.uint32) == 10 * turn + value).all()
+        taken.append(device.allocated - before)
+        if turn == 2:
+            arena.free(buffers[0])
+        arena.close()
+    assert all(24_000 <= taken[turn] < 32_000 for turn in (0, 1, 3))  # in between there is too little room
+    assert 28_000 <= device.allocated - before < 32_000  # it stays
+    arena.give_back()
+    assert device.allocated == before
 
 
 def test_scratch_grows_and_survives_failure(device: Device) -> None:

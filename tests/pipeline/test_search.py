@@ -48,7 +48,7 @@ def psnr(device, scene, file, cameras):
 
 
 @pytest.mark.parametrize("preset", PRESETS)
-@pytest.mark.parametrize("size", [18_000, 24_000])
+@pytest.mark.parametrize("size", [18_000, pytest.param(24_000, marks=pytest.mark.slow)])
 def test_a_size_is_filled_and_not_passed(device, plush_excerpt, cameras, size, preset):
     lines = []
     options = EncodeOptions.for_preset(preset, prune={"iterations": 6})
@@ -76,7 +76,7 @@ class HalfOpaque(Stage):
         return dataclasses.replace(state, scene=scene, geometry=None)
 
 
-@pytest.mark.parametrize("place", [0, -2, -1])
+@pytest.mark.parametrize("place", [0, pytest.param(-2, marks=pytest.mark.slow), -1])
 def test_a_stage_of_ones_own_takes_part_in_a_search_as_in_an_encode(device, plush_excerpt, cameras, place):
     stages = list(EncodeOptions.for_preset("best", prune={"iterations": 4}, refit={"steps": 3}).stages)
     stages.insert(place, HalfOpaque())
@@ -107,8 +107,13 @@ def test_a_psnr_is_reached_with_little_to_spare(device, plush_excerpt, cameras, 
 
 @pytest.mark.parametrize(
     ("preset", "target"),
-    [("best", Target(max_bytes=size)) for size in (17_000, 22_000, 28_000)]
-    + [("fast", Target(min_psnr=psnr)) for psnr in (46, 49)],
+    [
+        pytest.param("best", Target(max_bytes=17_000), marks=pytest.mark.slow),
+        ("best", Target(max_bytes=22_000)),
+        pytest.param("best", Target(max_bytes=28_000), marks=pytest.mark.slow),
+        ("fast", Target(min_psnr=46)),
+        pytest.param("fast", Target(min_psnr=49), marks=pytest.mark.slow),
+    ],
 )
 def test_what_is_found_is_what_a_plain_encode_makes(device, plush_excerpt, cameras, preset, target):
     """So it lies on the plain encodes' curve, as far as its parameters are those of one q."""

@@ -116,7 +116,7 @@ def test_the_refit_finds_the_least_squares_solution(device):
 
 
 @pytest.mark.parametrize("low_pass", LOW_PASSES)
-@pytest.mark.parametrize("preset", ["paper", "fast", "best"])
+@pytest.mark.parametrize("preset", ["paper", pytest.param("fast", marks=pytest.mark.slow), "best"])
 def test_a_file_keeps_how_its_scene_is_rendered(device, preset, low_pass):
     """Through pruning, compaction, re-fit and coder; and the file is judged by antialiased pictures."""
     scene, cameras = small(300, 2, low_pass=low_pass), ring_of_cameras(6, size=40)

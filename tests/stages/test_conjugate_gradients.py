@@ -14,7 +14,7 @@ class ArrayVectors:
     def __init__(self, size):
         self.size = size
 
-    def vector(self):
+    def vector(self, rank):
         return np.full(self.size, np.nan)
 
     def zero(self, x):

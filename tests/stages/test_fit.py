@@ -237,7 +237,7 @@ def test_the_stage_mends_what_pruning_has_left(family_device):
     left = np.arange(0, 120, 2)
     cameras = ring_of_cameras(8, size=48)
     before = State.of(source, cameras).keeping(left)
-    after = Fit(steps=200).run(before, bench_of(family_device))
+    after = Fit(steps=200, choosing=0, rounding=0).run(before, bench_of(family_device))
     assert np.array_equal(after.survivors, left)
     assert after.geometry is None
     assert isinstance(after.learnt["fit"], Fitted)
@@ -311,7 +311,7 @@ def test_splats_are_removed_for_the_fit_to_make_up_for(family_device, plush_exce
 def priced_fit(further, **options):
     """A fit that removes splats up to so many times the price."""
     at_price = further / math.sqrt(PRICE / 10**-9.3)
-    fit = Fit(**{"steps": 50, "further": at_price, "between": 0, **options})
+    fit = Fit(**{"steps": 50, "further": at_price, "between": 0, "choosing": 0, "rounding": 0, **options})
     assert fit.limit(PRICE) == pytest.approx(further * PRICE)
     return fit
 

@@ -9,10 +9,9 @@ import pytest
 
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
-from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
 from potr_cl.reference.refit_cases import Case, Linearised, Pictures
-from potr_cl.reference.scenes import plain_splats, ring_of_cameras, straight_camera, tilted_camera, visible_scene
+from potr_cl.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, active_coefficients, refit_colours
 from tests.devices import KERNELS, open_device
@@ -40,9 +39,6 @@ def case(device):
 
 def relative(a, b) -> float:
     return float(np.linalg.norm(a - b) / np.linalg.norm(b))
-
-
-# ------------------------------------------------------------------------------------------ the map
 
 
 @pytest.mark.parametrize("degree", [0, 1, 2, 3])
@@ -153,13 +149,10 @@ def test_errors_are_those_of_the_pictures(case):
     assert refitted.errors[1] == pytest.approx(reference.error(to_ycocg(refitted.sh)), rel=1e-4)
 
 
-# ------------------------------------------------------------------------------------------ the solution
-
-
 @pytest.mark.parametrize(
     ("degree", "lam", "prior", "background"),
-    [(0, 0.0, 3.0, (0.0, 0.0, 0.0)), (1, 30.0, 3.0, (1.0, 0.5, 0.0)), (2, 30.0, 10.0, (0.0, 0.0, 0.0)),
-     (3, 100.0, 10.0, (0.0, 0.0, 0.0))],
+    [pytest.param(0, 0.0, 3.0, (0.0, 0.0, 0.0), marks=pytest.mark.slow), (1, 30.0, 3.0, (1.0, 0.5, 0.0)),
+     pytest.param(2, 30.0, 10.0, (0.0, 0.0, 0.0), marks=pytest.mark.slow), (3, 100.0, 10.0, (0.0, 0.0, 0.0))],
 )  # fmt: skip
 def test_the_solution_is_the_least_squares_one(device, degree, lam, prior, background):
     other = visible_scene(60, 2, seed=7)
@@ -220,7 +213,7 @@ def test_it_stops_when_a_step_gains_too_little(case):
     assert case.solve(RefitOptions(steps=0)).steps == 0
 
 
-@pytest.mark.parametrize("degree", [0, 2])
+@pytest.mark.parametrize("degree", [pytest.param(0, marks=pytest.mark.slow), 2])
 def test_it_stops_where_single_precision_ends(device, degree):
     other = visible_scene(60, 2, seed=7)
     with Case(device, visible_scene(40, degree), other, ring_of_cameras(3, size=40)) as case:
@@ -266,159 +259,6 @@ def test_the_target_itself_is_left_alone(device):
         refitted = case.solve(RefitOptions())
     assert refitted.errors[1] <= refitted.errors[0] < 1e-12
     assert np.allclose(refitted.sh, scene.sh, atol=1e-4)
-
-
-# ------------------------------------------------------------------------------------------ AC coefficients rounded
-
-
-def coarse(sh, refit) -> np.ndarray:
-    """AC coefficients in steps of 0.1."""
-    return np.concatenate([sh[:, :1], np.round(sh[:, 1:] * 10) / 10], axis=1)
-
-
-@pytest.mark.parametrize("degree", [1, 3])
-def test_the_constant_coefficients_make_up_for_the_rounding_of_the_others(device, degree):
-    """They come to the least-squares solution with the others held."""
-    options = RefitOptions(steps=200, gain=0, prior=10)
-    with Case(device, visible_scene(40, degree), visible_scene(60, 2, 7), ring_of_cameras(3, size=40)) as case:
-        with ColourRefit(device, case.scene, case.cameras) as refit:
-            rounded = coarse(refit.solve(case.scene.sh, case.targets, options).sh, refit)
-            solved = refit.solve_constant(case.targets, options, rounded)
-            sh = refit.colours()
-        active = np.zeros(rounded.shape, bool)
-        active[:, 0] = True
-        start = dataclasses.replace(case.scene, sh=rounded)
-        with Case(device, start, visible_scene(60, 2, 7), case.cameras) as again:
-            reference = again.reference(prior=10, active=active, hold=True)
-        x, solution = to_ycocg(sh), reference.solution()
-        assert np.allclose(sh[:, 1:], rounded[:, 1:], atol=1e-6)
-        assert np.linalg.norm(x - solution) < 1e-3 * np.linalg.norm(solution - reference.start)
-        assert solved.errors[0] == pytest.approx(reference.error(reference.start), rel=1e-4)
-        assert solved.errors[1] == pytest.approx(reference.error(x), rel=1e-4)
-
-
-def test_the_grid_is_asked_for_with_what_constants_are_worth(case):
-    """In a thread of its own, while the re-fit solves."""
-    told = []
-
-    def worth(sh, refit):
-        told.append(refit.worth()[:, 0])
-        return sh
-
-    def colour_grid(effects):
-        told.append(effects)
-        ones = np.ones(len(effects), np.float32)
-        return ColourGrid(ones, ones, np.arange(len(effects)))
-
-    options = RefitOptions(steps=6, gain=0, drop=1e-7)
-    refit_colours(case.device, case.scene, case.cameras, case.targets, options, fix_ac=worth)
-    refit_colours(case.device, case.scene, case.cameras, case.targets, options, colour_grid=colour_grid)
-    assert np.array_equal(told[0], told[1])
-
-
-@pytest.mark.parametrize("degree", [0, 2, 3])
-def test_colours_come_to_the_device_and_back(device, degree):
-    """In rows as trainers write them, and coefficient by coefficient as a re-fit leaves them."""
-    scene = visible_scene(300, degree)
-    with ColourRefit(device, scene, ring_of_cameras(1, size=20)) as refit:
-        vectors = refit.coefficients
-        x = vectors.vector()
-        for sh in (scene.sh, np.ascontiguousarray(scene.sh.transpose(1, 2, 0)).transpose(2, 0, 1)):
-            vectors.write_sh(x, sh)
-            assert np.abs(vectors.read(x) - to_ycocg(scene.sh)).max() < 1e-6 * np.abs(scene.sh).max()
-            assert np.abs(vectors.read_sh(x) - scene.sh).max() < 1e-6 * np.abs(scene.sh).max()
-
-
-class Counted:
-    """Targets that count how often they are asked for."""
-
-    def __init__(self, targets) -> None:
-        self.targets, self.asked = targets, 0
-
-    def into(self, numbers, buffer) -> None:
-        self.asked += len(numbers)
-        self.targets.into(numbers, buffer)
-
-
-@pytest.mark.one_runtime
-@pytest.mark.parametrize("rounds", [True, False])
-def test_no_picture_is_looked_at_only_to_measure_what_the_next_solution_measures(case, rounds):
-    """At the start, after the choice of coefficients, after rounding, and at the end; where nothing is rounded, the
-    last two are one."""
-    targets = Counted(case.targets)
-    refitted = refit_colours(
-        case.device, case.scene, case.cameras, targets, RefitOptions(steps=4, gain=0, drop=1e-7, memory=0),
-        fix_ac=coarse if rounds else lambda sh, refit: sh,
-    )  # fmt: skip
-    assert targets.asked == (4 if rounds else 3) * len(case.cameras)
-    reference = case.reference()
-    assert refitted.errors[0] == pytest.approx(reference.error(reference.start), rel=1e-4)
-    assert refitted.errors[1] == pytest.approx(reference.error(to_ycocg(refitted.sh)), rel=1e-4)
-    assert refitted.errors[1] < refitted.errors[0]
-
-
-@pytest.mark.one_runtime
-@pytest.mark.parametrize("rounds", [True, False])
-@pytest.mark.parametrize(("seed", "steps", "dc"), [(0, 30, -3), (3, 8, -5), (7, 30, -3)])
-def test_a_solution_that_overshoots_is_taken_back_before_it_is_rounded(device, seed, steps, dc, rounds):
-    """Dark scenes without a prior, as below."""
-    scene = visible_scene(40, seed=seed)
-    scene.sh[:, 0] += dc
-    with Case(device, scene, visible_scene(60, 2, seed + 7), ring_of_cameras(3, size=40)) as case:
-        options = RefitOptions(steps=steps, selection_steps=steps, gain=0, drop=1e-15, prior=0)
-        careful = case.solve(options)
-
-        def finely(sh, refit):
-            return sh + np.float32(1e-6) if rounds else sh
-
-        refitted = refit_colours(device, scene, case.cameras, case.targets, options, fix_ac=finely)
-    assert refitted.errors[1] <= refitted.errors[0] * (1 + 1e-4)
-    assert refitted.errors[1] <= careful.errors[1] * (1 + 1e-3)
-
-
-# ------------------------------------------------------------------------------------------ same bits
-
-
-def test_same_bits_every_time(case):
-    options = RefitOptions(steps=6, gain=0, drop=1e-7)
-    results = [case.solve(options).sh.tobytes() for _ in range(3)]
-    assert len(set(results)) == 1
-
-
-@pytest.mark.one_runtime
-@pytest.mark.parametrize("memory", [0, 40_000, 200_000])
-def test_a_small_memory_budget_changes_the_time_and_nothing_else(case, memory):
-    everything = case.solve(RefitOptions(steps=4, gain=0, drop=1e-7))
-    little = case.solve(RefitOptions(steps=4, gain=0, drop=1e-7, memory=memory))
-    assert np.array_equal(everything.sh, little.sh)
-    assert everything.errors == little.errors
-
-
-@pytest.mark.one_runtime
-@pytest.mark.parametrize("share", [0.2, 0.4, 0.6, 0.9])
-def test_the_memory_budget_is_used_and_not_exceeded(device, share):
-    """What the device holds when views and targets are kept, above what it holds at most when none is."""
-    cameras = ring_of_cameras(60, size=32)
-    with Case(device, visible_scene(2000), visible_scene(60, 1, seed=7), cameras) as case:
-
-        def taken(memory):
-            with Linearised(case, memory=memory) as linear:
-                return device.allocated, linear.room
-
-        plenty = 10**9
-        wanted = plenty - taken(plenty)[1]
-        budget = int(share * wanted)
-        assert 0.88 * budget <= taken(budget)[0] - taken(0)[0] <= 1.1 * budget
-
-
-def test_more_views_than_are_swept_at_a_time(device):
-    """Some views kept, some made again, and more of both than a GPU's queues."""
-    with Case(device, visible_scene(30, 1), visible_scene(50, 1, 5), ring_of_cameras(37, size=20)) as case:
-        one, other = (case.solve(RefitOptions(steps=3, gain=0, memory=memory)) for memory in (None, 250_000))
-    assert np.array_equal(one.sh, other.sh)
-
-
-# ------------------------------------------------------------------------------------------ selection
 
 
 def test_active_coefficients_are_those_that_the_quantiser_keeps():
@@ -478,144 +318,6 @@ def test_a_selection_that_overshoots_is_taken_back(device, seed, steps, dc):
     with Case(device, scene, visible_scene(60, 2, seed + 7), ring_of_cameras(3, size=40)) as case:
         refitted = case.solve(RefitOptions(steps=steps, selection_steps=steps, gain=0, drop=1e-15, prior=0))
     assert refitted.errors[1] <= refitted.errors[0] * (1 + 1e-6)
-
-
-# ------------------------------------------------------------------------------------------ stress
-
-
-def solve_and_check(case: Case, options: RefitOptions, active=None) -> np.ndarray:
-    """Finite, and by the float64 objective no worse than the start; the coefficients in Y, Co, Cg."""
-    refitted = case.solve(options, active)
-    assert np.isfinite(refitted.sh).all()
-    assert np.isfinite(refitted.errors).all()
-    x = to_ycocg(refitted.sh)
-    reference = case.reference(lam=options.lam, prior=options.prior, active=active)
-    before = reference.objective(reference.start)
-    assert reference.objective(x) <= before * (1 + 1e-6) + 1e-9
-    return x
-
-
-def test_splats_that_no_view_sees_stay_as_they_are(device):
-    scene = visible_scene(30)
-    scene.means[10:] += np.float32(1000)
-    with Case(device, scene, visible_scene(30, 2, 7), ring_of_cameras(3, size=40)) as case:
-        for prior in (0.0, 0.1):
-            x = solve_and_check(case, RefitOptions(prior=prior))
-            assert np.allclose(x[10:], to_ycocg(scene.sh)[10:], atol=1e-6)
-            assert not np.allclose(x[:10], to_ycocg(scene.sh)[:10], atol=1e-3)
-
-
-def test_no_splat_is_seen(device):
-    scene = visible_scene(30)
-    scene.means[:] += np.float32(1000)
-    with Case(device, scene, visible_scene(30, 2, 7), ring_of_cameras(3, size=40)) as case:
-        for options in (RefitOptions(), RefitOptions(lam=1, prior=0), RefitOptions(prior=0)):
-            solve_and_check(case, options)
-
-
-def test_one_view(device):
-    with Case(device, visible_scene(40), visible_scene(60, 2, 7), ring_of_cameras(5, size=40)[1:2]) as case:
-        solve_and_check(case, RefitOptions(steps=30, gain=0))
-        solve_and_check(case, RefitOptions(steps=30, gain=0, prior=0))
-
-
-def test_a_black_target(device):
-    black = visible_scene(20, 0)
-    black.sh[:] = -10
-    with Case(device, visible_scene(40), black, ring_of_cameras(3, size=40)) as case:
-        assert not any(p.any() for p in case.pictures)
-        solve_and_check(case, RefitOptions(steps=30, gain=0))
-
-
-def test_all_colours_cut_at_0(device):
-    scene = visible_scene(40)
-    scene.sh[:, 0] = -20
-    with Case(device, scene, visible_scene(60, 2, 7), ring_of_cameras(3, size=40)) as case:
-        x = solve_and_check(case, RefitOptions(steps=10))
-        assert np.allclose(x, to_ycocg(scene.sh), atol=1e-5)
-
-
-def test_no_regulariser_on_a_rank_deficient_system(device):
-    """16 coefficients, 2 views, and every splat twice in the same place."""
-    scene = visible_scene(20).subset(np.tile(np.arange(20), 2))
-    with Case(device, scene, visible_scene(60, 2, 7), ring_of_cameras(2, size=40)) as case:
-        for steps in (1, 8, 100):
-            x = solve_and_check(case, RefitOptions(steps=steps, gain=0, lam=0, prior=0))
-            assert np.abs(x).max() < 1e3
-
-
-def test_a_strong_pull_to_zero_is_no_better_than_what_it_costs(case):
-    for lam in (1e3, 1e6, 1e12):
-        solve_and_check(case, RefitOptions(steps=20, gain=0, lam=lam))
-    solve_and_check(case, RefitOptions(steps=20, gain=0, prior=1e12))
-
-
-@pytest.mark.parametrize("value", [1e4, 1e10, 1e30, 3e38])
-@pytest.mark.parametrize("where", ["dc", "ac", "both"])
-def test_absurd_coefficients(device, value, where):
-    scene = visible_scene(40)
-    rng = np.random.default_rng(0)
-    for k in range(0, 40, 7):
-        if where != "ac":
-            scene.sh[k, 0] = value * rng.choice([-1, 1], size=3)
-        if where != "dc":
-            scene.sh[k, 1:] = value * rng.choice([-1, 1], size=(15, 3))
-    with Case(device, scene, visible_scene(60, 2, 7), ring_of_cameras(3, size=40)) as case:
-        for options in (RefitOptions(), RefitOptions(lam=1), RefitOptions(prior=0), RefitOptions(drop=1e-7)):
-            refitted = case.solve(options)
-            assert np.isfinite(refitted.sh).all()
-            assert np.isfinite(refitted.errors).all()
-            if not options.drop:
-                assert refitted.errors[1] <= refitted.errors[0] or options.lam
-
-
-def test_absurd_targets(device):
-    bright = visible_scene(30, 0)
-    bright.sh[:] = 1e30
-    with Case(device, visible_scene(40), bright, ring_of_cameras(3, size=40)) as case:
-        refitted = case.solve(RefitOptions(steps=10))
-    assert np.isfinite(refitted.sh).all()
-
-
-def test_views_of_different_sizes(device):
-    cameras = ring_of_cameras(4, size=40)
-    cameras = [cameras[0], of_size(cameras[1], 61, 33), of_size(cameras[2], 16, 16), of_size(cameras[3], 7, 90)]
-    with Case(device, visible_scene(30, 1), visible_scene(60, 2, 7), cameras) as case:
-        options = RefitOptions(steps=200, gain=0, prior=10)
-        x = solve_and_check(case, options)
-        reference = case.reference(prior=10)
-        solution = reference.solution()
-    assert np.linalg.norm(x - solution) < 1e-3 * np.linalg.norm(solution - reference.start)
-
-
-@pytest.mark.one_runtime
-@pytest.mark.parametrize(
-    "count", [20_000, pytest.param(1_000_000, marks=pytest.mark.slow)]
-)  # fmt: skip
-def test_overlapping_splats_on_one_pixel_column(device, count):
-    rng = np.random.default_rng(0)
-    centres = np.zeros((count, 3))
-    centres[:, 1] = rng.uniform(-0.3, 0.3, count)
-    centres[:, 2] = rng.uniform(1, 3, count)
-    # Alphas of 0.01 at most: hundreds of splats share a pixel.
-    scene = plain_splats(centres, sigma=2e-3, logit=-4.6, colour=rng.uniform(0, 1, (count, 3)))
-    target = plain_splats(centres[::2], sigma=2e-3, logit=-4.0, colour=(0.2, 0.9, 0.4))
-    with Case(device, scene, target, [straight_camera(1, 48), straight_camera(16, 16)]) as case:
-        for prior in (0.0, 0.1):
-            refitted = case.solve(RefitOptions(steps=4, gain=0, prior=prior))
-            assert np.isfinite(refitted.sh).all()
-            assert refitted.errors[1] < 0.5 * refitted.errors[0]
-
-
-def test_one_splat(device):
-    scene = plain_splats((0, 0, 2), sigma=0.3, logit=3, colour=(0.2, 0.2, 0.2))
-    target = plain_splats((0, 0, 2), sigma=0.3, logit=3, colour=(0.8, 0.5, 0.3))
-    with Case(device, scene, target, [straight_camera(33, 21)]) as case:
-        sh = case.solve(RefitOptions(prior=0)).sh
-    assert np.allclose(sh, target.sh, atol=1e-5)
-
-
-# ------------------------------------------------------------------------------------------ wrong calls
 
 
 @pytest.mark.parametrize(

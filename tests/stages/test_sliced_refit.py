@@ -58,8 +58,10 @@ def test_a_solution(device, degree, memory):
 
 
 @pytest.mark.parametrize("way", ["colour_grid", "fix_ac"])
-def test_what_a_file_holds(device, way):
+@pytest.mark.parametrize("resident", [0, 1, 3, 7], ids="{} vectors on the device".format)
+def test_what_a_file_holds(device, way, resident, monkeypatch):
     """Rounded in rounds, and rounded by somebody who asks what coefficients are worth."""
+    monkeypatch.setattr(placement, "_FEWEST", resident)
     with case_of(device) as case:
         rounding = {"colour_grid": lambda effects: grid_of(SPLATS)} if way == "colour_grid" else {"fix_ac": coarse}
 
@@ -135,3 +137,20 @@ def test_the_same_file(device, plush_excerpt, plush_excerpt_cameras, monkeypatch
     sliced = encode(plush_excerpt, small, options, device=device)
     assert sliced.data == whole.data
     assert sliced.refitted.errors == whole.refitted.errors
+
+
+@pytest.mark.one_runtime
+def test_memory_is_that_of_vectors_and_views_together(device, monkeypatch):
+    """Also where the vectors lie on the device."""
+    monkeypatch.setattr(placement, "_ANYWAY", 0)
+    count = 3000
+    one_piece = 3400 * count
+    with case_of(device, 3, count) as case:
+        free, room = device.allocated, []
+        for memory in (4 * one_piece, 12 * one_piece):
+            with ColourRefit(device, case.scene, case.cameras, memory=memory) as refit:
+                refit.solve(case.scene.sh, case.targets, RefitOptions(steps=1, gain=0))
+                assert device.allocated - free < memory
+                room.append(refit.colour_map.room)
+    assert room[1] - room[0] == pytest.approx(8 * one_piece, rel=0.01)
+    assert room[0] < 3 * one_piece

@@ -57,7 +57,9 @@ def test_the_seen_ones_are_pruned_as_without_the_others(device, half_seen, plush
     assert alone.unseen.splats == 0
 
 
-@pytest.mark.parametrize("prune", [{"unseen": "drop"}, {"count": 1000}, {"keep": 0.5}])
+@pytest.mark.parametrize(
+    "prune", [{"unseen": "drop"}, pytest.param({"count": 1000}, marks=pytest.mark.slow), {"keep": 0.5}]
+)
 def test_they_are_dropped_where_that_is_asked_for_or_exact_numbers_are(device, half_seen, plush_excerpt_cameras, prune):
     options = EncodeOptions.for_preset("fast", prune=FEW | prune)
     encoded = encode(half_seen, plush_excerpt_cameras, options, device=device)

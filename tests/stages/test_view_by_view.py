@@ -39,11 +39,13 @@ def _small_groups(monkeypatch):
     monkeypatch.setattr(splat_groups, "_GROUP", 32)
 
 
-#: Bytes that some of the street's views fit.
-SOME = 1_600_000
+#: Bytes that some of the street's views fit, and bytes that hardly more than the pictures of all fit.
+SOME, TARGETS = 1_600_000, 1_100_000
 
 
-@pytest.mark.parametrize("memory", [None, SOME, 0], ids=["all fits", "some fits", "nothing fits"])
+@pytest.mark.parametrize(
+    "memory", [None, SOME, TARGETS, 0], ids=["all fits", "some fits", "targets fit", "nothing fits"]
+)
 @pytest.mark.parametrize("tolerance", [0.0, 0.05])
 def test_the_same_bits(device, memory, tolerance):
     """While splats go and colours change. Which views are kept is another matter: so none may be skipped there."""
@@ -56,9 +58,9 @@ def test_the_same_bits(device, memory, tolerance):
         RemovalSweep(rasterizer, cameras, dataclasses.replace(options, memory=None)) as wanted,
         ViewByView(device, whole, cameras, Sights.of(scene, cameras, INRIA.near), options) as got,
     ):
-        few = {None: len(cameras), SOME: got.kept_views, 0: 0}[memory]
-        assert got.kept_views == few
+        assert memory is not None or got.kept_views == len(cameras)
         assert memory != SOME or 2 < got.kept_views < len(cameras) - 2
+        assert memory != 0 or got.kept_views == 0
         for step in range(4):
             effects, found = wanted.measure(), got.measure()
             left = np.flatnonzero(wanted.alive)
@@ -124,7 +126,7 @@ def test_views_that_are_not_kept_wait_until_they_have_lost_enough(device):
         (_, importances), first = eager.measure(), waiting.measure()
         order = np.argsort(importances)
         covered = np.cumsum(importances[order])
-        little, much = order[covered < 0.01], order[covered < 0.05]
+        little, much = order[covered < 0.03], order[covered < 0.08]
         assert 0 < len(little) < len(much)
         for removal in (eager, waiting):
             removal.remove(little)

@@ -51,7 +51,7 @@ def family(request):
 @pytest.mark.parametrize(
     "options",
     [
-        OPTIONS,
+        pytest.param(OPTIONS, marks=pytest.mark.slow),
         OPTIONS.changed(memory=0),  # nothing is kept of any view
         OPTIONS.changed(prune={"keep": None}),  # a GPU decides itself
     ],
@@ -112,6 +112,13 @@ def test_a_device_with_too_little_memory_leaves_its_views_to_others(plush_excerp
     assert [device.allocated for device in devices] == [0, 0]
 
 
+@pytest.fixture(scope="module")
+def pruned_by_threshold(plush_excerpt, plush_excerpt_cameras):
+    """Options with which a GPU decides itself, and the file that one device makes."""
+    options = OPTIONS.changed(prune={"keep": None})
+    return options, encode(plush_excerpt, few(plush_excerpt_cameras), options, device=open_device("gpu")).data
+
+
 @pytest.mark.parametrize(
     ("kind", "command", "call"),
     [
@@ -122,11 +129,12 @@ def test_a_device_with_too_little_memory_leaves_its_views_to_others(plush_excerp
         (ColourPart, "normal", 4),
     ],
 )
-def test_a_device_that_fails_on_the_way(plush_excerpt, plush_excerpt_cameras, monkeypatch, caplog, kind, command, call):
+def test_a_device_that_fails_on_the_way(
+    plush_excerpt, plush_excerpt_cameras, pruned_by_threshold, monkeypatch, caplog, kind, command, call
+):
     """Its part is made again on the first device, from what is lent, and repeats what it was told."""
     cameras = few(plush_excerpt_cameras)
-    options = OPTIONS.changed(prune={"keep": None})
-    expected = encode(plush_excerpt, cameras, options, device=open_device("gpu")).data
+    options, expected = pruned_by_threshold
     devices = [open_device("gpu") for _ in range(2)]
     real, calls = getattr(kind, command), []
 

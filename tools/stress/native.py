@@ -23,7 +23,7 @@ import tempfile
 import time
 from collections.abc import Callable, Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from functools import cache
 from pathlib import Path
 from random import Random
@@ -32,11 +32,14 @@ from unittest.mock import patch
 
 import numpy as np
 
-from potr_cl.codec import bundled_scene, decoder, encoder
+from potr_cl.codec import bundled_scene, encoder, sectioned_scene
 from potr_cl.codec.decoder import PotrFile
-from potr_cl.codec.native import arrays, bundles, functions
+from potr_cl.codec.destination import BundleTaker, SceneArrays
+from potr_cl.codec.native import arrays, bundles, functions, octree, share, values
 from potr_cl.codec.native.library import LIBRARY_VARIABLE, VARIABLE, VECTORS_VARIABLE
+from potr_cl.codec.native.values import BUNDLE, PackedValues
 from potr_cl.codec.quantize import HyperParameters
+from potr_cl.codec.sections import Coder, Property
 from potr_cl.errors import DataError
 from potr_cl.reference.scenes import random_scene
 from tools.make.native import compile_library
@@ -114,13 +117,13 @@ def work(seed: int, first: int, stop: int, compare: int, version: int) -> None:
 
     at = os.open(os.environ["POTR_STRESS_AT"], os.O_WRONLY | os.O_CREAT)
     with (
-        patch.object(arrays, "address", copied),
-        patch.object(functions, "address", copied),
-        patch.object(bundles, "address", copied),
-        patch.object(decoder, "thread_pool", _at_once),
+        ExitStack() as patches,
+        patch.object(sectioned_scene, "thread_pool", _at_once),
         patch.object(bundled_scene, "thread_pool", _at_once),
         patch.object(bundles.BundledFile, "work", _work_again(bundles.BundledFile.work)),
     ):
+        for module in (arrays, functions, bundles, octree, share, values):
+            patches.enter_context(patch.object(module, "address", copied))
         tally = dict.fromkeys(("read", "refused", "compared"), 0)
         for number in range(first, stop):
             data = changed_file(seed, number, version)
@@ -133,7 +136,11 @@ def work(seed: int, first: int, stop: int, compare: int, version: int) -> None:
                 tally["refused"] += 1
             else:
                 found = _outcome(file)
+                packed = _outcome_packed(file)
                 kept.clear()
+                if packed not in (None, found):
+                    told = {"differs": number, "native": _told(found), "numpy": f"(packed) {_told(packed or '')}"}
+                    print(json.dumps(told), flush=True)
                 tally["refused" if isinstance(found, str) else "read"] += 1
                 if number % compare == 0:
                     os.environ[VARIABLE] = "0"
@@ -180,6 +187,39 @@ def _outcome(file: PotrFile) -> str | dict[str, bytes]:
     except DataError as error:
         return str(error)
     return {name: np.ascontiguousarray(getattr(scene, name)).tobytes() for name in _ATTRIBUTES}
+
+
+def _outcome_packed(file: PotrFile) -> str | dict[str, bytes] | None:
+    """Of the same by way of packed bundles, as devices are sent them; None for files of other coders."""
+    section = file.header.find(Property.OPACITY)
+    if section is None or section.coder != Coder.BUNDLES:
+        return None
+    unpacked = _Unpacked(file.header, file.rules, file.sh_count())
+    try:
+        file.decode_into(unpacked, threads=1)
+    except DataError as error:
+        return str(error)
+    return {name: np.ascontiguousarray(getattr(unpacked.scene, name)).tobytes() for name in _ATTRIBUTES}
+
+
+class _Unpacked(SceneArrays, BundleTaker):
+    """The arrays of a scene that takes packed bundles."""
+
+    def expect_bundles(self) -> None:
+        assert self.values.sh is not None
+        self.values.sh[...] = 0
+
+    def take_bundle(self, first: int, packed: PackedValues, items: int) -> None:
+        own = self.values.part(first, first + BUNDLE)
+        assert own.log_scales is not None
+        assert own.quaternions is not None
+        assert own.logits is not None
+        assert own.sh is not None
+        n = len(own.logits)
+        own.log_scales[...], own.quaternions[...] = packed.log_scales[:, :n].T, packed.quaternions[:, :n].T
+        own.logits[...], own.sh[0] = packed.logits[:n], packed.dc[:, :n]
+        some = packed.items[:items]
+        own.sh[some[:, 0] // BUNDLE, :, some[:, 0] % BUNDLE] = some[:, 1:].copy().view(np.float32)
 
 
 def _told(outcome: str | dict[str, bytes]) -> str:

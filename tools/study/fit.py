@@ -125,6 +125,8 @@ def _without(*groups: str) -> Rates:
 #: Parts of the fit by what they are called: without them it has these options.
 _PARTS: dict[str, dict[str, Any]] = {
     "everything": {},
+    "coefficients chosen by the re-fit alone": {"choosing": 0.0},
+    "geometry rounded at once": {"rounding": 0.0},
     "positions stay": {"rates": _without("means")},
     "scales stay": {"rates": _without("log_scales")},
     "rotations stay": {"rates": _without("quaternions")},

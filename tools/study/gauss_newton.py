@@ -91,10 +91,10 @@ class Vectors(Owner):
             device.shared_kernel("refit/coefficients.cl", name, LANES=1, SH_COUNT=1)
             for name in ("combine", "dot_parts")
         )
-        self._parts = self._memory.allocate(8 * _DOT_ITEMS, "a dot product")
+        self._parts = self._memory.allocate(12 * _DOT_ITEMS, "a dot product")
 
-    def vector(self) -> cl.Buffer:
-        """A new vector, 0."""
+    def vector(self, rank: int = 0) -> cl.Buffer:
+        """A new vector, 0; it lies on the device whatever its rank."""
         buffer = self._memory.allocate(4 * self.length, "a vector")
         self.zero(buffer)
         return buffer
@@ -113,7 +113,7 @@ class Vectors(Owner):
 
     def dot(self, x: cl.Buffer, y: cl.Buffer) -> float:
         """x · y."""
-        self._dot.bind(x=x, y=y, count=self.length, parts=self._parts).launch((_DOT_ITEMS,), (64,))
+        self._dot.bind(x=x, y=y, count=self.length, more=0, parts=self._parts).launch((_DOT_ITEMS,), (64,))
         return float(self.device.download(self._parts, (2, _DOT_ITEMS), np.float32)[0].sum(dtype=np.float64))
 
     def close(self) -> None:

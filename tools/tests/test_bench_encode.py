@@ -13,7 +13,7 @@ from potr_cl.model.camera import camera_centres
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import choose_device
 from potr_cl.stages.compaction.ridge import CompactionOptions, Compactor
-from tests.stages.test_compaction import channels, dense_weights, on_a_sphere, sparse_weights
+from tests.cases.ridges import channels, dense_weights, on_a_sphere, sparse_weights
 from tools.bench import encode as benchmark
 from tools.bench import stage_variants, tradeoffs
 from tools.bench.tradeoffs import Row, on_front

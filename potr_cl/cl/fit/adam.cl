@@ -10,12 +10,14 @@
 
 /* steps: for each column the length of a step, which is multiplied by `part`, and the least and the greatest value that
    it may reach.
+   averages: of each parameter over the last steps: the newest value counts `newest` in it.
    debias_mean, debias_square: what the moments are multiplied by because they began at 0. */
 kernel void adam(
     global float *parameters,
     global float *gradient,
     global float *means,
     global float *squares,
+    global float *averages,
     global float *sh,
     uint splats,
     uint stride,
@@ -24,6 +26,7 @@ kernel void adam(
     float part,
     float decay_mean,
     float decay_square,
+    float newest,
     float debias_mean,
     float debias_square)
 {
@@ -39,7 +42,7 @@ kernel void adam(
     means[i] = mean;
     squares[i] = square;
     if (mean == 0.0f || !(square > 0.0f))
-        return;
+        return; /* and the average is what the parameter is */
     const float value = parameters[i] - part * step.x * (mean * debias_mean) / sqrt(square * debias_square);
     if (fabs(value) < 1e30f) {
         const float kept = fmin(fmax(value, step.y), step.z);
@@ -47,6 +50,7 @@ kernel void adam(
         if (get_global_id(1) >= first_sh)
             sh[i - first_sh * (size_t)stride] = kept;
     }
+    averages[i] += newest * (parameters[i] - averages[i]);
 }
 
 /* Parameters as the projection takes them (raster/project.cl), one splat a work-item: the scales' exponentials, unit

@@ -1,5 +1,6 @@
-/* The numbers of the splats of some groups, ascending. A work-group looks at CHUNK splats: count finds how many of them
-   are wanted, and write puts their numbers behind those of the work-groups before it. Both kernel families use it.
+/* The numbers of the splats of some groups that are in a given state, ascending. A work-group looks at CHUNK splats:
+   count_wanted finds how many of them are wanted, and write_wanted puts their numbers behind those of the work-groups
+   before it. Both kernel families use it.
 
    Macros: none. */
 
@@ -7,9 +8,28 @@
 #define ROUNDS 16
 #define CHUNK (GROUP * ROUNDS)
 
-/* groups[i] is the group of splat i, wanted[g] is 1 if the splats of group g are. */
+/* Whether a splat is wanted: groups[i] is the group of splat i, wanted[g] is 1 if the splats of group g are, and
+   states[i] must be `state`, if `by_state` says so. */
+inline uint is_wanted(
+    global const uint *groups,
+    global const uchar *wanted,
+    global const uchar *states,
+    int by_state,
+    uint state,
+    size_t i)
+{
+    return wanted[groups[i]] && (!by_state || states[i] == state);
+}
+
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
-void count_wanted(global const uint *groups, global const uchar *wanted, uint splats, global uint *counts)
+void count_wanted(
+    global const uint *groups,
+    global const uchar *wanted,
+    global const uchar *states,
+    int by_state,
+    uint state,
+    uint splats,
+    global uint *counts)
 {
     local uint sum;
     const uint lid = get_local_id(0);
@@ -20,7 +40,7 @@ void count_wanted(global const uint *groups, global const uchar *wanted, uint sp
     for (uint round = 0; round < ROUNDS; ++round) {
         const size_t splat = get_group_id(0) * CHUNK + round * GROUP + lid;
         if (splat < splats)
-            mine += wanted[groups[splat]];
+            mine += is_wanted(groups, wanted, states, by_state, state, splat);
     }
     if (mine > 0)
         atomic_add(&sum, mine);
@@ -34,6 +54,9 @@ kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void write_wanted(
     global const uint *groups,
     global const uchar *wanted,
+    global const uchar *states,
+    int by_state,
+    uint state,
     uint splats,
     global const uint *starts,
     global uint *numbers)
@@ -43,7 +66,7 @@ void write_wanted(
     uint start = starts[get_group_id(0)];
     for (uint round = 0; round < ROUNDS; ++round) {
         const size_t splat = get_group_id(0) * CHUNK + round * GROUP + lid;
-        const uint flag = splat < splats ? wanted[groups[splat]] : 0;
+        const uint flag = splat < splats ? is_wanted(groups, wanted, states, by_state, state, splat) : 0;
         sums[lid] = flag;
         barrier(CLK_LOCAL_MEM_FENCE);
         for (uint step = 1; step < GROUP; step *= 2) {

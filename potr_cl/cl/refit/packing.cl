@@ -1,13 +1,39 @@
 /* Coefficients that may change, splat by splat in one row, as they travel between devices; and back into columns. One
    splat a work-item.
 
-   Macros: SH_COUNT; LANES (1). */
+   Macros: SH_COUNT; LANES (1); RUN, splats that a work-item counts. */
 
 #include "refit/coefficients.clh"
 
 inline int may_change(global const uint *active, ulong stride, size_t splat, int column)
 {
     return active[(column / 24) * stride + splat] >> (column % 24) & 1;
+}
+
+/* How many coefficients of a run of splats may change. */
+kernel void count_active(global const uint *active, ulong stride, ulong splats, global ulong *counts)
+{
+    const size_t first = RUN * get_global_id(0), end = min(first + RUN, (size_t)splats);
+    if (first >= splats)
+        return;
+    uint count = 0;
+    for (size_t splat = first; splat < end; ++splat)
+        count += popcount(active[splat]) + popcount(active[stride + splat]);
+    counts[get_global_id(0)] = count;
+}
+
+/* Where each splat's coefficients begin in the row, from where those of each run do. */
+kernel void place_active(
+    global const uint *active, ulong stride, ulong splats, global const ulong *starts, global ulong *places)
+{
+    const size_t first = RUN * get_global_id(0), end = min(first + RUN, (size_t)splats);
+    if (first >= splats)
+        return;
+    ulong place = starts[get_global_id(0)];
+    for (size_t splat = first; splat < end; ++splat) {
+        places[splat] = place;
+        place += popcount(active[splat]) + popcount(active[stride + splat]);
+    }
 }
 
 kernel void pack_floats(

@@ -174,7 +174,9 @@ class _Run:
         elif prop == Property.SCALE:
             self.levels.scales = self._dense(key)
         elif prop == Property.ROTATION:
-            scales = [self._terms[f"scale {axis}"] for axis in range(3)]
+            # It comes last, and needs no other terms.
+            self._terms = {name: self._terms[name] for name in (f"scale {axis}" for axis in range(3))}
+            scales = list(self._terms.values())
             self._terms.update({f"difference {k}": each for k, each in enumerate(differences(scales))})
             self.levels.rotations = [_signed(values) for values in self._dense(key)]
         elif index == 0:
@@ -214,7 +216,9 @@ class _Run:
 
     def _stream(self, key: Key, words: Words, fitted: Fitted, layout: Layout, base: I32) -> Integers:
         """Integers of a stream, mapped to unsigned; their sizes become a term. ``base``: (items,) weighted sums."""
-        tokens, integers = decode_stream(layout, base, fitted, self._chain(key), words)
+        rows = layout.laid(base, np.int64)
+        del base
+        tokens, integers = decode_stream(layout, rows, fitted, self._chain(key), words)
         self._terms[fitted.stream.name] = fitted.stream.sizes.astype(np.int16).take(tokens)
         return integers
 
@@ -232,13 +236,13 @@ class _Run:
     def _find_steps(self) -> None:
         """What the steps of splats' colours tell of them."""
         steps, levels = self._reader.steps, self.levels
-        classes = np.zeros(self._bundles.splats, np.int8)
+        levels.classes = classes = np.zeros((2, self._bundles.splats), np.int8)
         if steps is not None and levels.scales is not None and levels.opacities is not None:
-            for start in range(0, len(classes), _AT_A_TIME):
+            for start in range(0, self._bundles.splats, _AT_A_TIME):
                 some = slice(start, start + _AT_A_TIME)
                 scales = [axis[some] for axis in levels.scales]
-                classes[some], _ = steps.classes(scales, levels.opacities[some], levels.start + start)
-        self._terms["step"] = step_terms(classes).astype(np.int16)
+                classes[:, some] = steps.classes(scales, levels.opacities[some], levels.start + start)
+        self._terms["step"] = step_terms(classes[0]).astype(np.int16)
 
     def _decode_band(self, key: Key) -> None:
         """The AC coefficients of a degree."""
@@ -256,7 +260,7 @@ class _Run:
         splat, which = _items(masks.astype(np.uint8), end - first)
         of_splats = {name: terms[name] for name in (*(f"sum {c}" for c in range(3)), "mask", "step")}
 
-        def base(fitted: Fitted, at: NDArray[np.integer] | slice, of_items: dict[str, I16]) -> I32:
+        def base(fitted: Fitted, at: NDArray[np.bool_] | slice, of_items: dict[str, I16]) -> I32:
             """Of some items: what their splats tell, then what they do themselves."""
             sums: I32 = self._sums(fitted, of_splats).take(splat[at])
             sums += fitted.biases.astype(np.int32).take(which[at])
@@ -272,7 +276,7 @@ class _Run:
         channels = np.zeros((3, len(splat)), wide)
         of_items = {"pattern": terms["pattern"]}
         for c, fitted in enumerate(values):
-            there = np.flatnonzero((patterns >> np.uint8(c) & np.uint8(1)).view(bool))
+            there = (patterns >> np.uint8(c) & np.uint8(1)).view(bool)
             integers = self._stream(
                 key, words, fitted, self._bundles.items(splat[there]), base(fitted, there, of_items)
             )

@@ -76,10 +76,13 @@ class Layout:
     @cached_property
     def places(self) -> I64:
         """(items,) where each item is in the flattened rows."""
-        bundle = np.repeat(np.arange(len(self.counts)), self.counts)
-        item = np.arange(len(bundle)) - np.repeat(np.cumsum(self.counts) - self.counts, self.counts)
-        lane, step = np.divmod(item, self.steps[bundle])
-        return step * self.shape[1] + LANES * bundle + lane
+        places, end = np.empty(int(self.counts.sum()), np.int64), 0
+        rows = np.arange(self.shape[0]) * self.shape[1]
+        for bundle, (count, lanes, steps) in enumerate(zip(self.counts, self.lanes, self.steps, strict=True)):
+            columns = LANES * bundle + np.arange(lanes)
+            places[end : end + count] = (columns[:, None] + rows[:steps]).ravel()[:count]
+            end += count
+        return places
 
     @cached_property
     def idle(self) -> NDArray[np.bool_]:

@@ -38,6 +38,7 @@ class Levels:
         rotations: x, y, z, (n,) each.
         dc: Y, Co, Cg of the DC coefficient, (n,) each: what its prediction has left.
         ac: items of the degrees asked for, those of each degree in the order of splats.
+        classes: (2, n) int8 classes of the steps of DC and of AC, where they were found.
     """
 
     start: int
@@ -47,6 +48,7 @@ class Levels:
     rotations: list[NDArray[Any]] | None = None
     dc: list[NDArray[Any]] | None = None
     ac: list[Items] = field(default_factory=list)
+    classes: NDArray[np.int8] | None = None
 
     def part(self, start: int, stop: int) -> Levels:
         """Those of some splats, which are counted from this run's first."""
@@ -56,6 +58,8 @@ class Levels:
         for name in ("scales", "rotations", "dc"):
             if (arrays := getattr(self, name)) is not None:
                 setattr(part, name, [array[own] for array in arrays])
+        if self.classes is not None:
+            part.classes = self.classes[:, own]
         for items in self.ac:
             first, end = np.searchsorted(items.splats, (start, stop))
             some = slice(first, end)

@@ -115,5 +115,5 @@ def _solved(stream: Stream, gram: I64) -> I64:
 
 
 def _fitted_model(encoder: BundleEncoder, number: int, alphabet: int) -> NativeModel:
-    counts = encoder.counts(number)
+    counts = encoder.counts(number, alphabet)
     return encoder.contexts(counts, alphabet, log_table()) if counts.any() else _NOTHING

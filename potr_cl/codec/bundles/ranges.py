@@ -27,6 +27,12 @@ CHUNK = 12
 #: Where an entry of a decoder's table has the place within a token, and twice the token's size.
 _FREQUENCY_BITS = PRECISION + 1
 _SIZE_AT = _FREQUENCY_BITS + PRECISION
+#: Numbers as arrays, which numpy takes in half the time.
+_LOWEST, _WORD_BITS, _TWO = (np.array(number, np.int64) for number in (LOWEST, 16, 2))
+_CONTEXT_SHIFT, _PRECISION, _PLACE = (np.array(number, np.int64) for number in (CONTEXT_SHIFT, PRECISION, TOTAL - 1))
+_SIZE_SHIFT, _START_SHIFT, _FREQUENCY = (
+    np.array(number, np.int64) for number in (_SIZE_AT, _FREQUENCY_BITS, 2 * TOTAL - 1)
+)
 
 
 class Words:
@@ -42,22 +48,29 @@ class Words:
         # Behind a word that nobody takes, so that ranks from 1 on tell the next ones.
         self._words, self._what = np.concatenate([np.zeros(1, np.int64), words]), what
         self._ends = np.cumsum(counts)
-        self._next = self._ends - counts
-        shape = (len(counts), LANES)
-        self._low, self._full = np.empty(shape, bool).ravel(), np.empty(shape, np.int64).ravel()
-        self._ranks, self._taken = np.empty(shape, np.int64), np.empty(shape, np.int64)
-        self._found = np.empty(shape, np.int64).ravel()
+        # All that a step needs is made once, views and numbers too: they take as long as a step's arithmetic.
+        bundles = len(counts)
+        self._low = np.empty(bundles * LANES, bool)
+        self._low_of_lanes = self._low.reshape(bundles, LANES)
+        # Before the lanes of a bundle stands where its next word is.
+        self._ranks = np.empty((bundles, 1 + LANES), np.int64)
+        self._ranks[:, 0] = self._ends - counts
+        self._first, self._of_lanes, self._last = self._ranks[:, 0], self._ranks[:, 1:], self._ranks[:, -1]
+        self._full, self._found = np.empty((2, bundles * LANES), np.int64)
+        self._found_of_lanes = self._found.reshape(bundles, LANES)
 
     def renormalise(self, states: I64) -> None:
         """Give a word to every state (bundles · LANES,) that needs one; :meth:`check` tells if there were enough."""
-        low = np.less(states, LOWEST, out=self._low)
-        # Lane after lane of a bundle: the first that needs a word has rank 1.
-        ranks = np.add.accumulate(low.reshape(-1, LANES), axis=1, out=self._ranks)
-        np.add(ranks, self._next[:, None], out=self._taken)
-        self._next += ranks[:, -1]
-        full = np.left_shift(states, 16, out=self._full)
-        full |= self._words.take(self._taken.ravel(), None, self._found, "clip")
+        low, full = self._low, self._full
+        np.less(states, _LOWEST, low)
+        # Lane after lane of a bundle: the first that needs a word has the one behind those that are taken.
+        np.copyto(self._of_lanes, self._low_of_lanes)
+        np.add.accumulate(self._ranks, 1, None, self._ranks)
+        self._words.take(self._of_lanes, None, self._found_of_lanes, "clip")
+        np.left_shift(states, _WORD_BITS, full)
+        np.bitwise_or(full, self._found, full)
         np.copyto(states, full, where=low)
+        np.copyto(self._first, self._last)
 
     def check(self) -> None:
         """Check that there was a word whenever one was asked for.
@@ -65,22 +78,22 @@ class Words:
         Raises:
             DataError: there was not.
         """
-        if (self._next > self._ends).any():
+        if (self._first > self._ends).any():
             raise no_words_left(self._what)
 
     @property
     def all_taken(self) -> bool:
-        return bool((self._next == self._ends).all())
+        return bool((self._first == self._ends).all())
 
 
 def decode_stream(
-    layout: Layout, base: NDArray[np.integer], fitted: Fitted, states: I64, words: Words
+    layout: Layout, rows: I64, fitted: Fitted, states: I64, words: Words
 ) -> tuple[U8, NDArray[np.signedinteger]]:
     """Decode a stream.
 
     Args:
         layout: of its items.
-        base: (items,) weighted sums of terms, with constant and bias.
+        rows: (rows, columns) weighted sums of terms, with constant and bias; written over.
         fitted: what the section says of the stream.
         states: (columns,), brought up to date.
         words: of the section.
@@ -92,40 +105,40 @@ def decode_stream(
         DataError: no words are left.
     """
     contexts, tokens, entries = _tables(fitted)
-    slots = np.zeros(layout.shape, np.int64)
     extra = np.zeros(layout.shape, np.int64) if fitted.alphabet > DIRECT else None
     width = layout.shape[1]
     recent, a, b, entry = (np.zeros(width, np.int64) for _ in range(4))
-    weight = fitted.recent
+    weight = np.array(fitted.recent)
     idle = layout.idle
     partly = set(np.flatnonzero(idle.any(axis=1)).tolist())
+    resting = len(entries) - TOTAL
     # Little is done in a step, so that what numpy takes to be called is most of the time: no call too many.
     multiply, add, subtract, shift, mask = np.multiply, np.add, np.subtract, np.right_shift, np.bitwise_and
-    for t, (expected, slot) in enumerate(zip(layout.laid(base, np.int64), slots, strict=True)):
+    for t, slot in enumerate(rows):
         multiply(recent, weight, a)
-        add(a, expected, a)
-        shift(a, CONTEXT_SHIFT, a)
+        add(a, slot, a)
+        shift(a, _CONTEXT_SHIFT, a)
         contexts.take(a, None, slot, "clip")
         if t in partly:
-            slot[idle[t]] = len(entries) - TOTAL
-        mask(states, TOTAL - 1, a)
+            slot[idle[t]] = resting
+        mask(states, _PLACE, a)
         add(slot, a, slot)
         entries.take(slot, None, entry, "wrap")  # faster than the other modes, and there is nothing to wrap
-        shift(recent, 2, a)
+        shift(recent, _TWO, a)
         subtract(recent, a, recent)
-        shift(entry, _SIZE_AT, a)
+        shift(entry, _SIZE_SHIFT, a)
         add(recent, a, recent)
-        shift(states, PRECISION, a)
-        mask(entry, 2 * TOTAL - 1, b)
+        shift(states, _PRECISION, a)
+        mask(entry, _FREQUENCY, b)
         multiply(a, b, a)
-        shift(entry, _FREQUENCY_BITS, entry)
-        mask(entry, TOTAL - 1, entry)
+        shift(entry, _START_SHIFT, entry)
+        mask(entry, _PLACE, entry)
         add(a, entry, states)
         words.renormalise(states)
         if extra is not None and (token := tokens.take(slot)).max() >= DIRECT:
             _take_bits(token, states, words, extra[t])
     words.check()
-    of_items = layout.taken(tokens.take(slots))
+    of_items = layout.taken(tokens.take(rows))
     extras = None if extra is None else layout.taken(extra)
     return of_items, _integers(of_items, extras, integer_type(fitted.alphabet))
 

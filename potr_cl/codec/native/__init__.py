@@ -9,8 +9,10 @@ its twin in Python:
 ``encode.c``          :mod:`potr_cl.codec.context`, :mod:`potr_cl.codec.rans`: an encoder's contexts and range coding
 ``bundles.c``         :mod:`potr_cl.codec.bundles`: a bundle's integers
 ``steps.c``           :mod:`potr_cl.codec.steps.rule`: classes of the steps of colours
-``bundles_tokens.c``   :mod:`potr_cl.codec.bundles.ranges`: tokens of the streams of a bundle
+``bundles_tokens.c``  :mod:`potr_cl.codec.bundles.ranges`: tokens of the streams of a bundle
 ``bundles_values.c``  :mod:`potr_cl.codec.bundled_scene`: their values, while they are in a cache
+``bundles_share.c``   :mod:`potr_cl.codec.bundled_scene`: how threads share bundles out
+``prediction.h``      :mod:`potr_cl.codec.steps.prediction`: DC from what its prediction has left
 ``bundles_encode.c``  :mod:`potr_cl.codec.bundles.encoder`: what contexts are fitted to, and range coding
 ``bundles_fit.c``     :mod:`potr_cl.codec.bundles.fitting`: contexts from counts
 ``octree.c``          :mod:`potr_cl.codec.octree`: streams to centres

@@ -197,18 +197,19 @@ class BundledFile:
         self._file = _File()
         self._file.splats = splats
         bundles, lanes = -(-splats // _BUNDLE), splats // _BUNDLE * (_BUNDLE // _LANE) + -(-(splats % _BUNDLE) // _LANE)
+        models: dict[int, StreamModel] = {}
         for number, section in sections.items():
             first, end = _STREAMS[number : number + 2]
             if len(section.models) != end - first or len(section.counts) != bundles or int(section.counts.min()) < 0:
                 raise TypeError("the native path was given a section without all of its parts")
-            for k, model in enumerate(section.models, start=first):
-                self._describe(self._file.streams[k], model)
+            models.update(enumerate(section.models, start=first))
             starts = np.zeros(bundles + 1, np.uint64)
             np.cumsum(section.counts, out=starts[1:])
             self._file.words[number] = self._keep(section.words, np.uint8, 2 * int(starts[-1]))
             if not self._file.words[number]:
                 self._file.words[number] = self._keep(np.zeros(2, np.uint8), np.uint8, 2)
             self._file.starts[number] = self._keep(starts, np.uint64, bundles + 1)
+        self._describe(models)
         self._file.states = self._keep(sections[0].states.astype(np.uint32), np.uint32, lanes)
         if SECTIONS - 1 in sections:
             self._file.rotation_states = self._keep(sections[SECTIONS - 1].states.astype(np.uint32), np.uint32, lanes)
@@ -221,28 +222,41 @@ class BundledFile:
         self._kept.append(array)
         return address(array, dtype, number, writable)
 
-    def _describe(self, to: _Stream, model: StreamModel) -> None:
-        contexts, alphabet = model.frequencies.shape
-        if int(model.classes.max()) >= contexts or alphabet > min(len(model.sizes), _TOKENS):
-            raise TypeError("the native path was given contexts without frequencies, or tokens without sizes")
-        if len(model.terms) > _WEIGHTS or len(model.biases) > _BIASES:
-            raise TypeError("the native path was given too many weights")
+    def _describe(self, models: Mapping[int, StreamModel]) -> None:
+        """Tell C of streams, all at once: each call of NumPy takes as long as what C does for a stream."""
+        number = len(models)
+        contexts = [len(model.frequencies) for model in models.values()]
         # Vectors of slots are looked up with some bytes too many.
-        slots, intervals = np.empty(contexts * _TOTAL + 3, np.uint8), np.empty(contexts * _TOKENS, np.uint32)
-        frequencies = np.ascontiguousarray(model.frequencies, np.uint16)
-        sizes = np.zeros(_TOKENS, np.int16)
-        sizes[: len(model.sizes)] = model.sizes
-        to.slots = self._keep(slots, np.uint8, len(slots), True)
-        to.intervals = self._keep(intervals, np.uint32, len(intervals), True)
-        to.sizes = self._keep(sizes, np.int16, _TOKENS)
-        rows = address(frequencies, np.uint16, frequencies.size)
-        if self._c["potr_bundles_table"](rows, contexts, alphabet, to.sizes, to.slots, to.intervals):
-            raise TypeError("the native path was given frequencies that do not add up")
-        to.classes = self._keep(model.classes, np.uint8, 256)
-        to.weights[: len(model.terms)] = list(model.terms)
-        to.biases[: len(model.biases)] = list(model.biases)
-        to.recent, to.constant, to.alphabet = model.recent, model.constant, alphabet
-        to.by_vectors = self._vectors and int(sizes[:alphabet].max()) < _TOKENS
+        slots, intervals = np.empty(sum(contexts) * _TOTAL + 3, np.uint8), np.empty(sum(contexts) * _TOKENS, np.uint32)
+        sizes = np.zeros((number, _TOKENS), np.int16)
+        classes = np.concatenate([model.classes for model in models.values()])
+        at_slots = self._keep(slots, np.uint8, len(slots), True)
+        at_intervals = self._keep(intervals, np.uint32, len(intervals), True)
+        for row, model in zip(sizes, models.values(), strict=True):
+            alphabet = model.frequencies.shape[1]
+            if alphabet > min(len(model.sizes), _TOKENS):
+                raise TypeError("the native path was given tokens without sizes")
+            row[:alphabet] = model.sizes[:alphabet]
+        if (classes.reshape(number, 256).max(axis=1) >= contexts).any():
+            raise TypeError("the native path was given contexts without frequencies")
+        at_sizes, at_classes = self._keep(sizes, np.int16, sizes.size), self._keep(classes, np.uint8, 256 * number)
+        small = (sizes.max(axis=1) < _TOKENS) & self._vectors
+        for k, (place, model) in enumerate(models.items()):
+            if len(model.terms) > _WEIGHTS or len(model.biases) > _BIASES:
+                raise TypeError("the native path was given too many weights")
+            to, alphabet = self._file.streams[place], model.frequencies.shape[1]
+            to.slots, to.intervals = at_slots, at_intervals
+            to.sizes, to.classes = at_sizes + 2 * _TOKENS * k, at_classes + 256 * k
+            frequencies = np.ascontiguousarray(model.frequencies, np.uint16)
+            rows = address(frequencies, np.uint16, contexts[k] * alphabet)
+            if self._c["potr_bundles_table"](rows, contexts[k], alphabet, to.sizes, at_slots, at_intervals):
+                raise TypeError("the native path was given frequencies that do not add up")
+            # The next stream's begin where the bytes too many of this one would be.
+            at_slots, at_intervals = at_slots + contexts[k] * _TOTAL, at_intervals + 4 * contexts[k] * _TOKENS
+            to.weights[: len(model.terms)] = model.terms
+            to.biases[: len(model.biases)] = model.biases
+            to.recent, to.constant, to.alphabet = model.recent, model.constant, alphabet
+            to.by_vectors = bool(small[k])
 
     def work(self) -> U8:
         """What a thread needs to decode bundles, one at a time."""

@@ -210,12 +210,11 @@ class BundleEncoder:
                 address(counts, np.uint32, counts.size, True),
             )
 
-    def counts(self, stream: int) -> U32:
-        """(256, 256) how often each expected size of a stream has each token."""
-        first, *others = self._counts.all()
-        total: U32 = first[stream].copy()
-        for other in others:
-            total += other[stream]
+    def counts(self, stream: int, alphabet: int) -> U32:
+        """(256, 256) how often each expected size of a stream has each token, which are fewer than ``alphabet``."""
+        total = np.zeros((_TOKENS, _TOKENS), np.uint32)
+        for counts in self._counts.all():
+            total[:, :alphabet] += counts[stream, :, :alphabet]
         return total
 
     def contexts(self, counts: U32, alphabet: int, logs: I64) -> Model:

@@ -69,6 +69,8 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
         [
             *[_POINTER] * 4,
             _SIZE,
+            _POINTER,
+            _POINTER,
             ctypes.c_double,
             _REAL,
             *[ctypes.c_double] * 3,
@@ -82,6 +84,7 @@ _DECLARATIONS: dict[str, tuple[Any, list[Any]]] = {
         _NUMBER,
         [_POINTER, *[_SIZE] * 4, _POINTER, _SIZE, _POINTER, _POINTER, _SIZE, _SIZE, _POINTER],
     ),
+    "potr_predicted": (None, [_POINTER, _SIZE, _SIZE, _SIZE, *[_POINTER] * 4]),
     "potr_nonzero_levels": (_NUMBER, [_POINTER, _SIZE, _SIZE, ctypes.c_double, ctypes.c_double, _POINTER]),
     "potr_unit_factors": (None, [_POINTER, _SIZE, _SIZE, _SIZE, _SIZE, _REAL, _POINTER]),
     "potr_widen": (None, [_POINTER, _SIZE, _NUMBER, _POINTER]),

@@ -49,10 +49,42 @@ static INLINE double nearest_whole(double x)
     return (x + shift) - shift;
 }
 
+/* The equivalent form of a splat with the largest real part: its number, and imaginary parts of its quaternion.
+ *
+ * row: w, x, y, z, of any length. group: (4, 24) w, x, y, z of the axes' rotations, conjugated. */
+static INLINE size_t canonical_form(const float *restrict row, const double *restrict group, double *restrict imaginary)
+{
+    const double a = row[0], b = row[1], c = row[2], d = row[3];
+    const double length = sqrt(a * a + b * b + c * c + d * d);
+    const double w = a / length, x = b / length, y = c / length, z = d / length;
+    double real[FORMS], size[FORMS], lanes[LANES] = {0}, largest = 0;
+    size_t best = 0;
+    for (size_t k = 0; k < FORMS; k++) {
+        /* Rounded, so that ties between equivalent forms fall the same way on every processor. */
+        real[k] = nearest_whole(
+            (w * group[k] + x * group[FORMS + k] + y * group[2 * FORMS + k] + z * group[3 * FORMS + k]) * 1e9);
+        size[k] = fabs(real[k]);
+    }
+    for (size_t k = 0; k < FORMS; k += LANES)
+        for (size_t lane = 0; lane < LANES; lane++)
+            lanes[lane] = size[k + lane] > lanes[lane] ? size[k + lane] : lanes[lane];
+    for (size_t lane = 0; lane < LANES; lane++)
+        largest = lanes[lane] > largest ? lanes[lane] : largest;
+    while (best < FORMS - 1 && size[best] < largest)
+        best++;
+    const double sign = real[best] < 0 ? -1 : 1;
+    const double gw = group[best], gx = -group[FORMS + best], gy = -group[2 * FORMS + best],
+                 gz = -group[3 * FORMS + best];
+    imaginary[0] = sign * (w * gx + x * gw + y * gz - z * gy);
+    imaginary[1] = sign * (w * gy - x * gz + y * gw + z * gx);
+    imaginary[2] = sign * (w * gz + x * gy - y * gx + z * gw);
+    return best;
+}
+
 /* The equivalent form with the largest real part of n splats, which `order` picks among some rows.
  *
- * quaternions: (rows, 4) w, x, y, z; log_scales: (rows, 3). group: (4, 24) w, x, y, z of the axes' rotations, conjugated;
- * permutations: (24, 3), the scales that each makes first, second and third. imaginary, turned: (n, 3). */
+ * quaternions: (rows, 4) w, x, y, z; log_scales: (rows, 3). group: as of canonical_form; permutations: (24, 3), the scales
+ * that each form makes first, second and third. imaginary, turned: (n, 3). */
 POTR_WIDE
 POTR_EXPORT void potr_canonical(
     const float *restrict quaternions, const float *restrict log_scales, const int64_t *restrict order, size_t n,
@@ -60,33 +92,10 @@ POTR_EXPORT void potr_canonical(
     float *restrict turned)
 {
     for (size_t i = 0; i < n; i++) {
-        const float *row = quaternions + 4 * order[i], *scales = log_scales + 3 * order[i];
-        const double a = row[0], b = row[1], c = row[2], d = row[3];
-        const double length = sqrt(a * a + b * b + c * c + d * d);
-        const double w = a / length, x = b / length, y = c / length, z = d / length;
-        double real[FORMS], size[FORMS], lanes[LANES] = {0}, largest = 0;
-        size_t best = 0;
-        for (size_t k = 0; k < FORMS; k++) {
-            /* Rounded, so that ties between equivalent forms fall the same way on every processor. */
-            real[k] = nearest_whole(
-                (w * group[k] + x * group[FORMS + k] + y * group[2 * FORMS + k] + z * group[3 * FORMS + k]) * 1e9);
-            size[k] = fabs(real[k]);
-        }
-        for (size_t k = 0; k < FORMS; k += LANES)
-            for (size_t lane = 0; lane < LANES; lane++)
-                lanes[lane] = size[k + lane] > lanes[lane] ? size[k + lane] : lanes[lane];
-        for (size_t lane = 0; lane < LANES; lane++)
-            largest = lanes[lane] > largest ? lanes[lane] : largest;
-        while (best < FORMS - 1 && size[best] < largest)
-            best++;
-        const double sign = real[best] < 0 ? -1 : 1;
-        const double gw = group[best], gx = -group[FORMS + best], gy = -group[2 * FORMS + best],
-                     gz = -group[3 * FORMS + best];
-        imaginary[3 * i] = sign * (w * gx + x * gw + y * gz - z * gy);
-        imaginary[3 * i + 1] = sign * (w * gy - x * gz + y * gw + z * gx);
-        imaginary[3 * i + 2] = sign * (w * gz + x * gy - y * gx + z * gw);
+        const float *scales = log_scales + 3 * order[i];
+        const size_t form = canonical_form(quaternions + 4 * order[i], group, imaginary + 3 * i);
         for (size_t axis = 0; axis < 3; axis++)
-            turned[3 * i + axis] = scales[permutations[3 * best + axis]];
+            turned[3 * i + axis] = scales[permutations[3 * form + axis]];
     }
 }
 
@@ -106,23 +115,27 @@ static INLINE void widen(int32_t level, int32_t *largest)
     *largest = size > *largest ? size : *largest;
 }
 
-/* Levels of the scales, rotations and opacities of n splats.
+/* Levels of the scales, rotations and opacities of n splats in their canonical forms, which `order` picks among some rows.
  *
- * sizes: (n, 3) standard deviations. imaginary: (n, 3) of unit quaternions. logits: of opacities, of the splats that
- * `order` (n) picks among them; counted from `least` to `most`. levels: (7, stride), of which n are filled: three of
- * scales, three of rotations, opacities. largest: (7), of their magnitudes. Returns whether all fit; if not, what was
- * filled means nothing. */
+ * quaternions, group, permutations: as of potr_canonical. sizes: (n, 3) standard deviations. logits: (rows) of
+ * opacities, counted from `least` to `most`. levels: (7, stride), of which n are filled: three of scales, three of
+ * rotations, opacities. largest: (7), of their magnitudes. Returns whether all fit; if not, what was filled means
+ * nothing. */
 POTR_WIDE
 POTR_EXPORT int potr_splat_levels(
-    const double *restrict sizes, const double *restrict imaginary, const float *restrict logits,
-    const int64_t *restrict order, size_t n, double sf_scale, float sf_rotation, double sf_opacity, double least,
-    double most, size_t stride, int32_t *restrict levels, int32_t *restrict largest)
+    const float *restrict quaternions, const double *restrict sizes, const float *restrict logits,
+    const int64_t *restrict order, size_t n, const double *restrict group, const uint8_t *restrict permutations,
+    double sf_scale, float sf_rotation, double sf_opacity, double least, double most, size_t stride,
+    int32_t *restrict levels, int32_t *restrict largest)
 {
     int fits = 1;
     for (size_t i = 0; i < n; i++) {
+        const double *size = sizes + 3 * i;
+        double imaginary[3];
+        const size_t form = canonical_form(quaternions + 4 * order[i], group, imaginary);
         int32_t scales[3], longest = 1;
         for (size_t axis = 0; axis < 3; axis++) {
-            scales[axis] = floor_of(sizes[3 * i + axis] * sf_scale + 0.5, &fits);
+            scales[axis] = floor_of(size[permutations[3 * form + axis]] * sf_scale + 0.5, &fits);
             levels[axis * stride + i] = scales[axis];
             longest = scales[axis] > longest ? scales[axis] : longest;
             widen(scales[axis], &largest[axis]);
@@ -131,7 +144,7 @@ POTR_EXPORT int potr_splat_levels(
         /* What is decoded as a ball has no direction. */
         const int ball = (scales[0] == scales[1]) & (scales[1] == scales[2]);
         for (size_t axis = 0; axis < 3; axis++) {
-            const int32_t level = floor_of(imaginary[3 * i + axis] * (double)factor + 0.5, &fits);
+            const int32_t level = floor_of(imaginary[axis] * (double)factor + 0.5, &fits);
             levels[(3 + axis) * stride + i] = ball ? 0 : level;
             widen(level, &largest[3 + axis]);
         }
@@ -201,6 +214,32 @@ POTR_EXPORT int potr_colour_levels(
             columns + 3 * m * stride + start + first);
     }
     return sound;
+}
+
+/* What the prediction of DC leaves of levels (docs/format.md, "Prediction"). Sums and products wrap round.
+ *
+ * levels, residuals: (channels, n). run: splats after which prediction begins anew. classes: (n) of the steps of DC, -32
+ * to 31. steps, inverses: (64), of each class. */
+POTR_EXPORT void potr_predicted(
+    const int64_t *restrict levels, size_t channels, size_t n, size_t run, const int8_t *restrict classes,
+    const uint64_t *restrict steps, const uint64_t *restrict inverses, int64_t *restrict residuals)
+{
+    for (size_t c = 0; c < channels; c++) {
+        const int64_t *const from = levels + c * n;
+        int64_t *const to = residuals + c * n;
+        for (size_t start = 0; start < n; start += run) {
+            const size_t stop = n - start < run ? n : start + run;
+            uint64_t last[4] = {0, 0, 0, 0}, total = 0;
+            for (size_t i = start; i < stop; i++) {
+                const unsigned class = (unsigned)(classes[i] + 32) & 63;
+                const int64_t mean = (int64_t)(total * inverses[class] + (UINT64_C(1) << 33)) >> 34;
+                const uint64_t level = (uint64_t)from[i], value = level * steps[class];
+                to[i] = (int64_t)(level - (uint64_t)mean);
+                total += value - last[(i - start) & 3];
+                last[(i - start) & 3] = value;
+            }
+        }
+    }
 }
 
 /* Which of the coefficients, in Y, Co, Cg, have a level other than 0: columns (count, 3, n) of 0 and 1. Returns whether

@@ -69,14 +69,16 @@ class Quantising:
         )
 
     def splat_levels(
-        self, sizes: F64, imaginary: F64, logits: F32, order: I64, factors: tuple[float, float, float],
-        range_of_logits: tuple[float, float], start: int, levels: NDArray[np.int32],
+        self, quaternions: F32, sizes: F64, logits: F32, order: I64, group: F64, permutations: U8,
+        factors: tuple[float, float, float], range_of_logits: tuple[float, float], start: int,
+        levels: NDArray[np.int32],
     ) -> NDArray[np.int32] | None:  # fmt: skip
         """Levels of the scales, rotations and opacities of some splats, as version 2 of the format has them.
 
         Args:
-            sizes, imaginary: (n, 3) standard deviations, and imaginary parts of unit quaternions.
-            logits: (rows,) of opacities, of which ``order`` (n,) tells which are theirs.
+            quaternions, group, permutations: as of :meth:`canonical`.
+            sizes: (n, 3) standard deviations. logits: (rows,) of opacities.
+            order: (n,) of the rows.
             factors: scale factors of scales, rotations and opacities.
             range_of_logits: the least one, from which they are counted, and the largest.
             levels: (7, stride) of three scales, three rotations, opacities; ``start`` to ``start + n`` are set.
@@ -84,18 +86,22 @@ class Quantising:
         Returns:
             (7,) the largest magnitude of each; None if one does not fit, and what was set means nothing.
         """
-        number, stride = len(order), levels.shape[1]
-        if number and not 0 <= int(order.min()) <= int(order.max()) < len(logits):
+        rows, number, stride = len(logits), len(order), levels.shape[1]
+        if number and not 0 <= int(order.min()) <= int(order.max()) < rows:
             raise TypeError("the native path was given splats that are not there")
+        if int(permutations.max()) > 2:
+            raise TypeError("the native path was given axes that are not there")
         if len(levels) != 7 or not 0 <= start <= stride - number:
             raise TypeError("the native path was given columns that are too short")
         largest = np.zeros(7, np.int32)
         fits = self._c["potr_splat_levels"](
+            address(quaternions, np.float32, 4 * rows),
             address(sizes, np.float64, 3 * number),
-            address(imaginary, np.float64, 3 * number),
-            address(logits, np.float32, len(logits)),
+            address(logits, np.float32, rows),
             address(order, np.int64, number),
             number,
+            address(group, np.float64, 24 * 4),
+            address(permutations, np.uint8, 24 * 3),
             *factors,
             *range_of_logits,
             stride,
@@ -139,6 +145,31 @@ class Quantising:
             address(levels, np.int16, 3 * stride * count, True),
         )
         return bool(fit)
+
+    def predicted(self, levels: I64, classes: NDArray[np.int8], run: int, steps: I64, inverses: I64) -> I64:
+        """What the prediction of DC leaves, :func:`potr_cl.codec.steps.prediction.to_residuals`.
+
+        Args:
+            levels: (channels, n).
+            classes: (n,), -32 to 31.
+            run: splats after which prediction begins anew.
+            steps, inverses: (64,) of each class.
+        """
+        channels, number = levels.shape
+        residuals = np.empty((channels, number), np.int64)
+        if run < 1:
+            raise TypeError("the native path was given runs without a splat")
+        self._c["potr_predicted"](
+            address(levels, np.int64, channels * number),
+            channels,
+            number,
+            run,
+            address(classes, np.int8, number),
+            address(steps, np.int64, 64),
+            address(inverses, np.int64, 64),
+            address(residuals, np.int64, channels * number, True),
+        )
+        return residuals
 
     def unit_quaternions(self, quaternions: F32) -> F32:
         """(n, 4) float32 quaternions of unit length, of (n, 4); those of length 0 become the identity."""

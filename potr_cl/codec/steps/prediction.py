@@ -11,6 +11,7 @@ from functools import lru_cache
 import numpy as np
 from numpy.typing import NDArray
 
+from potr_cl.codec.native.library import native
 from potr_cl.codec.steps.rule import CLASSES
 
 I64 = NDArray[np.int64]
@@ -47,6 +48,10 @@ def tables() -> tuple[I64, I64]:
 
 def to_residuals(levels: I64, classes: I8) -> I64:
     """(channels, n) levels, each less its prediction; ``classes`` (n,) are those of DC."""
+    functions = native()
+    if functions is not None:
+        levels, classes = np.ascontiguousarray(levels), np.ascontiguousarray(classes)
+        return functions.quantising.predicted(levels, classes, RUN, *tables())
     steps, inverses = (table[classes.astype(np.intp) + CLASSES] for table in tables())
     values = levels * steps
     total = np.zeros_like(values)

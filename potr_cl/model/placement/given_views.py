@@ -19,8 +19,8 @@ F32 = NDArray[np.float32]
 
 #: So many splats, evenly taken, tell where a scene is; views are judged by so many of them, and points that hide them.
 _TAKEN, _TARGETS, _OCCLUDERS = 20_000, 1_000, 8_000
-#: Views that are looked at together: what is found of them on the way stays in a cache.
-_AT_ONCE = 8
+#: Views that are looked at together, so that threads wait for each other seldom.
+_AT_ONCE = 24
 #: Part of what a new view shows that some given view must show, too.
 _KNOWN = 0.9
 #: A new view shows at least this part of what the view shows that it lies beside, by number of splats.

@@ -61,7 +61,8 @@ class FitOptions:
         patience: the fit ends after so many rounds in which they did not become better.
         rates: of the first step, if the scene is far from the targets; smaller where it is near to them. ``means`` in
             parts of a usual splat's size.
-        last: part of the rates that is left at the end; they fall by the same factor in each step.
+        start: part of the rates that it begins with.
+        last: part of these that is left at the end; they fall by the same factor in each step.
         seed: of the order of the views.
         memory: bytes of device memory that target pictures may take; None: a quarter of what is free.
 
@@ -74,6 +75,7 @@ class FitOptions:
     rounds: int = 10
     patience: int = 3
     rates: Rates = RATES
+    start: float = 1.0
     last: float = 0.1
     seed: int = 0
     memory: int | None = None
@@ -84,8 +86,9 @@ class FitOptions:
         for name in ("batch", "rounds", "patience"):
             if not 1 <= getattr(self, name) <= 1000:
                 raise UsageError(f"the fit's {name} is {getattr(self, name)}, it must be from 1 to 1000")
-        if not 0 < self.last <= 1:
-            raise UsageError(f"the fit's last rate is {self.last:g}, it must be above 0 and at most 1")
+        for name in ("start", "last"):
+            if not 0 < getattr(self, name) <= 1:
+                raise UsageError(f"the fit's {name} rate is {getattr(self, name):g}, it must be above 0 and at most 1")
 
 
 @dataclass(frozen=True)
@@ -100,6 +103,7 @@ class Fitted:
         ended_early: whether someone has asked it to end.
         spared: how many splats were removed before it for it to make up for.
         without: the error of these views before those were removed; None where none were.
+        settled: mean squared error of these views after each fit that followed a choice of coefficients or a rounding.
         photographs: what a further fit to photographs did; None if there were none.
     """
 
@@ -111,6 +115,7 @@ class Fitted:
     ended_early: bool = False
     spared: int = 0
     without: float | None = None
+    settled: tuple[float, ...] = ()
     photographs: FittedToPhotographs | None = None
 
     @property
@@ -127,7 +132,8 @@ class Fitted:
     def facts(self) -> dict[str, Any]:
         """All but the scene, by name."""
         names = ("steps", "kept", "held_out", "ended_early", "spared", "without")
-        facts = {name: getattr(self, name) for name in names} | {"errors": list(self.errors)}
+        facts = {name: getattr(self, name) for name in names}
+        facts |= {"errors": list(self.errors), "settled": list(self.settled)}
         return facts | {"photographs": None if self.photographs is None else self.photographs.facts}
 
     def __str__(self) -> str:
@@ -139,6 +145,8 @@ class Fitted:
         said = f"{steps}: PSNR {before:.2f} dB before, {after:.2f} dB after, {views}"
         if self.spared and self.without is not None:
             said += f"; {_decibels(self.without):.2f} dB with {self.spared:,} splats more, without it"
+        if self.settled:
+            said += f"; {_decibels(self.settled[-1]):.2f} dB with geometry and coefficients as in the file"
         if self.photographs is not None:
             said += f"; {self.photographs}"
         return said
@@ -275,7 +283,7 @@ class _Fit:
     ) -> Fitted:
         options = self._options
         errors = [self._judges.error()]
-        pace = min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
+        pace = options.start * min(max(math.sqrt(errors[0]) / _USUAL_ERROR, _SLOWEST), 1.0)
         slowing = options.last ** (1 / max(options.steps - 1, 1))
         kept = done = since = 0
         order = batches(fit_to, options.batch, options.seed)
@@ -290,14 +298,15 @@ class _Fit:
                     progress(done, options.steps)
             if done < end:
                 break
-            errors.append(self._judges.error())
+            with self._adam.averaged():
+                errors.append(self._judges.error())
+                if errors[-1] < min(errors[:-1]):
+                    self._adam.keep()
+                    kept, since = done, 0
+                else:
+                    since += 1
             now, first = _decibels(errors[-1]), _decibels(errors[0])
             tell(f"fit: {done} steps, held-out views {now:.2f} dB, {first:.2f} dB at first")
-            if errors[-1] < min(errors[:-1]):
-                self._adam.keep()
-                kept, since = done, 0
-            else:
-                since += 1
             if since >= options.patience:
                 break
         return Fitted(self._adam.kept(), done, kept, tuple(errors), len(self._judges), bool(asked))

@@ -2,8 +2,8 @@
 
 from __future__ import annotations
 
-#: Buffers of all parameters: the rasterizer's, the gradient, the parameters, the best ones, two moments.
-_VECTORS = 6
+#: Buffers of all parameters: the rasterizer's, the gradient, the parameters, the best ones, averages, two moments.
+_VECTORS = 7
 #: Bytes of a splat in each view of a batch besides the prepared view: its sums, its bounds.
 _OF_SPLAT = 72 + 8
 #: Bytes of a splat in what a rasterizer keeps to render pictures one by one: its projection, and a list of four

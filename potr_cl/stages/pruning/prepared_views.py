@@ -147,6 +147,8 @@ class PreparedSet(Owner):
         rasterizer: that prepared them.
         numbers: of the views among the cameras.
         views: projection and lists, this object's from now on.
+        memory: to take the rest from, which is closed with this object; None: memory of its own.
+        target: the pictures before any removal, which stay the caller's; None: memory for them.
 
     Attributes:
         numbers, views: as given.
@@ -159,16 +161,23 @@ class PreparedSet(Owner):
         DeviceMemoryError: the device has no room.
     """
 
-    def __init__(self, rasterizer: Rasterizer, numbers: range, views: ViewSet) -> None:
+    def __init__(
+        self,
+        rasterizer: Rasterizer,
+        numbers: range,
+        views: ViewSet,
+        memory: Memory | None = None,
+        target: cl.Buffer | None = None,
+    ) -> None:
         self._device = device = rasterizer.device
-        self._memory = Memory(device)
+        self._memory = memory or Memory(device)
         self.numbers, self.views = numbers, views
         self.first_tile = 0
         try:
             lengths = np.concatenate([np.diff(offsets) for offsets in views.read_offsets()])
             self.lengths = self._memory.upload(lengths, "the tile lists")
             self.sums = self._memory.allocate(8 * views.capacity, "the tiles' removal effects")
-            self.target = self._memory.allocate(12 * views.pixels, "the target images")
+            self.target = target or self._memory.allocate(12 * views.pixels, "the target images")
         except BaseException:
             self.close()
             raise

@@ -4,14 +4,15 @@ Of a large scene no view sees much. The whole scene lies on the device once; a v
 its projection, lists and totals are of these and no others. Totals are added up by the scene's numbers. They are
 integers in units that follow from all views, so they are the same bits as of all views with all splats.
 
-Views that the memory has no room for are prepared again whenever they are measured. They are measured together, and
-only when they have lost more since the last time, on the average, than a tile may lose before it is swept again.
+Views that the memory has no room for are prepared again whenever they are measured, some neighbours at a time and only
+with the splats that are left; their target pictures stay, if there is room for them. They are measured when on the
+average they have lost twice as much since the last time as a tile may lose before it is swept again.
 """
 
 from __future__ import annotations
 
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
 
@@ -24,7 +25,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.kernel import Kernel
-from potr_cl.opencl.memory import Memory, Owner, Scratch
+from potr_cl.opencl.memory import Arena, Memory, Owner, Scratch
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.picked_splats import PickedSplats, Picker
@@ -46,9 +47,16 @@ _GROUP = 64
 _LOST_CHUNK = 4096
 #: Views that are swept at the same time: the longest list of one keeps a work-group busy when the others are done.
 _QUEUES = 8
-#: Bytes that a view takes at least: of a splat (shape, colour, totals, state, number) and of a pixel (the target). And
-#: what making one takes besides, of a splat.
-_SPLAT, _PIXEL, _MAKING = 69, 12, 120
+#: Bytes that a view is expected to take: of a splat (shape, colour, totals, state, number, and two and a half tile
+#: intersections), and of a pixel (the target).
+_SPLAT, _PIXEL = 104, 12
+#: Views that are made again take so many bytes while they are: of each one's splats, and of those of all together.
+_OWN, _TOGETHER = 70, 56
+#: Of the memory, what these may take; how many they are at most; and how many times as many splats as one of them (on
+#: the average) they see together at most.
+_PASSING, _MOST, _SPREAD = 1 / 5, 16, 4.0
+#: How much more than a tile they may lose, on the average.
+_PATIENCE = 2.0
 
 
 @dataclass(frozen=True)
@@ -71,6 +79,39 @@ class _View:
     def items(self) -> tuple[int]:
         """Work-items for a kernel that does a splat each."""
         return (-(-self.splats // _GROUP) * _GROUP,)
+
+
+@dataclass
+class _Batch:
+    """Views that are made again together.
+
+    Attributes:
+        numbers: of them among all views.
+        wanted: (G,) the groups of which they may draw splats.
+        targets: their pictures before any removal, one after the other; None: they are made again too.
+        known: whether the targets are there.
+    """
+
+    numbers: list[int]
+    wanted: NDArray[np.bool_]
+    targets: cl.Buffer | None = None
+    known: bool = False
+
+
+@dataclass(frozen=True)
+class _Ready:
+    """A batch's views, ready to be swept.
+
+    Attributes:
+        prepared: their lists and sums.
+        numbers: of the splats that they were prepared with, in the device's memory, and splats: how many these are.
+        kernels: with all arguments bound; the target is yet to be stored.
+    """
+
+    prepared: PreparedSet
+    numbers: cl.Buffer
+    splats: int
+    kernels: SetKernels
 
 
 class _KeptView(Owner):
@@ -167,25 +208,30 @@ class ViewByView(Owner):
         self._queues = Queues(device, _QUEUES)
         self._sh: cl.Buffer | None = None  # other coefficients than those of the targets
         self._kept: list[_KeptView] = []
-        self._unkept: list[_View] = []
+        self._unkept: list[_Batch] = []
         #: Tiles of each kept view that the next measurement sweeps.
         self._listed: list[int] = []
         #: Whether every splat is left, and has the colours of the targets.
         self._pristine = True
         self._targets_known = self._unkept_known = False
+        self._seen = sights.seen
         with ExitStack() as owned:
             self._memory = memory = owned.enter_context(Memory(device))
             owned.callback(self._close_kept)
             self._scratch = [
                 owned.enter_context(Scratch(device, what))
-                for what in ("a view's effects", "a view's splats that are left", "a view's tiles", "their staleness")
+                for what in ("some views' effects", "some views' tiles", "their staleness", "their targets")
             ]
+            #: Of views that are not kept, one after the other.
+            self._passing = Arena(device, "some views")
+            owned.callback(self._passing.give_back)
             self._preparing = owned.enter_context(PreparingMemory(device))
             self.totals = memory.allocate(16 * whole.stride, "the removal effects")
             self._first: cl.Buffer | None = None
             if first_totals is not None:
                 self._first = memory.upload(first_totals, "the removal effects to begin with")
             self.marks = memory.upload(np.full(whole.stride, SplatState.ALIVE, np.uint8), "the splats that are left")
+            self._picker = owned.enter_context(Picker(device, sights.groups.group_of))
             self._prepare_all(sights, progress)
             self._owned = owned.pop_all()
         self.kept_views = len(self._kept)
@@ -199,44 +245,75 @@ class ViewByView(Owner):
 
     def _prepare_all(self, sights: Sights, progress: Callable[[int, int], None] | None) -> None:
         device, memory = self.device, self._memory
-        most = max(camera.width * camera.height for camera in self._cameras)
-        budget = default_memory(device) if self._options.memory is None else self._options.memory
         totals = sights.totals
-        # What views take that are not kept, and what making one of them takes.
-        left = budget - 4 * int(totals.sum()) - _MAKING * int(totals.max()) - _PIXEL * most
+        targets = np.array([_PIXEL * camera.width * camera.height for camera in self._cameras])
+        left = default_memory(device) if self._options.memory is None else self._options.memory
         tiles = [-(-camera.width // TILE) * -(-camera.height // TILE) for camera in self._cameras]
         self._stale = memory.upload(np.zeros(sum(tiles), np.float32), "the tiles' staleness")
         self._tiles = memory.allocate(4 * sum(tiles), "the tiles to sweep")
         self._counts = memory.allocate(4 * len(tiles), "the numbers of tiles to sweep")
-        first_tile = 0
-        with Picker(device, sights.groups.group_of) as picker:
-            for number, camera in enumerate(self._cameras):
-                if totals[number]:
-                    numbers, count = picker.pick(memory, sights.seen[number])
-                    view = _View(number, camera, count, numbers)
-                    kept = self._keep(view, left, first_tile)
-                    if kept:
-                        left -= kept
-                        first_tile += tiles[number]
-                    else:
-                        self._unkept.append(view)
-                if progress is not None:
-                    progress(number + 1, len(self._cameras))
+        passing = int(_PASSING * left)
+        # For the targets of all views that are not kept room is left, unless all will be kept.
+        reserved = 0
+        if _SPLAT * int(totals.sum()) + int(targets.sum()) > left:
+            left -= passing + 16 * self._whole.stride
+            reserved = int(targets.sum())
+        first_tile, others = 0, []
+        for done, number in enumerate(sights.order().tolist()):
+            own = int(targets[number])
+            reserved = max(reserved - own, 0)
+            if totals[number]:
+                kept = self._keep(number, int(totals[number]), left - reserved, first_tile)
+                if kept:
+                    first_tile += tiles[number]
+                    left -= kept
+                else:
+                    others.append(number)
+                    left -= own
+            if progress is not None:
+                progress(done + 1, len(self._cameras))
         self._list_everything()
-        if self._unkept:
+        if others:
             self._totals_of_unkept = memory.allocate(16 * self._whole.stride, "the effects in views that are not kept")
+            self._unkept = self._dealt_out(others, sights, targets, passing)
+            room = left + int(targets[others].sum())
+            for batch in self._unkept:
+                nbytes = int(targets[batch.numbers].sum())
+                if nbytes <= room:
+                    with suppress(DeviceMemoryError):
+                        batch.targets = memory.allocate(nbytes, "the target images")
+                        room -= nbytes
 
-    def _keep(self, view: _View, room: float, first_tile: int) -> int:
+    def _dealt_out(self, others: list[int], sights: Sights, targets: NDArray[np.int64], passing: int) -> list[_Batch]:
+        """The views that are not kept in batches, each of which takes no more bytes than may pass, if it can be."""
+        totals, counts = sights.totals, sights.groups.counts
+        batches: list[_Batch] = []
+        for number in others:
+            wanted = sights.seen[number]
+            if batches:
+                numbers = [*batches[-1].numbers, number]
+                together = batches[-1].wanted | wanted
+                seen, own = len(numbers) * int(counts[together].sum()), int(totals[numbers].sum())
+                nbytes = _TOGETHER * seen + _OWN * own + int(targets[numbers].sum())
+                if len(numbers) <= _MOST and nbytes <= passing and seen <= _SPREAD * own:
+                    batches[-1] = _Batch(numbers, together)
+                    continue
+            batches.append(_Batch([number], wanted))
+        return batches
+
+    def _keep(self, number: int, splats: int, room: int, first_tile: int) -> int:
         """Prepare a view, and keep it if it takes no more than the room; returns the bytes that it takes, or 0."""
-        device = self.device
-        if _SPLAT * view.splats + _PIXEL * view.camera.width * view.camera.height > room:
+        device, camera = self.device, self._cameras[number]
+        if 2 / 3 * _SPLAT * splats + _PIXEL * camera.width * camera.height > room:
             return 0
         before = device.allocated
         with suppress(DeviceMemoryError), ExitStack() as stack:
-            rasterizer = stack.enter_context(self._rasterizer(view))
-            prepared = stack.enter_context(self._prepared(view, rasterizer))
-            rasterizer.rest()
             memory = stack.enter_context(Memory(device))
+            view = _View(number, camera, splats, self._picker.pick(memory, self._seen[number])[0])
+            rasterizer = stack.enter_context(self._rasterizer(view.numbers, splats))
+            prepared = PreparedSet(rasterizer, range(number, number + 1), rasterizer.prepare_set([camera]))
+            stack.enter_context(prepared)
+            rasterizer.rest()
             marks = memory.allocate(rasterizer.stride, "a view's splats that are left")
             totals = memory.allocate(16 * rasterizer.stride, "a view's removal effects")
             taken = device.allocated - before
@@ -254,25 +331,21 @@ class ViewByView(Owner):
                 first_time=True,
                 place=len(self._kept),
             )
-            kept.bind(kernels, self._add(view, self.totals, totals), self._mark(view, marks))
+            kept.bind(kernels, self._add(self.totals, totals, view.numbers, splats), self._mark(view, marks))
             self._kept.append(kept)
             stack.pop_all()
             return taken
         return 0
 
-    def _rasterizer(self, view: _View) -> Rasterizer:
-        picked = PickedSplats(self._whole, view.numbers, view.splats)
-        if self._sh is not None:
+    def _rasterizer(self, numbers: cl.Buffer, splats: int, former: bool = False) -> Rasterizer:
+        """Of some splats, with the colours that they have now, or with those of the targets."""
+        picked = PickedSplats(self._whole, numbers, splats)
+        if self._sh is not None and not former:
             picked.sh = self._sh
         return Rasterizer(self.device, picked, background=self._background, preparing=self._preparing)
 
-    def _prepared(self, view: _View, rasterizer: Rasterizer) -> PreparedSet:
-        views = rasterizer.prepare_set([view.camera])
-        return PreparedSet(rasterizer, range(view.number, view.number + 1), views)
-
-    def _add(self, view: _View, totals: cl.Buffer, part: cl.Buffer) -> Kernel:
-        kernel = self._kernel("add_part")
-        return kernel.bind(totals=totals, part=part, numbers=view.numbers, count=view.splats)
+    def _add(self, totals: cl.Buffer, part: cl.Buffer, numbers: cl.Buffer, splats: int) -> Kernel:
+        return self._kernel("add_part").bind(totals=totals, part=part, numbers=numbers, count=splats)
 
     def _mark(self, view: _View, marks: cl.Buffer) -> Kernel:
         kernel = self._kernel("mark_part")
@@ -353,53 +426,77 @@ class ViewByView(Owner):
             )
             lost.launch((-(-self.splats // _LOST_CHUNK) * _GROUP,), (_GROUP,))
             importance = int(self.device.download(words, (1,), np.int64)[0])
-        return importance * self.units[1] * len(self._cameras) / len(self._unkept) > self._options.tolerance
+        part = sum(len(batch.numbers) for batch in self._unkept) / len(self._cameras)
+        return importance * self.units[1] / part > _PATIENCE * self._options.tolerance
 
     def _measure_unkept(self) -> None:
         self.device.fill(self._totals_of_unkept, np.uint32(0))
-        for view in self._unkept:
-            with self._swept(view, self._totals_of_unkept):
+        for batch in self._unkept:
+            with self._swept(batch, self._totals_of_unkept):
                 pass
 
-    def _swept(self, view: _View, totals: cl.Buffer | None) -> PreparedSet:
-        """A view prepared and swept, its totals added to others; the caller closes it."""
-        device = self.device
-        own_totals, marks, tiles, stale = self._scratch
-        with self._rasterizer(view) as rasterizer:
-            stride = rasterizer.stride
-            own_totals.reserve(16 * stride)
-            marks.reserve(stride)
-            prepared = self._prepared(view, rasterizer)
-            try:
-                count = prepared.views.tiles
-                tiles.reserve(4 * count)
-                stale.reserve(4 * count)
-                numbers = np.arange(count, dtype=np.uint32)
-                cl.enqueue_copy(device.queue, tiles.buffer, numbers, is_blocking=True)
-                buffers = SweepBuffers(marks.buffer, tiles.buffer, stale.buffer, self._counts, own_totals.buffer)
-                launcher = launcher_for(rasterizer, self._options, self._fixed_point)
-                geometry = (prepared.views.shapes, prepared.views.colours)
-                prepared.first_tile = 0
-                kernels = launcher.bind(prepared, geometry, buffers, first_time=True)
-                if not self._pristine:
-                    if self._sh is not None:
-                        rasterizer.project(prepared.views, self._whole.sh)
-                    device.fill(marks.buffer, np.uint8(SplatState.ALIVE), stride)
-                    kernels.store_target()
-                    prepared.zero_sums()
-                    if self._sh is not None:
-                        rasterizer.project(prepared.views)
-                device.fill(own_totals.buffer, np.uint32(0), 16 * stride)
-                self._mark(view, marks.buffer).launch(view.items, (_GROUP,))
-                kernels.sweep_all()
+    @contextmanager
+    def _swept(self, batch: _Batch, totals: cl.Buffer | None) -> Iterator[_Ready | None]:
+        """Some views prepared and swept, their totals added to others; None if none of their splats is left."""
+        target, stored = batch.targets, batch.known
+        if target is None:
+            scratch, stored = self._scratch[-1], False
+            scratch.reserve(_PIXEL * sum(self._cameras[k].width * self._cameras[k].height for k in batch.numbers))
+            target = scratch.buffer
+        if not stored and not self._pristine:
+            with self._ready(batch, target, whole=True) as views:
+                assert views is not None
+                views.kernels.store_target()
+                self._finish()
+            stored = True
+        with self._ready(batch, target) as views:
+            if views is not None:
+                if stored:
+                    views.kernels.target_is_known()
+                views.kernels.sweep(0, views.prepared.views.tiles)
                 if totals is not None:
-                    self._add(view, totals, own_totals.buffer).launch(view.items, (_GROUP,))
-                with device.errors("failed while computing"):
-                    device.queue.finish()
-            except BaseException:
-                prepared.close()
-                raise
-        return prepared
+                    items = (-(-views.splats // _GROUP) * _GROUP,)
+                    self._add(totals, self._scratch[0].buffer, views.numbers, views.splats).launch(items, (_GROUP,))
+                self._finish()
+            batch.known = True
+            yield views
+
+    @contextmanager
+    def _ready(self, batch: _Batch, target: cl.Buffer, whole: bool = False) -> Iterator[_Ready | None]:
+        """Some views prepared, all their sums and totals 0; None if there is no splat to prepare them with.
+
+        Args:
+            batch: the views.
+            target: their pictures.
+            whole: with all splats, and with the colours of the target.
+        """
+        device, cameras = self.device, [self._cameras[number] for number in batch.numbers]
+        own_totals, tiles, stale, _ = self._scratch
+        with Memory(device) as memory, ExitStack() as stack:
+            states = None if whole else self.marks
+            numbers, splats = self._picker.pick(memory, batch.wanted, states, SplatState.ALIVE)
+            if not splats:
+                yield None
+                return
+            rasterizer = stack.enter_context(self._rasterizer(numbers, splats, former=whole))
+            views = rasterizer.prepare_set(cameras, self._passing)
+            prepared = PreparedSet(rasterizer, range(len(cameras)), views, self._passing, target)
+            stack.enter_context(prepared)
+            own_totals.reserve(16 * rasterizer.stride)
+            device.fill(own_totals.buffer, np.uint32(0), 16 * rasterizer.stride)
+            for scratch in (tiles, stale):
+                scratch.reserve(4 * views.tiles)
+            everything = np.arange(views.tiles, dtype=np.uint32)
+            with device.errors("failed while computing"):
+                cl.enqueue_copy(device.queue, tiles.buffer, everything, is_blocking=True)
+            buffers = SweepBuffers(self.marks, tiles.buffer, stale.buffer, self._counts, own_totals.buffer)
+            launcher = launcher_for(rasterizer, self._options, self._fixed_point)
+            kernels = launcher.bind(prepared, (views.shapes, views.colours), buffers, first_time=True)
+            yield _Ready(prepared, numbers, splats, kernels)
+
+    def _finish(self) -> None:
+        with self.device.errors("failed while computing"):
+            self.device.queue.finish()
 
     # ----------------------------------------------------------------------------------- for a controller on the host
 
@@ -423,8 +520,7 @@ class ViewByView(Owner):
         self._pristine = self._unkept_known = False
         for kept in self._kept:
             kept.rasterizer.project(kept.prepared.views, self._sh)
-            with self.device.errors("failed while computing"):
-                self.device.queue.finish()
+            self._finish()
             kept.rasterizer.rest()
         if former is not None:
             self._memory.free(former)
@@ -436,21 +532,28 @@ class ViewByView(Owner):
         self._sweep_listed()
         alive = self.alive
         kept = {each.view.number: each for each in self._kept}
-        views = sorted([*self._unkept, *(each.view for each in self._kept)], key=lambda view: view.number)
-        for view in views:
-            if view.number in kept:
-                yield self._importances(view, kept[view.number].prepared, alive)
-            else:
-                with self._swept(view, None) as prepared:
-                    yield self._importances(view, prepared, alive)
+        unkept = {number for batch in self._unkept for number in batch.numbers}
+        for number in sorted([*kept, *unkept]):
+            if number in kept:
+                view = kept[number].view
+                yield self._importances(number, kept[number].prepared, view.numbers, view.splats, alive)
+                continue
+            with self._swept(_Batch([number], self._seen[number]), None) as ready:
+                if ready is None:
+                    yield number, np.zeros(0, np.int64), np.zeros(0)
+                else:
+                    yield self._importances(number, ready.prepared, ready.numbers, ready.splats, alive)
 
-    def _importances(self, view: _View, prepared: PreparedSet, alive: NDArray[np.bool_]) -> tuple[int, Indices, F64]:
-        numbers = self.device.download(view.numbers, (view.splats,), np.uint32).astype(np.int64)
+    def _importances(
+        self, number: int, prepared: PreparedSet, numbers: cl.Buffer, splats: int, alive: NDArray[np.bool_]
+    ) -> tuple[int, Indices, F64]:
+        named = self.device.download(numbers, (splats,), np.uint32).astype(np.int64)
         ((_, _, intersections, sums),) = prepared.read_sums()
         weights = np.maximum(sums[:, 1], 0)  # negative: touches no pixel
-        total = np.bincount(intersections, weights=weights, minlength=view.splats)
-        seen = np.flatnonzero((total > 0) & alive[numbers])
-        return view.number, numbers[seen], total[seen] / (view.camera.width * view.camera.height)
+        total = np.bincount(intersections, weights=weights, minlength=splats)
+        seen = np.flatnonzero((total > 0) & alive[named])
+        camera = self._cameras[number]
+        return number, named[seen], total[seen] / (camera.width * camera.height)
 
     def _close_kept(self) -> None:
         for kept in self._kept:

@@ -55,7 +55,11 @@ def groups_of_large(scene: Scene, run: Run = map) -> SplatGroups | None:
 
 
 def sights_worth_it(
-    scene: Scene, cameras: Sequence[Camera], options: SweepOptions, groups: SplatGroups | None = None
+    scene: Scene,
+    cameras: Sequence[Camera],
+    options: SweepOptions,
+    groups: SplatGroups | None = None,
+    run: Run = map,
 ) -> Sights | None:
     """What the views see; None where they had better share one scene.
 
@@ -64,11 +68,12 @@ def sights_worth_it(
         cameras: the views.
         options: of the sweep.
         groups: of the scene, where they are known.
+        run: shares the work out.
     """
     # A sample of the tiles is drawn from all of them in turn.
     if len(scene) < LEAST_SPLATS or options.sample < 1 or not cameras:
         return None
-    sights = Sights.of(scene, cameras, INRIA.near, groups)
+    sights = Sights.of(scene, cameras, INRIA.near, groups, run)
     return sights if sights.totals.sum() <= _WORTH_IT * len(scene) * len(cameras) else None
 
 

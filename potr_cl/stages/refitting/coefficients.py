@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory
-from potr_cl.stages.refitting.vector_space import Layout, Ridge, VectorSpace
+from potr_cl.stages.refitting.vector_space import RARELY, Layout, Ridge, VectorSpace
 
 _SOURCE = "refit/coefficients.cl"
 #: Work-items that share a dot product.
@@ -57,8 +57,8 @@ class Coefficients(VectorSpace):
 
     # ------------------------------------------------------------------------------------------ vectors
 
-    def vector(self) -> cl.Buffer:
-        """A new vector, not set; it is given back with the others by :meth:`close`."""
+    def vector(self, rank: int = RARELY) -> cl.Buffer:
+        """See :meth:`VectorSpace.vector`."""
         return self._memory.allocate(4 * self.length, "the SH coefficients")
 
     def zero(self, x: cl.Buffer) -> None:

@@ -16,8 +16,8 @@ _CONVERGED = 1e-14
 class Vectors(Protocol):
     """Arithmetic of vectors; :class:`potr_cl.stages.refitting.coefficients.Coefficients` is one."""
 
-    def vector(self) -> Vector:
-        """A new vector."""
+    def vector(self, rank: int) -> Vector:
+        """A new vector; the lower the rank, the more often it is used."""
         ...
 
     def zero(self, x: Vector) -> None:
@@ -57,7 +57,7 @@ class ConjugateGradients:
 
     def __init__(self, vectors: Vectors) -> None:
         self._vectors = vectors
-        self.direction, self.product, self.preconditioned = (vectors.vector() for _ in range(3))
+        self.direction, self.product, self.preconditioned = (vectors.vector(rank) for rank in (0, 1, 3))
 
     def descend(
         self,

@@ -14,6 +14,8 @@ from potr_cl.stages.refitting.coefficients import Coefficients
 _SOURCE = "refit/packing.cl"
 #: Work-items of a work-group.
 _GROUP = 64
+#: Splats whose coefficients a work-item counts one after the other.
+_RUN = 64
 #: Bytes of lent sums that are added at a time.
 _AT_ONCE = 1 << 27
 
@@ -25,8 +27,7 @@ class Packing(Owner):
         coefficients: whose vectors and flags they are.
 
     Attributes:
-        flags: (2, N) uint32, the flags by which is packed, as :meth:`take_flags` or :meth:`give_flags` left them.
-        count: coefficients that are active.
+        count: coefficients that were active when :meth:`take_flags` or :meth:`give_flags` was called last.
 
     Raises:
         DeviceError: the kernels cannot be built.
@@ -36,33 +37,55 @@ class Packing(Owner):
         self._coefficients, layout = coefficients, coefficients.layout
         device = coefficients.device
         self._kernels = {
-            name: device.kernel(_SOURCE, name, LANES=1, SH_COUNT=layout.sh_count)
-            for name in ("pack_floats", "unpack_floats", "pack_sums", "add_sums", "add_rows")
+            name: device.kernel(_SOURCE, name, LANES=1, SH_COUNT=layout.sh_count, RUN=_RUN)
+            for name in (
+                "pack_floats",
+                "unpack_floats",
+                "pack_sums",
+                "add_sums",
+                "add_rows",
+                "count_active",
+                "place_active",
+            )
         }
         self._staging = Staging(device)
         self._relay = Relay(device)
-        self.flags: NDArray[np.uint32] | None = None
         self.count = 0
         self._places = Scratch(device, "the coefficients' places")
+        self._starts = Scratch(device, "the coefficients' places")
         self._packed = Scratch(device, "the packed coefficients")
 
-    def take_flags(self) -> bool:
-        """Pack by the flags as they are on the device from now on; whether they are others than before."""
-        layout = self._coefficients.layout
-        flags = np.ascontiguousarray(self._coefficients.save_flags()[:, : layout.splats])
-        if self.flags is not None and np.array_equal(flags, self.flags):
-            return False
-        self._know(flags)
-        return True
+    def take_flags(self) -> None:
+        """Pack by the flags as they are on the device from now on."""
+        layout, device = self._coefficients.layout, self._coefficients.device
+        runs = -(-layout.splats // _RUN)
+        self._starts.reserve(8 * runs)
+        self._places.reserve(8 * layout.splats)
+        self._launch_runs("count_active", counts=self._starts.buffer)
+        counts = device.download(self._starts.buffer, (runs,), np.uint64)
+        ends = np.cumsum(counts, dtype=np.uint64)
+        self.count = int(ends[-1])
+        self._copy_to(self._starts, ends - counts)
+        self._launch_runs("place_active", starts=self._starts.buffer, places=self._places.buffer)
 
-    def give_flags(self, flags: NDArray[np.uint32]) -> None:
-        """Have these flags, (2, N) uint32, on the device, and pack by them from now on; the array must not change."""
-        if flags is self.flags:
-            return
-        words = np.zeros((2, self._coefficients.layout.stride), np.uint32)
-        words[:, : flags.shape[1]] = flags
-        self._coefficients.restore_flags(words)
-        self._know(flags)
+    def flags(self) -> NDArray[np.uint32]:
+        """(2, N) uint32, the flags as they are on the device."""
+        return np.ascontiguousarray(self._coefficients.save_flags()[:, : self._coefficients.layout.splats])
+
+    def lend_flags(self) -> Lent:
+        """The same on the device, for others of this process."""
+        coefficients = self._coefficients
+        return Lent(coefficients.device, coefficients.active, 8 * coefficients.layout.stride)
+
+    def give_flags(self, flags: NDArray[np.uint32] | Lent) -> None:
+        """Have these flags, (2, N) uint32, on the device, and pack by them from now on."""
+        if isinstance(flags, Lent):
+            self._relay.fetch(self._coefficients.active, flags)
+        else:
+            words = np.zeros((2, self._coefficients.layout.stride), np.uint32)
+            words[:, : flags.shape[1]] = flags
+            self._coefficients.restore_flags(words)
+        self.take_flags()
 
     def floats(self, x: cl.Buffer) -> FloatArray:
         """(count,) float32, a vector's active coefficients; valid until something else is packed."""
@@ -126,14 +149,6 @@ class Packing(Owner):
         """Take a whole vector from another device, which lays it out in the same way."""
         self._relay.fetch(x, lent)
 
-    def _know(self, flags: NDArray[np.uint32]) -> None:
-        self.flags = flags
-        counts = np.bitwise_count(flags).sum(axis=0, dtype=np.uint64)
-        ends = np.cumsum(counts, dtype=np.uint64)
-        self.count = int(ends[-1]) if len(ends) else 0
-        self._places.reserve(8 * len(ends))
-        self._copy_to(self._places, ends - counts)
-
     def _take(self, packed: NDArray[np.generic] | Lent, nbytes: int) -> None:
         """Have packed coefficients of so many bytes each on the device."""
         if packed.nbytes != nbytes * self.count:
@@ -150,6 +165,11 @@ class Packing(Owner):
             with device.errors("failed while computing"):
                 cl.enqueue_copy(device.queue, scratch.buffer, array, is_blocking=True)
 
+    def _launch_runs(self, name: str, **buffers: cl.Buffer) -> None:
+        layout, kernel = self._coefficients.layout, self._kernels[name]
+        kernel.bind(active=self._coefficients.active, stride=layout.stride, splats=layout.splats, **buffers)
+        kernel.launch((-(-layout.splats // (_RUN * _GROUP)) * _GROUP,), (_GROUP,))
+
     def _launch(self, name: str, columns: cl.Buffer) -> None:
         layout, kernel = self._coefficients.layout, self._kernels[name]
         kernel.bind(
@@ -165,6 +185,7 @@ class Packing(Owner):
     def close(self) -> None:
         """Give the device's memory back."""
         self._places.close()
+        self._starts.close()
         self._packed.close()
         self._staging.close()
         self._relay.close()

@@ -95,7 +95,9 @@ class ColourPart(Part):
             self._block_sums: cl.Buffer | None = None
             self._owned = owned.pop_all()
 
-    def gradient(self, x: FloatArray | Lent, flags: NDArray[np.uint32], blocks: bool, constant: bool) -> Gradient:
+    def gradient(
+        self, x: FloatArray | Lent, flags: NDArray[np.uint32] | Lent, blocks: bool, constant: bool
+    ) -> Gradient:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.gradient`.
 
         Args:

@@ -1,8 +1,9 @@
 """Where a re-fit's vectors lie: in the device's memory, or, where it has not enough, on the host (:func:`placed`).
 
 A splat takes about 3,400 bytes in one piece at SH degree 3: seven vectors of 48 values, the sums over views, the blocks
-of the normal equations and what they are added up in. With the vectors and the blocks on the host it takes about 900:
-two vectors that views are looked at with, and the sums.
+of the normal equations and what they are added up in. With the blocks and all vectors but one on the host it takes
+about 950: the direction that views are looked along, a place for the other vectors that they are looked at with, and
+the sums. Further vectors stay on the device as far as there is room, those that are used most often first.
 """
 
 from __future__ import annotations
@@ -17,11 +18,16 @@ from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.rounding import Round, Rounding, SlicedRounding
 from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
-from potr_cl.stages.refitting.sliced_coefficients import OPERANDS, SlicedCoefficients
+from potr_cl.stages.refitting.sliced_coefficients import SlicedCoefficients
 from potr_cl.stages.refitting.vector_space import Layout, Vector, VectorSpace
 
 #: Vectors of a solution: six of the solver and what it was before it was rounded.
 _VECTORS = 7
+#: Vectors that lie on the device in any case, and at most: beyond, the blocks are most of what travels.
+_FEWEST, _MOST = 1, 6
+#: With the sums they take no more than this part of a GPU's memory: to take one there again and again costs more than
+#: to prepare views that it leaves no room for; and of the host's, where a CPU computes: there it is the other way.
+_OF_VECTORS, _OF_HOST = 0.8, 0.5
 #: What a sweep has besides for each splat: geometry, the splats of a view as they are projected, and its sums.
 _SWEEP = 68 + 32 + 16 + 16 + 32 + 8
 #: The vectors lie on the device if they take no more than this part of what is free, or of the memory that is given.
@@ -30,7 +36,9 @@ _OF_FREE, _OF_GIVEN = 0.75, 0.5
 _ANYWAY = 256e6
 #: Of the memory, what a slice may take, and the integers of blocks that are on the device at a time.
 _SLICE, _BLOCKS = 1 / 32, 1 / 5
-_LEAST_SLICE, _MOST_SLICE = 1 << 12, 1 << 18
+_LEAST_SLICE, _MOST_SLICE = 1 << 14, 1 << 18
+#: For the blocks, all views are looked at so many times at most.
+_MOST_RANGES = 8
 
 
 @dataclass(frozen=True)
@@ -41,11 +49,13 @@ class Place:
         slice: splats whose coefficients go through the device together.
         blocks: splats whose blocks are added up together.
         views: bytes that prepared views and targets may take.
+        resident: vectors that lie on the device.
     """
 
     slice: int
     blocks: int
     views: int
+    resident: int = _FEWEST
 
 
 def placed(device: Device, splats: int, sh_count: int, memory: int | None, slices: int | None = None) -> Place | None:
@@ -59,7 +69,7 @@ def placed(device: Device, splats: int, sh_count: int, memory: int | None, slice
         slices: splats of a slice, if the vectors are to lie on the host in any case.
     """
     vector, triangle = 12 * sh_count, sh_count * (sh_count + 1) // 2
-    one_piece = splats * (_VECTORS * vector + 2 * vector + 12 * triangle)
+    one_piece = _one_piece(splats, sh_count)
     free = max(device.info.memory - device.allocated, 0)
     fits = one_piece <= max(_OF_FREE * free if memory is None else min(_OF_GIVEN * memory, _OF_FREE * free), _ANYWAY)
     if slices is None and fits:
@@ -67,10 +77,29 @@ def placed(device: Device, splats: int, sh_count: int, memory: int | None, slice
     total = free if memory is None else min(memory, free)
     of_slice = 2 * vector + 4 * triangle + 8
     some = slices or min(max(int(_SLICE * total / of_slice), _LEAST_SLICE), _MOST_SLICE)
-    blocks = slices or max(int(_BLOCKS * total / (8 * triangle)), 1)
-    resident = splats * ((OPERANDS + 2) * vector + _SWEEP)
-    besides = some * of_slice + 8 * triangle * min(blocks, splats)
-    return Place(some, blocks, max(int(total - resident - besides), 0))
+    blocks = slices or max(int(_BLOCKS * total / (8 * triangle)), -(-splats // _MOST_RANGES))
+    # A place for a vector that views are looked at with, the sums, and some vectors.
+    of_host = device.info.kind == "cpu" or device.info.integrated
+    room = int(((_OF_HOST if of_host else _OF_VECTORS) * total / max(splats, 1) - _SWEEP) / vector) - 3
+    resident = min(max(room, _FEWEST), _MOST) if slices is None else _FEWEST
+    besides = splats * ((3 + resident) * vector + _SWEEP) + some * of_slice + 8 * triangle * min(blocks, splats)
+    return Place(some, blocks, max(int(total - besides), 0), resident)
+
+
+def left_for_views(splats: int, sh_count: int, memory: int | None) -> int | None:
+    """Bytes of the device's memory that views may take, where the vectors lie there in one piece.
+
+    Args:
+        splats, sh_count, memory: as of :func:`placed`, which found that they fit.
+    """
+    one_piece = _one_piece(splats, sh_count)
+    return memory if memory is None or one_piece <= _ANYWAY else max(memory - one_piece, 0)
+
+
+def _one_piece(splats: int, sh_count: int) -> int:
+    """Bytes of all vectors, sums and blocks."""
+    vector, triangle = 12 * sh_count, sh_count * (sh_count + 1) // 2
+    return splats * (_VECTORS * vector + 2 * vector + 12 * triangle)
 
 
 def vectors_of(device: Device, layout: Layout, place: Place | None) -> VectorSpace:
@@ -80,7 +109,11 @@ def vectors_of(device: Device, layout: Layout, place: Place | None) -> VectorSpa
         PotrError: the host has no room for them.
         DeviceError: the device has none.
     """
-    return Coefficients(device, layout) if place is None else SlicedCoefficients(device, layout, place.slice)
+    return (
+        Coefficients(device, layout)
+        if place is None
+        else SlicedCoefficients(device, layout, place.slice, place.resident)
+    )
 
 
 def blocks_of(vectors: VectorSpace, place: Place | None) -> SplatBlocks | SlicedBlocks:

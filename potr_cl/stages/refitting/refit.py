@@ -34,7 +34,7 @@ from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
-from potr_cl.stages.refitting.placement import blocks_of, placed, rounding_of, vectors_of
+from potr_cl.stages.refitting.placement import blocks_of, left_for_views, placed, rounding_of, vectors_of
 from potr_cl.stages.refitting.rounding import ROUNDS
 from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
@@ -271,8 +271,8 @@ class ColourRefit(Owner):
         scene: whose geometry, opacities and SH degree are used.
         cameras: the views that count, all the same whatever their size.
         rules, background: of the rasterizer.
-        memory: bytes of device memory that prepared views and targets may take; None: a quarter of what is free. Where
-            the vectors do not fit, of all that the re-fit takes.
+        memory: bytes of device memory that prepared views and targets may take, together with the vectors where these
+            take much; None: views take a quarter of what is free.
         help_from: workers that do some of the views.
         slices: as of :class:`RefitOptions`.
 
@@ -314,7 +314,10 @@ class ColourRefit(Owner):
             layout = Layout(len(scene), rasterizer.stride, scene.sh.shape[1], launcher.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             place = placed(device, layout.splats, layout.sh_count, memory, slices) if others is None else None
-            memory = memory if place is None else place.views
+            if place is not None:
+                memory = place.views
+            elif others is None:
+                memory = left_for_views(layout.splats, layout.sh_count, memory)
             self.coefficients = owned.enter_context(vectors_of(device, layout, place))
             blocks = blocks_of(self.coefficients, place)
             owned.callback(blocks.close)

@@ -26,7 +26,7 @@ from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
-from potr_cl.stages.refitting.sliced_coefficients import HostColumns, SlicedCoefficients
+from potr_cl.stages.refitting.sliced_coefficients import AnyVector, SlicedCoefficients
 
 _SOURCE = "refit/rounding.cl"
 #: Splats are due in so many turns: every fourth one in the order of the file in turn 0, the next ones in turn 1, …
@@ -158,7 +158,7 @@ class SlicedRounding:
         self._coefficients = coefficients
         self._steps = Steps.of(grid, coefficients.layout.stride)
 
-    def round(self, x: HostColumns, blocks: SlicedBlocks, this: Round, worth: float) -> None:
+    def round(self, x: AnyVector, blocks: SlicedBlocks, this: Round, worth: float) -> None:
         """See :meth:`Rounding.round`."""
         own = self._coefficients.own
 

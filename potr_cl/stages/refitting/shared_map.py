@@ -47,9 +47,9 @@ class SharedViews(Owner):
 
     def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
         """Have them begin with a gradient at x."""
+        flags = self._packing.lend_flags() if self._in_process else self._packing.flags()
+        self._pending = self._others.begin("gradient", self._sent(x), flags, blocks, constant, anew=True)
         self._packing.take_flags()
-        given = (self._packing.flags, blocks, constant)
-        self._pending = self._others.begin("gradient", self._sent(x), *given, anew=True)
 
     def _sent(self, x: cl.Buffer) -> Lent | FloatArray:
         layout = self._coefficients.layout

@@ -9,7 +9,7 @@ from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
 from potr_cl.stages.refitting.blocks import SplatBlocks
-from potr_cl.stages.refitting.sliced_coefficients import HostColumns, SlicedCoefficients
+from potr_cl.stages.refitting.sliced_coefficients import AnyVector, HostColumns, SlicedCoefficients
 from potr_cl.stages.refitting.vector_space import Ridge
 
 
@@ -34,6 +34,10 @@ class SlicedBlocks(Owner):
         self._splats = min(max(splats // SPLAT_GROUP, 1) * SPLAT_GROUP, layout.stride)
         self._triangle = layout.sh_count * (layout.sh_count + 1) // 2
         self._columns: HostColumns = coefficients.columns(self._triangle, "the splats' normal equations")
+        self._columns.changed()
+        #: Where ranges begin whose blocks are 0, whatever is written there.
+        self._unset: set[int] = set()
+        self.zero()
         self.own = SplatBlocks(coefficients.own)
 
     @property
@@ -44,28 +48,41 @@ class SlicedBlocks(Owner):
 
     def zero(self) -> None:
         """Have all blocks 0."""
-        self._coefficients.zero(self._columns)
-        self._columns.values[:] = 0
+        self._unset = {splats.start for splats in self.ranges}
 
     def add_fixed(self, splats: range, sums: cl.Buffer, unit: float) -> None:
         """See :meth:`potr_cl.stages.refitting.blocks.SplatBlocks.add_fixed`."""
         device, values = self._coefficients.device, self._columns.values
+        first = splats.start in self._unset
         with Memory(device) as memory:
             column = memory.allocate(4 * len(splats), "the splats' normal equations")
             for row in range(self._triangle):
                 own = values[row, splats.start : splats.stop]
                 with device.errors("failed while computing"):
-                    cl.enqueue_copy(device.queue, column, own, is_blocking=True)
+                    if first:
+                        self._coefficients.clear(column)
+                    else:
+                        cl.enqueue_copy(device.queue, column, own, is_blocking=True)
                     self._coefficients.own.add_fixed_some(column, sums, row * len(splats), len(splats), unit)
                     cl.enqueue_copy(device.queue, own, column, is_blocking=True)
-        self._columns.changed()
+        self._unset.discard(splats.start)
+
+    def _values(self) -> FloatArray:
+        """(M (M + 1) / 2, N) float32, the blocks, where they lie."""
+        for splats in self.ranges:
+            if splats.start in self._unset:
+                self._columns.values[:, splats.start : splats.stop] = 0
+        self._unset.clear()
+        return self._columns.values[:, : self._coefficients.layout.splats]
 
     def give(self, part: range) -> SplatBlocks:
         """A slice's blocks, on the device: valid until the next call."""
+        if self._unset:
+            self._values()
         self._coefficients.copy_part(self._columns, part, self.own.buffer)
         return self.own
 
-    def precondition(self, residual: HostColumns, ridge: Ridge, result: HostColumns) -> None:
+    def precondition(self, residual: AnyVector, ridge: Ridge, result: AnyVector) -> None:
         """See :meth:`potr_cl.stages.refitting.blocks.SplatBlocks.precondition`."""
         vectors = self._coefficients
         for part in vectors.parts():
@@ -73,15 +90,17 @@ class SlicedBlocks(Owner):
             some, found = vectors.give(residual, part, 0), vectors.place(1)
             self.give(part).precondition(some, ridge, found)
             vectors.take(result, part, found)
-        result.changed()
+        if isinstance(result, HostColumns):
+            result.changed()
 
-    def give_up(self, x: HostColumns, prior: float, least: float) -> None:
+    def give_up(self, x: AnyVector, prior: float, least: float) -> None:
         """See :meth:`potr_cl.stages.refitting.blocks.SplatBlocks.give_up`."""
         self._coefficients.each(x, lambda part, some: self.give(part).give_up(some, prior, least))
 
     def packed(self) -> FloatArray:
         """(M (M + 1) / 2, N) float32, the upper triangles row by row."""
-        return self._columns.values[:, : self._coefficients.layout.splats].copy()
+        packed: FloatArray = self._values().copy()
+        return packed
 
     def read(self) -> FloatArray:
         """(N, M, M) float32, symmetric."""
@@ -95,11 +114,12 @@ class SlicedBlocks(Owner):
         """(N, M) float32, what stands on the blocks' diagonals."""
         rows, columns = np.triu_indices(self._coefficients.layout.sh_count)
         places = np.flatnonzero(rows == columns)
-        return np.ascontiguousarray(self._columns.values[places, : self._coefficients.layout.splats].T)
+        return np.ascontiguousarray(self._values()[places].T)
 
     def constants(self) -> FloatArray:
         """(N,) float32, what stands on the blocks' diagonals for the constant coefficient."""
-        return self._columns.values[0, : self._coefficients.layout.splats].copy()
+        constants: FloatArray = self._values()[0].copy()
+        return constants
 
     def close(self) -> None:
         """Give the device's memory back."""

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import pyopencl as cl
@@ -25,10 +25,10 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
 from potr_cl.stages.refitting.coefficients import DOT_ITEMS, Coefficients
-from potr_cl.stages.refitting.vector_space import Layout, Ridge, VectorSpace
+from potr_cl.stages.refitting.vector_space import RARELY, Layout, Ridge, VectorSpace
 
 #: Vectors of which a slice is on the device at a time, and vectors that are there whole to be read.
-_SLICES, OPERANDS = 2, 2
+_SLICES, _OPERANDS = 2, 2
 
 
 @dataclass
@@ -51,13 +51,18 @@ class HostColumns:
         self.changes += 1
 
 
+#: A vector on the host, or one on the device.
+AnyVector: TypeAlias = "HostColumns | cl.Buffer"
+
+
 class SlicedCoefficients(VectorSpace):
-    """A :class:`potr_cl.stages.refitting.vector_space.VectorSpace` whose vectors are :class:`HostColumns`.
+    """A :class:`potr_cl.stages.refitting.vector_space.VectorSpace` whose vectors are mostly :class:`HostColumns`.
 
     Args:
         device: to compute on.
         layout: of the vectors.
         splats: of a slice.
+        resident: vectors of a lower rank than this lie on the device.
 
     Attributes:
         own: the slice's vectors and flags on the device.
@@ -67,15 +72,16 @@ class SlicedCoefficients(VectorSpace):
         DeviceError: the device has no room for a slice, or the kernels cannot be built.
     """
 
-    def __init__(self, device: Device, layout: Layout, splats: int) -> None:
+    def __init__(self, device: Device, layout: Layout, splats: int, resident: int = 0) -> None:
         super().__init__(device, layout)
         self._splats = min(-(-splats // SPLAT_GROUP) * SPLAT_GROUP, layout.stride)
         #: Values of a piece of a vector; the sums of a dot product go on after a multiple of their items.
         self._piece = -(-self._splats * layout.columns // DOT_ITEMS) * DOT_ITEMS
+        self._resident = resident
         self._words = np.zeros((2, layout.stride), np.uint32)
         self._memory = Memory(device)
-        self._operands: list[cl.Buffer | None] = [None] * OPERANDS
-        self._held: list[tuple[HostColumns, int] | None] = [None] * OPERANDS
+        self._operands: list[cl.Buffer | None] = [None] * _OPERANDS
+        self._held: list[tuple[HostColumns, int] | None] = [None] * _OPERANDS
         with device.all_or_nothing():
             self.own = Coefficients(device, Layout(self._splats, self._splats, layout.sh_count, layout.lanes))
             self._slices = [self._memory.allocate(4 * self._piece, "the SH coefficients") for _ in range(_SLICES)]
@@ -87,66 +93,86 @@ class SlicedCoefficients(VectorSpace):
         """So many new columns that stand for zeros."""
         return HostColumns(mapped.array((number, self.layout.stride), np.float32, what))
 
-    def vector(self) -> HostColumns:
-        """A new vector."""
+    def vector(self, rank: int = RARELY) -> HostColumns | cl.Buffer:
+        """See :meth:`VectorSpace.vector`. Those that are used most often lie on the device after all."""
+        if rank < self._resident:
+            return self._memory.allocate(4 * self.length, "the SH coefficients")
         return self.columns(self.layout.columns, "SH coefficients")
 
-    def zero(self, x: HostColumns) -> None:
+    def zero(self, x: AnyVector) -> None:
         """x = 0."""
-        x.changed()
-        x.zero = True
+        if isinstance(x, HostColumns):
+            x.changed()
+            x.zero = True
+        else:
+            self.clear(x)
 
-    def copy(self, y: HostColumns, x: HostColumns) -> None:
+    def copy(self, y: AnyVector, x: AnyVector) -> None:
         """y = x."""
-        y.changed()
-        y.zero = x.zero
-        if not x.zero:
-            np.copyto(y.values, x.values)
+        if isinstance(y, HostColumns) and isinstance(x, HostColumns):
+            y.changed()
+            y.zero = x.zero
+            if not x.zero:
+                np.copyto(y.values, x.values)
+            return
+        for first, count in self._pieces():
+            some = self._piece_of(x, 0, first, count)
+            if isinstance(y, HostColumns):
+                self._take_piece(y, some, first, count)
+            else:
+                cl.enqueue_copy(self.device.queue, y, some, byte_count=4 * count, dst_offset=4 * first)
+        _changed(y)
 
-    def combine(self, a: float, y: HostColumns, b: float, x: HostColumns) -> None:
+    def combine(self, a: float, y: AnyVector, b: float, x: AnyVector) -> None:
         """y = a y + b x."""
         for first, count in self._pieces():
             some = self._piece_of(y, 0, first, count)
             self.own.combine_some(a, some, b, self._piece_of(x, 1, first, count), count)
             self._take_piece(y, some, first, count)
-        y.changed()
+        _changed(y)
 
-    def dot(self, x: HostColumns, y: HostColumns) -> float:
+    def dot(self, x: AnyVector, y: AnyVector) -> float:
         """x · y; waits for the device. Not finite where single precision overflows."""
         return self._dot(x, y)[0]
 
-    def largest(self, x: HostColumns) -> float:
+    def largest(self, x: AnyVector) -> float:
         """The largest |x_i|; waits for the device."""
         return self._dot(x, x)[1]
 
-    def _dot(self, x: HostColumns, y: HostColumns) -> tuple[float, float]:
+    def _dot(self, x: AnyVector, y: AnyVector) -> tuple[float, float]:
         for first, count in self._pieces():
             one = self._piece_of(x, 0, first, count)
             other = one if y is x else self._piece_of(y, 1, first, count)
             self.own.begin_dot(one, other, count, more=first > 0)
         return self.own.found_dot()
 
-    def add_ridge(self, sums: HostColumns, x: HostColumns, ridge: Ridge) -> None:
+    def add_ridge(self, sums: AnyVector, x: AnyVector, ridge: Ridge) -> None:
         """sums += (lam on AC + prior) x on the active coefficients; the others' sums become 0."""
         for part in self.parts():
             self.give_flags(part)
             some = self.give(sums, part, 0)
             self.own.add_ridge(some, some if x is sums else self.give(x, part, 1), ridge)
             self.take(sums, part, some)
-        sums.changed()
+        _changed(sums)
 
-    def add_fixed(self, x: HostColumns, sums: cl.Buffer, unit: float, constant: bool = False) -> None:
+    def add_fixed(self, x: AnyVector, sums: cl.Buffer, unit: float, constant: bool = False) -> None:
         """See :meth:`VectorSpace.add_fixed`."""
-        for first, count in self._pieces(3 * self.layout.stride if constant and not x.zero else self.length):
+        # Of zeros all are written: they only stand for them.
+        some_do = constant and not (isinstance(x, HostColumns) and x.zero)
+        for first, count in self._pieces(3 * self.layout.stride if some_do else self.length):
             some = self._piece_of(x, 0, first, count)
             self.own.add_fixed_some(some, sums, first, count, unit)
             self._take_piece(x, some, first, count)
-        x.changed()
+        _changed(x)
 
     # ------------------------------------------------------------------------------------------ to and from elsewhere
 
-    def on_device(self, x: HostColumns, place: int = 0) -> cl.Buffer:
+    def on_device(self, x: AnyVector, place: int = 0) -> cl.Buffer:
         """See :meth:`VectorSpace.on_device`. What is there already is not taken there again."""
+        if not isinstance(x, HostColumns):
+            return x
+        # The direction is on the device itself: the other vector may have its place.
+        place = 0 if self._resident else place
         if self._operands[place] is None:
             self._operands[place] = self._memory.allocate(4 * self.length, "the SH coefficients")
         buffer = self._operands[place]
@@ -159,15 +185,15 @@ class SlicedCoefficients(VectorSpace):
             self._held[place] = (x, x.changes)
         return buffer
 
-    def write_sh(self, x: HostColumns, sh: FloatArray) -> None:
+    def write_sh(self, x: AnyVector, sh: FloatArray) -> None:
         """Set a vector from (N, M, 3) R, G, B."""
         for part in self.parts():
             rows = np.ascontiguousarray(sh[part.start : part.stop], np.float32)
             self.own.write_sh(self._slices[0], rows)
             self.take(x, part, self._slices[0])
-        x.changed()
+        _changed(x)
 
-    def read_sh(self, x: HostColumns) -> FloatArray:
+    def read_sh(self, x: AnyVector) -> FloatArray:
         """(N, M, 3) float32, a vector in R, G, B; each coefficient contiguous in memory, which may be a file's."""
         layout = self.layout
         sh = mapped.array((layout.columns, layout.splats), np.float32, "SH coefficients")
@@ -176,19 +202,6 @@ class SlicedCoefficients(VectorSpace):
             self._rectangle(sh, range(part.start, min(part.stop, layout.splats)), self._slices[1], to_device=False)
         return sh.reshape(layout.sh_count, 3, layout.splats).transpose(2, 0, 1)
 
-    def write(self, x: HostColumns, values: NDArray[np.floating]) -> None:
-        """Set a vector from (N, M, 3) in Y, Co, Cg."""
-        x.values[:, self.layout.splats :] = 0
-        x.values[:, : self.layout.splats] = values.reshape(self.layout.splats, -1).T
-        x.changed()
-
-    def read(self, x: HostColumns) -> FloatArray:
-        """(N, M, 3) float32, a vector in Y, Co, Cg."""
-        layout = self.layout
-        if x.zero:
-            return np.zeros((layout.splats, layout.sh_count, 3), np.float32)
-        return np.ascontiguousarray(x.values[:, : layout.splats].T).reshape(layout.splats, layout.sh_count, 3)
-
     # ------------------------------------------------------------------------------------------ slices
 
     def parts(self) -> Iterator[range]:
@@ -196,25 +209,30 @@ class SlicedCoefficients(VectorSpace):
         for first in range(0, self.layout.stride, self._splats):
             yield range(first, min(first + self._splats, self.layout.stride))
 
-    def give(self, columns: HostColumns, part: range, place: int) -> cl.Buffer:
+    def give(self, x: AnyVector, part: range, place: int) -> cl.Buffer:
         """A slice of a vector, on the device: valid until the next call for the place, 0 or 1."""
-        self.copy_part(columns, part, self._slices[place])
+        self.copy_part(x, part, self._slices[place])
         return self._slices[place]
 
     def place(self, number: int) -> cl.Buffer:
         """Where :meth:`give` puts slices."""
         return self._slices[number]
 
-    def copy_part(self, columns: HostColumns, part: range, buffer: cl.Buffer) -> None:
+    def copy_part(self, x: AnyVector, part: range, buffer: cl.Buffer) -> None:
         """A slice of columns to a buffer on the device, of as many columns as a slice has splats."""
-        if columns.zero:
+        if not isinstance(x, HostColumns):
+            self._on_device_rectangle(x, part, buffer, to_slice=True)
+        elif x.zero:
             self.clear(buffer)
         else:
-            self._rectangle(columns.values, part, buffer, to_device=True)
+            self._rectangle(x.values, part, buffer, to_device=True)
 
-    def take(self, columns: HostColumns, part: range, buffer: cl.Buffer) -> None:
+    def take(self, x: AnyVector, part: range, buffer: cl.Buffer) -> None:
         """A slice of columns from the device. The columns are :meth:`HostColumns.changed` when all have come."""
-        self._rectangle(columns.values, part, buffer, to_device=False)
+        if isinstance(x, HostColumns):
+            self._rectangle(x.values, part, buffer, to_device=False)
+        else:
+            self._on_device_rectangle(x, part, buffer, to_slice=False)
 
     def give_flags(self, part: range) -> None:
         """The flags of a slice's splats to the device."""
@@ -226,7 +244,7 @@ class SlicedCoefficients(VectorSpace):
         """The flags of a slice's splats from the device."""
         self._words[:, part.start : part.stop] = self.own.save_flags()[:, : len(part)]
 
-    def each(self, x: HostColumns, work: Callable[[range, cl.Buffer], None]) -> None:
+    def each(self, x: AnyVector, work: Callable[[range, cl.Buffer], None]) -> None:
         """Have work done on the slices of a vector and on their flags.
 
         Args:
@@ -239,7 +257,7 @@ class SlicedCoefficients(VectorSpace):
             work(part, some)
             self.take(x, part, some)
             self.take_flags(part)
-        x.changed()
+        _changed(x)
 
     def _pieces(self, length: int | None = None) -> Iterator[tuple[int, int]]:
         """The first value of each piece of a vector, and how many it has."""
@@ -247,15 +265,18 @@ class SlicedCoefficients(VectorSpace):
         for first in range(0, length, self._piece):
             yield first, min(self._piece, length - first)
 
-    def _piece_of(self, x: HostColumns, place: int, first: int, count: int) -> cl.Buffer:
+    def _piece_of(self, x: AnyVector, place: int, first: int, count: int) -> cl.Buffer:
+        if not isinstance(x, HostColumns):
+            return x.get_sub_region(4 * first, 4 * count)
         if x.zero:
             self.clear(self._slices[place])
         else:
             self._copy(self._slices[place], x.values.reshape(-1)[first : first + count])
         return self._slices[place]
 
-    def _take_piece(self, x: HostColumns, buffer: cl.Buffer, first: int, count: int) -> None:
-        self._copy(x.values.reshape(-1)[first : first + count], buffer)
+    def _take_piece(self, x: AnyVector, buffer: cl.Buffer, first: int, count: int) -> None:
+        if isinstance(x, HostColumns):  # else it was the piece itself
+            self._copy(x.values.reshape(-1)[first : first + count], buffer)
 
     def _copy(self, target: Any, source: Any) -> None:
         with self.device.errors("failed while computing"):
@@ -276,6 +297,21 @@ class SlicedCoefficients(VectorSpace):
                 is_blocking=True,
             )
 
+    def _on_device_rectangle(self, x: cl.Buffer, part: range, buffer: cl.Buffer, to_slice: bool) -> None:
+        """The same between a vector on the device and a slice."""
+        whole, some = ((4 * part.start, 0, 0), (4 * self.layout.stride, 0)), ((0, 0, 0), (4 * self._splats, 0))
+        source, target = (whole, some) if to_slice else (some, whole)
+        with self.device.errors("failed while computing"):
+            cl.enqueue_copy(
+                self.device.queue,
+                *((buffer, x) if to_slice else (x, buffer)),
+                src_origin=source[0],
+                dst_origin=target[0],
+                region=(4 * len(part), self.layout.columns, 1),
+                src_pitches=source[1],
+                dst_pitches=target[1],
+            )
+
     # ------------------------------------------------------------------------------------------ flags
 
     def save_flags(self) -> NDArray[np.uint32]:
@@ -288,7 +324,12 @@ class SlicedCoefficients(VectorSpace):
 
     def close(self) -> None:
         """Give all device memory back; the vectors' files go with the vectors."""
-        self._held = [None] * OPERANDS
-        self._operands = [None] * OPERANDS
+        self._held = [None] * _OPERANDS
+        self._operands = [None] * _OPERANDS
         self.own.close()
         self._memory.close()
+
+
+def _changed(x: AnyVector) -> None:
+    if isinstance(x, HostColumns):
+        x.changed()

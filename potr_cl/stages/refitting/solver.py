@@ -135,7 +135,8 @@ class ColourSolver:
 
     def __init__(self, coefficients: VectorSpace, blocks: SplatBlocks | SlicedBlocks) -> None:
         self._coefficients = coefficients
-        self.x, self._start, self._residual = (coefficients.vector() for _ in range(3))
+        # Conjugate gradients have the ranks between.
+        self.x, self._start, self._residual = (coefficients.vector(rank) for rank in (4, 5, 2))
         self._gradients = ConjugateGradients(coefficients)
         self.blocks = blocks
 

@@ -87,6 +87,10 @@ class Ridge:
         }
 
 
+#: The rank of vectors that are used rarely.
+RARELY = 100
+
+
 class VectorSpace(Owner):
     """The vectors of one scene's coefficients in Y, Co, Cg, and the flags of those that may change.
 
@@ -113,8 +117,12 @@ class VectorSpace(Owner):
     # ------------------------------------------------------------------------------------------ vectors
 
     @abstractmethod
-    def vector(self) -> Vector:
-        """A new vector, not set; it is given back with the others by :meth:`close`."""
+    def vector(self, rank: int = RARELY) -> Vector:
+        """A new vector, not set; it is given back with the others by :meth:`close`.
+
+        Args:
+            rank: the lower, the more often it is used: where there is no room for all on the device, it comes first.
+        """
 
     @abstractmethod
     def zero(self, x: Vector) -> None:
@@ -174,19 +182,6 @@ class VectorSpace(Owner):
     @abstractmethod
     def read_sh(self, x: Vector) -> FloatArray:
         """(N, M, 3) float32, a vector in R, G, B; each coefficient contiguous in memory."""
-
-    @abstractmethod
-    def write(self, x: Vector, values: NDArray[np.floating]) -> None:
-        """Set a vector.
-
-        Args:
-            x: the vector.
-            values: (N, M, 3) in Y, Co, Cg.
-        """
-
-    @abstractmethod
-    def read(self, x: Vector) -> FloatArray:
-        """(N, M, 3) float32, a vector in Y, Co, Cg."""
 
     # ------------------------------------------------------------------------------------------ which may change
 

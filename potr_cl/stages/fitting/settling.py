@@ -1,0 +1,140 @@
+"""What a file does to a fitted scene, done step by step, and what is left fitted once more in between: :func:`settle`.
+
+A file gives up most AC coefficients and rounds all the rest. Done at once, that costs as much again as removed splats
+do. Here it comes one kind after the other, and what may still move makes up for it:
+
+1. AC coefficients are chosen as the re-fit of the colours does; all but them moves on.
+2. Scales and rotations are rounded to the file's steps; centres, opacities and constant colours move on.
+3. Centres are rounded; opacities and constant colours move on.
+
+The re-fit then solves for the colours, on just this geometry. Held-out views watch over every step of it: a fit that
+does not help them is not taken.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from potr_cl.codec.geometry import Geometry
+from potr_cl.host.threads import thread_pool
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.fitting.adam import Rates
+from potr_cl.stages.fitting.fit import FitOptions, SupportsBool, fit_scene
+from potr_cl.stages.fitting.pictures import TargetPictures
+from potr_cl.stages.fitting.views import share_out
+from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
+from potr_cl.stages.refitting.targets import RenderedTargets, Targets
+from potr_cl.stages.stage import State, Workbench
+
+#: Steps of the solution that coefficients are chosen by; the last solution, of the re-fit, takes more.
+_CHOICE_STEPS = 4
+
+
+@dataclass(frozen=True)
+class Settling:
+    """How far what is left is fitted once more.
+
+    Attributes:
+        choosing, rounding: steps after coefficients have been chosen, and after each of the two roundings, as parts of
+            those of the fit. 0: that is left to the re-fit and the coder.
+        start: part of the fit's first rates that these fits begin with.
+        last: part of these that is left at the end of each.
+    """
+
+    choosing: float
+    rounding: float
+    start: float
+    last: float = 0.1
+
+
+@dataclass(frozen=True)
+class Looking:
+    """What these fits look at.
+
+    Attributes:
+        views: of the fit; the last ``added`` of them are not given ones. added: see there.
+        targets: what these should show.
+        rasterizer: of the scene that they show.
+    """
+
+    views: Sequence[Camera]
+    added: int
+    targets: Targets | TargetPictures
+    rasterizer: Rasterizer
+
+
+def settle(
+    state: State,
+    bench: Workbench,
+    looking: Looking,
+    settling: Settling,
+    options: FitOptions,
+    asked: SupportsBool = False,
+    progress: Callable[[int], None] = lambda steps: None,
+) -> tuple[State, tuple[float, ...]]:
+    """Choose coefficients and round geometry, with fits in between.
+
+    Args:
+        state: that was fitted; its views are those that the file is made for.
+        bench: of the stage.
+        looking: what the fits look at.
+        settling: how far they go.
+        options: of the fit before.
+        asked: whether to end early: nothing more is fitted then.
+        progress: called with the number of steps that a fit has taken.
+
+    Returns:
+        The state: its ``scene`` is not rounded yet, so that other steps can be tried with it. Its ``geometry`` is, for
+        the steps of now, if the output is a .potr file in one block: only that can keep some kinds rounded while others
+        move. And the mean squared error of the held-out views after each fit.
+
+    Raises:
+        DeviceError: it does not fit the device.
+    """
+    errors: list[float] = []
+
+    def fitted(scene: Scene, part: float, still: Sequence[str]) -> Scene:
+        steps = max(round(part * options.steps), 1)
+        rates: Rates = dataclasses.replace(options.rates, **dict.fromkeys(still, 0.0))
+        more = dataclasses.replace(
+            options, steps=steps, rounds=3, rates=rates, start=settling.start, last=settling.last, patience=3
+        )
+        found = fit_scene(
+            bench.opened, scene, looking.views, looking.targets, more, looking.added, bench.background,
+            tell=bench.tell, asked=asked,
+        )  # fmt: skip
+        errors.append(found.error)
+        progress(steps)
+        return found.scene
+
+    still = ["ac"]
+    if settling.choosing and bench.parameters.drop and "compact" not in state.learnt:
+        scene = fitted(_with_chosen(state, bench, looking), settling.choosing, still)
+        state = dataclasses.replace(state, scene=scene, geometry=None)
+    rounded = bench.output.geometry(state.scene, bench.request(state)) if settling.rounding else None
+    if not isinstance(rounded, Geometry):
+        return state, tuple(errors)
+    still += ["log_scales", "quaternions"]
+    decoded = rounded.decoded(state.scene.sh)
+    scene = dataclasses.replace(decoded, means=state.scene.means, opacity_logits=state.scene.opacity_logits)
+    scene = fitted(scene, settling.rounding, still)
+    with thread_pool(bench.threads) as pool:
+        rounded = rounded.with_centres_of(scene.means, state.views, pool.map)
+    scene = dataclasses.replace(rounded.decoded(scene.sh), opacity_logits=scene.opacity_logits)
+    scene = fitted(scene, settling.rounding, [*still, "means"])
+    then = dataclasses.replace(state.recoloured(scene.sh), geometry=rounded.with_opacities_of(scene.opacity_logits))
+    return then, tuple(errors)
+
+
+def _with_chosen(state: State, bench: Workbench, looking: Looking) -> Scene:
+    """The scene with the AC coefficients that are worth their bytes, solved for without a look at held-out views."""
+    _, held_out = share_out(len(looking.views) - looking.added, looking.added)
+    views = [view for number, view in enumerate(state.views) if number not in held_out]  # given ones come first in both
+    options = RefitOptions(steps=_CHOICE_STEPS, drop=bench.parameters.drop, memory=bench.memory)
+    targets = RenderedTargets(looking.rasterizer, views)
+    refitted = refit_colours(bench.opened, state.scene, views, targets, options, background=bench.background)
+    return dataclasses.replace(state.scene, sh=refitted.sh)

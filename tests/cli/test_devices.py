@@ -1,0 +1,72 @@
+"""The command devices, and how a device is chosen."""
+
+from __future__ import annotations
+
+import json
+
+import pytest
+
+from potr_cl import cli
+from potr_cl.errors import DeviceError
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DEVICE_VARIABLE, compiler_fault, list_devices
+from tests.cli.calls import fails, run
+
+
+def test_devices(capsys):
+    report = json.loads(run(capsys, "devices", "--json"))
+    assert [entry["index"] for entry in report] == list(range(len(list_devices())))
+    assert [entry["name"] for entry in report if entry["chosen"]] == [Device().info.name]
+    lines = [line for line in run(capsys, "devices").splitlines() if "cannot compile anything: " not in line]
+    assert len(lines) == 1 + len(report)
+    assert [line.startswith("*") for line in lines[1:]] == [entry["chosen"] for entry in report]
+
+
+def test_devices_check(capsys, monkeypatch):
+    """What can compile computes right on this machine; what cannot is passed over, and only marked."""
+    assert cli.main(["devices", "--check", "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert [entry["check"] == "passed" for entry in report] == [entry["fault"] is None for entry in report]
+
+    def broken(self):
+        raise DeviceError("1 + 1 is 3")
+
+    monkeypatch.setattr(Device, "self_check", broken)
+    assert cli.main(["devices", "--check"]) == 1
+    captured = capsys.readouterr()
+    assert "\n*!" in captured.out
+    assert "self-check: 1 + 1 is 3" in captured.out
+    assert captured.err.startswith("potr-cl: ")
+    assert captured.err.endswith("none works\n")
+
+
+@pytest.mark.parametrize(
+    ("checks", "code", "said"),
+    [
+        (["passed", "wrong"], 0, ""),
+        (["wrong", "passed"], 1, "choose another with --device: 1"),
+        (["wrong", "wrong"], 1, "none works"),
+    ],
+)
+def test_devices_check_fails_if_the_one_to_be_taken_does(capsys, monkeypatch, checks, code, said):
+    entry = json.loads(run(capsys, "devices", "--json"))[0] | {"fault": None}
+    entries = [entry | {"index": i, "chosen": i == 0, "check": check} for i, check in enumerate(checks)]
+    monkeypatch.setattr("potr_cl.cli.devices.device_report", lambda check: entries)
+    assert cli.main(["devices", "--check"]) == code
+    captured = capsys.readouterr()
+    assert said in captured.err
+    marks = [line[:2].strip() for line in captured.out.splitlines() if line[2:3].isdigit()]
+    assert marks == [("*" if i == 0 else "") + ("" if check == "passed" else "!") for i, check in enumerate(checks)]
+
+
+def test_no_device(capsys, monkeypatch):
+    monkeypatch.setattr("potr_cl.opencl.discovery.list_devices", list)
+    fails(capsys, ["devices"], 1, "no OpenCL device found")
+
+
+def test_device_by_environment(tmp_path, scene_path, cameras_path, capsys, monkeypatch):
+    render = ["render", scene_path, "--cameras", cameras_path, "--views", "0", "-o", tmp_path / "out"]
+    monkeypatch.setenv(DEVICE_VARIABLE, "no such thing")
+    fails(capsys, render, 1, "'no such thing'")
+    able = next(info for info in list_devices() if compiler_fault(info) is None)
+    assert able.name in run(capsys, *render, "--device", able.index)

@@ -1,0 +1,264 @@
+"""The command encode, and what decode and info make of its files."""
+
+from __future__ import annotations
+
+import json
+import re
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from potr_cl import cli
+from potr_cl.errors import DeviceError
+from potr_cl.formats import load_scene
+from potr_cl.formats.scenes import ply
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.amounts import size_in_bytes
+from potr_cl.reference.scenes import random_scene
+from tests.cli.calls import KEEP, cameras_json, fails, run
+
+
+def test_encode_decode_info(tmp_path, scene_path, capsys):
+    potr, back = tmp_path / "a.potr", tmp_path / "back.ply"
+    cameras = cameras_json(tmp_path / "cameras.json")
+    arguments = ["encode", scene_path, "-o", potr, "-q", "0.7", "--cameras", cameras, *KEEP]
+    assert cli.main([str(a) for a in arguments]) == 0
+    assert "200 of 200" in capsys.readouterr().out
+    assert cli.main(["decode", str(potr), "-o", str(back)]) == 0
+    assert len(ply.load(back)) == 200
+    capsys.readouterr()
+    assert cli.main(["info", str(potr), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["splats"], report["sh_degree"], report["q"]) == (200, 2, 0.7)
+    assert sum(s["bytes"] for s in report["sections"].values()) == report["bytes"] == potr.stat().st_size
+    assert report["source_bytes"] == scene_path.stat().st_size
+    assert report["ply_bytes"] == pytest.approx(back.stat().st_size, rel=0.05)
+    assert cli.main(["info", str(potr)]) == 0
+    text = capsys.readouterr().out
+    assert "colour: AC degree 2" in text
+    assert "rotation" in text
+
+
+def test_encode_tells_what_it_did(tmp_path, scene_path, capsys):
+    potr, cameras = tmp_path / "a.potr", cameras_json(tmp_path / "cameras.json")
+    encode = ["encode", scene_path, "-o", potr, "--cameras", cameras, "--iterations", "3", "--count", "90"]
+    encode += ["--preset", "paper"]
+    report = json.loads(run(capsys, *encode, "--json"))
+    assert (report["bytes"], report["source"]["bytes"]) == (potr.stat().st_size, scene_path.stat().st_size)
+    assert report["ratio"] == report["source"]["bytes"] / report["bytes"]
+    assert (report["splats"], report["source"]["splats"]) == (90, 200)
+    assert sum(report["properties"].values()) == report["bytes"]
+    assert report["pruning"]["history"][-1]["left"] == 90
+    stages = ["prepare views", "prune", "compact", "octree", "quantise and code", "evaluate", "total"]
+    assert list(report["seconds"]) == stages
+    assert sum(report["seconds"][stage] for stage in stages[:-1]) <= report["seconds"]["total"]
+    assert report["device"]["name"] == Device().info.name
+
+    judged = json.loads(run(capsys, "compare", scene_path, potr, "--cameras", cameras, "--json"))
+    quality = report["quality"]
+    assert quality["kind"] == "test"
+    assert quality["psnr"] == pytest.approx(judged["mean"]["b_against_a"]["psnr"])
+    assert quality["ssim"] == pytest.approx(judged["mean"]["b_against_a"]["ssim"])
+    assert quality["worst"]["name"] == judged["worst_view"]
+    assert [view["name"] for view in quality["views"]] == ["view_0", "view_4"]
+
+    text = run(capsys, *encode)
+    for part in (f"{report['bytes']:,} bytes", "90 of 200", f"PSNR {quality['psnr']:.2f} dB", "colour: AC", "compact"):
+        assert part in text
+    assert f"worst view {quality['worst']['name']}" in text
+    assert "not judged, as asked" in run(capsys, *encode, "--no-quality")
+    assert "evaluate" not in json.loads(run(capsys, *encode, "--no-quality", "--json"))["seconds"]
+
+
+def test_encode_to_a_size(tmp_path, excerpt, capsys):
+    potr = tmp_path / "a.potr"
+    report = json.loads(run(capsys, *excerpt, "-o", potr, "--max-size", "20 kB", "--json"))
+    assert 19_600 <= potr.stat().st_size == report["bytes"] <= 20_000
+    assert report["search"]["target"] == "at most 20,000 bytes"
+    assert report["search"]["max_bytes"] == 20_000
+    assert report["search"]["tries"][-1]["value"] == report["bytes"]
+    assert report["search"]["reached"] == f"{report['bytes']:,} bytes"
+    assert "asked for  at most 20,480 bytes; reached" in run(capsys, *excerpt, "-o", potr, "--max-size", "20KiB")
+
+
+def test_encode_to_a_psnr(tmp_path, excerpt, capsys):
+    report = json.loads(run(capsys, *excerpt, "-o", tmp_path / "a.potr", "--min-psnr", "43", "--json"))
+    assert 43 <= report["quality"]["psnr"] <= 43.1
+
+
+def test_encode_to_the_impossible(tmp_path, excerpt, capsys):
+    potr = tmp_path / "a.potr"
+    fails(
+        capsys, [*excerpt, "-o", potr, "--max-size", "1k"], 1, "at most 1,000 bytes cannot be reached: quality 0 gives"
+    )
+    fails(capsys, [*excerpt, "-o", potr, "--min-psnr", "99"], 1, "at least 99 dB cannot be reached", "quality 1 gives")
+    for size in ("8 bananas", "", "-5", "1e", "0.1", "1.2.3M"):
+        fails(capsys, [*excerpt, "-o", potr, f"--max-size={size}"], 2)
+    fails(capsys, [*excerpt, "-o", potr, "--min-psnr", "-3"], 2, "-3 dB")
+    assert list(tmp_path.iterdir()) == []
+    with pytest.raises(SystemExit) as exit_:
+        cli.main([str(a) for a in [*excerpt, "-o", potr, "--max-size", "1M", "-q", "0.2"]])
+    assert exit_.value.code == 2
+    capsys.readouterr()
+
+
+@pytest.mark.parametrize(
+    ("text", "size"),
+    [
+        ("1234567", 1_234_567),
+        ("8MB", 8_000_000),
+        ("8 MiB", 8 << 20),
+        ("800k", 800_000),
+        ("1.5e6", 1_500_000),
+        ("2 gib", 2 << 30),
+        ("0.5GB", 500_000_000),
+        ("12_000 B", 12_000),
+        ("3Ki", 3072),
+    ],
+)
+def test_sizes_as_people_write_them(text, size):
+    assert size_in_bytes(text) == size
+
+
+def test_encode_report_page(tmp_path, excerpt, capsys):
+    page = tmp_path / "page.html"
+    encode = [*excerpt, "-o", tmp_path / "a.potr"]
+    report = json.loads(run(capsys, *encode, "--report", page, "--report-view", "20240212_003919", "--json"))
+    text = page.read_text()
+    assert f"worst view: {report['quality']['worst']['name']}" in text
+    assert "chosen view: 20240212_003919" in text
+    assert text.count("<img") == 9
+    run(capsys, *encode, "--report", page, "--no-quality")
+    assert "not judged, as asked" in page.read_text()
+    page.unlink()
+    fails(capsys, [*encode, "--report", page, "--report-view", "nobody"], 2, "no view 'nobody'", "'20240212_003919'")
+    fails(capsys, [*encode, "--report-view", "20240212_003919"], 2, "--report")
+    fails(capsys, [*encode, "--report", tmp_path / "a.potr"], 2, "name the same file")
+    fails(capsys, [*encode, "--report", tmp_path / "nowhere" / "page.html"], 2, "does not exist")
+    assert [path.name for path in tmp_path.iterdir()] == ["a.potr"]
+
+
+def test_encode_judges_by_training_views_if_there_are_no_others(tmp_path, scene_path, capsys):
+    path = cameras_json(tmp_path / "cameras.json")
+    path.write_text(json.dumps([view for view in json.loads(path.read_text()) if view["split"] == "train"]))
+    text = run(capsys, "encode", scene_path, "-o", tmp_path / "a.potr", "--cameras", path, "--iterations", "2")
+    assert "all 6 training views, for the cameras name no test views" in text
+
+
+def test_a_device_that_fails_while_judging_leaves_the_file(tmp_path, scene_path, capsys, monkeypatch):
+    potr, cameras = tmp_path / "a.potr", cameras_json(tmp_path / "cameras.json")
+
+    def fail(*_args):
+        raise DeviceError("device 'X' vanished")
+
+    monkeypatch.setattr("potr_cl.api.encoding.Evaluator", fail)
+    text = run(capsys, "encode", scene_path, "-o", potr, "--cameras", cameras, "--iterations", "2")
+    assert "not judged: device 'X' vanished" in text
+    assert load_scene(potr)
+
+
+def test_every_parameter_can_be_set(tmp_path, scene_path, capsys):
+    potr = tmp_path / "a.potr"
+    options = {
+        "--gamma": 0.01,
+        "--beta": 0.001,
+        "--sf-sh": 20,
+        "--sf-opacity": 30,
+        "--sf-rotation": 40,
+        "--sf-scale": 50,
+    }
+    flat = [str(x) for pair in options.items() for x in pair]
+    cameras = cameras_json(tmp_path / "cameras.json")
+    paper = ["--preset", "paper"]
+    assert cli.main(["encode", str(scene_path), "-o", str(potr), "--cameras", str(cameras), *paper, *flat]) == 0
+    capsys.readouterr()
+    assert cli.main(["info", str(potr), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert report["scale_factors"] == {"scale": 50, "rotation": 40, "opacity": 30, "DC": 20, "AC": 20}
+    assert (report["gamma"], report["beta"]) == (0.01, 0.001)
+
+
+def test_both_entropy_stages(tmp_path, scene_path, capsys):
+    scenes = []
+    for entropy in ("zstd", "npz"):
+        potr = tmp_path / f"{entropy}.potr"
+        assert cli.main(["encode", str(scene_path), "-o", str(potr), "--entropy", entropy, *KEEP]) == 0
+        assert cli.main(["decode", str(potr), "-o", str(tmp_path / "back.ply")]) == 0
+        scenes.append(ply.load(tmp_path / "back.ply"))
+    assert np.array_equal(scenes[0].sh, scenes[1].sh)
+    capsys.readouterr()
+
+
+def test_encode_prunes(tmp_path, scene_path, capsys):
+    cameras = cameras_json(tmp_path / "cameras.json")
+    potr = tmp_path / "a.potr"
+    arguments = ["encode", scene_path, "-o", potr, "--cameras", cameras, "--iterations", "3", "--memory", "0.00001"]
+    assert cli.main([str(a) for a in [*arguments, "--count", "60"]]) == 0
+    assert "60 of 200, " in capsys.readouterr().out
+    assert cli.main(["info", str(potr), "--json"]) == 0
+    report = json.loads(capsys.readouterr().out)
+    assert (report["splats"], report["source_splats"]) == (60, 200)
+
+
+def test_without_cameras_virtual_ones_are_placed(tmp_path, scene_path, capsys):
+    potr = tmp_path / "a.potr"
+    few = ["--iterations", "2", "--virtual-views", "8", "--count", "90"]
+    assert cli.main(["encode", str(scene_path), "-o", str(potr), *few]) == 0
+    said = capsys.readouterr()
+    assert "no --cameras: 8 virtual views and 1 to judge by placed" in said.err
+    assert "1 held-out virtual view" in said.out
+    assert "place cameras" in said.out
+    assert json.loads(run(capsys, "info", potr, "--json"))["cameras"] == "virtual"
+    assert "virtual" in run(capsys, "info", potr)
+    for command, options in (("prune", few), ("compact", few[2:4])):
+        assert cli.main([command, str(scene_path), "-o", str(tmp_path / "out.ply"), *options]) == 0
+        assert "8 virtual views" in capsys.readouterr().err
+        assert len(ply.load(tmp_path / "out.ply")) == (90 if command == "prune" else 200)
+    fails(capsys, ["encode", scene_path, "-o", tmp_path / "b.potr", "--virtual-views", "0"], 2, "at least 1")
+    assert not (tmp_path / "b.potr").exists()
+
+
+def test_whose_cameras_is_in_the_file(tmp_path, scene_path, capsys):
+    cameras, potr = cameras_json(tmp_path / "cameras.json"), tmp_path / "a.potr"
+    for options, said in (([*KEEP], None), ([*KEEP, "--cameras", cameras], "given")):
+        run(capsys, "encode", scene_path, "-o", potr, *options)
+        assert json.loads(run(capsys, "info", potr, "--json"))["cameras"] == said
+
+
+def test_a_scene_too_large_to_quantise(tmp_path, capsys):
+    scene = random_scene(5, 0)
+    scene.sh[2] = 1e30
+    ply.save(tmp_path / "scene.ply", scene)
+    fails(capsys, ["encode", tmp_path / "scene.ply", "-o", tmp_path / "a.potr", *KEEP], 1, "too large to quantise")
+    assert not (tmp_path / "a.potr").exists()
+
+
+def test_encode_to_ground_truth(tmp_path, scene_path, capsys):
+    """Photographs that are darker than the scene: the file comes nearer to them than the scene is."""
+    cameras_path, photos, out = cameras_json(tmp_path / "cameras.json"), tmp_path / "photos", tmp_path / "out.potr"
+    run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", photos)
+    for photo in photos.iterdir():
+        with Image.open(photo) as image:
+            darker = image.point(lambda value: value * 0.8)
+        darker.save(photo)
+    encode = ["encode", scene_path, "-o", out, "--cameras", cameras_path, "--iterations", "2", "--no-quality"]
+    said = run(capsys, *encode, "--photos", photos)
+    before, after = (
+        float(value) for value in re.findall(r"([\d.]+) dB", said.split("photos ")[1].split("PSNR")[1])[:2]
+    )
+    assert after > before + 3
+    assert "those fitted to photographs are kept" in said
+    (photos / "view_4.png").unlink()
+    page = tmp_path / "page.html"
+    report = json.loads(run(capsys, *encode[:-1], "--photos", photos, "--json", "--report", page))["photographs"]
+    assert report["held_out"]["kept"]
+    assert report["missing"] == "view 'view_4' has no photograph and is left out"
+    assert report["file"] > report["uncompressed"] + 3
+    shown = page.read_text()
+    assert ", photograph" in shown
+    assert "colours fitted to the others reach" in shown
+    assert f"potr-cl encode {scene_path} -o" in shown
+    fails(capsys, [*encode, "--photos", photos, "--refit", "off"], 2, "--photos", "re-fit")
+    fails(capsys, ["encode", scene_path, "-o", out, "--photos", photos], 2, "--photos", "--cameras")
+    fails(capsys, [*encode, "--photos", tmp_path / "nowhere"], 2, "nowhere")

@@ -1,0 +1,239 @@
+"""The commands that look: render and compare."""
+
+from __future__ import annotations
+
+import json
+
+import numpy as np
+import pytest
+from PIL import Image
+
+from potr_cl import cli
+from potr_cl.formats import load_cameras, load_scene
+from potr_cl.formats.images import to_8_bits
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import list_devices
+from potr_cl.quality.compare import side_by_side
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT
+from tests.cli.calls import fails, run
+
+
+def test_render_writes_what_the_rasterizer_sees(tmp_path, potr_path, cameras_path, capsys):
+    out = tmp_path / "new" / "folder"
+    options = ["--background", "1,0.5,0", "--rules", "gsplat"]
+    text = run(capsys, "render", potr_path, "--cameras", cameras_path, "-o", out, *options)
+    assert "8 images" in text
+    rasterizer = Rasterizer(Device(), load_scene(potr_path), GSPLAT, (1, 0.5, 0))
+    cameras = load_cameras(cameras_path)
+    assert sorted(file.name for file in out.iterdir()) == sorted(f"{c.name}.png" for c in cameras)
+    for camera in cameras:
+        with Image.open(out / f"{camera.name}.png") as image:
+            assert np.array_equal(np.asarray(image), to_8_bits(rasterizer.render(camera)[0]))
+
+
+@pytest.mark.parametrize(
+    ("options", "views"),
+    [
+        (["--split", "test"], [0, 4]),
+        (["--split", "train"], [1, 2, 3, 5, 6, 7]),
+        (["--split", "all"], range(8)),
+        (["--views", "view_3", "5", "view_5"], [3, 5]),
+    ],
+)
+def test_render_chosen_views(tmp_path, scene_path, cameras_path, capsys, options, views):
+    run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", tmp_path / "out", *options)
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == [f"view_{k}.png" for k in views]
+
+
+def test_a_view_named_like_a_number_is_that_view(tmp_path, scene_path, cameras_path, capsys):
+    views = json.loads(cameras_path.read_text())
+    views[7]["img_name"] = "0"
+    cameras_path.write_text(json.dumps(views))
+    run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", tmp_path / "out", "--views", "0", "1")
+    assert sorted(file.name for file in (tmp_path / "out").iterdir()) == ["0.png", "view_1.png"]
+
+
+def test_pictures_stay_in_their_folder(tmp_path, scene_path, cameras_path, capsys):
+    """Names of views come from files that others wrote."""
+    views = json.loads(cameras_path.read_text())[:3]
+    for view, name in zip(views, ("../../x.png", "/x.png", "a/x.png"), strict=True):
+        view["img_name"] = name
+    cameras_path.write_text(json.dumps(views))
+    out = tmp_path / "out"
+    before = set(tmp_path.iterdir())
+    run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", out)
+    assert set(tmp_path.iterdir()) == before | {out}
+    assert sorted(file.name for file in out.iterdir()) == [".._.._x.png", "_x.png", "a_x.png"]
+    views[0]["img_name"] = "a_x.png"
+    views[1]["img_name"] = "b/x.png"
+    cameras_path.write_text(json.dumps(views))
+    fails(capsys, ["render", scene_path, "--cameras", cameras_path, "-o", out], 1, "two views", "--views")
+
+
+def test_render_bad_calls(tmp_path, scene_path, cameras_path, capsys):
+    out = tmp_path / "out"
+    render = ["render", scene_path, "--cameras", cameras_path, "-o", out]
+    fails(capsys, ["render", tmp_path / "none.ply", *render[2:]], 2, "none.ply")
+    fails(capsys, ["render", cameras_path, *render[2:]], 2, "cameras.json", "unknown kind of scene")
+    fails(capsys, [*render[:3], tmp_path / "none.json", *render[4:]], 2, "none.json")
+    fails(capsys, [*render, "--views", "view_9"], 2, "'view_9'", "0 ('view_0') to 7 ('view_7')")
+    fails(capsys, [*render, "--views", "8"], 2, "'8'")
+    fails(capsys, [*render, "--background", "beige-ish"], 2, "'beige-ish' is no colour")
+    fails(capsys, [*render, "--device", "no such thing"], 1, "'no such thing'", list_devices()[0].name)
+    (tmp_path / "file").write_bytes(b"")
+    fails(capsys, [*render[:5], tmp_path / "file"], 2, "cannot make the folder")
+    (tmp_path / "folder" / "view_0.png").mkdir(parents=True)
+    fails(capsys, [*render[:5], tmp_path / "folder"], 2, "view_0.png")
+    views = [view for view in json.loads(cameras_path.read_text()) if view["split"] == "train"]
+    cameras_path.write_text(json.dumps(views))
+    fails(capsys, [*render, "--split", "test"], 2, "--split all")
+
+
+def test_compare_from_cameras(tmp_path, scene_path, potr_path, cameras_path, capsys):
+    both = [scene_path, potr_path, "--cameras", cameras_path]
+    report = json.loads(run(capsys, "compare", *both, "--json"))
+    assert [view["name"] for view in report["views"]] == ["view_0", "view_4"]  # the test views
+    assert report["a"]["bytes"] == scene_path.stat().st_size
+    assert report["b"]["bytes"] == potr_path.stat().st_size
+    assert report["size_ratio"] == report["a"]["bytes"] / report["b"]["bytes"]
+    assert report["rules"] == "inria"
+    psnrs = [view["b_against_a"]["psnr"] for view in report["views"]]
+    assert report["mean"]["b_against_a"]["psnr"] == pytest.approx(np.mean(psnrs))
+    assert min(psnrs) > 30
+    text = run(capsys, "compare", *both)
+    assert f"{np.mean(psnrs):.2f}" in text
+    assert "LPIPS" in text  # its column, or that it is left out
+    assert len(json.loads(run(capsys, "compare", *both, "--json", "--split", "all"))["views"]) == 8
+    assert json.loads(run(capsys, "compare", *both, "--json", "--views", "2"))["worst_view"] == "view_2"
+
+
+def test_compare_with_itself_is_valid_json(scene_path, cameras_path, capsys):
+    report = json.loads(run(capsys, "compare", scene_path, scene_path, "--cameras", cameras_path, "--json"))
+    assert report["mean"]["b_against_a"] == {"psnr": None, "ssim": 1}
+    assert "identical" in run(capsys, "compare", scene_path, scene_path, "--cameras", cameras_path)
+
+
+def test_compare_without_cameras(scene_path, potr_path, capsys):
+    assert cli.main(["compare", str(scene_path), str(potr_path)]) == 0
+    captured = capsys.readouterr()
+    assert "times smaller" in captured.out
+    assert "8 virtual views of 800 x 800 pixels" in captured.err
+    placed = [line for line in captured.err.splitlines() if "no --cameras" in line]
+    assert len(placed) == 1
+    report = json.loads(run(capsys, "compare", scene_path, potr_path, "--json", "--virtual-views", 2, "--size", 64))
+    assert (report["a"]["splats"], report["b"]["splats"]) == (200, 200)
+    assert [view["name"] for view in report["views"]] == ["virtual_000", "virtual_001"]
+    assert all(25 < view["b_against_a"]["psnr"] < 70 for view in report["views"])
+    turning = json.loads(run(capsys, "compare", scene_path, potr_path, "--json", "--turntable", 3, "--size", 64))
+    assert [view["name"] for view in turning["views"]] == ["turntable_000", "turntable_001", "turntable_002"]
+    one = run(capsys, "compare", scene_path, potr_path, "--turntable", 3, "--views", "1", "--size", 64)
+    assert "turntable_001" in one
+    assert "turntable_000" not in one
+    fails(capsys, ["compare", scene_path, potr_path, "--truth", "x"], 2, "--cameras")
+
+
+def test_compare_tells_sizes_where_there_is_no_device(scene_path, potr_path, capsys, monkeypatch):
+    monkeypatch.setattr("potr_cl.cli.pictures.list_devices", list)
+    assert cli.main(["compare", str(scene_path), str(potr_path)]) == 0
+    captured = capsys.readouterr()
+    assert "times smaller" in captured.out
+    assert "virtual" not in captured.out
+    assert "no OpenCL device" in captured.err
+    assert set(json.loads(run(capsys, "compare", scene_path, potr_path, "--json"))) == {"a", "b", "size_ratio"}
+
+
+def test_render_without_cameras_places_views(tmp_path, scene_path, capsys):
+    assert cli.main(["render", str(scene_path), "-o", str(tmp_path / "around"), "--size", "40"]) == 0
+    placed = [line for line in capsys.readouterr().err.splitlines() if "no --cameras" in line]
+    assert len(placed) == 1
+    assert "8 virtual views of 40 x 40 pixels" in placed[0]
+    files = sorted((tmp_path / "around").iterdir())
+    assert [file.name for file in files] == [f"virtual_{k:03d}.png" for k in range(8)]
+    run(capsys, "render", scene_path, "-o", tmp_path / "turn", "--turntable", 5, "--size", 40, "--up=-y")
+    files += sorted((tmp_path / "turn").iterdir())
+    assert [file.name for file in files[8:]] == [f"turntable_{k:03d}.png" for k in range(5)]
+    for file in files:
+        with Image.open(file) as image:
+            assert image.size == (40, 40)
+            assert np.asarray(image).std() > 5, "the scene is in the picture"
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        (["--turntable", "0"], ["0 views"]),
+        (["--virtual-views", "100000"], ["100000 views"]),
+        (["--size", "0"], ["0 x 0"]),
+        (["--size", "99999"], ["99999 x 99999"]),
+        (["--up", "sideways"], ["'sideways' is no direction", "--up=x|y|z|-x|-y|-z"]),
+        (["--up", "0,0,0"], ["'0,0,0' is no direction"]),
+        (["--up", "nan,0,1"], ["is no direction"]),
+    ],
+)
+def test_wrong_views_to_place(tmp_path, scene_path, cameras_path, capsys, options, words):
+    render = ["render", scene_path, "-o", tmp_path / "out"]
+    fails(capsys, [*render, *options], 2, *words)
+    assert not (tmp_path / "out").exists()
+
+
+@pytest.mark.parametrize("option", ["--turntable", "--virtual-views", "--up", "--size"])
+def test_views_are_placed_only_without_cameras(tmp_path, scene_path, cameras_path, capsys, option):
+    value = "z" if option == "--up" else "3"
+    for command in (["render", scene_path, "-o", tmp_path / "out"], ["compare", scene_path, scene_path]):
+        fails(capsys, [*command, "--cameras", cameras_path, option, value], 2, option, "without cameras")
+
+
+def test_compare_picture(tmp_path, scene_path, potr_path, cameras_path, capsys):
+    picture = tmp_path / "worst.png"
+    text = run(capsys, "compare", scene_path, potr_path, "--cameras", cameras_path, "-o", picture)
+    factor = int(text.split("difference times ")[1].split()[0])
+    worst = text.split("worst view: ")[1].split(",")[0]
+    a, b = (Rasterizer(Device(), load_scene(path)) for path in (scene_path, potr_path))
+    view = next(camera for camera in load_cameras(cameras_path) if camera.name == worst)
+    with Image.open(picture) as image:
+        assert image.width == 3 * 64
+        assert image.height > 64 + 20, "there are labels above the pictures"
+        pixels = np.asarray(image)
+        assert np.array_equal(pixels[-64:], side_by_side(a.render(view)[0], b.render(view)[0])[0])
+        labels = pixels[:-64]
+        assert labels.max() > 200
+        assert all((labels[len(labels) // 2 :, k * 64 : (k + 1) * 64].max() > 200) for k in range(3))
+        assert image.text["Description"] == (
+            f"view {worst}: A, B and their difference times {factor}; A is scene.ply, B is scene.potr"
+        )
+
+
+def test_compare_with_ground_truth(tmp_path, scene_path, potr_path, cameras_path, capsys):
+    """The uncompressed scene's own pictures as photographs: 8 bits are all that A loses."""
+    photos = tmp_path / "photos"
+    run(capsys, "render", scene_path, "--cameras", cameras_path, "-o", photos, "--background", "white")
+    both = ["compare", scene_path, potr_path, "--cameras", cameras_path, "--background", "white"]
+    mean = json.loads(run(capsys, *both, "--truth", photos, "--json"))["mean"]
+    assert mean["a_against_truth"]["psnr"] > 55
+    assert mean["b_against_truth"]["psnr"] == pytest.approx(mean["b_against_a"]["psnr"], abs=0.5)
+    assert "loss by photo" in run(capsys, *both, "--truth", photos)
+
+    picture = tmp_path / "worst.png"
+    with_truth = [*both, "--truth", photos, "-o", picture]
+    fails(capsys, [*both, "--truth", tmp_path / "nowhere"], 2, "nowhere")
+    whole = (photos / "view_4.png").read_bytes()
+    (photos / "view_4.png").write_bytes(whole[: len(whole) // 2])
+    fails(capsys, with_truth, 1, "view_4.png", "damaged")
+    Image.new("RGB", (32, 64)).save(photos / "view_4.png")
+    fails(capsys, with_truth, 2, "32 x 64", "64 x 64")
+    assert not picture.exists()
+    (photos / "view_4.png").unlink()
+    assert "view 'view_4' has no photograph" in run(capsys, *with_truth)
+
+
+def test_compare_bad_calls(tmp_path, scene_path, potr_path, cameras_path, capsys):
+    call = ["compare", scene_path, potr_path, "--cameras", cameras_path]
+    fails(capsys, ["compare", scene_path, tmp_path / "none.potr"], 2, "none.potr")
+    fails(capsys, ["compare", scene_path, potr_path, "--cameras", tmp_path / "none.json"], 2, "none.json")
+    fails(capsys, [*call, "-o", tmp_path], 2, "it is a directory")
+    fails(capsys, [*call, "--device", "77"], 1, "'77'")
+    fails(capsys, [*call, "--views", "nobody"], 2, "'nobody'")
+    potr_path.write_bytes(potr_path.read_bytes()[:-20])
+    fails(capsys, [*call, "-o", tmp_path / "worst.png"], 1, str(potr_path))
+    assert sorted(p.name for p in tmp_path.iterdir()) == ["cameras.json", "scene.ply", "scene.potr"]

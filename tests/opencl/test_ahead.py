@@ -1,0 +1,55 @@
+"""A device that is opened before somebody asks for it."""
+
+from __future__ import annotations
+
+import pytest
+
+from potr_cl.errors import DeviceError
+from potr_cl.opencl import ahead
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import choose_device
+
+
+@pytest.fixture
+def contexts(monkeypatch):
+    """The devices of which contexts are made, in their order."""
+    made = []
+    real = ahead.new_context
+
+    def counted(handle):
+        made.append(handle)
+        return real(handle)
+
+    monkeypatch.setattr(ahead, "new_context", counted)
+    return made
+
+
+def test_what_was_begun_is_taken_once(contexts):
+    info = choose_device()
+    ahead.begin_to_open(None)
+    first, second = Device(), Device()
+    assert contexts == [info.handle] * 2
+    assert first.context.devices == second.context.devices == [info.handle]
+    assert first.context != second.context
+
+
+@pytest.mark.parametrize("spec", ["no such device", "all", "0,1", None])
+def test_whatever_was_begun_a_device_opens(spec, contexts):
+    """Also where nothing has begun because the name fits no device, or several."""
+    ahead.begin_to_open(spec, whole=spec is not None)
+    device = Device()
+    assert device.context.devices == [device.info.handle]
+    with pytest.raises(DeviceError, match="no such device"):
+        Device("no such device")
+
+
+def test_a_context_of_another_device_is_left_alone(contexts):
+    info = choose_device()
+
+    class Other:
+        handle = object()
+
+    ahead.begin_to_open(None)
+    with pytest.raises(AttributeError):  # an object is no device: it was asked all the same
+        ahead.context_of(Other())
+    assert contexts == [info.handle, Other.handle]

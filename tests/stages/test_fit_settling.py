@@ -1,0 +1,101 @@
+"""What is left is fitted once more after the choice of coefficients and after each rounding."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.codec.geometry import Geometry
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.model.camera import resized, train_views
+from potr_cl.outputs.ply import Ply
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.stages.fit import Fit
+from potr_cl.stages.fitting.fit import FitOptions
+from potr_cl.stages.fitting.settling import Looking, Settling, settle
+from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.stages.stage import State, Workbench
+from tests.devices import FAMILIES, open_device
+
+PARAMETERS = HyperParameters.from_quality(0.2, "best")
+OPTIONS = FitOptions(steps=120)
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def device(request):
+    device = open_device(request.param)
+    yield device
+    assert device.allocated == 0, "memory was not given back"
+
+
+@pytest.fixture(scope="module")
+def views(plush_excerpt_cameras):
+    return [resized(camera, 120, 90) for camera in train_views(plush_excerpt_cameras)]
+
+
+def settled(device, scene, views, settling, **changes):
+    """A state before and after, and the errors that are told."""
+    bench = dataclasses.replace(Workbench(PARAMETERS, device=device), **changes)
+    before = State.of(scene, views)
+    with Rasterizer(device, scene) as rasterizer:
+        looking = Looking(views, 0, RenderedTargets(rasterizer, views), rasterizer)
+        then, errors = settle(before, bench, looking, settling, OPTIONS)
+    return before, then, errors, bench
+
+
+def error_of(device, source, scene, views):
+    with Rasterizer(device, source) as one, Rasterizer(device, scene) as other:
+        return np.mean([np.mean((one.render(c)[0] - other.render(c)[0]) ** 2) for c in views])
+
+
+def test_what_moves_makes_up_for_what_is_rounded(device, plush_excerpt, views):
+    before, then, errors, bench = settled(device, plush_excerpt, views, Settling(0, 0.5, 1.0))
+    assert isinstance(then.geometry, Geometry)
+    assert then.geometry.asked == PARAMETERS
+    assert len(errors) == 2
+    at_once = bench.output.geometry(plush_excerpt, bench.request(before)).decoded(plush_excerpt.sh)
+    in_turns = then.geometry.decoded(then.scene.sh)
+    found = [error_of(device, plush_excerpt, scene, views) for scene in (at_once, in_turns)]
+    assert found[1] < 0.8 * found[0]
+    assert np.array_equal(in_turns.log_scales, at_once.log_scales), "what was rounded moved again"
+    assert not np.array_equal(in_turns.means, at_once.means)
+    assert np.array_equal(then.scene.means, plush_excerpt.means), "other steps start from what is not rounded"
+    assert np.array_equal(then.scene.sh[:, 1:], plush_excerpt.sh[:, 1:])
+
+
+def test_coefficients_are_chosen_and_the_rest_moves(device, plush_excerpt, views):
+    _, then, errors, _ = settled(device, plush_excerpt, views, Settling(0.5, 0, 0.1))
+    assert then.geometry is None
+    assert len(errors) == 1
+    zeros = [np.mean(scene.sh[:, 1:] == 0) for scene in (plush_excerpt, then.scene)]
+    assert zeros[1] > zeros[0] + 0.3
+    assert not np.array_equal(then.scene.means, plush_excerpt.means)
+
+
+def test_nothing_of_it_where_nothing_is_asked_for(device, plush_excerpt, views):
+    before, then, errors, _ = settled(device, plush_excerpt, views, Settling(0, 0, 0.1))
+    assert then.scene is before.scene
+    assert errors == ()
+
+
+def test_other_kinds_of_files_round_at_once(device, plush_excerpt, views):
+    _, then, errors, _ = settled(device, plush_excerpt, views, Settling(0, 0.5, 0.1), output=Ply())
+    assert then.geometry is None
+    assert errors == ()
+
+
+def test_the_stage_hands_its_geometry_on(device, plush_excerpt, views):
+    bench = Workbench(PARAMETERS, device=device)
+    smaller = plush_excerpt.subset(np.arange(0, len(plush_excerpt), 2))
+    start = dataclasses.replace(State.of(plush_excerpt, views), scene=smaller, survivors=np.arange(0, 1500, 2))
+    with_it, without = (
+        Fit(steps=60, rounding=rounding, choosing=0, between=0).run(start, bench) for rounding in (0.3, 0)
+    )
+    assert isinstance(with_it.geometry, Geometry)
+    assert without.geometry is None
+    told = with_it.learnt["fit"]
+    assert len(told.settled) == 2
+    assert told.facts["settled"] == list(told.settled)
+    assert "as in the file" in str(told)
