@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import hashlib
 import os
+import pickle
 import shutil
-from collections.abc import Iterator
+from collections.abc import Iterator, Sequence
 from pathlib import Path
 from typing import Any
 
@@ -12,6 +14,7 @@ import pytest
 
 from potr_cl import Camera, Scene
 from potr_cl.formats import load_cameras, load_scene
+from potr_cl.model import agreement
 
 DATA = Path(__file__).parent / "data"
 #: Where Chromium is, if it has another name than systems give it.
@@ -31,6 +34,25 @@ def pytest_collection_modifyitems(config: pytest.Config, items: list[pytest.Item
     if repeated:
         config.hook.pytest_deselected(items=repeated)
         items[:] = [item for item in items if item not in set(repeated)]
+
+
+@pytest.fixture(scope="session", autouse=True)
+def judged_once() -> Iterator[None]:
+    """Each encode asks whether its cameras belong to its scene; of the same scene and cameras, they are told once.
+
+    That is a quarter of what an encode of the excerpt takes. The tests of the judgement call the function itself.
+    """
+    judge, known = agreement.judge_cameras, {}
+
+    def judged(scene: Scene, cameras: Sequence[Camera]) -> agreement.Judgement:
+        key = hashlib.sha256(pickle.dumps((scene, list(cameras)))).digest()
+        if key not in known:
+            known[key] = judge(scene, cameras)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(agreement, "judge_cameras", judged)
+        yield
 
 
 @pytest.fixture(scope="session")

@@ -154,7 +154,11 @@ def _encode_one(args: argparse.Namespace, shared: _Shared, several: bool) -> Non
         with frame_checked_beside(scene, cameras, options.cameras_anyway):
             workers = opened.result() if opened is not None and options.look_at_views(scene) else None
             device, pool = (None, None) if workers is None else (workers.device, workers.pool)
-            kept = None if device is None or target is not None else stack.enter_context(KeptScene(device, scene))
+            kept = (
+                None
+                if device is None or target is not None
+                else stack.enter_context(KeptScene(device, scene, options.memory))
+            )
         progress = stack.enter_context(contextlib.closing(Progress()))
         page = stack.enter_context(replacing(args.report)) if args.report is not None else None
         placing = Stopwatch(progress)

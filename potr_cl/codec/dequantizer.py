@@ -31,6 +31,8 @@ I8 = NDArray[np.int8]
 #: Splats worked on at a time: few enough that temporaries stay in a cache, many enough that threads seldom wait. A
 #: multiple of the runs in which DC is predicted.
 _BLOCK = 1 << 15
+#: The same where the predictions of a block take a call for each splat of a run.
+_LARGE_BLOCK = 1 << 16
 #: Levels whose values the native path looks up: small tables for levels of one byte, larger ones for others.
 _SMALL_TABLE, _LARGE_TABLE = 1 << 8, 1 << 16
 
@@ -142,8 +144,8 @@ class Dequantizer:
 
     def of_levels(self, levels: Levels, steps: ColourSteps | None, arrays: ValueArrays) -> None:
         """The values of some splats' levels, by NumPy, into the arrays that there are, of all of the file's splats."""
-        for start in range(0, levels.stop - levels.start, _BLOCK):
-            self._of_block(levels.part(start, start + _BLOCK), steps, arrays)
+        for start in range(0, levels.stop - levels.start, _LARGE_BLOCK):
+            self._of_block(levels.part(start, start + _LARGE_BLOCK), steps, arrays)
 
     def _of_block(self, levels: Levels, steps: ColourSteps | None, arrays: ValueArrays) -> None:
         version, header = self.version, self.header

@@ -24,7 +24,7 @@ Indices = NDArray[np.int64]
 F64 = NDArray[np.float64]
 
 #: Splats of a group.
-_GROUP = 1024
+LARGEST = 1024
 #: Groups whose boxes are found at a time.
 _GROUPS = 256
 #: Splats that are so many times as large as the median have groups of their own: they can be seen from everywhere.
@@ -71,7 +71,7 @@ class SplatGroups:
             group: so many of them are a group at most.
             run: shares the work out.
         """
-        group = group or _GROUP
+        group = group or LARGEST
         logarithms = largest_scales(scene.log_scales)
         large = logarithms > np.median(logarithms) + math.log(_LARGE)
         along = morton_order(scene.means, run)

@@ -28,8 +28,8 @@ logger = logging.getLogger("potr_cl")
 #: Held while a program is built or loaded.
 _BUILDING = threading.RLock()
 
-#: Bytes that are filled at a time: no driver has to count beyond 32 bits.
-_FILLED = 1 << 30
+#: Bytes that the driver fills; more are filled by a kernel, with work-groups of so many work-items.
+_FILLED, _FILLING = 1 << 30, 256
 
 #: How drivers say that there is not enough memory, besides what pyopencl makes a MemoryError of.
 _NO_MEMORY = (
@@ -286,11 +286,18 @@ class Device:
         """
         nbytes = buffer.size // value.nbytes * value.nbytes if nbytes is None else nbytes
         with self.errors("failed to fill a buffer"):
-            for start in range(0, nbytes, _FILLED):
-                count = min(_FILLED, nbytes - start)
-                # NVIDIA's driver (quirks.SHORT_FILLS) writes elsewhere where the offset is large.
-                some = _region(buffer, start, count) if start else buffer
-                cl.enqueue_fill_buffer(self.queue, some, value, 0, count)
+            if nbytes <= _FILLED:
+                cl.enqueue_fill_buffer(self.queue, buffer, value, 0, nbytes)
+                return
+        # NVIDIA's driver (quirks.SHORT_FILLS) writes elsewhere where a buffer is large.
+        words = np.frombuffer(value.tobytes() * (8 // value.nbytes), np.uint32)
+        kernel = self.shared_kernel("opencl/fill.cl", "fill")
+        kernel.bind(words=buffer, count=nbytes // 4, first=int(words[0]), second=int(words[1]))
+        kernel.launch((-(-nbytes // (4 * _FILLING)) * _FILLING,), (_FILLING,))
+        if nbytes % 4:
+            rest = np.frombuffer(value.tobytes() * (nbytes % 4 // value.nbytes), np.uint8)
+            with self.errors("failed to fill a buffer"):
+                cl.enqueue_copy(self.queue, buffer, rest, dst_offset=nbytes - nbytes % 4, is_blocking=True)
 
     def download(self, buffer: cl.Buffer, shape: tuple[int, ...], dtype: Any, start: int = 0) -> np.ndarray[Any, Any]:
         """A copy of a part of a buffer, from the byte ``start`` on, once everything before it in the queue is done."""
@@ -393,14 +400,6 @@ class Device:
                 if not np.array_equal(mark, back):
                     raise DeviceError(f"device {self.info} fails the self-check: a large buffer loses its content")
         self.free(big)
-
-
-def _region(buffer: cl.Buffer, start: int, nbytes: int) -> cl.Buffer:
-    """A part of a buffer, which may be a part of another one itself."""
-    whole = buffer.get_info(cl.mem_info.ASSOCIATED_MEMOBJECT)
-    if whole is None:
-        return buffer.get_sub_region(start, nbytes)
-    return whole.get_sub_region(buffer.get_info(cl.mem_info.OFFSET) + start, nbytes)
 
 
 def _literal(value: str | int | float) -> str:

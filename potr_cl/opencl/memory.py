@@ -15,6 +15,10 @@ if TYPE_CHECKING:
     from potr_cl.opencl.device import Device
 
 
+#: Buffers that are too small are replaced by ones so many times as large as needed.
+_MARGIN = 1.25
+
+
 class Owner(ABC):
     """Something that holds device memory until it is closed: ``with Rasterizer(…) as rasterizer:``."""
 
@@ -82,55 +86,61 @@ class Memory(Owner):
         self.free(*self._buffers)
 
 
-class Arena(Memory):
-    """Buffers that are parts of one large one: what is taken and given back again and again, always together.
+class Reused(Memory):
+    """Buffers that are taken again and again, in the same order and always together.
 
-    To give a driver hundreds of megabytes back and to take them again can take longer than the work in between.
-    :meth:`close` only makes room for the next ones; :meth:`give_back` gives the large buffer back.
+    To give a driver hundreds of megabytes back and to take them again can take longer than the work between; parts of
+    one large buffer are worse, for NVIDIA's driver copies them to the host and back. So the n-th buffer after
+    :meth:`close` is the n-th that was taken before, or a larger one in its place. :meth:`give_back` gives all back.
 
     Args:
         device: whose memory it is.
-        what: the buffers hold, for errors.
     """
 
-    def __init__(self, device: Device, what: str) -> None:
+    def __init__(self, device: Device) -> None:
         super().__init__(device)
-        self._block = Scratch(device, what)
-        self._parts: list[cl.Buffer] = []
-        self._used = self._wanted = 0
-        self._grain = max(device.info.handle.mem_base_addr_align // 8, 1)
+        self._places: list[Scratch] = []
+        self._taken = 0
+
+    @property
+    def nbytes(self) -> int:
+        return sum(place.nbytes for place in self._places)
 
     def allocate(self, nbytes: int, what: str) -> cl.Buffer:
-        nbytes = -(-max(int(nbytes), 16) // self._grain) * self._grain
-        if not self._parts and not self._buffers:
-            self._block.reserve(min(max(self._wanted, self._grain), self._device.info.largest_buffer))
-            self._wanted = 0
-        self._wanted += nbytes
-        if self._used + nbytes > self._block.nbytes:
-            return super().allocate(nbytes, what)  # next time there will be room
-        part = self._block.buffer.get_sub_region(self._used, nbytes)
-        self._used += nbytes
-        self._parts.append(part)
-        return part
+        """A buffer of at least so many bytes, see :meth:`potr_cl.opencl.device.Device.allocate`."""
+        if self._taken == len(self._places):
+            self._places.append(Scratch(self._device, what))
+        place = self._places[self._taken]
+        if place.nbytes < nbytes:
+            place.reserve(max(nbytes, min(int(_MARGIN * nbytes), self._device.info.largest_buffer)))
+        self._taken += 1
+        return place.buffer
+
+    def upload(self, array: np.ndarray[Any, Any], what: str, pending: list[cl.Event] | None = None) -> cl.Buffer:
+        """A buffer that begins with a copy of ``array``, see :meth:`potr_cl.opencl.device.Device.upload`."""
+        array = np.ascontiguousarray(array)
+        buffer = self.allocate(array.nbytes, what)
+        if array.nbytes:
+            with self._device.errors(f"cannot hold {what}"):
+                event = cl.enqueue_copy(self._device.queue, buffer, array, is_blocking=pending is None)
+            if pending is not None:
+                pending.append(event)
+        return buffer
 
     def free(self, *buffers: cl.Buffer) -> None:
-        for buffer in buffers:
-            if buffer in self._parts:
-                self._parts.remove(buffer)
-                buffer.release()
-            else:
-                super().free(buffer)
+        """Give those back that were adopted; the others are taken again after :meth:`close`."""
+        super().free(*(buffer for buffer in buffers if buffer in self._buffers))
 
     def close(self) -> None:
-        self.free(*self._parts)
         super().close()
-        self._used = 0
+        self._taken = 0
 
     def give_back(self) -> None:
         """Give all memory back."""
         self.close()
-        self._block.close()
-        self._wanted = 0
+        for place in self._places:
+            place.close()
+        self._places = []
 
 
 class Scratch(Owner):

@@ -121,7 +121,7 @@ NO_PREFETCH = Quirk(
     test=lambda platform, version: "nvidia" in platform or "oclgrind" in platform,
 )
 
-#: Buffers are filled by the gigabyte, each through a sub-buffer of its own. Right everywhere, so nothing asks for it.
+#: Buffers of more than a gigabyte are filled by a kernel. Right everywhere, so nothing asks for it.
 SHORT_FILLS = Quirk(
     vendor="NVIDIA",
     versions="driver 580",

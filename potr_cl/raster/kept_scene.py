@@ -28,16 +28,21 @@ class KeptScene(Owner):
     Args:
         device: to keep it on.
         scene: whose arrays do not change meanwhile.
+        memory: bytes that the user would have taken; None: as much as there is. Where a device's memory is the host's,
+            a scene that is a large part of it is not kept: it is there already.
     """
 
-    def __init__(self, device: Device, scene: Scene) -> None:
-        self._device, self._scene = device, scene
+    def __init__(self, device: Device, scene: Scene, memory: int | None = None) -> None:
+        self._device, self._scene, self._memory = device, scene, memory
         self._buffers = self._uploaded(device)
         self._elsewhere: dict[Device, Future[SceneBuffers | None]] = {}
         self._lock = threading.Lock()
 
     def _uploaded(self, device: Device) -> SceneBuffers | None:
-        if _PART * self._scene.nbytes <= device.info.memory:
+        most = device.info.memory
+        if self._memory is not None and (device.info.kind == "cpu" or device.info.integrated):
+            most = min(most, self._memory)
+        if _PART * self._scene.nbytes <= most:
             with suppress(DeviceMemoryError):
                 return uploaded(device, self._scene)
         return None

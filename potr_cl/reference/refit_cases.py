@@ -75,14 +75,14 @@ class Linearised:
         self.gradient: Array = vectors.read(result).astype(np.float64)
         self.room = colour_map.room
 
-    def normal(self, direction: Array) -> Array:
-        """A transposed W A times a direction."""
+    def normal(self, direction: Array, part: int | None = None) -> Array:
+        """A transposed W A times a direction, by a part of the views or by all."""
         vectors = self._refit.coefficients
         assert isinstance(vectors, Coefficients)
         x, result = vectors.vector(), vectors.vector()
         vectors.write(x, direction)
         vectors.zero(result)
-        self._refit.colour_map.normal(x, self._at, result)
+        self._refit.colour_map.normal(x, self._at, result, part=part)
         product: Array = vectors.read(result).astype(np.float64)
         return product
 

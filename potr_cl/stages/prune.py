@@ -27,7 +27,7 @@ from potr_cl.stages.pruning.unseen import (
     set_aside,
     without_directions,
 )
-from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, groups_of_large, sights_worth_it
+from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, LIKELY, groups_of_large, seen_part, sights_worth_it
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 
@@ -146,11 +146,11 @@ class Prune(Stage):
         """
         with thread_pool(bench.threads) as pool, lying_on(bench.opened, bench.placed(state)) as placed:
             quick = partial(surely_seen, placed) if isinstance(placed, SceneBuffers) else None
-            # Several devices share all views.
-            groups = None if bench.pool and quick else groups_of_large(state.scene, pool.map)
+            likely = seen_part(state.scene, state.views) <= LIKELY
+            groups = groups_of_large(state.scene, pool.map) if likely or not quick else None
             hidden, area = find_unseen(state, groups, pool.map, quick)
             options = self._sweep_options(bench.memory)
-            sights = None if bench.pool else sights_worth_it(state.scene, state.views, options, groups, pool.map)
+            sights = sights_worth_it(state.scene, state.views, options, groups, pool.map) if likely else None
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
         told = state.having_learnt("unseen", Unseen(splats, len(state.scene), area, kept))
@@ -159,7 +159,12 @@ class Prune(Stage):
         if not (kept and splats):
             return self._pruned(told, bench, sights)
         # A copy of a large scene without them would take as much memory as the scene.
-        if sights is not None and not bench.interludes and bench.parameters.delta_mse_max < LARGEST_LIMIT:
+        if (
+            sights is not None
+            and not bench.pool
+            and not bench.interludes
+            and bench.parameters.delta_mse_max < LARGEST_LIMIT
+        ):
             return without_directions(self._pruned(told, bench, sights, hidden), told.survivors[hidden])
         split = set_aside(told, hidden)
         if not len(split.seen_splats):

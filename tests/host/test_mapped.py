@@ -11,6 +11,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+import potr_cl
 from potr_cl.errors import PotrError
 from potr_cl.formats import load_scene
 from potr_cl.host import mapped
@@ -78,6 +79,18 @@ def test_a_scene_that_is_read_and_what_is_taken_of_it(tmp_path):
     assert np.array_equal(read.sh, scene.sh)
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
         assert np.array_equal(getattr(part, name), getattr(scene, name)[::-1])
+
+
+def test_a_file_is_the_same_wherever_arrays_lie(plush_excerpt, plush_excerpt_cameras, tmp_path, monkeypatch):
+    plush_excerpt.save(tmp_path / "scene.ply")
+    files = []
+    for part in (1e9, 1e-9):
+        monkeypatch.setattr(mapped, "_PART", part)
+        encoded = potr_cl.encode(
+            tmp_path / "scene.ply", plush_excerpt_cameras[:4], preset="fast", iterations=2, memory=0.25
+        )
+        files.append(encoded.data)
+    assert files[0] == files[1]
 
 
 @linux

@@ -17,7 +17,7 @@ from potr_cl.opencl import device as opencl_device
 from potr_cl.opencl import discovery, loader
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, choose_device, compiler_fault, list_devices
-from potr_cl.opencl.memory import Arena, Scratch
+from potr_cl.opencl.memory import Reused, Scratch
 from potr_cl.opencl.source import kernel_source
 from potr_cl.report.devices import device_report, format_devices
 
@@ -439,37 +439,40 @@ def test_upload_and_download(device: Device) -> None:
     device.free(nothing)
 
 
-@pytest.mark.parametrize("values", [1, 4096, 5000])
-def test_a_buffer_is_filled_piece_by_piece(device: Device, values: int, monkeypatch: pytest.MonkeyPatch) -> None:
+@pytest.mark.parametrize("count", [1, 4095, 4096, 4097, 5003])
+@pytest.mark.parametrize("value", [np.uint8(7), np.float32(-np.inf), np.int64(-3 << 40)])
+def test_large_buffers_are_filled_too(
+    device: Device, count: int, value: np.generic, monkeypatch: pytest.MonkeyPatch
+) -> None:
     monkeypatch.setattr(opencl_device, "_FILLED", 4096)  # a gigabyte would take too long
-    buffer = device.upload(np.arange(values + 8, dtype=np.uint32), "a test")
-    device.fill(buffer, np.uint32(77), 4 * values)
-    expected = np.arange(values + 8, dtype=np.uint32)
-    expected[:values] = 77
-    assert np.array_equal(device.download(buffer, (values + 8,), np.uint32), expected)
-    device.fill(buffer, np.uint32(3))
-    assert (device.download(buffer, (values + 8,), np.uint32) == 3).all()
+    expected = np.arange(count + 8).astype(value.dtype)
+    buffer = device.upload(expected, "a test")
+    device.fill(buffer, value, count * value.nbytes)
+    expected[:count] = value
+    assert np.array_equal(device.download(buffer, (count + 8,), value.dtype), expected)
+    device.fill(buffer, value)
+    assert (device.download(buffer, (count + 8,), value.dtype) == value).all()
     device.free(buffer)
 
 
-def test_an_arena_gives_the_same_memory_again(device: Device, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(opencl_device, "_FILLED", 4096)
+def test_the_same_memory_is_taken_again(device: Device) -> None:
     before = device.allocated
-    arena = Arena(device, "a test")
+    memory = Reused(device)
     taken = []
-    for turn, counts in enumerate([(1000, 5000), (1000, 5000), (300, 7000), (300, 7000, 10)]):
-        buffers = [arena.allocate(4 * count, "a test") for count in counts]
+    for turn, counts in enumerate([(1000, 5000), (900, 5000), (300, 7000, 10), (300, 7000)]):
+        buffers = [memory.allocate(4 * count, "a test") for count in counts]
         for value, (buffer, count) in enumerate(zip(buffers, counts, strict=True)):
             device.fill(buffer, np.uint32(10 * turn + value), 4 * count)
         for value, (buffer, count) in enumerate(zip(buffers, counts, strict=True)):
             assert (device.download(buffer, (count,), np.uint32) == 10 * turn + value).all()
         taken.append(device.allocated - before)
-        if turn == 2:
-            arena.free(buffers[0])
-        arena.close()
-    assert all(24_000 <= taken[turn] < 32_000 for turn in (0, 1, 3))  # in between there is too little room
-    assert 28_000 <= device.allocated - before < 32_000  # it stays
-    arena.give_back()
+        assert memory.nbytes == taken[-1]
+        words = np.arange(50 + turn, dtype=np.uint32)
+        assert np.array_equal(device.download(memory.upload(words, "a test"), words.shape, np.uint32), words)
+        memory.close()
+    assert 24_000 <= taken[0] <= taken[1] < 31_000
+    assert 32_000 <= taken[2] <= taken[3] < 42_000
+    memory.give_back()
     assert device.allocated == before
 
 

@@ -105,7 +105,7 @@ def test_every_splat_is_in_one_group():
 
 def test_parts_have_all_views_and_what_they_see(monkeypatch):
     scene = clusters(6)
-    monkeypatch.setattr(splat_groups, "_GROUP", 64)
+    monkeypatch.setattr(splat_groups, "LARGEST", 64)
     cameras = wide_and_narrow(scene, 40, 7, (0.05, 0.1))
     groups = SplatGroups.of(scene)
     parts = parts_of_views(scene, cameras, INRIA.near)

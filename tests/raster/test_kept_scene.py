@@ -47,6 +47,16 @@ def test_a_scene_is_not_kept_where_it_would_take_much_of_the_memory(device, monk
         assert device.allocated == 0
 
 
+def test_a_large_scene_is_not_there_twice_where_a_device_has_the_memory_of_the_host(device):
+    if device.info.kind != "cpu":
+        pytest.skip("this device has memory of its own")
+    scene = random_splats(5000)
+    with KeptScene(device, scene, memory=2 * scene.nbytes) as kept:
+        assert kept.drawable(device, scene) is scene
+    with KeptScene(device, scene, memory=20 * scene.nbytes) as kept:
+        assert kept.drawable(device, scene) is not scene
+
+
 def test_other_colours_leave_the_kept_ones_alone(device):
     scene, camera = random_splats(400, seed=3), straight_camera()
     other = random_splats(400, seed=4).sh

@@ -89,6 +89,28 @@ def test_the_normal_matrix(device, degree):
         assert np.abs(blocks - wanted).max() < 1e-5 * wanted.max()
 
 
+@pytest.mark.parametrize("views", [63, 64, 71])
+def test_a_part_of_many_views_stands_for_all(device, views):
+    """Every second view, however many a launch does; where they are few, all of them."""
+    scene = visible_scene(40, 1, seed=views)
+    cameras = ring_of_cameras(views, size=12)
+    direction = np.random.default_rng(views).normal(size=scene.sh.shape)
+    with Case(device, scene, scene, cameras) as case, Linearised(case) as linear:
+        whole = linear.normal(direction)
+        halves = [linear.normal(direction, part) for part in (0, 1)]
+        again = linear.normal(direction, 0)
+    assert np.array_equal(halves[0], again)
+    if views < 64:
+        assert np.array_equal(halves, [whole, whole])
+        return
+    number = np.array([len(range(part, views, 2)) for part in (0, 1)])
+    assert relative(np.tensordot(number / views, halves, 1), whole) < 1e-5
+    for part, half in enumerate(halves):
+        assert 1e-3 < relative(half, whole) < 0.5
+        with Case(device, scene, scene, cameras[part::2]) as case, Linearised(case) as linear:
+            assert relative(half * number[part] / views, linear.normal(direction)) < 1e-5
+
+
 def test_lists_of_more_splats_than_are_walked_at_a_time(device):
     """CPU kernels take 1024 at a time."""
     scene = visible_scene(1400, 1)
@@ -334,3 +356,21 @@ def test_options_out_of_range(bad):
 def test_no_view_is_an_error(device):
     with pytest.raises(UsageError, match="at least one view"):
         ColourRefit(device, visible_scene(3), [])
+
+
+@pytest.mark.one_runtime
+def test_views_that_are_not_kept_share_their_memory(case, monkeypatch):
+    """Drivers take long to give memory back: a product with views that are prepared anew takes none after the first."""
+    with Linearised(case, memory=0) as linear:
+        direction = np.random.default_rng(0).normal(size=case.scene.sh.shape)
+        first = linear.normal(direction)
+        taken, allocate = [], case.device.allocate
+
+        def noted(nbytes, what):
+            taken.append(what)
+            return allocate(nbytes, what)
+
+        monkeypatch.setattr(case.device, "allocate", noted)
+        again = linear.normal(direction)
+    assert np.array_equal(first, again)
+    assert set(taken) <= {"the SH coefficients"}, "the vectors of this test"

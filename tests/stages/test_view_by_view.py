@@ -36,7 +36,7 @@ def device(request):
 
 @pytest.fixture(autouse=True)
 def _small_groups(monkeypatch):
-    monkeypatch.setattr(splat_groups, "_GROUP", 32)
+    monkeypatch.setattr(splat_groups, "LARGEST", 32)
 
 
 #: Bytes that some of the street's views fit, and bytes that hardly more than the pictures of all fit.

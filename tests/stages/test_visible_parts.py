@@ -33,7 +33,7 @@ def device(request):
 
 @pytest.fixture(autouse=True)
 def _small_groups(monkeypatch):
-    monkeypatch.setattr(splat_groups, "_GROUP", 32)
+    monkeypatch.setattr(splat_groups, "LARGEST", 32)
 
 
 def parted(device, scene, cameras, options, whole=None) -> PartedRemoval:

@@ -9,14 +9,18 @@ import pytest
 
 import potr_cl
 from potr_cl.errors import DeviceError, DeviceMemoryError, UsageError
+from potr_cl.model import splat_groups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import choose_device, choose_devices
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.stages.pruning import measured, part, shared_removal, visible_parts
 from potr_cl.stages.pruning.part import RemovalPart
+from potr_cl.stages.pruning.view_by_view import ViewByView
 from potr_cl.stages.refitting.part import ColourPart
 from potr_cl.workers.host import HostPool
 from potr_cl.workers.opening import open_workers
+from tests.cases.streets import street
 from tests.devices import FAMILIES, open_device
 
 #: Splats go, colours are made sparse and re-fitted on the way, coefficients are given up, and AC is rounded.
@@ -71,6 +75,20 @@ def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options):
         assert found.shared.sent > 0
         assert found.shared.received > 0
         assert [device.allocated for device in devices] == [0] * count
+
+
+def test_steps_by_a_part_of_the_views_give_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, monkeypatch):
+    """Every device knows which of its views these are, and whether there are any."""
+    cameras = few(plush_excerpt_cameras)
+    options = OPTIONS.changed(prune={"iterations": 2}, compact=False)
+    every = encode(plush_excerpt, cameras, options, device=open_device(family)).data
+    monkeypatch.setattr("potr_cl.stages.refitting.colour_map.ENOUGH", 2)
+    expected = encode(plush_excerpt, cameras, options, device=open_device(family)).data
+    assert expected != every
+    for count in (2, 4):
+        devices = [open_device(family) for _ in range(count)]
+        with HostPool(devices) as pool:
+            assert encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).data == expected
 
 
 def test_more_devices_than_views(plush_excerpt, plush_excerpt_cameras, family):
@@ -206,3 +224,31 @@ def test_a_search_shares_views_out_too(plush_excerpt, plush_excerpt_cameras):
     together = potr_cl.encode(plush_excerpt, cameras, options, device=[device, Device()], max_size=16_000)
     assert together.data == alone.data
     assert together.shared is not None
+
+
+def test_large_scenes_view_by_view(monkeypatch):
+    """Each device looks at its views with what these may draw."""
+    scene, cameras = street(5, 900)
+    options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 6}, refit={"steps": 2})
+    options = dataclasses.replace(options, cameras_anyway=True)
+    alone = open_device("gpu")
+    expected = encode(scene, cameras, options, device=alone)
+    monkeypatch.setattr(splat_groups, "LARGEST", 32)
+    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    shares = []
+
+    class Noting(ViewByView):
+        def __init__(self, *given, **named):
+            super().__init__(*given, **named)
+            shares.append(self.kept_views)
+
+    for module in (measured, part):
+        monkeypatch.setattr(module, "ViewByView", Noting)
+    monkeypatch.setattr(shared_removal, "ViewByView", ViewByView)
+    devices = [open_device("gpu") for _ in range(3)]
+    with HostPool(devices) as pool:
+        found = encode(scene, cameras, options, device=devices[0], pool=pool)
+    assert len(shares) == 3
+    assert sum(shares) == len(cameras)
+    assert found.data == expected.data
+    assert [device.allocated for device in devices] == [0] * 3

@@ -112,6 +112,8 @@ def decode_stream(
     idle = layout.idle
     partly = set(np.flatnonzero(idle.any(axis=1)).tolist())
     resting = len(entries) - TOTAL
+    # Tokens with bits beside them are at least as large.
+    least = 2 * int(fitted.stream.sizes[DIRECT:].min(initial=LARGEST_SIZE))
     # Little is done in a step, so that what numpy takes to be called is most of the time: no call too many.
     multiply, add, subtract, shift, mask = np.multiply, np.add, np.subtract, np.right_shift, np.bitwise_and
     for t, slot in enumerate(rows):
@@ -128,6 +130,7 @@ def decode_stream(
         subtract(recent, a, recent)
         shift(entry, _SIZE_SHIFT, a)
         add(recent, a, recent)
+        large = extra is not None and a.max() >= least
         shift(states, _PRECISION, a)
         mask(entry, _FREQUENCY, b)
         multiply(a, b, a)
@@ -135,7 +138,7 @@ def decode_stream(
         mask(entry, _PLACE, entry)
         add(a, entry, states)
         words.renormalise(states)
-        if extra is not None and (token := tokens.take(slot)).max() >= DIRECT:
+        if large and extra is not None and (token := tokens.take(slot)).max() >= DIRECT:
             _take_bits(token, states, words, extra[t])
     words.check()
     of_items = layout.taken(tokens.take(rows))

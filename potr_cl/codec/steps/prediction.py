@@ -77,14 +77,19 @@ def from_residuals(residuals: I64, classes: I8) -> I64:
     for k, table in enumerate((steps, inverses)):
         by_class[k, :, 0] = _turned(table[index], runs)
     last = np.zeros((BEFORE, channels, runs), np.int64)
-    total = np.zeros((channels, runs), np.int64)
-    for t in range(min(RUN, n)):
-        level = laid[t]
-        level += (total * by_class[1, t] + _HALF) >> _MEAN_SHIFT
-        value = level * by_class[0, t]
-        total += value
-        total -= last[t % BEFORE]
-        last[t % BEFORE] = value
+    total, mean = np.zeros((2, channels, runs), np.int64)
+    half, shift = np.array(_HALF), np.array(_MEAN_SHIFT)  # as arrays they are taken in half the time
+    for t, (level, step, inverse) in enumerate(zip(laid, *by_class, strict=True)):
+        if t == n:
+            break
+        np.multiply(total, inverse, mean)
+        np.add(mean, half, mean)
+        np.right_shift(mean, shift, mean)
+        np.add(level, mean, level)
+        value = last[t % BEFORE]
+        np.subtract(total, value, total)
+        np.multiply(level, step, value)
+        np.add(total, value, total)
     return np.stack([np.ascontiguousarray(laid[:, c].T).reshape(-1)[:n] for c in range(channels)])
 
 

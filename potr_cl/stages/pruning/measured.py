@@ -12,12 +12,11 @@ from numpy.typing import NDArray
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import lying_on
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.pruning.part import RemovalPart
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.shared_removal import SharedRemoval
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.pruning.view_by_view import ViewByView
+from potr_cl.stages.pruning.view_by_view import ViewByView, can_go_by_view
 from potr_cl.stages.pruning.visible_parts import PartedRemoval, first_totals, whole_on_device
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.workers.dealing import shares
@@ -39,7 +38,7 @@ def measurement(
 
     Args:
         state, bench, options: of the stage.
-        sights: what the views see, where one device had better look at each with what it sees.
+        sights: what the views see, where each had better be looked at with what it sees.
         spared: as of :class:`~potr_cl.stages.pruning.visible_parts.PartedRemoval`; only with ``sights``.
 
     Raises:
@@ -57,7 +56,7 @@ def measurement(
             if sights is not None:
                 whole = stack.enter_context(whole_on_device(device, bench.drawable(state.scene)))
                 given = (options, bench.background, progress)
-                if isinstance(whole, SceneBuffers) and device.family == "gpu" and options.only_by_tolerance:
+                if can_go_by_view(whole, device, options):
                     first = None if spared is None else first_totals(len(state.scene), spared)
                     yield stack.enter_context(ViewByView(device, whole, views, sights, *given, first))
                 else:
@@ -69,16 +68,25 @@ def measurement(
             yield stack.enter_context(RemovalSweep(rasterizer, views, options, progress))
             return
         scene = stack.enter_context(pool.shared(bench.shared(state)))
-        each = [(scene, views, options, bench.background, numbers) for numbers in share.others]
+        # Other processes would have to be sent as much as the sights save.
+        sights = sights if pool.in_process else None
+        each = [(scene, views, options, bench.background, numbers, sights) for numbers in share.others]
         others = stack.enter_context(
             Parts(pool, RemovalPart, each, options.memory, [len(each) for each in share.others])
         )
-        own, stride = None, len(state.scene)
+        own: RemovalSweep | ViewByView | None = None
+        stride = len(state.scene)
         if share.own:
             drawable = stack.enter_context(lying_on(device, bench.placed(state)))
-            rasterizer = stack.enter_context(Rasterizer(device, drawable, background=bench.background))
-            own = stack.enter_context(RemovalSweep(rasterizer, views, options, progress, share.own))
-            stride = rasterizer.stride
+            if sights is not None and can_go_by_view(drawable, device, options):
+                given = (options, bench.background, progress)
+                own = ViewByView(device, drawable, views, sights, *given, numbers=share.own)
+                stride = drawable.stride
+            else:
+                rasterizer = stack.enter_context(Rasterizer(device, drawable, background=bench.background))
+                own = RemovalSweep(rasterizer, views, options, progress, share.own)
+                stride = rasterizer.stride
+            stack.callback(own.close)
         others.ready()
         steers = all(others.ask(place, "can_steer") for place in range(len(others)))
         steers = steers and (device.family == "gpu" if own is None else own.steering is not None)

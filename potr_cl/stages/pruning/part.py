@@ -14,11 +14,13 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Scratch, Staging
 from potr_cl.opencl.relay import Lent
+from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.survivors import Bits
 from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.view_by_view import ViewByView, can_go_by_view
 from potr_cl.workers.pool import Part
 
 Indices = NDArray[np.int64]
@@ -35,6 +37,7 @@ class RemovalPart(Part):
         options: speed/accuracy trade-offs.
         background: R, G, B behind the scene.
         numbers: of the views of this part, ascending.
+        sights: what all views see, where each had better be looked at with what it sees; None: with all splats.
 
     Raises:
         DeviceError: the scene or a view does not fit the device.
@@ -49,12 +52,18 @@ class RemovalPart(Part):
         options: SweepOptions,
         background: tuple[float, float, float],
         numbers: Sequence[int],
+        sights: Sights | None = None,
     ) -> None:
         options = SweepOptions(**{**vars(options), "memory": memory})
         with ExitStack() as owned:
             drawable = owned.enter_context(lying_on(device, scene))
-            rasterizer = owned.enter_context(Rasterizer(device, drawable, background=background))
-            self._sweep = owned.enter_context(RemovalSweep(rasterizer, cameras, options, numbers=numbers))
+            self._sweep: RemovalSweep | ViewByView
+            if sights is not None and can_go_by_view(drawable, device, options):
+                self._sweep = ViewByView(device, drawable, cameras, sights, options, background, numbers=numbers)
+            else:
+                rasterizer = owned.enter_context(Rasterizer(device, drawable, background=background))
+                self._sweep = RemovalSweep(rasterizer, cameras, options, numbers=numbers)
+            owned.callback(self._sweep.close)
             self._staging = owned.enter_context(Staging(device))
             self._totals = owned.enter_context(Scratch(device, "the removal effects"))
             self._owned = owned.pop_all()

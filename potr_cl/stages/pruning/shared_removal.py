@@ -25,6 +25,7 @@ from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
 from potr_cl.stages.pruning.steering import Steered, Steering
 from potr_cl.stages.pruning.survivors import Survivors
+from potr_cl.stages.pruning.view_by_view import ViewByView
 from potr_cl.workers.parts import Parts, Pending
 from potr_cl.workers.pool import Pool
 
@@ -57,7 +58,7 @@ class SharedRemoval(Owner):
         splats: int,
         stride: int,
         cameras: Sequence[Camera],
-        own: RemovalSweep | None,
+        own: RemovalSweep | ViewByView | None,
         others: Parts,
         pool: Pool,
         steers: bool,
@@ -146,8 +147,8 @@ class _SharedSteering(Owner):
         self._shared = shared
         self.device, self.splats, self.units = device, shared.splats, shared._fixed_point.units
         own = None if shared._own is None else shared._own.steering
-        assert own is None or isinstance(own, Steering)
-        self._own: Steering | None = own
+        assert own is None or isinstance(own, (Steering, ViewByView))
+        self._own: Steering | ViewByView | None = own
         self._memory = Memory(device)
         self._marks: Survivors | None = None
         self._relay = Relay(device) if shared._in_process else None

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from functools import partial
+from typing import TypeGuard
 
 import numpy as np
 import pyopencl as cl
@@ -25,19 +26,19 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.kernel import Kernel
-from potr_cl.opencl.memory import Arena, Memory, Owner, Scratch
+from potr_cl.opencl.memory import Memory, Owner, Reused, Scratch
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.macros import totals_limits
 from potr_cl.raster.picked_splats import PickedSplats, Picker
 from potr_cl.raster.rasterizer import PreparingMemory, Rasterizer
-from potr_cl.raster.scene_buffers import SceneBuffers
+from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.raster.view_set import TILE
 from potr_cl.stages.pruning.fixed_point import FixedPoint
 from potr_cl.stages.pruning.launcher import SetKernels, launcher_for
 from potr_cl.stages.pruning.prepared_views import PreparedSet
 from potr_cl.stages.pruning.queues import Queues
 from potr_cl.stages.pruning.removal import F64, Indices
-from potr_cl.stages.pruning.survivors import SplatState
+from potr_cl.stages.pruning.survivors import Bits, SplatState, Survivors
 from potr_cl.stages.pruning.sweep_buffers import SweepBuffers
 from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
 
@@ -57,6 +58,11 @@ _OWN, _TOGETHER = 70, 56
 _PASSING, _MOST, _SPREAD = 1 / 5, 16, 4.0
 #: How much more than a tile they may lose, on the average.
 _PATIENCE = 2.0
+
+
+def can_go_by_view(scene: Drawable, device: Device, options: SweepOptions) -> TypeGuard[SceneBuffers]:
+    """Whether a scene can be looked at view by view: on a GPU that has it, where staleness alone chooses tiles."""
+    return isinstance(scene, SceneBuffers) and device.family == "gpu" and options.only_by_tolerance
 
 
 @dataclass(frozen=True)
@@ -180,6 +186,8 @@ class ViewByView(Owner):
         background: R, G, B behind the scene.
         progress: called with the views prepared and their number.
         first_totals: (N, 2) int64 that the scene's totals begin with; None: zeros.
+        numbers: of the views that are measured here, where others are measured elsewhere and all totals are added up;
+            None: all.
 
     Attributes:
         splats: N.
@@ -200,6 +208,7 @@ class ViewByView(Owner):
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
         progress: Callable[[int, int], None] | None = None,
         first_totals: NDArray[np.int64] | None = None,
+        numbers: Sequence[int] | None = None,
     ) -> None:
         self.device, self.splats = device, whole.splats
         self._whole, self._cameras, self._options, self._background = whole, cameras, options, background
@@ -215,6 +224,10 @@ class ViewByView(Owner):
         self._pristine = True
         self._targets_known = self._unkept_known = False
         self._seen = sights.seen
+        own = np.ones(len(cameras), bool)
+        if numbers is not None:
+            own[:] = False
+            own[list(numbers)] = True
         with ExitStack() as owned:
             self._memory = memory = owned.enter_context(Memory(device))
             owned.callback(self._close_kept)
@@ -223,16 +236,19 @@ class ViewByView(Owner):
                 for what in ("some views' effects", "some views' tiles", "their staleness", "their targets")
             ]
             #: Of views that are not kept, one after the other.
-            self._passing = Arena(device, "some views")
+            self._passing = Reused(device)
             owned.callback(self._passing.give_back)
             self._preparing = owned.enter_context(PreparingMemory(device))
             self.totals = memory.allocate(16 * whole.stride, "the removal effects")
             self._first: cl.Buffer | None = None
             if first_totals is not None:
                 self._first = memory.upload(first_totals, "the removal effects to begin with")
-            self.marks = memory.upload(np.full(whole.stride, SplatState.ALIVE, np.uint8), "the splats that are left")
+            self._survivors = owned.enter_context(
+                Survivors(device, self.splats, whole.stride, lambda: self._queues.wait())
+            )
+            self.marks: cl.Buffer = self._survivors.buffer
             self._picker = owned.enter_context(Picker(device, sights.groups.group_of))
-            self._prepare_all(sights, progress)
+            self._prepare_all(sights, own, progress)
             self._owned = owned.pop_all()
         self.kept_views = len(self._kept)
 
@@ -243,10 +259,12 @@ class ViewByView(Owner):
 
     # --------------------------------------------------------------------------------------------- preparing views
 
-    def _prepare_all(self, sights: Sights, progress: Callable[[int, int], None] | None) -> None:
+    def _prepare_all(
+        self, sights: Sights, mine: NDArray[np.bool_], progress: Callable[[int, int], None] | None
+    ) -> None:
         device, memory = self.device, self._memory
-        totals = sights.totals
-        targets = np.array([_PIXEL * camera.width * camera.height for camera in self._cameras])
+        totals = np.where(mine, sights.totals, 0)
+        targets = np.array([_PIXEL * camera.width * camera.height for camera in self._cameras]) * mine
         left = default_memory(device) if self._options.memory is None else self._options.memory
         tiles = [-(-camera.width // TILE) * -(-camera.height // TILE) for camera in self._cameras]
         self._stale = memory.upload(np.zeros(sum(tiles), np.float32), "the tiles' staleness")
@@ -359,8 +377,7 @@ class ViewByView(Owner):
     @property
     def alive(self) -> NDArray[np.bool_]:
         """(N,) which splats are left."""
-        alive: NDArray[np.bool_] = self.device.download(self.marks, (self.splats,), np.uint8) == SplatState.ALIVE
-        return alive
+        return self._survivors.alive
 
     def measure_on_device(self) -> None:
         """Bring the totals up to date."""
@@ -383,7 +400,16 @@ class ViewByView(Owner):
     def remove_marked(self) -> None:
         """Take the splats out that are marked JUST_REMOVED."""
         self._list_stale(self._options.tolerance)
+        self._survivors.marked_by_device()
         self._pristine = False
+
+    def mark(self, splats: Bits) -> None:
+        """See :meth:`potr_cl.stages.pruning.steering.Steering.mark`."""
+        self._survivors.mark(splats)
+
+    def just_marked(self) -> Bits:
+        """The splats that are marked JUST_REMOVED, see :meth:`Survivors.just_marked`."""
+        return self._survivors.just_marked()
 
     def _sweep_listed(self) -> None:
         work = [(count, kept) for count, kept in zip(self._listed, self._kept, strict=True) if count]
@@ -472,9 +498,10 @@ class ViewByView(Owner):
         """
         device, cameras = self.device, [self._cameras[number] for number in batch.numbers]
         own_totals, tiles, stale, _ = self._scratch
-        with Memory(device) as memory, ExitStack() as stack:
+        with ExitStack() as stack:
+            stack.callback(self._passing.close)
             states = None if whole else self.marks
-            numbers, splats = self._picker.pick(memory, batch.wanted, states, SplatState.ALIVE)
+            numbers, splats = self._picker.pick(self._passing, batch.wanted, states, SplatState.ALIVE)
             if not splats:
                 yield None
                 return
@@ -502,16 +529,18 @@ class ViewByView(Owner):
 
     def measure(self) -> tuple[F64, F64]:
         """ΔMSE_k and I_k of all N splats, float64; the values of removed splats mean nothing."""
+        return self._fixed_point.values(self.measure_totals())
+
+    def measure_totals(self) -> NDArray[np.int64]:
+        """The same as (N, 2) int64 in units of the fixed point: the sums over the views that are measured here."""
         self.measure_on_device()
-        return self._fixed_point.values(self.device.download(self.totals, (self.splats, 2), np.int64))
+        return self.device.download(self.totals, (self.splats, 2), np.int64)
 
     def remove(self, splats: Indices) -> None:
         """Take splats out for good."""
-        states = self.device.download(self.marks, (self._whole.stride,), np.uint8)
-        states[states == SplatState.JUST_REMOVED] = SplatState.REMOVED
-        states[splats] = SplatState.JUST_REMOVED
-        cl.enqueue_copy(self.device.queue, self.marks, states, is_blocking=True)
-        self.remove_marked()
+        self._survivors.remove(splats)
+        self._list_stale(self._options.tolerance)
+        self._pristine = False
 
     def replace_sh(self, sh: FloatArray) -> None:
         """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
@@ -524,12 +553,25 @@ class ViewByView(Owner):
             kept.rasterizer.rest()
         if former is not None:
             self._memory.free(former)
+        self.sweep_everything()
+
+    def sweep_everything(self) -> None:
+        """Have the next measurement sweep every tile, whatever has changed."""
         self._list_everything()
+        self._unkept_known = False
 
     def view_importances(self) -> Iterator[tuple[int, Indices, F64]]:
         """See :meth:`potr_cl.stages.pruning.removal.RemovalSweep.view_importances`."""
+        self.sweep_changed()
+        yield from self.known_importances()
+
+    def sweep_changed(self) -> None:
+        """Measure whatever anything was removed from since it was last measured, in the views that are kept."""
         self._list_stale(0.0)
         self._sweep_listed()
+
+    def known_importances(self) -> Iterator[tuple[int, Indices, F64]]:
+        """:meth:`view_importances` of the views that are measured here, right after :meth:`sweep_changed`."""
         alive = self.alive
         kept = {each.view.number: each for each in self._kept}
         unkept = {number for batch in self._unkept for number in batch.numbers}

@@ -43,13 +43,18 @@ _CHANGE, _TOTALS = 16, 32
 _COLOURED = 8
 
 
+#: Views are divided into so many parts, every second one in each, where each has as many as are enough: twice the 16
+#: coefficients that a channel of a splat has.
+_PARTS, ENOUGH = 2, 32
+
+
 class Helpers(Protocol):
     """Do some of the views of a :class:`ColourMap`."""
 
     def begin_gradient(self, x: cl.Buffer, blocks: bool, constant: bool) -> None:
         """Have them begin with :meth:`ColourMap.sum_gradient` of their views."""
 
-    def begin_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool) -> None:
+    def begin_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool, part: int | None) -> None:
         """Have them begin with :meth:`ColourMap.sum_normal` of their views."""
 
     def add(self, sums: cl.Buffer, blocks: cl.Buffer | None) -> dict[int, float]:
@@ -77,6 +82,8 @@ class ColourMap(Owner):
 
     Attributes:
         sums: (3 M, stride) int64 in the device's memory, what the views have added to coefficients; 0 between products.
+        parts: into how many parts views are divided, each of which shows about the same as all of them: one part where
+            they are few.
         total_weight: the sum over all pixels and channels of their weights: a squared error over it is a mean one.
 
     Raises:
@@ -122,7 +129,13 @@ class ColourMap(Owner):
         self.total_weight = 3 * REFERENCE_PIXELS * len(cameras)
         self._one = gathered_scale(cameras, [_weight(camera) for camera in cameras])
         fixed_points = self._launcher.fixed_point_scales(cameras)
-        self._numbers = range(len(cameras)) if numbers is None else numbers
+        self._views_of_all = len(cameras)
+        self.parts = _PARTS if len(cameras) >= _PARTS * ENOUGH else 1
+        own_numbers = range(len(cameras)) if numbers is None else numbers
+        # Launches, and what is gathered together, are of one part.
+        self._numbers = sorted(own_numbers, key=lambda number: (number % self.parts, number))
+        of_parts = [sum(number % self.parts == part for number in own_numbers) for part in range(self.parts)]
+        breaks = np.cumsum(of_parts).tolist()
         cameras = [cameras[number] for number in self._numbers]
         self._weights = [_weight(camera) for camera in cameras]
         self._fixed_points = [fixed_points[number] for number in self._numbers]
@@ -133,12 +146,18 @@ class ColourMap(Owner):
             columns[:, : layout.splats] = means.T
             self._means = self._memory.upload(columns, "the centres")
             own = (_CHANGE + _TOTALS) * layout.stride
-            self._views = PreparedViews(rasterizer, cameras, self._launcher.most_views, own, memory)
+            self._views = PreparedViews(rasterizer, cameras, self._launcher.most_views, own, memory, breaks)
             self._owned.append(self._views)
             launches = self._views.launches
             most = max((len(numbers) for numbers in launches), default=0)
             together = min(self._launcher.gathered, max(len(launches), 1)) if most == 1 else 1
-            self._groups = [launches[first : first + together] for first in range(0, len(launches), together)]
+            self._groups: list[list[list[range]]] = [
+                [some[first : first + together] for first in range(0, len(some), together)]
+                for some in (
+                    [numbers for numbers in launches if self._numbers[numbers[0]] % self.parts == part]
+                    for part in range(self.parts)
+                )
+            ]
             at_once = most * together
             self._change = self._memory.allocate(_CHANGE * layout.stride * at_once, "the colours' change")
             self._totals = self._memory.allocate(_TOTALS * layout.stride * at_once, "the re-fit's sums")
@@ -228,7 +247,7 @@ class ColourMap(Owner):
             The squared error by W of each view, by number.
         """
         errors: dict[int, float] = {}
-        for group in self._groups:
+        for group in self._groups_of(None):
             for slot, numbers in zip(self._slots, group, strict=False):
                 with self._views.ready(numbers) as (views, _):
                     self._enqueue_colours(views, x, views.colours, None)
@@ -245,14 +264,16 @@ class ColourMap(Owner):
     def _sum_blocks(self, blocks: cl.Buffer, first: int) -> None:
         """The blocks' part of :meth:`sum_gradient` alone, of the splats from one on."""
         self._coefficients.clear(self._change)  # black, and no channel is free
-        for group in self._groups:
+        for group in self._groups_of(None):
             for slot, numbers in zip(self._slots, group, strict=False):
                 with self._views.ready(numbers) as (views, _):
                     self._enqueue_sweep(numbers, views, slot.change, None, True, slot)
                     self._enqueue_table(numbers, group, views)
             self._enqueue_gather(group, blocks, False, first)
 
-    def normal(self, direction: Vector, at: Vector, result: Vector, constant: bool = False) -> None:
+    def normal(
+        self, direction: Vector, at: Vector, result: Vector, constant: bool = False, part: int | None = None
+    ) -> None:
         """result += Aᵀ W A direction, nothing if the direction is 0 or not finite.
 
         Args:
@@ -260,10 +281,12 @@ class ColourMap(Owner):
             at: the vector that :meth:`gradient` was given last, with the same content.
             result: another vector.
             constant: the direction's AC coefficients are all 0, and those of the result are left alone.
+            part: number of the part of the views that stands for all of them, modulo :attr:`parts`. None: all.
 
         Raises:
             DeviceError: the device failed.
         """
+        part = None if part is None else part % self.parts
         largest = self._coefficients.largest(direction)
         if not 0 < largest < math.inf:
             return
@@ -271,20 +294,23 @@ class ColourMap(Owner):
         on_device = self._coefficients.on_device(direction)
         if self._helpers is not None:
             assert isinstance(at, cl.Buffer), "several devices have their vectors on the master's device"
-            self._helpers.begin_normal(on_device, at, unit, constant)
-        self.sum_normal(on_device, at, unit, constant)
+            self._helpers.begin_normal(on_device, at, unit, constant, part)
+        self.sum_normal(on_device, at, unit, constant, part)
         if self._helpers is not None:
             self._helpers.add(self.sums, None)
-        self._coefficients.add_fixed(result, self.sums, 1 / (self._one * unit), constant)
+        share = 1.0 if part is None else len(range(part, self._views_of_all, self.parts)) / self._views_of_all
+        self._coefficients.add_fixed(result, self.sums, 1 / (self._one * unit * share), constant)
 
-    def sum_normal(self, direction: cl.Buffer, at: Vector, unit: float, constant: bool = False) -> None:
+    def sum_normal(
+        self, direction: cl.Buffer, at: Vector, unit: float, constant: bool = False, part: int | None = None
+    ) -> None:
         """The part of :meth:`normal` that is a sum over this device's views: it is added to :attr:`sums`.
 
         Args:
-            direction, at, constant: as of :meth:`normal`; the direction on the device.
+            direction, at, constant, part: as of :meth:`normal`; the direction on the device.
             unit: the direction is multiplied by this.
         """
-        for group in self._groups:
+        for group in self._groups_of(part):
             for slot, numbers in zip(self._slots, group, strict=False):
                 with self._views.ready(numbers) as (views, anew):
                     if anew:  # which colours are cut is not known any more
@@ -295,6 +321,10 @@ class ColourMap(Owner):
             self._enqueue_gather(group, None, constant)
 
     # ------------------------------------------------------------------------------------------ their parts
+
+    def _groups_of(self, part: int | None) -> list[list[range]]:
+        """The launches that are gathered together, of a part of the views or of all."""
+        return [group for groups in self._groups for group in groups] if part is None else self._groups[part]
 
     def _block_sums(self, memory: Memory, splats: int) -> cl.Buffer:
         """Integers for the blocks of so many splats, 0."""

@@ -138,20 +138,23 @@ class ColourPart(Part):
         self._blocks.close()
         self._block_sums = None
 
-    def normal(self, direction: FloatArray | Lent, unit: float, constant: bool) -> NDArray[np.int64] | Lent:
+    def normal(
+        self, direction: FloatArray | Lent, unit: float, constant: bool, part: int | None = None
+    ) -> NDArray[np.int64] | Lent:
         """What these views add to :meth:`~potr_cl.stages.refitting.colour_map.ColourMap.normal`.
 
         Args:
             direction: (active coefficients,) float32. If it is lent, the sums are lent too.
             unit: it is multiplied by this.
             constant: whether only the constant coefficients are active.
+            part: of the views; None: all of them.
 
         Returns:
             (active coefficients,) int64.
         """
         self._forget_blocks()
         self._packing.set_floats(self._direction, direction)
-        self._map.sum_normal(self._direction, self._x, unit, constant)
+        self._map.sum_normal(self._direction, self._x, unit, constant, part)
         if isinstance(direction, Lent):
             return self._packing.lend_sums(self._map.sums)
         return self._packing.sums(self._map.sums)

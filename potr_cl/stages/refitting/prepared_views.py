@@ -24,6 +24,7 @@ class PreparedViews(Owner):
         cameras: the views.
         most_views: how many views a launch can do.
         nbytes: bytes that a view takes in a sweep's own buffers.
+        breaks: numbers of views at which a launch begins, whatever came before.
         memory: bytes that the kept views, and what else is taken from :attr:`budget`, may take; None: a quarter of what
             is free.
 
@@ -36,15 +37,24 @@ class PreparedViews(Owner):
     """
 
     def __init__(
-        self, rasterizer: Rasterizer, cameras: Sequence[Camera], most_views: int, nbytes: int, memory: int | None
+        self,
+        rasterizer: Rasterizer,
+        cameras: Sequence[Camera],
+        most_views: int,
+        nbytes: int,
+        memory: int | None,
+        breaks: Sequence[int] = (),
     ) -> None:
         self._rasterizer = rasterizer
         self._cameras = list(cameras)
+        self._breaks = sorted({*breaks, len(cameras)})
         device = rasterizer.device
         free = device.info.memory - device.allocated
         self.budget = ViewCache(rasterizer, free * _SHARE if memory is None else memory)
         self.launches: list[range] = []
         self._kept: dict[range, ViewSet] = {}
+        #: Memory for views that are not kept, by their number.
+        self._spare: dict[int, ViewSet] = {}
         try:
             self._prepare_all(self.budget.most_views(most_views, nbytes))
         except BaseException:
@@ -54,27 +64,28 @@ class PreparedViews(Owner):
     def _prepare_all(self, most: int) -> None:
         number = 0
         while number < len(self._cameras):
-            numbers = range(number, min(number + most, len(self._cameras)))
+            stop = next(each for each in self._breaks if each > number)
+            numbers = range(number, min(number + most, stop))
             try:
-                views = self._prepare(numbers)
+                views = self._prepare_again(numbers)
             except DeviceMemoryError:
+                self._forget_spare()
                 if most == 1:
                     raise
                 most //= 2
                 continue
-            self._keep_or_free(numbers, views)
+            self._keep_if_possible(numbers, views)
             self.launches.append(numbers)
             number += len(numbers)
 
-    def _keep_or_free(self, numbers: range, views: ViewSet) -> None:
-        kept = False
-        try:
-            kept = self.budget.keep(views)
-        finally:
-            if not kept:
-                views.close()
-        if kept:
-            self._kept[numbers] = views
+    def _keep_if_possible(self, numbers: range, views: ViewSet) -> None:
+        if self.budget.keep(views):
+            self._kept[numbers] = self._spare.pop(len(numbers))
+
+    def _forget_spare(self) -> None:
+        for views in self._spare.values():
+            views.close()
+        self._spare = {}
 
     def _prepare(self, numbers: range) -> ViewSet:
         return self._rasterizer.prepare_set([self._cameras[number] for number in numbers])
@@ -90,16 +101,30 @@ class PreparedViews(Owner):
             DeviceError: they do not fit the device.
         """
         kept = self._kept.get(numbers)
-        views = self._prepare(numbers) if kept is None else kept
-        try:
-            with self.budget.geometry(views) as projected:
-                yield views, projected or kept is None
-        finally:
-            if kept is None:
-                views.close()
+        views = self._prepare_again(numbers) if kept is None else kept
+        with self.budget.geometry(views) as projected:
+            yield views, projected or kept is None
+
+    def _prepare_again(self, numbers: range) -> ViewSet:
+        """Views that are not kept, in the memory of others: drivers take long to give memory back and take it anew."""
+        cameras = [self._cameras[number] for number in numbers]
+        views = self._spare.pop(len(numbers), None)
+        if views is not None:
+            fits = False
+            try:
+                fits = self._rasterizer.prepare_again(views, cameras)
+            finally:
+                if not fits:
+                    views.close()
+            if fits:
+                self._spare[len(numbers)] = views
+                return views
+        views = self._spare[len(numbers)] = self._prepare(numbers)
+        return views
 
     def close(self) -> None:
         """Give all device memory back."""
+        self._forget_spare()
         for views in self._kept.values():
             views.close()
         self._kept = {}

@@ -391,7 +391,7 @@ class ColourRefit(Owner):
         selection, total = None, options.steps
         if options.drop:
             ridge = replace(descent.ridge, lam=options.selection_lam)
-            selection = Selection(Descent(options.selection_steps, options.gain, ridge), options.drop)
+            selection = Selection(Descent(options.selection_steps, options.gain, ridge, part=0), options.drop)
             total += options.selection_steps
 
         def after_step(steps: int) -> None:
@@ -448,11 +448,11 @@ class ColourRefit(Owner):
             *first, last = ROUNDS
             for each in first:
                 round_some(solver.x, each, worth)
-                gone_on = solver.go_on(self.colour_map, targets, Descent(each.steps, 0.0, ridge))
+                gone_on = solver.go_on(self.colour_map, targets, Descent(each.steps, 0.0, ridge, part=0))
                 steps += gone_on.steps
                 errors.append(gone_on.start)
             round_some(solver.x, last, worth)
-            solved = solver.solve(self.colour_map, targets, Descent(last.steps, 0.0, ridge), constant=True)
+            solved = solver.solve(self.colour_map, targets, Descent(last.steps, 0.0, ridge, part=1), constant=True)
         return Solved((errors[0], solved.errors[1]), steps + solved.steps, solved.start)
 
     def error(self, targets: Targets, sh: FloatArray | None = None) -> float:

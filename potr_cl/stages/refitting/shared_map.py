@@ -59,12 +59,12 @@ class SharedViews(Owner):
         columns: FloatArray = self._columns.download(x, (layout.columns, layout.stride), np.float32)
         return columns[:, : layout.splats]
 
-    def begin_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool) -> None:
+    def begin_normal(self, direction: cl.Buffer, at: cl.Buffer, unit: float, constant: bool, part: int | None) -> None:
         """Have them begin with a product of the normal matrix."""
         if self._x is not None:
             self._x.lend(at)  # a part that is made again asks for it; where it was before it may have changed
         packed = self._packing.lend_floats(direction) if self._in_process else self._packing.floats(direction)
-        self._pending = self._others.begin("normal", packed, unit, constant, logged=False)
+        self._pending = self._others.begin("normal", packed, unit, constant, part, logged=False)
 
     def add(self, sums: cl.Buffer, blocks: cl.Buffer | None) -> dict[int, float]:
         """Add what they found to sums on the master's device."""

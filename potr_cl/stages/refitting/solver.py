@@ -38,11 +38,14 @@ class Descent:
         steps: the most conjugate-gradient steps.
         gain: stop when a step takes less than this part off the objective.
         ridge: what holds the coefficients down or near their start.
+        part: of the views (:attr:`ColourMap.parts`) by which the normal equations are made, for a way that need not be
+            exact because another one follows, or leads less far; None: of all.
     """
 
     steps: int
     gain: float
     ridge: Ridge
+    part: int | None = None
 
 
 @dataclass(frozen=True)
@@ -100,13 +103,14 @@ class _NormalEquations:
     ridge: Ridge
     at: Vector
     constant: bool
+    part: int | None
 
     def precondition(self, residual: Vector, result: Vector) -> None:
         self.blocks.precondition(residual, self.ridge, result)
 
     def product(self, direction: Vector, result: Vector) -> None:
         self.coefficients.zero(result)
-        self.colour_map.normal(direction, self.at, result, self.constant)
+        self.colour_map.normal(direction, self.at, result, self.constant, self.part)
         self.coefficients.add_ridge(result, direction, self.ridge)
 
 
@@ -232,7 +236,7 @@ class ColourSolver:
     def _descend(self, problem: _Problem, state: _State, how: Descent, after_step: Callable[[int], None]) -> int:
         """Take conjugate-gradient steps from where x was linearised; returns their number."""
         equations = _NormalEquations(
-            problem.colour_map, self._coefficients, self.blocks, how.ridge, at=self._start, constant=problem.constant
+            problem.colour_map, self._coefficients, self.blocks, how.ridge, self._start, problem.constant, how.part
         )
         return self._gradients.descend(
             equations, self.x, self._residual, state.objective, how.steps, how.gain, after_step
