@@ -246,7 +246,7 @@ class Rasterizer(Owner):
             views.close()
             raise
         finally:
-            if len(cameras) > 1:  # far more than a single view will need
+            if len(cameras) > 1 and not self._shares:  # far more than a single view will need
                 self._preparing.close()
         return views
 
