@@ -11,6 +11,7 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.reference.refit_cases import Case
 from potr_cl.reference.scenes import ring_of_cameras, visible_scene
+from potr_cl.stages import refit as refit_stage
 from potr_cl.stages.refitting import placement
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, refit_colours
 from tests.devices import KERNELS, open_device
@@ -132,6 +133,9 @@ def test_the_same_file(device, plush_excerpt, plush_excerpt_cameras, monkeypatch
     small = plush_excerpt_cameras[:12]
     options = EncodeOptions.for_preset("best", between=False).changed(prune={"iterations": 4})
     whole = encode(plush_excerpt, small, options, device=device)
+    monkeypatch.setattr(refit_stage, "_LARGE", 0)
+    remembered = encode(plush_excerpt, small, options.changed(memory=1 << 30), device=device)
+    assert remembered.data == whole.data
     for name in ("_ANYWAY", "_OF_FREE", "_OF_GIVEN"):
         monkeypatch.setattr(placement, name, 0)
     sliced = encode(plush_excerpt, small, options, device=device)
