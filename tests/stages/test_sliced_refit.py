@@ -158,3 +158,19 @@ def test_memory_is_that_of_vectors_and_views_together(device, monkeypatch):
                 room.append(refit.colour_map.room)
     assert room[1] - room[0] == pytest.approx(8 * one_piece, rel=0.01)
     assert room[0] < 3 * one_piece
+
+
+@pytest.mark.one_runtime
+def test_with_many_views(device):
+    """Of which some steps look at every second one."""
+    cameras = ring_of_cameras(70, size=20)
+    with Case(device, visible_scene(SPLATS, 1), visible_scene(100, 1, seed=7), cameras) as case:
+
+        def fitted(slices):
+            options = RefitOptions(steps=3, gain=0, drop=1e-7, slices=slices)
+            return refit_colours(
+                device, case.scene, case.cameras, case.targets, options, colour_grid=lambda effects: grid_of(SPLATS)
+            )
+
+        whole, sliced = fitted(None), fitted(SLICES)
+    assert same(sliced, whole)
