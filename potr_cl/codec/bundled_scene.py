@@ -41,8 +41,8 @@ _SIDE_BY_SIDE = 32
 _HANDED = 4
 #: Bundles for each thread, so that one more pays.
 _BUNDLES_A_THREAD = 2
-#: Bundles for each thread that may be packed, or wait to be taken, at a time.
-_ROOMS_A_THREAD = 2
+#: Bundles that may wait to be taken, beside those that threads are packing.
+_ROOMS_BESIDE = 8
 #: Bytes of a file whose checksums take long enough for several threads.
 _LARGE = 1 << 20
 #: Levels whose values are looked up.
@@ -133,7 +133,6 @@ class BundledScene:
             if file is None or share is None:
                 scene._side_by_side(lambda bundles: scene._pack_by_numpy(destination, sh_count, wanted, bundles))
             else:
-                rooms = [PackedValues() for _ in range(min(number, _ROOMS_A_THREAD * threads))]
                 share.open(file, wanted.sections, wanted.rotations, rooms, scene.tables)
                 for bundle in range(number):
                     room = bundle % len(rooms)
@@ -148,7 +147,8 @@ class BundledScene:
             if not taken:
                 destination.take_means(helpers.finish())
 
-        self._helped(threads, wanted, means, work)
+        with destination.rooms(0 if native() is None else min(number, threads + _ROOMS_BESIDE)) as rooms:
+            self._helped(threads, wanted, means, work)
 
     def _helped(
         self,

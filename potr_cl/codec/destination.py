@@ -9,6 +9,7 @@ from __future__ import annotations
 
 from abc import ABC, abstractmethod
 from collections.abc import Sequence
+from contextlib import AbstractContextManager
 from typing import Protocol
 
 import numpy as np
@@ -18,7 +19,7 @@ from potr_cl.codec.byte_planes import IntegerStream
 from potr_cl.codec.colour_factors import ColourFactors
 from potr_cl.codec.container import Header
 from potr_cl.codec.dequantizer import Dequantizer
-from potr_cl.codec.native.values import PackedValues, ValueArrays
+from potr_cl.codec.native.values import PackedValues, ValueArrays, packing_rooms
 from potr_cl.codec.versions import FormatVersion
 from potr_cl.model.scene import Scene
 
@@ -102,6 +103,10 @@ class BundleTaker(ABC):
     @abstractmethod
     def expect_bundles(self) -> None:
         """Bundles will come."""
+
+    def rooms(self, number: int) -> AbstractContextManager[list[PackedValues]]:
+        """Memory that so many bundles are packed in, before they are taken."""
+        return packing_rooms(number)
 
     @abstractmethod
     def take_bundle(self, first: int, packed: PackedValues, items: int) -> None:

@@ -11,6 +11,7 @@ from __future__ import annotations
 
 import threading
 from collections.abc import Callable, Sequence
+from contextlib import AbstractContextManager
 from typing import Any
 
 import numpy as np
@@ -26,7 +27,7 @@ from potr_cl.codec.native.library import native
 from potr_cl.codec.native.values import PackedValues
 from potr_cl.codec.versions import FormatVersion
 from potr_cl.errors import DataError
-from potr_cl.ondevice.staged_bundles import StagedBundles
+from potr_cl.ondevice.staged_bundles import StagedBundles, pinned_rooms
 from potr_cl.opencl.memory import Memory
 from potr_cl.raster.activation import activated_scales, log2_opacities, unit_quaternions
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
@@ -36,6 +37,8 @@ F32 = NDArray[np.float32]
 _SOURCE = "ondevice/dequantise.cl"
 #: Levels that are as large, or sums that are as far from 0, are left to the host. Tables of them take 2 and 4 MB.
 _MOST_LEVELS, _FARTHEST_SUM = 1 << 19, 1 << 19
+#: Splats of which the upload is what decoding waits for, unless the driver can copy from where they are.
+_WORTH_PINNING = 1 << 18
 #: Types of levels on the device, by NumPy's.
 _TYPES = {np.uint8: "uchar", np.uint16: "ushort", np.int16: "short", np.int32: "int"}
 
@@ -122,6 +125,11 @@ class DeviceDequantiser(BundleTaker):
 
     def expect_bundles(self) -> None:
         self._staged = StagedBundles(self._buffers, self._lock)
+
+    def rooms(self, number: int) -> AbstractContextManager[list[PackedValues]]:
+        if self._header.splats < _WORTH_PINNING:
+            return super().rooms(number)
+        return pinned_rooms(self._buffers.device, number)
 
     def take_bundle(self, first: int, packed: PackedValues, items: int) -> None:
         assert self._staged is not None

@@ -7,11 +7,16 @@ neither the host nor the bus handles the AC coefficients that are 0, which most 
 from __future__ import annotations
 
 import threading
+from collections.abc import Iterator
+from contextlib import contextmanager
+from weakref import WeakKeyDictionary
 
+import numpy as np
 import pyopencl as cl
 
 from potr_cl.codec.native.values import BUNDLE, PACKED, PackedValues
-from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory, Owner, Staging
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
 
 _SOURCE = "ondevice/spread.cl"
@@ -68,3 +73,27 @@ class StagedBundles(Owner):
 
     def close(self) -> None:
         self._memory.close()
+
+
+@contextmanager
+def pinned_rooms(device: Device, number: int) -> Iterator[list[PackedValues]]:
+    """Memory for so many bundles, which the driver copies from without a detour.
+
+    To take it takes longer than to decode a small file, so it stays with the device.
+    """
+    with _guard:
+        kept = _pinned.pop(device, [])
+    rooms = kept[:number]
+    try:
+        rooms += [PackedValues(Staging(device).array((PACKED,), np.float32)) for _ in range(number - len(rooms))]
+        yield rooms
+    finally:
+        rooms += kept[number:]
+        with _guard:
+            if len(rooms) > len(_pinned.get(device, [])):
+                _pinned[device] = rooms
+
+
+#: Memory that no file is decoded in now, by device.
+_pinned: WeakKeyDictionary[Device, list[PackedValues]] = WeakKeyDictionary()
+_guard = threading.Lock()

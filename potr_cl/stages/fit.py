@@ -47,10 +47,10 @@ FINER = 0.18
 STEPS: dict[Family, int] = {"cpu": 800, "gpu": 1000}
 #: Views between for each given one that a fit looks at: they keep it from fitting the given ones too closely.
 BETWEEN: dict[Family, float] = {"cpu": 1.0, "gpu": 3.0}
-#: Steps of a fit to photographs that "auto" stands for: so many for each of them, because more follow few photographs
-#: too closely; and the most.
-_STEPS_EACH = 5
-_MOST_STEPS: dict[Family, int] = {"cpu": 250, "gpu": 500}
+#: Steps of a fit to photographs that "auto" stands for: their number's square, divided by this, because few photographs
+#: are followed too closely soon; and the most.
+_SQUARE = 10
+_MOST_STEPS: dict[Family, int] = {"cpu": 250, "gpu": 1000}
 #: Part of the steps in each cycle but the last.
 _FIRST = 0.25
 #: What a splat costs as a multiple of the error for which pruning would have let it go: what it adds to the error when
@@ -121,10 +121,9 @@ class Fit(Stage):
             many as pay on the device.
         photograph_steps: in which what came of it is fitted to photographs, where the re-fit has some; 0: it is not.
             "auto": as many as pay on the device.
+        photograph_rate: by what the rates are multiplied for photographs.
         choosing, rounding, gentle: how far what is left is fitted once more after the choice of coefficients and the
-            rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`); not where photographs follow.
-        photograph_rate: by what the rates are multiplied for photographs, which pictures are farther from than from the
-            uncompressed scene's.
+            rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`).
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -152,7 +151,7 @@ class Fit(Stage):
     iterations: int = option(16)
     between: float | Literal["auto"] = option("auto")
     photograph_steps: int | Literal["auto"] = option("auto")
-    photograph_rate: float = option(3.0)
+    photograph_rate: float = option(1.0)
     batch: int = option(FitOptions.batch)
     rounds: int = option(FitOptions.rounds)
     patience: int = option(FitOptions.patience)
@@ -198,7 +197,7 @@ class Fit(Stage):
     def photograph_steps_on(self, family: Family, photographs: int) -> int:
         """The steps of the fit to so many photographs on a device of a family."""
         if self.photograph_steps == "auto":
-            return min(_STEPS_EACH * photographs, _MOST_STEPS[family])
+            return min(max(photographs * photographs // _SQUARE, 1), _MOST_STEPS[family])
         return self.photograph_steps
 
     def views_on(self, family: Family) -> float:
@@ -243,14 +242,16 @@ class Fit(Stage):
                 targets = stack.enter_context(kept_pictures(bench.opened, seen.views, rendered))
             found = self._cycles(seen, bench, targets, asked)
             found = dataclasses.replace(found, views=state.views, added=state.added)
-            if asked:
+            if bench.photographs is not None and self.photograph_steps != 0 and not asked:
+                found = self._to_photographs(found, bench, asked)
+            told = found.learnt[self.name]
+            # Others do not round as finely then as is known here.
+            if asked or not (isinstance(told, Fitted) and told.spared):
                 return found
-            if bench.photographs is not None and self.photograph_steps != 0:
-                return self._to_photographs(found, bench, asked)
-            if not isinstance(found.learnt[self.name], Fitted):
-                return found
-            looking = Looking(seen.views, seen.added, targets, rasterizer)
-            return self._settled(found, bench, looking, asked)
+            if found.truth is not None:
+                rasterizer = stack.enter_context(Rasterizer(bench.opened, found.truth, background=bench.background))
+                targets = RenderedTargets(rasterizer, seen.views)
+            return self._settled(found, bench, Looking(seen.views, seen.added, targets, rasterizer), asked)
 
     def _looking_between(self, state: State, bench: Workbench) -> State:
         """The state with the views that the fit looks at."""

@@ -24,6 +24,7 @@ from potr_cl.codec.native.share import BundleShare
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.codec.sections import Coder, Property
 from potr_cl.errors import DataError, DeviceError, DeviceMemoryError, UsageError
+from potr_cl.ondevice import dequantiser
 from potr_cl.ondevice.decode import decode_to_device
 from potr_cl.ondevice.staged_bundles import StagedBundles
 from potr_cl.opencl.device import Device
@@ -225,13 +226,17 @@ def compiled():
         pytest.skip("the compiled library is not there: python -m tools.make.native, or pip install -e .")
 
 
-@pytest.mark.parametrize(("rooms", "threads"), [(1, 1), (1, 3), (2, 2)])
-def test_memory_that_bundles_take_turns_in(rooms, threads, device, monkeypatch, compiled):
+@pytest.mark.parametrize("pinned", [False, True])
+@pytest.mark.parametrize(("beside", "threads"), [(0, 1), (0, 3), (1, 2)])
+def test_memory_that_bundles_take_turns_in(beside, threads, pinned, device, monkeypatch, compiled):
     """Less of it than there are bundles: those that come late wait until others are on the device."""
-    monkeypatch.setattr(bundled_scene, "_ROOMS_A_THREAD", rooms)
-    file = PotrFile.from_bytes(of_bundles(9 * 8192 + 77, 2))
-    with uploaded(device, file.scene()) as wanted, decode_to_device(file, device, threads=threads) as got:
-        assert bits(wanted) == bits(got)
+    monkeypatch.setattr(bundled_scene, "_ROOMS_BESIDE", beside)
+    if pinned:
+        monkeypatch.setattr(dequantiser, "_WORTH_PINNING", 1)
+    for splats in (9 * 8192 + 77, 3 * 8192):
+        file = PotrFile.from_bytes(of_bundles(splats, 2))
+        with uploaded(device, file.scene()) as wanted, decode_to_device(file, device, threads=threads) as got:
+            assert bits(wanted) == bits(got)
 
 
 def test_a_device_that_fails_among_bundles_ends_all_threads(device, monkeypatch, compiled):
@@ -242,7 +247,7 @@ def test_a_device_that_fails_among_bundles_ends_all_threads(device, monkeypatch,
         if len(taken) == 2:
             raise DeviceError("gone")
 
-    monkeypatch.setattr(bundled_scene, "_ROOMS_A_THREAD", 1)
+    monkeypatch.setattr(bundled_scene, "_ROOMS_BESIDE", 0)
     monkeypatch.setattr(StagedBundles, "take", fail)
     before = device.allocated, threading.active_count()
     with pytest.raises(DeviceError, match="gone"):

@@ -211,7 +211,7 @@ class Bench(Owner):
             found = {"bytes": len(data), "psnr": self._judge.psnr(decode(data, trust=True))}
             if known.psnrs is None:
                 self._plain.append(found)
-            same = size_at(self._plain, "psnr", found["psnr"])
+            same = size_at(self._plain, "psnr", found["psnr"]) if self._plain else None
             saved = 100 * (len(data) / same - 1) if same else None
             table.add(
                 self.name, course.text, q, len(coded.scene), len(data), found["psnr"], known.psnrs, saved,

@@ -7,6 +7,7 @@ from collections.abc import Callable, Mapping, Sequence
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
+from numpy.typing import NDArray
 
 from potr_cl.codec.native.arrays import address
 from potr_cl.codec.native.values import PackedValues, Tables, ValueArrays, ValuesOfC, to_arrays, to_packed
@@ -17,6 +18,11 @@ if TYPE_CHECKING:
 _POINTER, _WORD, _NUMBER = ctypes.c_void_p, ctypes.c_uint64, ctypes.c_int32
 #: Bundles that a thread does before Python may end it.
 _AT_A_TIME = 64
+
+
+#: What threads work with, while nobody has it, and how much of it is kept.
+_spare: list[NDArray[np.uint8]] = []
+_MOST_SPARE = 16
 
 
 class _Share(ctypes.Structure):
@@ -84,11 +90,18 @@ class BundleShare:
     def do(self) -> None:
         """A thread's share."""
         size = self._c["potr_bundles_work"]()
-        memory = np.empty(size + 64, np.uint8)
+        try:
+            memory = _spare.pop()  # which was written to before, and is there at once
+        except IndexError:
+            memory = np.empty(size + 64, np.uint8)
         start = -memory.ctypes.data % 64
         work = address(memory[start : start + size], np.uint8, size, True)
-        while self._c["potr_bundles_share"](ctypes.byref(self._share), work, _AT_A_TIME):
-            pass
+        try:
+            while self._c["potr_bundles_share"](ctypes.byref(self._share), work, _AT_A_TIME):
+                pass
+        finally:
+            if len(_spare) < _MOST_SPARE:
+                _spare.append(memory)
 
     def allow(self, limit: int) -> None:
         """There is room for the bundles before number ``limit``: what was packed of earlier ones is needed no more."""

@@ -5,6 +5,8 @@ levels (:class:`Tables`).
 from __future__ import annotations
 
 import ctypes
+from collections.abc import Iterator
+from contextlib import contextmanager
 from dataclasses import dataclass
 
 import numpy as np
@@ -97,6 +99,28 @@ class PackedValues:
     def used(items: int) -> int:
         """Floats of the memory that hold something, with so many items."""
         return PACKED_COLUMNS * BUNDLE + 4 * items
+
+
+@contextmanager
+def packing_rooms(number: int) -> Iterator[list[PackedValues]]:
+    """Memory for so many bundles, which the next file gets too: what was written to before is there at once."""
+    rooms = [_room() for _ in range(number)]
+    try:
+        yield rooms
+    finally:
+        _spare.extend(rooms[: max(_MOST_SPARE - len(_spare), 0)])
+
+
+def _room() -> PackedValues:
+    try:
+        return _spare.pop()
+    except IndexError:  # whatever other threads do meanwhile
+        return PackedValues()
+
+
+#: Rooms that nobody has now, and how many are kept.
+_spare: list[PackedValues] = []
+_MOST_SPARE = 24
 
 
 @dataclass(frozen=True)

@@ -23,7 +23,7 @@ from potr_cl.stages.refitting.photographs import hold_out
 from potr_cl.stages.refitting.targets import GroundTruthTargets, Photographs
 
 #: The trial: its steps, the parts after which held-out photographs are looked at, and its rates as parts of the fit's.
-_TRIAL_STEPS, _TRIAL_LOOKS, _TRIAL_RATES = 40, 4, 1 / 30
+_TRIAL_STEPS, _TRIAL_LOOKS, _TRIAL_RATES = 40, 4, 0.1
 #: Whole rounds of the fit, of which someone who ends it early keeps the last.
 _ROUNDS = 5
 
@@ -63,7 +63,7 @@ def fit_to_photographs(
     # Photographs that it looks at are no judges: these only see to it that nothing goes wrong.
     some = range(0, len(cameras), max(len(cameras) // len(judging), 1))
     trial_options = dataclasses.replace(
-        options, steps=min(_TRIAL_STEPS, options.steps), rounds=_TRIAL_LOOKS, patience=_TRIAL_LOOKS, last=1.0,
+        options, steps=_TRIAL_STEPS, rounds=_TRIAL_LOOKS, patience=_TRIAL_LOOKS, last=1.0,
         rates=times(options.rates, _TRIAL_RATES),
     )  # fmt: skip
     with kept_pictures(device, cameras, GroundTruthTargets(device, photographs, cameras), options.memory) as pictures:

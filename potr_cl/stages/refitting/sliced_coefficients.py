@@ -116,15 +116,14 @@ class SlicedCoefficients(VectorSpace):
                 np.copyto(y.values, x.values)
             return
         for first, count in self._pieces():
-            some = self._piece_of(x, 0, first, count)
-            if isinstance(y, HostColumns):
-                self._take_piece(y, some, first, count)
-            else:
-                cl.enqueue_copy(self.device.queue, y, some, byte_count=4 * count, dst_offset=4 * first)
+            self._take_piece(y, self._piece_of(x, 0, first, count), first, count)
         _changed(y)
 
     def combine(self, a: float, y: AnyVector, b: float, x: AnyVector) -> None:
         """y = a y + b x."""
+        if not (isinstance(y, HostColumns) or isinstance(x, HostColumns)):
+            self.own.combine_some(a, y, b, x, self.length)
+            return
         for first, count in self._pieces():
             some = self._piece_of(y, 0, first, count)
             self.own.combine_some(a, some, b, self._piece_of(x, 1, first, count), count)
@@ -140,6 +139,9 @@ class SlicedCoefficients(VectorSpace):
         return self._dot(x, x)[1]
 
     def _dot(self, x: AnyVector, y: AnyVector) -> tuple[float, float]:
+        if not (isinstance(x, HostColumns) or isinstance(y, HostColumns)):
+            self.own.begin_dot(x, y, self.length)
+            return self.own.found_dot()
         for first, count in self._pieces():
             one = self._piece_of(x, 0, first, count)
             other = one if y is x else self._piece_of(y, 1, first, count)
@@ -157,13 +159,16 @@ class SlicedCoefficients(VectorSpace):
 
     def add_fixed(self, x: AnyVector, sums: cl.Buffer, unit: float, constant: bool = False) -> None:
         """See :meth:`VectorSpace.add_fixed`."""
+        length = 3 * self.layout.stride if constant else self.length
+        if not isinstance(x, HostColumns):
+            self.own.add_fixed_some(x, sums, 0, length, unit)
+            return
         # Of zeros all are written: they only stand for them.
-        some_do = constant and not (isinstance(x, HostColumns) and x.zero)
-        for first, count in self._pieces(3 * self.layout.stride if some_do else self.length):
+        for first, count in self._pieces(self.length if x.zero else length):
             some = self._piece_of(x, 0, first, count)
             self.own.add_fixed_some(some, sums, first, count, unit)
             self._take_piece(x, some, first, count)
-        _changed(x)
+        x.changed()
 
     # ------------------------------------------------------------------------------------------ to and from elsewhere
 
@@ -267,16 +272,19 @@ class SlicedCoefficients(VectorSpace):
 
     def _piece_of(self, x: AnyVector, place: int, first: int, count: int) -> cl.Buffer:
         if not isinstance(x, HostColumns):
-            return x.get_sub_region(4 * first, 4 * count)
-        if x.zero:
+            # Not a part of the buffer: NVIDIA's driver carries these to the host and back.
+            cl.enqueue_copy(self.device.queue, self._slices[place], x, byte_count=4 * count, src_offset=4 * first)
+        elif x.zero:
             self.clear(self._slices[place])
         else:
             self._copy(self._slices[place], x.values.reshape(-1)[first : first + count])
         return self._slices[place]
 
     def _take_piece(self, x: AnyVector, buffer: cl.Buffer, first: int, count: int) -> None:
-        if isinstance(x, HostColumns):  # else it was the piece itself
+        if isinstance(x, HostColumns):
             self._copy(x.values.reshape(-1)[first : first + count], buffer)
+        else:
+            cl.enqueue_copy(self.device.queue, x, buffer, byte_count=4 * count, dst_offset=4 * first)
 
     def _copy(self, target: Any, source: Any) -> None:
         with self.device.errors("failed while computing"):
