@@ -29,6 +29,9 @@ from potr_cl.stages.refitting.refit import (
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RememberedTargets, RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
+#: A scene that takes more than this part of the memory that is given makes room for the re-fit.
+_LARGE = 1 / 16
+
 
 def _steps(text: str) -> int | None:
     if text in ("auto", "off"):
@@ -194,10 +197,11 @@ class Refit(Stage):
 def _pictures_of_goal(state: State, bench: Workbench) -> Iterator[Targets]:
     """The pictures that colours are re-fitted to; where the re-fit needs its room, they are rendered before."""
     device, views = bench.opened, state.views
-    in_one_piece = placed(device, len(state.scene), state.scene.sh.shape[1], bench.memory) is None
+    little = placed(device, len(state.scene), state.scene.sh.shape[1], bench.memory) is not None
+    little = little or (bench.memory is not None and state.source.nbytes > _LARGE * bench.memory)
     with Rasterizer(device, bench.drawable(state.goal), background=bench.background) as rasterizer:
         targets = RenderedTargets(rasterizer, views)
-        if in_one_piece or bench.pool is not None:
+        if not little or bench.pool is not None:
             yield targets
             return
         remembered = RememberedTargets(device, targets, views)

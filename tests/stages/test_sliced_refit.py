@@ -11,6 +11,7 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.reference.refit_cases import Case
 from potr_cl.reference.scenes import ring_of_cameras, visible_scene
+from potr_cl.stages import refit as refit_stage
 from potr_cl.stages.refitting import placement
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, refit_colours
 from tests.devices import KERNELS, open_device
@@ -132,6 +133,9 @@ def test_the_same_file(device, plush_excerpt, plush_excerpt_cameras, monkeypatch
     small = plush_excerpt_cameras[:12]
     options = EncodeOptions.for_preset("best", between=False).changed(prune={"iterations": 4})
     whole = encode(plush_excerpt, small, options, device=device)
+    monkeypatch.setattr(refit_stage, "_LARGE", 0)
+    remembered = encode(plush_excerpt, small, options.changed(memory=1 << 30), device=device)
+    assert remembered.data == whole.data
     for name in ("_ANYWAY", "_OF_FREE", "_OF_GIVEN"):
         monkeypatch.setattr(placement, name, 0)
     sliced = encode(plush_excerpt, small, options, device=device)
@@ -154,3 +158,19 @@ def test_memory_is_that_of_vectors_and_views_together(device, monkeypatch):
                 room.append(refit.colour_map.room)
     assert room[1] - room[0] == pytest.approx(8 * one_piece, rel=0.01)
     assert room[0] < 3 * one_piece
+
+
+@pytest.mark.one_runtime
+def test_with_many_views(device):
+    """Of which some steps look at every second one."""
+    cameras = ring_of_cameras(70, size=20)
+    with Case(device, visible_scene(SPLATS, 1), visible_scene(100, 1, seed=7), cameras) as case:
+
+        def fitted(slices):
+            options = RefitOptions(steps=3, gain=0, drop=1e-7, slices=slices)
+            return refit_colours(
+                device, case.scene, case.cameras, case.targets, options, colour_grid=lambda effects: grid_of(SPLATS)
+            )
+
+        whole, sliced = fitted(None), fitted(SLICES)
+    assert same(sliced, whole)

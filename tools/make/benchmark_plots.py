@@ -147,6 +147,27 @@ def _rate_distortion(results: Results, axes: Sequence[Any], against: str, other:
     axes[0].set_ylabel(f"PSNR against {'the photographs' if other == 'lost' else 'the uncompressed renders'}, dB")
 
 
+#: Of the plot of files that were fitted to photographs.
+_FITTED_SERIES = ("paper", "best", "smallest", "smallest with photographs")
+
+
+def _photographs(results: Results, axes: Sequence[Any]) -> None:
+    """PSNR against unseen photographs by size, with a fit to others and without."""
+    full = {row["scene"]: row for row in results["photographs/uncompressed"].records()}
+    for scene, axis in zip(SCENES, axes, strict=True):
+        rows = results[f"photographs/{scene}"].records()
+        for series, style in zip(_FITTED_SERIES, _STYLES, strict=False):
+            of_it = [row for row in rows if row["preset"] == series]
+            axis.plot([r["size"] for r in of_it], [r["PSNR against photographs"] for r in of_it], label=series, **style)
+        uncompressed = full[scene]["PSNR against photographs"]
+        axis.axhline(uncompressed, color="0.5", ls=":", label="uncompressed")
+        _plain_log(axis, "x", (0.5, 1, 2, 4))
+        # Below this a file is smaller than anybody asks for.
+        axis.set_ylim(bottom=uncompressed - 1.6)
+        axis.set(title=f"{scene}, {full[scene]['PLY bytes'] / 1e6:.1f} MB as PLY", xlabel="MB")
+    axes[0].set_ylabel("PSNR against the photographs of test views, dB")
+
+
 def bytes_at(rows: Sequence[dict[str, Any]], psnr: float) -> float:
     """Megabytes at a PSNR against the uncompressed renders, interpolated in the logarithm of the size."""
     points = sorted((row["PSNR against uncompressed"], math.log(row["size"])) for row in rows)
@@ -270,6 +291,12 @@ PLOTS = (
         _CURVES,
         partial(_rate_distortion, against="photographs", other="lost"),
         "How near does a file of a size come to the photographs?",
+    ),
+    Plot(
+        "photographs",
+        (*_both("photographs/"), "photographs/uncompressed"),
+        _photographs,
+        "What does a fit to photographs bring, on photographs that nobody has looked at?",
     ),
     Plot(
         "encode_presets",
