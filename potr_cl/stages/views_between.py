@@ -18,6 +18,8 @@ from potr_cl.stages.between.room import room_for
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
 _MOST_ASKED = 100
+#: That look at views.
+_THREADS = 4
 
 
 def _number(text: str) -> float | Literal["auto"]:
@@ -104,7 +106,8 @@ class Between(Stage):
         if virtual and self.views == "auto" and not needed_of_virtual(slow):
             return state
         bench.progress("views between", 0.0)
-        with thread_pool(bench.threads) as pool:
+        # More wait for each other longer than they work.
+        with thread_pool(min(bench.threads or _THREADS, _THREADS)) as pool:
             known = GivenViews(state.source, state.views, pool.map)
             each, shown_by = self.views, None
             if each == "auto" and virtual:
@@ -114,7 +117,7 @@ class Between(Stage):
                 if len(parts):
                     shown_by = views_where_few(parts)
                     each = needed(shown_by, given, slow)
-            added = views_between(state.source, state.views, each, self.spread, known=known, run=pool.map)
+            added = views_between(state.source, state.views, each, self.spread, known=known)
         if self.views == "auto":
             added = _evenly(added, room_for(added, state, bench))
         bench.progress("views between", 1.0)

@@ -35,13 +35,12 @@ class GivenViews:
     Args:
         scene: that they show.
         cameras: the given views, at least one.
-        run: in place of :func:`map`, to work with several threads, as long as somebody asks.
+        run: in place of :func:`map`, to work with several threads.
     """
 
     def __init__(self, scene: Scene, cameras: Sequence[Camera], run: Run = map) -> None:
         every = max(len(scene) // _TAKEN, 1)
         some = scene.subset(np.arange(0, len(scene), every))
-        self._run = run
         self._frame = frame_of(some, run)
         matter = matter_of(some, self._frame, _TARGETS, _OCCLUDERS)
         # Each point stands for the surface of the splats that were not taken, too.
@@ -57,11 +56,10 @@ class GivenViews:
     @cached_property
     def _memory(self) -> tuple[ColourMemory, float]:
         """What colours remember of given places, and the least that they must remember of others."""
-        memory = ColourMemory(self._places, self._matter, self._run)
+        memory = ColourMemory(self._places, self._matter)
         if not memory.tells:
             return memory, 0.0
-        known = self._run(lambda number: memory.of_known(number, self._shown[number]), range(len(self._shown)))
-        return memory, _REMEMBERED * min(known)
+        return memory, _REMEMBERED * min(memory.of_known(*given) for given in enumerate(self._shown))
 
     def views_of_parts(self) -> NDArray[np.int64]:
         """(K,) how many given views show each of some splats, evenly taken; those that none shows are left out."""
