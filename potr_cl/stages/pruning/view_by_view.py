@@ -436,7 +436,8 @@ class ViewByView(Owner):
         self._listed = [kept.prepared.views.tiles for kept in self._kept]
         if self._kept:
             everything = np.concatenate([np.arange(count, dtype=np.uint32) for count in self._listed])
-            cl.enqueue_copy(self.device.queue, self._tiles, everything, is_blocking=True)
+            with self.device.errors("failed while computing"):
+                cl.enqueue_copy(self.device.queue, self._tiles, everything, is_blocking=True)
             self.device.fill(self._stale, np.float32(0))
 
     # --------------------------------------------------------------------------------------- views that are not kept
