@@ -72,10 +72,11 @@ class RememberedTargets:
         self._device = device
         self._ends = np.cumsum([0, *(_nbytes(camera) // 4 for camera in cameras)])
         self._pictures = mapped.array((int(self._ends[-1]),), np.float32, "pictures")
+        largest = max(map(_nbytes, cameras))
         # On a GPU several at a time are rendered faster.
-        together = max(int(_TOGETHER // max(map(_nbytes, cameras))), 1)
+        together = 1 if device.family == "cpu" else min(max(_TOGETHER // largest, 1), len(cameras))
         with Memory(device) as memory:
-            buffer = memory.allocate(together * max(map(_nbytes, cameras)), "the target images")
+            buffer = memory.allocate(together * largest, "the target images")
             for first in range(0, len(cameras), together):
                 numbers = range(first, min(first + together, len(cameras)))
                 targets.into(numbers, buffer)
