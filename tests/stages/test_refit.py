@@ -8,7 +8,6 @@ import numpy as np
 import pytest
 
 from potr_cl.errors import UsageError
-from potr_cl.model.camera import Camera
 from potr_cl.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
 from potr_cl.reference.refit_cases import Case, Linearised, Pictures
 from potr_cl.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
@@ -22,13 +21,6 @@ def device(request):
     device = open_device(request.param)
     yield device
     assert device.allocated == 0, "a re-fit did not give all its memory back"
-
-
-def of_size(camera: Camera, width: int, height: int) -> Camera:
-    factor = width / camera.width
-    return dataclasses.replace(
-        camera, width=width, height=height, fx=factor * camera.fx, fy=factor * camera.fy, cx=width / 2, cy=height / 2
-    )
 
 
 @pytest.fixture

@@ -21,6 +21,7 @@ from potr_cl.stages.pruning.schedule import PruningOptions
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.visible_parts import PartedRemoval
 from tests.cases.streets import street
+from tests.cases.sweeps import assert_same_bits
 from tests.devices import KERNELS, open_device
 
 
@@ -57,24 +58,7 @@ def test_the_same_bits(device, memory, tolerance):
         RemovalSweep(rasterizer, cameras, options) as wanted,
         parted(device, scene, cameras, options) as got,
     ):
-        for step in range(4):
-            effects, found = wanted.measure(), got.measure()
-            left = np.flatnonzero(wanted.alive)
-            assert np.array_equal(left, np.flatnonzero(got.alive))
-            assert np.array_equal(effects[0][left], found[0][left])
-            assert np.array_equal(effects[1][left], found[1][left])
-            assert np.count_nonzero(found[1]) > 100
-            gone = rng.choice(left, len(left) // 8, replace=False)
-            wanted.remove(gone)
-            got.remove(gone)
-            if step == 1:
-                sh = scene.sh + rng.normal(0, 0.05, scene.sh.shape).astype(np.float32)
-                wanted.replace_sh(sh)
-                got.replace_sh(sh)
-        for a, b in zip(wanted.view_importances(), got.view_importances(), strict=True):
-            assert a[0] == b[0]
-            assert np.array_equal(a[1], b[1])
-            assert np.array_equal(a[2], b[2])
+        assert_same_bits(wanted, got, scene, rng)
 
 
 def test_the_same_choice(device):

@@ -22,7 +22,7 @@ _LEVELS = 54  # of counts
 
 
 class OctreeBuilding:
-    """The same bits as NumPy gives. All may be called from several threads at a time, and leaves the interpreter free.
+    """The same bits as NumPy gives. All may be called from several threads at a time, and leave the interpreter free.
 
     Args:
         functions: of the library, by name.
