@@ -4,17 +4,19 @@
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photographs in images. Stages are those of
 the fastest of some encodes in a process that has encoded with the preset before; the whole command is a fresh process,
-the fastest too after one that is not counted, with reading, decoding and judging by all test views. No preset is begun
-after S seconds, so the most interesting ones come first.
+the fastest too after one that is not counted, with reading, decoding and judging by all test views; a second table has
+what it tells of itself. No preset is begun after S seconds, so the most interesting ones come first.
 """
 
 from __future__ import annotations
 
 import argparse
+import json
 import math
 import tempfile
 import time
 from pathlib import Path
+from typing import Any
 
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.quantize import PRESETS
@@ -46,19 +48,28 @@ def main() -> None:
     parser.add_argument("--json", type=Path, metavar="FILE", help="keep the table for docs/benchmarks")
     args = parser.parse_args()
     began, device = time.perf_counter(), Device(args.device)
-    table = Results(device.info, args.json).table(
+    results = Results(device.info, args.json)
+    quality = (Column("bytes", format=","), Column("PSNR against the uncompressed renders", "dB", ".2f"))
+    stages = results.table(
         "stages",
         "Whole encodes at quality 0.5, stage by stage",
         Column("scene"),
         Column("preset", default="{preset}"),
         Column("PLY bytes", format=","),
         Column("splats kept", format=","),
-        Column("bytes", format=","),
-        Column("PSNR against the uncompressed renders", "dB", ".2f"),
+        *quality,
         Column("lost on the photographs", "dB", ".2f"),
         *(Column(stage, "s", ".2f") for stage in STAGES),
         Column("in all", "s", ".2f"),
         Column("the whole command", "s", ".1f"),
+    )
+    commands = results.table(
+        "commands",
+        "Whole commands at quality 0.5",
+        Column("scene"),
+        Column("preset", default="{preset}"),
+        *quality,
+        *(Column(part, "s", ".1f") for part in ("encode", "with reading and judging", "whole command")),
     )
     with tempfile.TemporaryDirectory() as folder:
         for preset in args.presets:
@@ -71,11 +82,15 @@ def main() -> None:
                     encoded, seconds = _fastest(evaluator, preset, device, args.runs, rehearsals)
                     judged = evaluator(PotrFile.from_bytes(b"".join(encoded.pieces)).scene())
                     facts = (evaluator.name, preset, evaluator.source_bytes, len(encoded.order), encoded.nbytes)
-                whole = _whole_command(scene, preset, args.device, Path(folder), args.runs, rehearsals)
-                stages = [sum(seconds.get(part, 0.0) for part in parts) for parts in STAGES.values()]
-                table.add(
-                    *facts, judged["psnr"], judged.get("psnr_loss"), *stages, sum(seconds.values()), whole
+                whole, told = _whole_command(scene, preset, args.device, Path(folder), args.runs, rehearsals)
+                by_stage = [sum(seconds.get(part, 0.0) for part in parts) for parts in STAGES.values()]
+                stages.add(
+                    *facts, judged["psnr"], judged.get("psnr_loss"), *by_stage, sum(seconds.values()), whole
                 )  # fmt: skip
+                spent = told["seconds"]
+                alone = sum(value for part, value in spent.items() if part not in ("evaluate", "total"))
+                figures = (told["bytes"], told["quality"]["psnr"])
+                commands.add(scene.resolve().name, preset, *figures, alone, spent["total"], whole)
 
 
 def _fastest(
@@ -89,15 +104,18 @@ def _fastest(
     return encodes[0], min((each.seconds for each in encodes), key=lambda seconds: sum(seconds.values()))
 
 
-def _whole_command(scene: Path, preset: str, device: str | None, folder: Path, runs: int, rehearsals: int) -> float:
-    """Seconds of the fastest of some fresh commands."""
+def _whole_command(
+    scene: Path, preset: str, device: str | None, folder: Path, runs: int, rehearsals: int
+) -> tuple[float, dict[str, Any]]:
+    """Seconds of the fastest of some fresh commands, and what it tells with --json."""
     arguments = [
         "-m", "potr_cl", "encode", str((scene / "point_cloud.ply").resolve()), "-o", str(folder / "scene.potr"),
         "--cameras", str((scene / "cameras.json").resolve()), "--json", "--preset", preset,
         *(["--device", device] if device else []),
     ]  # fmt: skip
-    times = [clocked(lambda: fresh_python(arguments, folder))[0] for _ in range(runs + rehearsals)]
-    return min(times[rehearsals:])
+    runs_of_it = [clocked(lambda: fresh_python(arguments, folder)) for _ in range(runs + rehearsals)]
+    seconds, said = min(runs_of_it[rehearsals:])
+    return seconds, json.loads(said)
 
 
 if __name__ == "__main__":
