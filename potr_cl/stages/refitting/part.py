@@ -90,6 +90,7 @@ class ColourPart(Part):
                 ColourMap(launcher, rasterizer, self._coefficients, scene.means, cameras, background, memory, numbers)
             )
             self._targets = RenderedTargets(of_source, cameras)
+            self._map.prepare(self._targets)
             self._staging = owned.enter_context(Staging(device))
             self._blocks = owned.enter_context(Memory(device))
             self._block_sums: cl.Buffer | None = None
@@ -118,11 +119,12 @@ class ColourPart(Part):
             triangle = layout.sh_count * (layout.sh_count + 1) // 2
             self._block_sums = self._blocks.allocate(8 * triangle * layout.stride, "the splats' normal equations")
             self._coefficients.zero(self._block_sums)
-        errors = self._map.sum_gradient(self._x, self._targets, self._block_sums, constant)
+        self._map.sum_gradient(self._x, self._targets, self._block_sums, constant)
         if isinstance(x, Lent):
+            sums = self._packing.lend_sums(self._map.sums)
             lent = None if self._block_sums is None else Lent(self._device, self._block_sums, self._block_sums.size)
-            return Gradient(errors, self._packing.lend_sums(self._map.sums), lent)
-        return Gradient(errors, self._packing.sums(self._map.sums))
+            return Gradient(self._map.found_errors(), sums, lent)
+        return Gradient(self._map.found_errors(), self._packing.sums(self._map.sums))
 
     def block_rows(self, first: int, rows: int) -> NDArray[np.int64]:
         """Some rows of the sums of the splats' own blocks after a gradient; valid until the next call.

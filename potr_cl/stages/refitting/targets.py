@@ -175,14 +175,19 @@ class TargetCache(Owner):
         self._kept: dict[range, cl.Buffer] = {}
         self._kept_of: Targets | None = None
 
+    def fill(self, targets: Targets) -> None:
+        """Have those pictures of these targets that are kept."""
+        self._keep_only(targets)
+        for launch, nbytes in self._nbytes.items():
+            if launch not in self._kept and nbytes <= self._budget.room:
+                self.pictures(targets, launch)
+
     def pictures(self, targets: Targets, numbers: range) -> cl.Buffer:
         """(pixels, 3) float32, what the views of a launch should show, one behind the other.
 
         They are valid until the next call. Other targets than at the last call take the place of what was kept.
         """
-        if targets is not self._kept_of:
-            self._forget()
-            self._kept_of = targets
+        self._keep_only(targets)
         if numbers in self._kept:
             return self._kept[numbers]
         nbytes = self._nbytes[numbers]
@@ -198,6 +203,11 @@ class TargetCache(Owner):
             self._drop(numbers)
             raise
         return buffer
+
+    def _keep_only(self, targets: Targets) -> None:
+        if targets is not self._kept_of:
+            self._forget()
+            self._kept_of = targets
 
     def _among_all(self, numbers: range) -> list[int]:
         return [self._numbers[number] for number in numbers]
