@@ -17,8 +17,8 @@ from potr_cl.raster.view_set import TILE
 class ViewErrors(Owner):
     """Each tile's error, of all launches of a gradient.
 
-    They are asked for once, when all is enqueued: while one thread waits for what it downloads, some drivers let no other
-    one use that device, and others may want to read from it what they need to begin with their views.
+    They are asked for once, when all is enqueued: while one thread waits for what it downloads, some drivers let no
+    other one use that device, and others may want to read from it what they need to begin with their views.
 
     Args:
         device: that computes.
