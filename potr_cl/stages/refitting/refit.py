@@ -34,6 +34,7 @@ from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
+from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import blocks_of, left_for_views, placed, rounding_of, vectors_of
 from potr_cl.stages.refitting.rounding import ROUNDS
 from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts
@@ -256,11 +257,11 @@ class HelpFrom:
 
     Attributes:
         pool: the workers.
-        source: the scene whose pictures are the targets, perhaps kept on devices.
+        source: the scene whose pictures are the targets, perhaps kept on devices, or with pictures of it there.
     """
 
     pool: Pool
-    source: Scene | KeptScene
+    source: Scene | KeptScene | PicturesAhead
 
 
 class ColourRefit(Owner):

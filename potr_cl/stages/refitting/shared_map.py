@@ -18,6 +18,7 @@ from potr_cl.raster.rules import RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.part import ColourPart, Gradient
+from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.workers.dealing import Shares
 from potr_cl.workers.parts import Parts, Pending
 from potr_cl.workers.pool import Pool
@@ -112,7 +113,7 @@ def colour_parts(
     scene: Scene,
     rules: RasterRules,
     background: tuple[float, float, float],
-    source: Scene | KeptScene,
+    source: Scene | KeptScene | PicturesAhead,
     cameras: Sequence[Camera],
     memory: int | None,
 ) -> Iterator[Parts]:
@@ -123,7 +124,7 @@ def colour_parts(
         shares: who does which views.
         scene: whose colours are re-fitted.
         rules, background: of the rasterizer.
-        source: the scene whose pictures are the targets, perhaps kept on devices.
+        source: the scene whose pictures are the targets, perhaps kept on devices, or with pictures of it there.
         cameras: all views.
         memory: bytes of a device's memory that prepared views and targets may take; None: the default.
     """
