@@ -167,9 +167,7 @@ class Refit(Stage):
         with ExitStack() as stack:
             stack.callback(bench.progress, "refit", 1.0)
             ahead = stack.enter_context(_pictures_ahead(state, bench))
-            rounded = state.geometry
-            if rounded is None or rounded.asked != parameters:
-                rounded = bench.output.geometry(state.scene, bench.request(state))
+            rounded = _rounded(state, bench)
             with thread_pool(bench.threads) as pool:
                 decoded = rounded.decoded(state.scene.sh, pool.map)
             pictures = stack.enter_context(_pictures_of_goal(state, bench, ahead))
@@ -197,6 +195,14 @@ class Refit(Stage):
                     refitted, geometry = to_photographs, its_geometry
         then = replace(state.recoloured(refitted.sh), geometry=geometry).having_learnt(self.name, refitted)
         return then if choice is None else then.having_learnt("photographs", choice)
+
+
+def _rounded(state: State, bench: Workbench) -> Rounded:
+    """The geometry of what is left of the scene as the file's readers will see it."""
+    geometry = state.geometry
+    if geometry is None or geometry.asked != bench.parameters:
+        geometry = bench.output.geometry(state.scene, bench.request(state))
+    return geometry
 
 
 @contextmanager
