@@ -28,9 +28,9 @@ from potr_cl.stages.refitting.refit import (
     active_coefficients,
     refit_colours,
 )
+from potr_cl.stages.refitting.shared_map import colour_shares
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RememberedTargets, RenderedTargets, Targets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
-from potr_cl.workers.dealing import shares
 
 #: A scene that takes more than this part of the memory that is given makes room for the re-fit.
 _LARGE = 1 / 16
@@ -214,7 +214,7 @@ def _pictures_ahead(state: State, bench: Workbench) -> Iterator[PicturesAhead | 
         yield None
         return
     numbers: dict[Device, Sequence[int]] = {device: range(len(state.views))}
-    if pool is not None and (share := shares(pool, len(state.views))).others:
+    if pool is not None and (share := colour_shares(pool, len(state.views))).others:
         numbers = {device: share.own, **dict(zip(pool.devices, share.others, strict=False))}
     with PicturesAhead(kept, bench.background, state.views, numbers) as ahead:
         yield ahead

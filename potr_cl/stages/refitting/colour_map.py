@@ -131,7 +131,7 @@ class ColourMap(Owner):
         self._one = gathered_scale(cameras, [_weight(camera) for camera in cameras])
         fixed_points = self._launcher.fixed_point_scales(cameras)
         self._views_of_all = len(cameras)
-        self.parts = _PARTS if len(cameras) >= _PARTS * ENOUGH else 1
+        self.parts = parts_of(len(cameras))
         own_numbers = range(len(cameras)) if numbers is None else numbers
         # Launches, and what is gathered together, are of one part.
         self._numbers = sorted(own_numbers, key=lambda number: (number % self.parts, number))
@@ -430,6 +430,11 @@ class _Slot:
 
     change: cl.Buffer
     totals: cl.Buffer
+
+
+def parts_of(views: int) -> int:
+    """Into how many parts so many views are divided; view k is in part k modulo this."""
+    return _PARTS if views >= _PARTS * ENOUGH else 1
 
 
 def _part(buffer: cl.Buffer, number: int, parts: int) -> cl.Buffer:
