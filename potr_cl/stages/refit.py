@@ -11,11 +11,12 @@ from typing import Any
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray
+from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
 from potr_cl.stages.refitting.placement import placed
 from potr_cl.stages.refitting.refit import (
@@ -27,6 +28,7 @@ from potr_cl.stages.refitting.refit import (
     refit_colours,
 )
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RememberedTargets, RenderedTargets, Targets
+from potr_cl.stages.refitting.visible_targets import VisibleTargets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 #: A scene that takes more than this part of the memory that is given makes room for the re-fit.
@@ -164,7 +166,7 @@ class Refit(Stage):
                 fix_ac=None if on_grid or not bench.output.fixes_ac else fix_ac,
                 # Photographs lie where the master reads them.
                 help_from=HelpFrom(bench.pool, bench.shared_source(state) if state.truth is None else state.truth)
-                if bench.pool and isinstance(targets, RenderedTargets)
+                if bench.pool and not isinstance(targets, GroundTruthTargets)
                 else None,
                 colour_grid=colour_grid if on_grid else None,
             )  # fmt: skip
@@ -199,13 +201,29 @@ def _pictures_of_goal(state: State, bench: Workbench) -> Iterator[Targets]:
     device, views = bench.opened, state.views
     little = placed(device, len(state.scene), state.scene.sh.shape[1], bench.memory) is not None
     little = little or (bench.memory is not None and state.source.nbytes > _LARGE * bench.memory)
-    with Rasterizer(device, bench.drawable(state.goal), background=bench.background) as rasterizer:
-        targets = RenderedTargets(rasterizer, views)
+    with _rendered(state, state.goal, bench) as targets:
         if not little or bench.pool is not None:
             yield targets
             return
         remembered = RememberedTargets(device, targets, views)
     yield remembered
+
+
+@contextmanager
+def _rendered(state: State, scene: Scene, bench: Workbench) -> Iterator[Targets]:
+    """The pictures of a scene in a state's views, which are rendered when they are asked for."""
+    device, drawable = bench.opened, bench.drawable(scene)
+    if (
+        state.sights is not None
+        and scene is state.source
+        and isinstance(drawable, SceneBuffers)
+        and device.family == "gpu"
+    ):
+        with VisibleTargets(drawable, state.views, state.sights, bench.background) as visible:
+            yield visible
+        return
+    with Rasterizer(device, drawable, background=bench.background) as rasterizer:
+        yield RenderedTargets(rasterizer, state.views)
 
 
 @dataclass(frozen=True)
@@ -219,13 +237,12 @@ class RefitOnTheWay(Stage):
 
     def run(self, state: State, bench: Workbench) -> State:
         bench.progress("refit", 0.0)
-        source = bench.drawable(state.source)
-        with Rasterizer(bench.opened, source, background=bench.background) as rasterizer:
+        with _rendered(state, state.source, bench) as targets:
             refitted = refit_colours(
                 bench.opened,
                 state.scene,
                 state.views,
-                RenderedTargets(rasterizer, state.views),
+                targets,
                 RefitOptions(steps=self.steps, memory=bench.memory),
                 background=bench.background,
                 progress=lambda done, steps: bench.progress("refit", 0.99 * done / steps),

@@ -22,7 +22,7 @@ from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
 from potr_cl.formats.scenes.ply_rows import Target, read_rows
 from potr_cl.formats.scenes.scene_files import NO_EXTENT, cleaned, unfilled
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
+from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS, Scene
 
 _log = logging.getLogger("potr_cl")
 
@@ -249,7 +249,7 @@ def _read(path: str | os.PathLike[str], stream: io.FileIO, size: int) -> Scene:
 
 
 def _targets(scene: Scene, rest: int, scales: int) -> list[Target]:
-    """Where in the scene's arrays each property belongs. A channel has ``rest`` AC coefficients, a splat 2 or 3 scales."""
+    """Where in the scene's arrays properties belong. A channel has ``rest`` AC coefficients, a splat 2 or 3 scales."""
     own = range(scene.sh.shape[1] - 1)
     sh = [f"f_dc_{channel}" for channel in range(3)]
     sh += [f"f_rest_{channel * rest + i}" for i in own for channel in range(3)]
@@ -377,7 +377,7 @@ def _report_dropped(path: str | os.PathLike[str], header: _Header, vertex: PlyEl
 def _text_blocks(
     path: str | os.PathLike[str], stream: io.FileIO, header: _Header, vertex: PlyElement, count: int
 ) -> Iterator[NDArray[np.void]]:
-    """The rows of the vertices of an ASCII file, a block at a time; those of earlier elements are skipped line by line."""
+    """The rows of the vertices of an ASCII file, a block at a time; earlier elements are skipped line by line."""
     # Every byte has a meaning in Latin-1, so a stray one is found where it stands, as a value that is no number.
     with io.TextIOWrapper(io.BufferedReader(stream), encoding="latin-1") as text:
         lines = (line for line in text if not line.isspace())

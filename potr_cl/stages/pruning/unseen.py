@@ -78,8 +78,8 @@ def find_unseen(
         state: whose scene and views.
         groups: of the scene, where they are known.
         run: shares the work out.
-        surely_seen: finds quickly, for some views, (N,) which splats they see (:class:`potr_cl.raster.surely_seen.Seen`);
-            those that it leaves undecided are looked at here.
+        surely_seen: finds quickly which splats some views see, (N,) :class:`potr_cl.raster.surely_seen.Seen`; those
+            that it leaves undecided are looked at here.
     """
     views, scene = state.views[: len(state.views) - state.added], state.scene
     if surely_seen is None:
