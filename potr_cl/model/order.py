@@ -1,7 +1,8 @@
-"""Numbers in order: :func:`ascending`. Pure NumPy."""
+"""Numbers in order: :func:`ascending`, for which :func:`over_ranges` shares many out. Pure NumPy."""
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from typing import Any
 
 import numpy as np
@@ -11,7 +12,7 @@ from potr_cl.host.threads import Run
 
 #: So many numbers are put into ranges first, which threads sort; numbers of a range, on the average, and how many
 #: ranges there are at most (their numbers take a byte).
-_LARGE, _RANGE, _MOST_RANGES = 1 << 20, 1 << 17, 256
+_LARGE, _RANGE, _MOST_RANGES = 1 << 19, 1 << 16, 256
 #: Numbers that are put into ranges at a time, and how many of each range are looked at to find where it ends.
 _DEALT, _SAMPLED = 1 << 19, 64
 
@@ -23,7 +24,11 @@ def ascending(score: NDArray[Any], run: Run = map) -> NDArray[np.int64]:
         score: (N,), no NaN.
         run: shares the work on many out.
     """
-    return _sorted(score) if len(score) < _LARGE else _sorted_by_ranges(score, run)
+
+    def finish(members: NDArray[np.int64], place: int) -> None:
+        members[:] = members[_sorted(score[members])]
+
+    return _sorted(score) if len(score) < _LARGE else over_ranges(score, finish, run)
 
 
 def _sorted(score: NDArray[Any]) -> NDArray[np.int64]:
@@ -40,9 +45,26 @@ def _sorted(score: NDArray[Any]) -> NDArray[np.int64]:
     return order
 
 
-def _sorted_by_ranges(score: NDArray[Any], run: Run) -> NDArray[np.int64]:
-    """Numbers are dealt out to ranges of scores, as they stand, and each range is sorted by itself."""
-    ranges = min(len(score) // _RANGE, _MOST_RANGES)
+def are_many(numbers: int) -> bool:
+    """Whether :func:`over_ranges` is worth its own time for so many numbers."""
+    return numbers >= _LARGE
+
+
+def over_ranges(
+    score: NDArray[Any], work: Callable[[NDArray[np.int64], int], None], run: Run = map
+) -> NDArray[np.int64]:
+    """Deal out numbers to ranges of scores, as they stand, and have each range worked on by itself.
+
+    Args:
+        score: (N,), no NaN; equal scores are in one range.
+        work: called with the numbers of a range, (n,) ascending, to be put into order in place, and with how many there
+            are in all ranges before it.
+        run: shares the ranges out.
+
+    Returns:
+        (N,) the numbers of all ranges one after another.
+    """
+    ranges = min(max(len(score) // _RANGE, 1), _MOST_RANGES)
     few = np.sort(score[:: max(len(score) // (ranges * _SAMPLED), 1)])
     # The first score of each range but the first one: equal ones are in the same range.
     ends = few[np.arange(1, ranges) * len(few) // ranges]
@@ -68,8 +90,7 @@ def _sorted_by_ranges(score: NDArray[Any], run: Run) -> NDArray[np.int64]:
     dealt.clear()
 
     def finish(number: int) -> None:
-        own = numbers[begins[number] : begins[number + 1]]
-        own[:] = own[_sorted(score[own])]
+        work(numbers[begins[number] : begins[number + 1]], int(begins[number]))
 
     list(run(finish, range(ranges)))
     return numbers
