@@ -184,7 +184,7 @@ def prune(
     """
     options = stage_options(Prune, q, background, memory, choices).changed(cameras_anyway=cameras_anyway)
     write = scene_writer(output) if output is not None else None
-    views, what = cameras_of(cameras), scene_of(scene, trust, antialiased)
+    views, what = cameras_of(cameras, virtual_views), scene_of(scene, trust, antialiased)
     with contextlib.ExitStack() as stack:
         ranks = stack.enter_context(replacing(order)) if order is not None else None
         state, used = _run(what, views, virtual_views, options, Prune, device, progress)
@@ -227,7 +227,7 @@ def compact(
     """
     options = stage_options(Compact, q, background, memory, choices, sf_sh).changed(cameras_anyway=cameras_anyway)
     write = scene_writer(output) if output is not None else None
-    views, what = cameras_of(cameras), scene_of(scene, trust, antialiased)
+    views, what = cameras_of(cameras, virtual_views), scene_of(scene, trust, antialiased)
     state, used = _run(what, views, virtual_views, options, Compact, device, progress)
     if write is not None:
         write(state.scene)
@@ -320,7 +320,7 @@ def refit(
     if photos is not None and cameras is None:
         raise UsageError("--photos needs --cameras, the views that the photographs show")
     write = scene_writer(output) if output is not None else None
-    given = cameras_of(cameras)
+    given = cameras_of(cameras, virtual_views)
     if photos is not None and given is not None:
         given = within_photographs(given)
     ground_truth = GroundTruth(Path(photos), given, colour) if photos is not None and given is not None else None
