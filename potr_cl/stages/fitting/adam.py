@@ -14,7 +14,7 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
 from potr_cl.stages.fitting.derivatives import Columns
-from potr_cl.stages.fitting.parameters import Parameters
+from potr_cl.stages.fitting.parameters import Factors, Parameters
 
 #: How fast the moments forget (Kingma and Ba, 2015), and the averages: after about so many steps.
 _DECAY_MEAN, _DECAY_SQUARE = 0.9, 0.999
@@ -70,15 +70,24 @@ class Adam(Parameters):
         columns: which parameter is in which column.
         rates: of a step.
         limits: of the parameters.
+        factors: what the rasterizer's scene is rounded with; the gradient is taken for that of the parameters, as if
+            nothing were (the straight-through estimator of Bengio et al., 2013).
 
     Raises:
         DeviceError: it does not fit the device, or the kernels cannot be built.
     """
 
     def __init__(
-        self, device: Device, scene: Scene, buffers: SceneBuffers, columns: Columns, rates: Rates, limits: Limits
+        self,
+        device: Device,
+        scene: Scene,
+        buffers: SceneBuffers,
+        columns: Columns,
+        rates: Rates,
+        limits: Limits,
+        factors: Factors = Factors(),
     ) -> None:
-        super().__init__(device, scene, buffers, columns)
+        super().__init__(device, scene, buffers, columns, factors)
         self._taken = 0
         try:
             nbytes = self.values.size

@@ -2,15 +2,33 @@
 
 from __future__ import annotations
 
+from dataclasses import dataclass
+
 import numpy as np
 import pyopencl as cl
 
+from potr_cl.codec.quantize import LEAST_LOGIT, ZERO_SCALE
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.activation import LARGEST_SCALE, unit_quaternions
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
 from potr_cl.stages.fitting.derivatives import Columns
+
+
+@dataclass(frozen=True)
+class Factors:
+    """What a file rounds shapes and opacities with: a step is 1 / factor. 0: they are not rounded.
+
+    Attributes:
+        scale: of standard deviations, world units.
+        rotation: of quaternions, times the root of the splat's largest scale level.
+        opacity: of logits.
+    """
+
+    scale: float = 0.0
+    rotation: float = 0.0
+    opacity: float = 0.0
 
 
 class Parameters(Owner):
@@ -21,6 +39,8 @@ class Parameters(Owner):
         scene: where they begin.
         buffers: of a rasterizer that has this scene.
         columns: which parameter is in which column.
+        factors: what :meth:`give` rounds with; ``values`` are never rounded. Quaternions have to be in the form that
+            a file has then (:func:`potr_cl.codec.quantize.canonical_rotations`).
 
     Attributes:
         buffers, columns: as given.
@@ -30,8 +50,11 @@ class Parameters(Owner):
         DeviceError: they do not fit the device, or the kernels cannot be built.
     """
 
-    def __init__(self, device: Device, scene: Scene, buffers: SceneBuffers, columns: Columns) -> None:
+    def __init__(
+        self, device: Device, scene: Scene, buffers: SceneBuffers, columns: Columns, factors: Factors = Factors()
+    ) -> None:
         self._device, self._scene, self.buffers, self.columns = device, scene, buffers, columns
+        self._factors = factors
         self._start = _columns_of(scene, columns, buffers.stride)
         self._memory = Memory(device)
         try:
@@ -55,6 +78,11 @@ class Parameters(Owner):
             stride=buffers.stride,
             sh_columns=self.columns.sh if colours else 0,
             largest_scale=LARGEST_SCALE,
+            sf_scale=self._factors.scale,
+            zero_scale=ZERO_SCALE,
+            sf_rotation=self._factors.rotation,
+            sf_opacity=self._factors.opacity,
+            least_logit=LEAST_LOGIT,
             means=buffers.means,
             scales=buffers.scales,
             quaternions=buffers.quaternions,

@@ -17,13 +17,18 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
+import numpy as np
+
 from potr_cl.codec.geometry import Geometry
+from potr_cl.codec.quantize import canonical_rotations
+from potr_cl.codec.versions import VERSIONS, Version2
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.fit import FitOptions, SupportsBool, fit_scene
+from potr_cl.stages.fitting.parameters import Factors
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import share_out
 from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
@@ -49,6 +54,7 @@ class Settling:
     rounding: float
     start: float
     last: float = 0.1
+    through: float = 0.0
 
 
 @dataclass(frozen=True)
@@ -97,15 +103,17 @@ def settle(
     """
     errors: list[float] = []
 
-    def fitted(scene: Scene, part: float, still: Sequence[str]) -> Scene:
+    def fitted(
+        scene: Scene, part: float, still: Sequence[str], factors: Factors = Factors(), start: float = settling.start
+    ) -> Scene:
         steps = max(round(part * options.steps), 1)
         rates: Rates = dataclasses.replace(options.rates, **dict.fromkeys(still, 0.0))
         more = dataclasses.replace(
-            options, steps=steps, rounds=3, rates=rates, start=settling.start, last=settling.last, patience=3
+            options, steps=steps, rounds=3, rates=rates, start=start, last=settling.last, patience=3
         )
         found = fit_scene(
             bench.opened, scene, looking.views, looking.targets, more, looking.added, bench.background,
-            tell=bench.tell, asked=asked,
+            tell=bench.tell, asked=asked, factors=factors,
         )  # fmt: skip
         errors.append(found.error)
         progress(steps)
@@ -118,6 +126,15 @@ def settle(
     rounded = bench.output.geometry(state.scene, bench.request(state)) if settling.rounding else None
     if not isinstance(rounded, Geometry):
         return state, tuple(errors)
+    if settling.through and VERSIONS[bench.parameters.version].quantises_splats_as(Version2):
+        world = rounded.parameters
+        factors = Factors(world.sf_scale, world.sf_rotation, world.sf_opacity)
+        scene = fitted(_canonical(state.scene), settling.rounding, still, factors, settling.through)
+        with thread_pool(bench.threads) as pool:
+            rounded = rounded.with_centres_of(scene.means, state.views, pool.map)
+        scene = dataclasses.replace(scene, means=rounded.decoded(scene.sh).means)
+        scene = fitted(scene, settling.rounding, [*still, "means"], factors, settling.through)
+        return dataclasses.replace(state.recoloured(scene.sh), geometry=rounded.with_shapes_of(scene)), tuple(errors)
     still += ["log_scales", "quaternions"]
     decoded = rounded.decoded(state.scene.sh)
     scene = dataclasses.replace(decoded, means=state.scene.means, opacity_logits=state.scene.opacity_logits)
@@ -128,6 +145,14 @@ def settle(
     scene = fitted(scene, settling.rounding, [*still, "means"])
     then = dataclasses.replace(state.recoloured(scene.sh), geometry=rounded.with_opacities_of(scene.opacity_logits))
     return then, tuple(errors)
+
+
+def _canonical(scene: Scene) -> Scene:
+    """The same splats with quaternions and scales in the form that a file has them in."""
+    imaginary, log_scales = canonical_rotations(scene.quaternions, scene.log_scales)
+    real = np.sqrt(np.maximum(1 - (imaginary**2).sum(axis=1), 0))
+    quaternions = np.column_stack([real, imaginary]).astype(np.float32)
+    return dataclasses.replace(scene, quaternions=quaternions, log_scales=log_scales)
 
 
 def _with_chosen(state: State, bench: Workbench, looking: Looking) -> Scene:
