@@ -14,7 +14,7 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
 from potr_cl.stages.fitting.derivatives import Columns
-from potr_cl.stages.fitting.parameters import Factors, Parameters
+from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, Parameters
 
 #: How fast the moments forget (Kingma and Ba, 2015), and the averages: after about so many steps.
 _DECAY_MEAN, _DECAY_SQUARE = 0.9, 0.999
@@ -85,7 +85,7 @@ class Adam(Parameters):
         columns: Columns,
         rates: Rates,
         limits: Limits,
-        factors: Factors = Factors(),
+        factors: Factors = UNROUNDED,
     ) -> None:
         super().__init__(device, scene, buffers, columns, factors)
         self._taken = 0

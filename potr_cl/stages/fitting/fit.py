@@ -29,7 +29,7 @@ from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.judges import Judges
-from potr_cl.stages.fitting.parameters import Factors
+from potr_cl.stages.fitting.parameters import UNROUNDED, Factors
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import batches, share_out
 from potr_cl.stages.refitting.targets import Targets
@@ -176,7 +176,7 @@ def fit_scene(
     asked: SupportsBool = False,
     held_out: Sequence[int] | None = None,
     fit_to: Sequence[int] | None = None,
-    factors: Factors = Factors(),
+    factors: Factors = UNROUNDED,
 ) -> Fitted:
     """Fit all parameters of a scene to pictures of some views.
 
@@ -219,7 +219,7 @@ def fit_scene(
             Judges(device, rasterizer, cameras, pictures, held_out) as judges,
             Adam(device, scene, rasterizer.parameters, derivatives.columns, rates, _limits(scene), factors) as adam,
         ):
-            if factors != Factors():
+            if factors != UNROUNDED:
                 adam.give()
             fit = _Fit(options, derivatives, adam, pictures, judges, cameras)
             return fit.run(fit_to, progress, tell or logger.debug, asked)

@@ -31,6 +31,9 @@ class Factors:
     opacity: float = 0.0
 
 
+UNROUNDED = Factors()
+
+
 class Parameters(Owner):
     """All parameters of a scene's splats, as a solver moves them.
 
@@ -51,7 +54,7 @@ class Parameters(Owner):
     """
 
     def __init__(
-        self, device: Device, scene: Scene, buffers: SceneBuffers, columns: Columns, factors: Factors = Factors()
+        self, device: Device, scene: Scene, buffers: SceneBuffers, columns: Columns, factors: Factors = UNROUNDED
     ) -> None:
         self._device, self._scene, self.buffers, self.columns = device, scene, buffers, columns
         self._factors = factors

@@ -28,7 +28,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.fit import FitOptions, SupportsBool, fit_scene
-from potr_cl.stages.fitting.parameters import Factors
+from potr_cl.stages.fitting.parameters import UNROUNDED, Factors
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import share_out
 from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
@@ -104,7 +104,7 @@ def settle(
     errors: list[float] = []
 
     def fitted(
-        scene: Scene, part: float, still: Sequence[str], factors: Factors = Factors(), start: float = settling.start
+        scene: Scene, part: float, still: Sequence[str], factors: Factors = UNROUNDED, start: float = settling.start
     ) -> Scene:
         steps = max(round(part * options.steps), 1)
         rates: Rates = dataclasses.replace(options.rates, **dict.fromkeys(still, 0.0))
