@@ -55,6 +55,8 @@ class Settling:
     start: float
     last: float = 0.1
     through: float = 0.0
+    choices: int = 1
+    gather: float = 0.4
 
 
 @dataclass(frozen=True)
@@ -121,8 +123,10 @@ def settle(
 
     still = ["ac"]
     if settling.choosing and bench.parameters.drop and "compact" not in state.learnt:
-        scene = fitted(_with_chosen(state, bench, looking), settling.choosing, still)
-        state = dataclasses.replace(state, scene=scene, geometry=None)
+        for number in range(1, settling.choices + 1):
+            drop = bench.parameters.drop * settling.gather ** (settling.choices - number)
+            scene = fitted(_with_chosen(state, bench, looking, drop), settling.choosing / settling.choices, still)
+            state = dataclasses.replace(state, scene=scene, geometry=None)
     rounded = bench.output.geometry(state.scene, bench.request(state)) if settling.rounding else None
     if not isinstance(rounded, Geometry):
         return state, tuple(errors)
@@ -155,11 +159,11 @@ def _canonical(scene: Scene) -> Scene:
     return dataclasses.replace(scene, quaternions=quaternions, log_scales=log_scales)
 
 
-def _with_chosen(state: State, bench: Workbench, looking: Looking) -> Scene:
+def _with_chosen(state: State, bench: Workbench, looking: Looking, drop: float) -> Scene:
     """The scene with the AC coefficients that are worth their bytes, solved for without a look at held-out views."""
     _, held_out = share_out(len(looking.views) - looking.added, looking.added)
     views = [view for number, view in enumerate(state.views) if number not in held_out]  # given ones come first in both
-    options = RefitOptions(steps=_CHOICE_STEPS, drop=bench.parameters.drop, memory=bench.memory)
+    options = RefitOptions(steps=_CHOICE_STEPS, drop=drop, memory=bench.memory)
     targets = RenderedTargets(looking.rasterizer, views)
     refitted = refit_colours(bench.opened, state.scene, views, targets, options, background=bench.background)
     return dataclasses.replace(state.scene, sh=refitted.sh)
