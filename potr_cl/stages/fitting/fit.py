@@ -194,7 +194,7 @@ def fit_scene(
         held_out: numbers of the views to judge by; None: some of the given ones.
         fit_to: numbers of the views to look at, where the judges are given; None: all others.
         factors: what a file will round shapes and opacities with. All is looked at as it is rounded, but what comes of
-            it is not; quaternions as :class:`potr_cl.stages.fitting.parameters.Parameters` takes them.
+            it is not. The scene as :class:`potr_cl.stages.fitting.parameters.Parameters` takes it then.
 
     Raises:
         UsageError: there are fewer than two given views, so that none can be held out.

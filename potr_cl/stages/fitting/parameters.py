@@ -2,12 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
 from dataclasses import dataclass
 
 import numpy as np
 import pyopencl as cl
 
-from potr_cl.codec.quantize import LEAST_LOGIT, ZERO_SCALE
+from potr_cl.codec.quantize import LEAST_LOGIT, ZERO_SCALE, canonical_rotations
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
@@ -42,8 +43,8 @@ class Parameters(Owner):
         scene: where they begin.
         buffers: of a rasterizer that has this scene.
         columns: which parameter is in which column.
-        factors: what :meth:`give` rounds with; ``values`` are never rounded. Quaternions have to be in the form that
-            a file has then (:func:`potr_cl.codec.quantize.canonical_rotations`).
+        factors: what :meth:`give` rounds with; ``values`` are never rounded. The scene has to be
+            :func:`in_form_of_files` then.
 
     Attributes:
         buffers, columns: as given.
@@ -122,6 +123,14 @@ class Parameters(Owner):
     def close(self) -> None:
         """Give all device memory back."""
         self._memory.close()
+
+
+def in_form_of_files(scene: Scene) -> Scene:
+    """The same splats, of their equivalent forms each in the one that a file has: what :class:`Factors` are for."""
+    imaginary, log_scales = canonical_rotations(scene.quaternions, scene.log_scales)
+    real = np.sqrt(np.maximum(1 - (imaginary**2).sum(axis=1), 0))
+    quaternions = np.column_stack([real, imaginary]).astype(np.float32)
+    return dataclasses.replace(scene, quaternions=quaternions, log_scales=log_scales)
 
 
 def _columns_of(scene: Scene, columns: Columns, stride: int) -> FloatArray:

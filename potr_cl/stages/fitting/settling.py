@@ -17,10 +17,7 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
-import numpy as np
-
 from potr_cl.codec.geometry import Geometry
-from potr_cl.codec.quantize import canonical_rotations
 from potr_cl.codec.versions import VERSIONS, Version2
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
@@ -28,7 +25,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.fit import FitOptions, SupportsBool, fit_scene
-from potr_cl.stages.fitting.parameters import UNROUNDED, Factors
+from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_files
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import share_out
 from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
@@ -133,7 +130,7 @@ def settle(
     if settling.through and VERSIONS[bench.parameters.version].quantises_splats_as(Version2):
         world = rounded.parameters
         factors = Factors(world.sf_scale, world.sf_rotation, world.sf_opacity)
-        scene = fitted(_canonical(state.scene), settling.rounding, still, factors, settling.through)
+        scene = fitted(in_form_of_files(state.scene), settling.rounding, still, factors, settling.through)
         with thread_pool(bench.threads) as pool:
             rounded = rounded.with_centres_of(scene.means, state.views, pool.map)
         scene = dataclasses.replace(scene, means=rounded.decoded(scene.sh).means)
@@ -149,14 +146,6 @@ def settle(
     scene = fitted(scene, settling.rounding, [*still, "means"])
     then = dataclasses.replace(state.recoloured(scene.sh), geometry=rounded.with_opacities_of(scene.opacity_logits))
     return then, tuple(errors)
-
-
-def _canonical(scene: Scene) -> Scene:
-    """The same splats with quaternions and scales in the form that a file has them in."""
-    imaginary, log_scales = canonical_rotations(scene.quaternions, scene.log_scales)
-    real = np.sqrt(np.maximum(1 - (imaginary**2).sum(axis=1), 0))
-    quaternions = np.column_stack([real, imaginary]).astype(np.float32)
-    return dataclasses.replace(scene, quaternions=quaternions, log_scales=log_scales)
 
 
 def _with_chosen(state: State, bench: Workbench, looking: Looking, drop: float) -> Scene:
