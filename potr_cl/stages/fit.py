@@ -161,6 +161,7 @@ class Fit(Stage):
     rounding: float = option(0.15)
     gentle: float = option(0.1)
     through: float = option(0.0)
+    sparse: int = option(0)
     choices: int = option(1)
     gather: float = option(0.4)
     seed: int = option(FitOptions.seed)
@@ -304,7 +305,13 @@ class Fit(Stage):
         """Choose coefficients and round geometry, with what is left fitted once more in between."""
         options = self._options(bench.opened.family, bench.memory)
         settling = Settling(
-            self.choosing, self.rounding, self.gentle, through=self.through, choices=self.choices, gather=self.gather
+            self.choosing,
+            self.rounding,
+            self.gentle,
+            through=self.through,
+            sparse=bool(self.sparse),
+            choices=self.choices,
+            gather=self.gather,
         )
         done, total = options.steps, options.steps + self.further_steps_on(bench.opened.family)
 

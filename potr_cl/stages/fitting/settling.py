@@ -52,6 +52,7 @@ class Settling:
     start: float
     last: float = 0.1
     through: float = 0.0
+    sparse: bool = False
     choices: int = 1
     gather: float = 0.4
 
@@ -112,13 +113,13 @@ def settle(
         )
         found = fit_scene(
             bench.opened, scene, looking.views, looking.targets, more, looking.added, bench.background,
-            tell=bench.tell, asked=asked, factors=factors,
+            tell=bench.tell, asked=asked, factors=factors, sparse=settling.sparse,
         )  # fmt: skip
         errors.append(found.error)
         progress(steps)
         return found.scene
 
-    still = ["ac"]
+    still = [] if settling.sparse else ["ac"]
     if settling.choosing and bench.parameters.drop and "compact" not in state.learnt:
         for number in range(1, settling.choices + 1):
             drop = bench.parameters.drop * settling.gather ** (settling.choices - number)
