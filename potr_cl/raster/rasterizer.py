@@ -254,7 +254,9 @@ class Rasterizer(Owner):
             counts, bounds = self._zeroed_counts(views), self._room_for_bounds(views)
             self._enqueue_project(views, bounds)
             self._launcher.enqueue_offsets(views, bounds, counts)
-            found = views.read_counts()
+            # All of them, while there is nothing else to wait for: the lists are enqueued behind them.
+            views.found_offsets = views.read_offsets()
+            found = [int(offsets[-1]) for offsets in views.found_offsets]
             for view, count in zip(views.views, found, strict=True):
                 _accept(view, count)
             views.make_room(found)

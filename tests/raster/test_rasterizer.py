@@ -213,10 +213,10 @@ def test_pictures_of_several_views_in_one_buffer(
     rasterizer = Rasterizer(device, random_splats(500, 1, seed=5))
     prepare_set = Rasterizer.prepare_set
 
-    def at_most(self: Rasterizer, cameras: Sequence[Camera]) -> ViewSet:
+    def at_most(self: Rasterizer, cameras: Sequence[Camera], memory: Memory | None) -> ViewSet:
         if most is not None and len(cameras) > most:
             raise DeviceMemoryError("too many views")
-        return prepare_set(self, cameras)
+        return prepare_set(self, cameras, memory)
 
     monkeypatch.setattr(Rasterizer, "prepare_set", at_most)
     cameras = [tilted_camera(1, 64, 64), tilted_camera(2, 50, 33), *(tilted_camera(seed, 17, 15) for seed in range(3))]

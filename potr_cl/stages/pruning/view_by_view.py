@@ -276,6 +276,7 @@ class ViewByView(Owner):
         if _SPLAT * int(totals.sum()) + int(targets.sum()) > left:
             left -= passing + 16 * self._whole.stride
             reserved = int(targets.sum())
+        self._pending: list[cl.Event] = []
         first_tile, others = 0, []
         for done, number in enumerate(sights.order().tolist()):
             own = int(targets[number])
@@ -291,6 +292,8 @@ class ViewByView(Owner):
             if progress is not None:
                 progress(done + 1, len(self._cameras))
         self._list_everything()
+        self._finish()
+        self._pending.clear()
         if others:
             self._totals_of_unkept = memory.allocate(16 * self._whole.stride, "the effects in views that are not kept")
             self._unkept = self._dealt_out(others, sights, targets, passing)
@@ -329,7 +332,9 @@ class ViewByView(Owner):
             memory = stack.enter_context(Memory(device))
             view = _View(number, camera, splats, self._picker.pick(memory, self._seen[number])[0])
             rasterizer = stack.enter_context(self._rasterizer(view.numbers, splats))
-            prepared = PreparedSet(rasterizer, range(number, number + 1), rasterizer.prepare_set([camera]))
+            views = rasterizer.prepare_set([camera])
+            # The device sorts its lists while the next view is made ready.
+            prepared = PreparedSet(rasterizer, range(number, number + 1), views, pending=self._pending)
             stack.enter_context(prepared)
             rasterizer.rest()
             marks = memory.allocate(rasterizer.stride, "a view's splats that are left")
