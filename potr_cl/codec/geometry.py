@@ -126,6 +126,19 @@ class Geometry:
             check_positions(means, log_scales, tolerance, tree, order)
         return moved
 
+    def with_shapes_of(self, scene: Scene, run: Run = map) -> Geometry:
+        """The same centres with the scales, rotations and opacities of a scene, not rounded yet.
+
+        Args:
+            scene: in its order; its centres and colours are of no account.
+            run: as of :func:`quantise_geometry`.
+
+        Raises:
+            DataError: a value too large to quantise.
+        """
+        levels = splat_levels(scene, self.order, self.parameters, run)
+        return replace(self, scales=levels.scales, rotations=levels.rotations, opacities=levels.opacities, steps=None)
+
     def with_opacities_of(self, logits: NDArray[np.float32]) -> Geometry:
         """The same with other opacities: (N,) logits in the order of the scene, not rounded yet."""
         version, factor = VERSIONS[self.parameters.version], self.parameters.sf_opacity

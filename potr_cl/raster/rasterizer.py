@@ -208,21 +208,44 @@ class Rasterizer(Owner):
         device = self.device
         most = int(max((device.info.memory - device.allocated) // (512 * self.stride), 1))
         number = 0
-        while number < len(cameras):
-            some = cameras[number : number + most]
-            try:
-                views = self.prepare_set(some, memory)
-            except DeviceMemoryError:
-                if most == 1:
-                    raise
-                most //= 2
-                continue
-            with views:
+        views: ViewSet | None = None
+        try:
+            while number < len(cameras):
+                # Sets of about one size: drivers take long to give memory back and to take it anew.
+                left = len(cameras) - number
+                sets = -(-left // most)
+                some = cameras[number : number - (-left // sets)]
+                try:
+                    former, views = views, None
+                    views = self._prepare_instead(former, some, memory)
+                except DeviceMemoryError:
+                    if most == 1:
+                        raise
+                    most = max(len(some) // 2, 1)
+                    continue
                 nbytes = 12 * views.pixels
                 self._enqueue_composite(views)
                 cl.enqueue_copy(device.queue, target, self._image.buffer, byte_count=nbytes, dst_offset=start)
-            number += len(some)
-            start += nbytes
+                number += len(some)
+                start += nbytes
+        finally:
+            if views is not None:
+                views.close()
+                if not self._shares:
+                    self._preparing.close()
+
+    def _prepare_instead(self, former: ViewSet | None, cameras: Sequence[Camera], memory: Memory | None) -> ViewSet:
+        """Prepared views, in the memory of others that nobody needs any more, if they fit in there."""
+        if former is not None:
+            fits = False
+            try:
+                fits = len(former.views) == len(cameras) and self.prepare_again(former, cameras)
+            finally:
+                if not fits:
+                    former.close()
+            if fits:
+                return former
+        return self.prepare_set(cameras, memory)
 
     def prepare(self, camera: Camera) -> View:
         """Find projection, tile lists and depth order of a view, which :meth:`composite` can use any number of times.
