@@ -100,7 +100,8 @@ class ViewSet(Owner):
             row["first_tile"], row["first_pixel"] = tile, pixel
             tile += view.tiles
             pixel += view.pixels
-        cl.enqueue_copy(self._device.queue, self.table, table, is_blocking=True)
+        # Nobody waits for it: an event that is replaced lets go of its table when that is there.
+        self._sent = cl.enqueue_copy(self._device.queue, self.table, table, is_blocking=False)
 
     def aim(self, camera: Camera) -> bool:
         """Point the only view at another camera, if that has as many tiles across and down.
