@@ -522,11 +522,11 @@ class ViewByView(Owner):
             stack.enter_context(prepared)
             own_totals.reserve(16 * rasterizer.stride)
             device.fill(own_totals.buffer, np.uint32(0), 16 * rasterizer.stride)
-            for scratch in (tiles, stale):
-                scratch.reserve(4 * views.tiles)
-            everything = np.arange(views.tiles, dtype=np.uint32)
-            with device.errors("failed while computing"):
-                cl.enqueue_copy(device.queue, tiles.buffer, everything, is_blocking=True)
+            stale.reserve(4 * views.tiles)
+            if tiles.reserve(4 * views.tiles):  # all of them: nobody writes to it
+                everything = np.arange(views.tiles, dtype=np.uint32)
+                with device.errors("failed while computing"):
+                    cl.enqueue_copy(device.queue, tiles.buffer, everything, is_blocking=True)
             buffers = SweepBuffers(self.marks, tiles.buffer, stale.buffer, self._counts, own_totals.buffer)
             launcher = launcher_for(rasterizer, self._options, self._fixed_point)
             kernels = launcher.bind(prepared, (views.shapes, views.colours), buffers, first_time=True)
