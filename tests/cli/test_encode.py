@@ -262,3 +262,23 @@ def test_encode_to_ground_truth(tmp_path, scene_path, capsys):
     fails(capsys, [*encode, "--photos", photos, "--refit", "off"], 2, "--photos", "re-fit")
     fails(capsys, ["encode", scene_path, "-o", out, "--photos", photos], 2, "--photos", "--cameras")
     fails(capsys, [*encode, "--photos", tmp_path / "nowhere"], 2, "nowhere")
+
+
+def test_few_cameras_are_told_where_held_out_views_suffer(tmp_path, data, capsys):
+    """Not where training views show what held-out ones show."""
+    scene, every = data / "plush_excerpt.ply", json.loads((data / "plush_excerpt_cameras.json").read_text())
+    training = [camera for camera in every if camera["split"] == "train"]
+    few = [*training[:1], *(dict(camera, split="test") for camera in training[4:])]
+    same = [*training, *(dict(camera, id=100 + n, split="test") for n, camera in enumerate(training))]
+    told, gap = [], []
+    for name, cameras in (("few", few), ("same", same)):
+        path = tmp_path / f"{name}.json"
+        path.write_text(json.dumps(cameras))
+        arguments = ["encode", scene, "--cameras", path, "--iterations", "4", "-q", "0.3", "-o", tmp_path / "a.potr"]
+        told.append("the held-out views are matched" in run(capsys, *arguments))
+        quality = json.loads(run(capsys, *arguments, "--json"))["quality"]
+        assert quality["training"]["views"] == (1 if name == "few" else 4)
+        assert (quality["training"]["said"] is not None) == told[-1]
+        gap.append(quality["training"]["psnr"] - quality["psnr"])
+    assert told == [True, False], gap
+    assert gap[0] > 6 > gap[1]
