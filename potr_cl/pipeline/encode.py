@@ -26,6 +26,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import is_virtual, place_cameras
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.fallback import on_device
+from potr_cl.pipeline.host_memory import for_views
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
@@ -361,7 +362,8 @@ class Run:
 
         def work(device: Device, memory: int | None) -> State:
             pool = self._pool if self._pool is not None and device is self._pool.first else None
-            return stage.run(state, dataclasses.replace(bench, device=device, memory=memory, pool=pool))
+            room = for_views(device, memory, len(state.source))
+            return stage.run(state, dataclasses.replace(bench, device=device, memory=room, pool=pool))
 
         device = self.device or self._given or Device()
         state, self.device = on_device(device, options.memory, work)

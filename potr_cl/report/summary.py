@@ -21,6 +21,8 @@ from potr_cl.quality.ground_truth import PhotographFigures
 
 #: By how many decibels held-out views may be matched worse than training views before the reader is told why.
 _APART = 6.0
+#: Views that show the quarter of a scene which the fewest show: with fewer, training views say little of others.
+_FEW = 8
 #: Packages whose version may change the bytes.
 _PACKAGES = ("numpy", "pyopencl", "zstandard")
 
@@ -216,6 +218,13 @@ def format_encode_report(report: dict[str, Any]) -> str:
         ]
         if quality.get("training") is not None and quality["training"]["said"] is not None:
             lines.append(f"           {quality['training']['said']}")
+        elif quality["kind"] == "train" and report["views_between"] is not None:
+            shown_by = report["views_between"]["shown_by"]
+            if shown_by is not None and shown_by < _FEW:
+                lines.append(
+                    f"           a quarter of the scene is shown by no more than {shown_by:.0f} of them: "
+                    "from elsewhere it may be matched far worse"
+                )
     if report.get("fit") is not None:
         lines.append(f"fit        {report['fit']['said']}")
     photographs = report["photographs"]

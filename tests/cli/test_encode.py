@@ -282,3 +282,21 @@ def test_few_cameras_are_told_where_held_out_views_suffer(tmp_path, data, capsys
         gap.append(quality["training"]["psnr"] - quality["psnr"])
     assert told == [True, False], gap
     assert gap[0] > 6 > gap[1]
+
+
+def test_training_views_that_judge_themselves_are_said_to_be_few(tmp_path, data, capsys):
+    training = [
+        camera for camera in json.loads((data / "plush_excerpt_cameras.json").read_text()) if camera["split"] == "train"
+    ]
+    more = [
+        dict(camera, id=100 * turn + n, position=[x + 0.001 * turn for x in camera["position"]])
+        for turn in range(3)
+        for n, camera in enumerate(training)
+    ]
+    scene, said = data / "plush_excerpt.ply", []
+    for name, cameras in (("few", training[:3]), ("more", more)):
+        path = tmp_path / f"{name}.json"
+        path.write_text(json.dumps(cameras))
+        text = run(capsys, "encode", scene, "--cameras", path, "--iterations", "2", "-o", tmp_path / "a.potr")
+        said.append("is shown by no more than 3 of them" in text)
+    assert said == [True, False]
