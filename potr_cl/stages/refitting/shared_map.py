@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from potr_cl.opencl.memory import Owner, Staging
 from potr_cl.opencl.relay import Lent
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.part import ColourPart, Gradient
@@ -112,7 +113,7 @@ def colour_parts(
     scene: Scene,
     rules: RasterRules,
     background: tuple[float, float, float],
-    source: Scene | KeptScene,
+    source: Scene | KeptScene | ViewShares,
     cameras: Sequence[Camera],
     memory: int | None,
 ) -> Iterator[Parts]:
@@ -123,12 +124,20 @@ def colour_parts(
         shares: who does which views.
         scene: whose colours are re-fitted.
         rules, background: of the rasterizer.
-        source: the scene whose pictures are the targets, perhaps kept on devices.
+        source: the scene whose pictures are the targets, perhaps kept on devices, or what the views see of it.
         cameras: all views.
         memory: bytes of a device's memory that prepared views and targets may take; None: the default.
     """
     constant = replace(scene, sh=np.ascontiguousarray(scene.sh[:, :1]))
-    with pool.shared(constant) as shape, pool.shared(source) as pictured:
-        given = [(shape, scene.sh.shape[1], rules, background, pictured, cameras, numbers) for numbers in shares.others]
+    with ExitStack() as stack:
+        shape = stack.enter_context(pool.shared(constant))
+        if isinstance(source, ViewShares):
+            pictured = [stack.enter_context(pool.shared(share.excerpt)) for share in source.shares]
+        else:
+            pictured = [stack.enter_context(pool.shared(source))] * len(shares.others)
+        given = [
+            (shape, scene.sh.shape[1], rules, background, own, cameras, numbers)
+            for own, numbers in zip(pictured, shares.others, strict=True)
+        ]
         with Parts(pool, ColourPart, given, memory, [len(each) for each in shares.others]) as parts:
             yield parts
