@@ -35,13 +35,14 @@ from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
+from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import blocks_of, left_for_views, placed, rounding_of, vectors_of
 from potr_cl.stages.refitting.rounding import ROUNDS
-from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts
+from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
 from potr_cl.stages.refitting.targets import Targets
 from potr_cl.stages.refitting.vector_space import Layout, Ridge, Vector
-from potr_cl.workers.dealing import Shares, shares
+from potr_cl.workers.dealing import Shares
 from potr_cl.workers.pool import Pool
 
 #: Steps in which the constant coefficients are solved for once more, after the others have been rounded.
@@ -257,12 +258,12 @@ class HelpFrom:
 
     Attributes:
         pool: the workers.
-        source: the scene whose pictures are the targets, perhaps kept on devices; or who does which views, and has what
-            these see of it.
+        source: the scene whose pictures are the targets, perhaps kept on devices, or with pictures of it there; or who
+            does which views, and has what these see of it.
     """
 
     pool: Pool
-    source: Scene | KeptScene | ViewShares
+    source: Scene | KeptScene | PicturesAhead | ViewShares
 
     def shares(self, views: int) -> Shares:
         """Who does which of so many views.
@@ -272,7 +273,7 @@ class HelpFrom:
         """
         if isinstance(self.source, ViewShares):
             return Shares([], [share.numbers for share in self.source.shares])
-        return shares(self.pool, views)
+        return colour_shares(self.pool, views)
 
 
 class ColourRefit(Owner):

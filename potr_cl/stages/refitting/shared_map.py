@@ -17,9 +17,11 @@ from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.colour_map import parts_of
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.part import ColourPart, Gradient
-from potr_cl.workers.dealing import Shares
+from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
+from potr_cl.workers.dealing import Shares, shares
 from potr_cl.workers.parts import Parts, Pending
 from potr_cl.workers.pool import Pool
 
@@ -106,14 +108,19 @@ class SharedViews(Owner):
         self._columns.close()
 
 
+def colour_shares(pool: Pool, views: int) -> Shares:
+    """Who does which of a re-fit's views; raises what :func:`potr_cl.workers.dealing.shares` does."""
+    return shares(pool, views, parts_of(views))
+
+
 @contextmanager
 def colour_parts(
     pool: Pool,
-    shares: Shares,
+    share: Shares,
     scene: Scene,
     rules: RasterRules,
     background: tuple[float, float, float],
-    source: Scene | KeptScene | ViewShares,
+    source: Scene | KeptScene | PicturesAhead | ViewShares,
     cameras: Sequence[Camera],
     memory: int | None,
 ) -> Iterator[Parts]:
@@ -121,10 +128,11 @@ def colour_parts(
 
     Args:
         pool: of their workers.
-        shares: who does which views.
+        share: who does which views.
         scene: whose colours are re-fitted.
         rules, background: of the rasterizer.
-        source: the scene whose pictures are the targets, perhaps kept on devices, or what the views see of it.
+        source: the scene whose pictures are the targets, perhaps kept on devices, with pictures of it there, or what
+            the views see of it.
         cameras: all views.
         memory: bytes of a device's memory that prepared views and targets may take; None: the default.
     """
@@ -132,12 +140,12 @@ def colour_parts(
     with ExitStack() as stack:
         shape = stack.enter_context(pool.shared(constant))
         if isinstance(source, ViewShares):
-            pictured = [stack.enter_context(pool.shared(share.excerpt)) for share in source.shares]
+            pictured = [stack.enter_context(pool.shared(each.excerpt)) for each in source.shares]
         else:
-            pictured = [stack.enter_context(pool.shared(source))] * len(shares.others)
+            pictured = [stack.enter_context(pool.shared(source))] * len(share.others)
         given = [
             (shape, scene.sh.shape[1], rules, background, own, cameras, numbers)
-            for own, numbers in zip(pictured, shares.others, strict=True)
+            for own, numbers in zip(pictured, share.others, strict=True)
         ]
-        with Parts(pool, ColourPart, given, memory, [len(each) for each in shares.others]) as parts:
+        with Parts(pool, ColourPart, given, memory, [len(each) for each in share.others]) as parts:
             yield parts
