@@ -32,7 +32,7 @@ from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, up
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
 from potr_cl.stages.pruning.steering import Steering
-from potr_cl.stages.pruning.survivors import Survivors
+from potr_cl.stages.pruning.survivors import Bits, Survivors
 from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
 
 #: Scenes of fewer splats are projected faster than parted.
@@ -244,11 +244,15 @@ class PartedRemoval(Owner):
 
     def measure(self) -> tuple[F64, F64]:
         """ΔMSE_k and I_k of all N splats, float64; the values of removed splats mean nothing."""
+        return self._fixed_point.values(self.measure_totals())
+
+    def measure_totals(self) -> NDArray[np.int64]:
+        """The same as (N, 2) int64 in units of the fixed point: the sums over all parts."""
         totals = self._first_totals.copy()
         for part in self._parts:
             with self.awake(part):
                 totals[part.splats] += part.sweep.measure_totals()
-        return self._fixed_point.values(totals)
+        return totals
 
     def remove(self, splats: Indices) -> None:
         """Take splats out for good."""
@@ -270,9 +274,22 @@ class PartedRemoval(Owner):
 
     def view_importances(self) -> Iterator[tuple[int, Indices, F64]]:
         """See :meth:`potr_cl.stages.pruning.removal.RemovalSweep.view_importances`."""
+        self.sweep_changed()
+        yield from self.known_importances()
+
+    def sweep_everything(self) -> None:
+        """Have the next measurement sweep every tile, whatever has changed."""
+        for part in self._parts:
+            part.sweep.sweep_everything()
+
+    def sweep_changed(self) -> None:
+        """Measure whatever anything was removed from since it was last measured."""
         for part in self._parts:
             with self.awake(part):
                 part.sweep.sweep_changed()
+
+    def known_importances(self) -> Iterator[tuple[int, Indices, F64]]:
+        """:meth:`view_importances` right after :meth:`sweep_changed`."""
         yield from heapq.merge(*map(self._importances, self._parts), key=lambda found: found[0])
 
     def _importances(self, part: _Part) -> Iterator[tuple[int, Indices, F64]]:
@@ -328,6 +345,10 @@ class _PartedSteering(Owner):
             self._mark.launch((-(-count // _GROUP) * _GROUP,), (_GROUP,))
             steering.remove_marked()
         self._survivors.marked_by_device()
+
+    def mark(self, splats: Bits) -> None:
+        """See :meth:`potr_cl.stages.pruning.steering.Steering.mark`."""
+        self._survivors.mark(splats)
 
     def close(self) -> None:
         self._survivors.close()
