@@ -328,12 +328,12 @@ def keep_losses(measured: dict[str, Any], against: str, path: Path) -> None:
         Column("preset", default="{preset}"),
         Column("q", default="{quality:g}"),
         Column("bytes", format=","),
-        Column(f"bytes against {against} at this PSNR", "%", "+.1f"),
+        Column("bytes at equal PSNR", "%", "+.1f"),
         Column("PSNR against uncompressed", "dB", ".2f"),
         Column("lost on photographs", "dB", ".3f"),
-        Column(f"{against} at this PSNR", "dB", ".3f"),
+        Column(f"lost by {against} at this PSNR", "dB", ".3f"),
         Column("SSIM against photographs", format=".4f"),
-        Column(f"{against} at this PSNR", format=".4f"),
+        Column(f"SSIM of {against} at this PSNR", format=".4f"),
     )
     for name, entry in measured["scenes"].items():
         reference = entry["series"][against]["encodes"]

@@ -147,7 +147,7 @@ def test_tables_of_curves_and_formats(monkeypatch, folder, tmp_path, capsys):
     call(monkeypatch, compare_formats, "report", formats, out, "--json", kept, "--series", "fast")
     heads = [column["name"] for column in json.loads(kept.read_text())["excerpt"]["columns"]]
     assert "fast at that PSNR" in heads
-    with pytest.raises(UsageError, match="there is no curve 'smallest' of excerpt"):
+    with pytest.raises(UsageError, match="there is no series 'smallest'"):
         call(monkeypatch, compare_formats, "report", formats, out, "--json", kept, "--series", "smallest")
 
 
