@@ -11,12 +11,13 @@ from typing import Any
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray
+from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import placed
@@ -30,6 +31,7 @@ from potr_cl.stages.refitting.refit import (
 )
 from potr_cl.stages.refitting.shared_map import colour_shares
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RememberedTargets, RenderedTargets, Targets
+from potr_cl.stages.refitting.visible_targets import VisibleTargets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 #: A scene that takes more than this part of the memory that is given makes room for the re-fit.
@@ -216,7 +218,7 @@ def _pictures_ahead(state: State, bench: Workbench) -> Iterator[PicturesAhead | 
     numbers: dict[Device, Sequence[int]] = {device: range(len(state.views))}
     if pool is not None and (share := colour_shares(pool, len(state.views))).others:
         numbers = {device: share.own, **dict(zip(pool.devices, share.others, strict=False))}
-    with PicturesAhead(kept, bench.background, state.views, numbers) as ahead:
+    with PicturesAhead(kept, bench.background, state.views, numbers, state.sights) as ahead:
         yield ahead
 
 
@@ -226,8 +228,7 @@ def _pictures_of_goal(state: State, bench: Workbench, ahead: PicturesAhead | Non
     device, views = bench.opened, state.views
     little = placed(device, len(state.scene), state.scene.sh.shape[1], bench.memory) is not None
     little = little or (bench.memory is not None and state.source.nbytes > _LARGE * bench.memory)
-    with Rasterizer(device, bench.drawable(state.goal), background=bench.background) as rasterizer:
-        targets: Targets = RenderedTargets(rasterizer, views)
+    with _rendered(state, state.goal, bench) as targets:
         if ahead is not None:
             targets = ahead.before(device, targets)
         if not little or bench.pool is not None:
@@ -235,6 +236,23 @@ def _pictures_of_goal(state: State, bench: Workbench, ahead: PicturesAhead | Non
             return
         remembered = RememberedTargets(device, targets, views)
     yield remembered
+
+
+@contextmanager
+def _rendered(state: State, scene: Scene, bench: Workbench) -> Iterator[Targets]:
+    """The pictures of a scene in a state's views, which are rendered when they are asked for."""
+    device, drawable = bench.opened, bench.drawable(scene)
+    if (
+        state.sights is not None
+        and scene is state.source
+        and isinstance(drawable, SceneBuffers)
+        and device.family == "gpu"
+    ):
+        with VisibleTargets(drawable, state.views, state.sights, bench.background) as visible:
+            yield visible
+        return
+    with Rasterizer(device, drawable, background=bench.background) as rasterizer:
+        yield RenderedTargets(rasterizer, state.views)
 
 
 @dataclass(frozen=True)
@@ -248,13 +266,12 @@ class RefitOnTheWay(Stage):
 
     def run(self, state: State, bench: Workbench) -> State:
         bench.progress("refit", 0.0)
-        source = bench.drawable(state.source)
-        with Rasterizer(bench.opened, source, background=bench.background) as rasterizer:
+        with _rendered(state, state.source, bench) as targets:
             refitted = refit_colours(
                 bench.opened,
                 state.scene,
                 state.views,
-                RenderedTargets(rasterizer, state.views),
+                targets,
                 RefitOptions(steps=self.steps, memory=bench.memory),
                 background=bench.background,
                 progress=lambda done, steps: bench.progress("refit", 0.99 * done / steps),

@@ -14,11 +14,13 @@ from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.refitting.targets import nbytes as bytes_of
+from potr_cl.stages.refitting.visible_targets import VisibleTargets
 
 #: They take no more than this part of a device's memory: for a moment they lie there twice.
 _PART = 1 / 16
@@ -34,6 +36,7 @@ class PicturesAhead(Owner):
         background: R, G, B behind it.
         cameras: all views.
         numbers: of the views whose pictures each device will be asked for.
+        sights: what each view may draw, where no view sees much of the scene.
 
     Attributes:
         source: as given.
@@ -45,10 +48,11 @@ class PicturesAhead(Owner):
         background: tuple[float, float, float],
         cameras: Sequence[Camera],
         numbers: Mapping[Device, Sequence[int]],
+        sights: Sights | None = None,
     ) -> None:
         self.source = source
         self._begun: dict[Device, Future[_Pictures | None]] = {
-            device: in_background(_rendered, device, source, background, cameras, some)
+            device: in_background(_rendered, device, source, background, cameras, some, sights)
             for device, some in numbers.items()
             if device.family == "gpu" and some
         }
@@ -135,6 +139,7 @@ def _rendered(
     background: tuple[float, float, float],
     cameras: Sequence[Camera],
     numbers: Sequence[int],
+    sights: Sights | None,
 ) -> _Pictures | None:
     """Some views' pictures on a device; None: it has not much room, or the scene does not lie there."""
     if sum(bytes_of(cameras[number]) for number in numbers) > _PART * device.info.memory:
@@ -144,6 +149,10 @@ def _rendered(
         return None
     with suppress(DeviceMemoryError), device.all_or_nothing():
         pictures = _Pictures(device, cameras, numbers)
+        if sights is not None:
+            with VisibleTargets(scene, cameras, sights, background) as visible:
+                visible.into(numbers, pictures.buffer)
+            return pictures
         with Rasterizer(device, scene, background=background) as rasterizer:
             RenderedTargets(rasterizer, cameras).into(numbers, pictures.buffer)
         return pictures
