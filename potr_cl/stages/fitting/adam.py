@@ -91,6 +91,7 @@ class Adam(Parameters):
     ) -> None:
         super().__init__(device, scene, buffers, columns, factors)
         self._taken = 0
+        self._moving = columns.count if rates.ac else columns.ac.start
         try:
             nbytes = self.values.size
             self._moments = [self._memory.allocate(nbytes, "the gradient's moments") for _ in range(2)]
@@ -141,7 +142,7 @@ class Adam(Parameters):
             debias_mean=1 / (1 - _DECAY_MEAN**self._taken),
             debias_square=1 / (1 - _DECAY_SQUARE**self._taken),
         )
-        self._step.launch((buffers.stride, columns.count), (SPLAT_GROUP, 1))
+        self._step.launch((buffers.stride, self._moving), (SPLAT_GROUP, 1))
         self.give(colours=False)
 
     @contextmanager
