@@ -35,6 +35,8 @@ from potr_cl.raster.view_set import View, ViewSet
 
 #: Least room for intersections before anything is known of a view, and as a multiple of the splats.
 _FIRST_CAPACITY, _FIRST_CAPACITY_A_SPLAT = 1 << 16, 4
+#: Projected splats of the views that are rendered together. More take gigabytes, and a driver long to find them.
+_PROJECTED = 1 << 26
 
 
 class PreparingMemory(Owner):
@@ -206,7 +208,8 @@ class Rasterizer(Owner):
         self, cameras: Sequence[Camera], target: cl.Buffer, start: int, memory: Memory | None
     ) -> None:
         device = self.device
-        most = int(max((device.info.memory - device.allocated) // (512 * self.stride), 1))
+        room = (device.info.memory - device.allocated) // 512
+        most = int(max(min(room, _PROJECTED) // self.stride, 1))
         number = 0
         views: ViewSet | None = None
         try:
