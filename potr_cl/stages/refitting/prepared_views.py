@@ -56,7 +56,8 @@ class PreparedViews(Owner):
         #: Memory for views that are not kept, by their number.
         self._spare: dict[int, ViewSet] = {}
         try:
-            self._prepare_all(self.budget.most_views(most_views, nbytes))
+            with rasterizer.preparing_many():
+                self._prepare_all(self.budget.most_views(most_views, nbytes))
         except BaseException:
             self.close()
             raise
