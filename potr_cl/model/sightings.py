@@ -104,6 +104,10 @@ class Poses:
             centres = scale * self.centres @ axes.T + shift
         return Poses(centres, self.rotations @ axes.T, self.windows, self.near * scale)
 
+    def turned_round(self) -> Poses:
+        """The same cameras, each with its own y and z axes turned round: it looks the other way."""
+        return Poses(self.centres, np.array([[1.0], [-1.0], [-1.0]]) * self.rotations, self.windows, self.near)
+
     def within(self, of: Sample) -> Poses:
         """The same cameras in the units of a sample."""
         with np.errstate(over="ignore", invalid="ignore"):

@@ -57,8 +57,8 @@ _OWN, _TOGETHER = 70, 56
 #: Of the memory, what these may take; how many they are at most; and how many times as many splats as one of them (on
 #: the average) they see together at most.
 _PASSING, _MOST, _SPREAD = 1 / 5, 16, 4.0
-#: How much more than a tile they may lose, on the average.
-_PATIENCE = 2.0
+#: How much more than a tile they may lose, on the average, and in how many iterations at most.
+_PATIENCE, _LONGEST = 2.0, 48
 
 
 def can_go_by_view(scene: Drawable, device: Device, options: SweepOptions) -> TypeGuard[SceneBuffers]:
@@ -202,6 +202,8 @@ class ViewByView(Owner):
         self._targets_known = self._unkept_known = False
         #: Whether the totals have what views that are not kept have added last.
         self._unkept_added = False
+        #: Iterations since the views that are not kept were measured.
+        self._unmeasured = 0
         self._seen = sights.seen
         own = np.ones(len(cameras), bool)
         if numbers is not None:
@@ -359,12 +361,15 @@ class ViewByView(Owner):
     def measure_on_device(self) -> None:
         """Bring the totals up to date."""
         self._sweep_listed()
-        if self._unkept and self._unkept_are_stale():
-            if self._unkept_added:
-                self._with_unkept("subtract_totals")
-            self._measure_unkept()
-            self._with_unkept("add_totals")
-            self._unkept_known = self._unkept_added = True
+        if self._unkept:
+            self._unmeasured += 1
+            if self._unkept_are_stale():
+                if self._unkept_added:
+                    self._with_unkept("subtract_totals")
+                self._measure_unkept()
+                self._with_unkept("add_totals")
+                self._unkept_known = self._unkept_added = True
+                self._unmeasured = 0
 
     def _with_unkept(self, name: str) -> None:
         kernel = self.device.shared_kernel("prune/add_totals.cl", name)
@@ -418,7 +423,7 @@ class ViewByView(Owner):
 
     def _unkept_are_stale(self) -> bool:
         """Whether they have lost more than the tolerance since they were measured: a part of their area, on average."""
-        if not self._unkept_known or self._options.tolerance <= 0:
+        if not self._unkept_known or self._options.tolerance <= 0 or self._unmeasured >= _LONGEST:
             return True
         with Memory(self.device) as memory:
             words = memory.upload(np.zeros(1, np.int64), "the importance that has gone")
