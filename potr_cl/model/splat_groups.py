@@ -28,6 +28,8 @@ F64 = NDArray[np.float64]
 LARGEST = 1024
 #: Groups whose boxes are found at a time.
 _GROUPS = 256
+#: Splats whose sizes are looked at at a time.
+_ROWS = 1 << 18
 #: Splats that are so many times as large as the median of some have groups of their own: they can be seen from
 #: everywhere.
 _LARGE, _SAMPLED = 8.0, 100_000
@@ -76,15 +78,9 @@ class SplatGroups:
             run: shares the work out.
         """
         group = group or LARGEST
-        logarithms = largest_scales(scene.log_scales)
-        some = logarithms[:: max(len(logarithms) // _SAMPLED, 1)]
-        large = logarithms > np.median(some) + math.log(_LARGE)
-        codes = morton_codes(scene.means, run)
-        codes |= large.astype(np.uint64) << np.uint64(3 * BITS)  # behind all others
-        numbers = ascending(codes, run)
-        del codes
+        numbers, logarithms, large = _in_order(scene, run)
         order, group_of = np.empty((2, len(numbers)), np.uint32)
-        n, small = len(order), len(order) - int(np.count_nonzero(large))
+        n, small = len(order), len(order) - large
         starts = np.concatenate([np.arange(0, small, group), np.arange(small, n, group), [n]])
         low, high = np.empty((2, len(starts) - 1, 3))
         largest = np.empty(len(starts) - 1)
@@ -174,6 +170,24 @@ class SplatGroups:
             1,
         )
         return features, origin
+
+
+def _in_order(scene: Scene, run: Run) -> tuple[Indices, NDArray[np.float32], int]:
+    """The splats' numbers along a Morton curve, large ones behind all others; their largest scales; how many are large."""
+    few = largest_scales(scene.log_scales[:: max(len(scene) // _SAMPLED, 1)])
+    limit = np.median(few) + math.log(_LARGE)
+    codes = morton_codes(scene.means, run)
+    logarithms = np.empty(len(scene), np.float32)
+
+    def flag(first: int) -> int:
+        rows = slice(first, first + _ROWS)
+        logarithms[rows] = largest_scales(scene.log_scales[rows])
+        large = logarithms[rows] > limit
+        codes[rows] |= large.astype(np.uint64) << np.uint64(3 * BITS)
+        return int(np.count_nonzero(large))
+
+    large = sum(run(flag, range(0, len(scene), _ROWS)))
+    return ascending(codes, run), logarithms, large
 
 
 def _bounds(camera: Camera, near: float, origin: F64) -> F64:

@@ -26,7 +26,6 @@ from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner, Reused, Scratch
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.macros import totals_limits
@@ -283,6 +282,7 @@ class ViewByView(Owner):
         self._pending.clear()
         if others:
             self._totals_of_unkept = memory.allocate(16 * self._whole.stride, "the effects in views that are not kept")
+            self._words_lost = memory.allocate(8, "the importance that has gone")
             self._unkept = self._dealt_out(others, sights, targets, passing)
             room = left + int(targets[others].sum())
             for batch in self._unkept:
@@ -347,9 +347,6 @@ class ViewByView(Owner):
         if self._sh is not None and not former:
             picked.sh = self._sh
         return Rasterizer(self.device, picked, background=self._background, preparing=self._preparing)
-
-    def _kernel(self, name: str) -> Kernel:
-        return self.device.kernel(_SOURCE, name, **totals_limits(self.device))
 
     # ------------------------------------------------------------------------------ for a controller on the device
 
@@ -425,13 +422,12 @@ class ViewByView(Owner):
         """Whether they have lost more than the tolerance since they were measured: a part of their area, on average."""
         if not self._unkept_known or self._options.tolerance <= 0 or self._unmeasured >= _LONGEST:
             return True
-        with Memory(self.device) as memory:
-            words = memory.upload(np.zeros(1, np.int64), "the importance that has gone")
-            lost = self._kernel("lost").bind(
-                states=self.marks, totals=self._totals_of_unkept, splats=self.splats, importance=words
-            )
-            lost.launch((-(-self.splats // _LOST_CHUNK) * _GROUP,), (_GROUP,))
-            importance = int(self.device.download(words, (1,), np.int64)[0])
+        words = self._words_lost
+        self.device.fill(words, np.int64(0))
+        lost = self.device.shared_kernel(_SOURCE, "lost", **totals_limits(self.device))
+        lost.bind(states=self.marks, totals=self._totals_of_unkept, splats=self.splats, importance=words)
+        lost.launch((-(-self.splats // _LOST_CHUNK) * _GROUP,), (_GROUP,))
+        importance = int(self.device.download(words, (1,), np.int64)[0])
         part = sum(len(batch.numbers) for batch in self._unkept) / len(self._cameras)
         return importance * self.units[1] / part > _PATIENCE * self._options.tolerance
 
