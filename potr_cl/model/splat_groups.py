@@ -173,7 +173,7 @@ class SplatGroups:
 
 
 def _in_order(scene: Scene, run: Run) -> tuple[Indices, NDArray[np.float32], int]:
-    """The splats' numbers along a Morton curve, large ones behind all others; their largest scales; how many are large."""
+    """The splats' numbers along a Morton curve, large ones last; their largest scales; and how many are large."""
     few = largest_scales(scene.log_scales[:: max(len(scene) // _SAMPLED, 1)])
     limit = np.median(few) + math.log(_LARGE)
     codes = morton_codes(scene.means, run)
