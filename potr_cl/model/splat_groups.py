@@ -28,8 +28,8 @@ F64 = NDArray[np.float64]
 LARGEST = 1024
 #: Groups whose boxes are found at a time.
 _GROUPS = 256
-#: Splats whose sizes are looked at at a time.
-_ROWS = 1 << 18
+#: Splats whose sizes are looked at at a time, and views.
+_ROWS, _VIEWS = 1 << 18, 4
 #: Splats that are so many times as large as the median of some have groups of their own: they can be seen from
 #: everywhere.
 _LARGE, _SAMPLED = 8.0, 100_000
@@ -142,12 +142,13 @@ class SplatGroups:
         found = np.zeros((len(cameras), len(self.starts) - 1), bool)
         features, origin = self._features()
 
-        def look(view: int) -> None:
+        def look(first: int) -> None:
+            rows = np.concatenate([_bounds(camera, near, origin) for camera in cameras[first : first + _VIEWS]])
             # Without BLAS, whose threads would wait for each other.
-            bounds = np.einsum("bf,fg->bg", _bounds(cameras[view], near, origin), features)
-            np.all(bounds >= 0, axis=0, out=found[view])
+            sums = np.einsum("bf,fg->bg", rows, features)
+            np.all(sums.reshape(-1, 5, len(self.sizes)) >= 0, axis=1, out=found[first : first + _VIEWS])
 
-        for _ in run(look, range(len(cameras))):
+        for _ in run(look, range(0, len(cameras), _VIEWS)):
             pass
         return found
 
