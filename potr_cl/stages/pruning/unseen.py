@@ -113,15 +113,7 @@ def put_back(split: Split, pruned: State) -> State:
     scene = dataclasses.replace(scene, sh=sh)
     numbers = np.concatenate([pruned.survivors, split.whole.survivors[split.unseen_splats]])
     order = np.argsort(numbers, kind="stable")  # the quickest way for two runs
-    left = pruned.scene
-    together = dataclasses.replace(
-        left,
-        means=np.concatenate([left.means, scene.means]),
-        log_scales=np.concatenate([left.log_scales, scene.log_scales]),
-        quaternions=np.concatenate([left.quaternions, scene.quaternions]),
-        opacity_logits=np.concatenate([left.opacity_logits, scene.opacity_logits]),
-        sh=np.concatenate([left.sh, scene.sh]),
-    ).subset(order)
+    together = pruned.scene.joined(scene, order)
     return dataclasses.replace(pruned, scene=together, survivors=numbers[order], geometry=None, cut=None)
 
 
