@@ -344,6 +344,8 @@ class ColourRefit(Owner):
                     launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory, own, helpers
                 )
             )
+            if others is not None:
+                owned.callback(others.begin_to_close)
             self._unrounded: Vector | None = None
             self._owned = owned.pop_all()
 
