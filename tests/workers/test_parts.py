@@ -160,3 +160,22 @@ def test_a_log_that_begins_anew_is_not_replayed_whole():
         parts.begin("look", anew=True).results()
         assert parts.tell("look") == [0]  # made again, and told only the two last commands
     assert second.commands == 2
+
+
+@pytest.mark.parametrize("in_process", [True, False])
+def test_threads_forget_their_parts_meanwhile(in_process, monkeypatch):
+    """The master goes on, and waits at the end; workers elsewhere are told at the end alone."""
+    order = []
+
+    def close(self):
+        time.sleep(0.05)
+        order.append("forgotten")
+
+    monkeypatch.setattr(Sum, "close", close)
+    pool = FakePool(FakeWorker("a"), FakeWorker("b"))
+    pool.in_process = in_process
+    with Parts(pool, Sum, [(10, 1), (10, 2)]) as parts:
+        assert parts.tell("add", 1) == [11, 12]
+        parts.begin_to_close()
+        order.append("went on")
+    assert order == ["went on", "forgotten", "forgotten"]
