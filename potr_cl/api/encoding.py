@@ -130,7 +130,7 @@ def encode(
     check_photographs_have_cameras(settings, cameras is not None)
     if report is None and report_view is not None:
         raise UsageError("report_view needs report, the page that shows it")
-    views = cameras_of(cameras)
+    views = cameras_of(cameras, virtual_views)
     with bounded(settings.memory):
         what = scene_of(scene, trust, antialiased)
     if views is None and virtual_views is not None and settings.look_at_views(what):

@@ -11,12 +11,14 @@ from potr_cl.model.order import ascending
 #: Of each coordinate, in a code of 64 bits.
 BITS = 21
 #: Centres whose codes are made at a time.
-_ROWS = 1 << 16
+_ROWS = 1 << 14
+#: Bits that a table spreads at a time.
+_TABLED = 11
 
 
 def morton_order(means: NDArray[np.float32], run: Run = map) -> NDArray[np.int64]:
     """(N,) the numbers of (N, 3) centres along a Morton curve (:func:`morton_codes`), those of one code by number."""
-    return ascending(morton_codes(means, run))
+    return ascending(morton_codes(means, run), run)
 
 
 def morton_codes(means: NDArray[np.float32], run: Run = map) -> NDArray[np.uint64]:
@@ -34,11 +36,17 @@ def morton_codes(means: NDArray[np.float32], run: Run = map) -> NDArray[np.uint6
     middle, side = (low + high) / 2, max(2 * float((high - low).max()), 1e-30)
     corner = middle - side / 2
     codes = np.empty(len(means), np.uint64)
+    table = spread(np.arange(1 << _TABLED, dtype=np.uint64))
 
     def place(start: int) -> None:
         rows = slice(start, start + _ROWS)
-        cells = np.clip((means[rows] - corner) * ((1 << BITS) / side), 0, (1 << BITS) - 1).astype(np.uint64)
-        codes[rows] = spread(cells[:, 0]) | spread(cells[:, 1]) << np.uint64(1) | spread(cells[:, 2]) << np.uint64(2)
+        within = means[rows] - corner
+        within *= (1 << BITS) / side
+        cells = np.clip(within, 0, (1 << BITS) - 1, out=within).T.astype(np.int64)
+        found = table[cells & (1 << _TABLED) - 1]
+        found |= table[cells >> _TABLED] << np.uint64(3 * _TABLED)
+        np.bitwise_or(found[0], found[1] << np.uint64(1), out=codes[rows])
+        codes[rows] |= found[2] << np.uint64(2)
 
     list(run(place, range(0, len(means), _ROWS)))
     return codes

@@ -99,6 +99,21 @@ def test_removal_before_anything_was_measured(device):
         assert np.array_equal(wanted[0][np.arange(1, len(scene), 3)], found[0][np.arange(1, len(scene), 3)])
 
 
+@pytest.mark.parametrize("memory", [None, 0])
+def test_a_view_in_which_nothing_is_drawn(device, memory):
+    """Its splats are too faint: there is not one intersection of a splat and a tile."""
+    scene, cameras = street(2)
+    faint = dataclasses.replace(scene, opacity_logits=np.full(len(scene), -30, np.float32))
+    sights = Sights.of(faint, cameras, INRIA.near)
+    with (
+        uploaded(device, faint) as whole,
+        ViewByView(device, whole, cameras, sights, SweepOptions(0.0, memory=memory)) as removal,
+    ):
+        effects, importances = removal.measure()
+    assert not effects.any()
+    assert not importances.any()
+
+
 def test_views_that_are_not_kept_wait_until_they_have_lost_enough(device):
     scene, cameras = street()
     sights = Sights.of(scene, cameras, INRIA.near)

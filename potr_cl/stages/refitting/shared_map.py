@@ -16,9 +16,11 @@ from potr_cl.opencl.relay import Lent
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rules import RasterRules
 from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.colour_map import parts_of
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.part import ColourPart, Gradient
-from potr_cl.workers.dealing import Shares
+from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
+from potr_cl.workers.dealing import Shares, shares
 from potr_cl.workers.parts import Parts, Pending
 from potr_cl.workers.pool import Pool
 
@@ -105,14 +107,19 @@ class SharedViews(Owner):
         self._columns.close()
 
 
+def colour_shares(pool: Pool, views: int) -> Shares:
+    """Who does which of a re-fit's views; raises what :func:`potr_cl.workers.dealing.shares` does."""
+    return shares(pool, views, parts_of(views))
+
+
 @contextmanager
 def colour_parts(
     pool: Pool,
-    shares: Shares,
+    share: Shares,
     scene: Scene,
     rules: RasterRules,
     background: tuple[float, float, float],
-    source: Scene | KeptScene,
+    source: Scene | KeptScene | PicturesAhead,
     cameras: Sequence[Camera],
     memory: int | None,
 ) -> Iterator[Parts]:
@@ -120,15 +127,15 @@ def colour_parts(
 
     Args:
         pool: of their workers.
-        shares: who does which views.
+        share: who does which views.
         scene: whose colours are re-fitted.
         rules, background: of the rasterizer.
-        source: the scene whose pictures are the targets, perhaps kept on devices.
+        source: the scene whose pictures are the targets, perhaps kept on devices, or with pictures of it there.
         cameras: all views.
         memory: bytes of a device's memory that prepared views and targets may take; None: the default.
     """
     constant = replace(scene, sh=np.ascontiguousarray(scene.sh[:, :1]))
     with pool.shared(constant) as shape, pool.shared(source) as pictured:
-        given = [(shape, scene.sh.shape[1], rules, background, pictured, cameras, numbers) for numbers in shares.others]
-        with Parts(pool, ColourPart, given, memory, [len(each) for each in shares.others]) as parts:
+        given = [(shape, scene.sh.shape[1], rules, background, pictured, cameras, numbers) for numbers in share.others]
+        with Parts(pool, ColourPart, given, memory, [len(each) for each in share.others]) as parts:
             yield parts
