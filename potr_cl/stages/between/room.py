@@ -54,7 +54,8 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
         if _by_view(state, bench):
             return len(added)
         own, more = (_nbytes_of_parts(state, bench, views) for views in sampled)
-        left, margin = budget - min(SCENES * budget, state.source.nbytes), _MARGIN_OF_PARTS
+        # Views in hand take room too, and parts are larger than what a view sees of them.
+        left, margin = budget - min(SCENES * budget, state.source.nbytes) - 2 * max(own, more), _MARGIN_OF_PARTS
     else:
         own, more = (_nbytes(bench, bench.drawable(state.source), views) for views in sampled)
         left, margin = budget, _MARGIN
