@@ -265,6 +265,34 @@ def test_encode_to_ground_truth(tmp_path, scene_path, capsys):
     fails(capsys, [*encode, "--photos", tmp_path / "nowhere"], 2, "nowhere")
 
 
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["encode", "{scene}", "-o", "{out}.potr"],
+        ["encode", "{scene}", "-o", "{out}", "--ladder", "0.5"],
+        ["prune", "{scene}", "-o", "{out}.ply"],
+        ["compact", "{scene}", "-o", "{out}.ply"],
+        ["refit", "{scene}", "--reference", "{scene}", "-o", "{out}.ply"],
+        ["fit", "{scene}", "--reference", "{scene}", "-o", "{out}.ply"],
+    ],
+    ids=lambda words: words[0] + ("_ladder" if "--ladder" in words else ""),
+)
+def test_virtual_views_beside_cameras_are_refused(tmp_path, scene_path, cameras_path, capsys, command):
+    typed = [word.format(scene=scene_path, out=tmp_path / "out") for word in command]
+    given = ["--cameras", cameras_path, "--virtual-views", "8"]
+    fails(capsys, [*typed, *given], 2, "--virtual-views is for scenes without cameras: leave it out, or --cameras")
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", "cameras.json"}
+
+
+@pytest.mark.parametrize("name", ["encode", "encode_ladder", "prune", "compact", "refit", "fit"])
+def test_virtual_views_beside_cameras_are_refused_from_python(tmp_path, name):
+    scene, cameras = random_scene(20, 0), ring_of_cameras(4)
+    more = {"encode_ladder": (tmp_path, "0.5"), "refit": (scene,), "fit": (scene,)}.get(name, ())
+    with pytest.raises(UsageError, match="for scenes without cameras"):
+        getattr(potr_cl, name)(scene, *more, cameras, virtual_views=8)
+    assert not list(tmp_path.iterdir())
+
+
 def test_few_cameras_are_told_where_held_out_views_suffer(tmp_path, data, capsys):
     """Not where training views show what held-out ones show."""
     scene, every = data / "plush_excerpt.ply", json.loads((data / "plush_excerpt_cameras.json").read_text())
@@ -301,31 +329,3 @@ def test_training_views_that_judge_themselves_are_said_to_be_few(tmp_path, data,
         text = run(capsys, "encode", scene, "--cameras", path, "--iterations", "2", "-o", tmp_path / "a.potr")
         said.append("is shown by no more than 3 of them" in text)
     assert said == [True, False]
-
-
-@pytest.mark.parametrize(
-    "command",
-    [
-        ["encode", "{scene}", "-o", "{out}.potr"],
-        ["encode", "{scene}", "-o", "{out}", "--ladder", "0.5"],
-        ["prune", "{scene}", "-o", "{out}.ply"],
-        ["compact", "{scene}", "-o", "{out}.ply"],
-        ["refit", "{scene}", "--reference", "{scene}", "-o", "{out}.ply"],
-        ["fit", "{scene}", "--reference", "{scene}", "-o", "{out}.ply"],
-    ],
-    ids=lambda words: words[0] + ("_ladder" if "--ladder" in words else ""),
-)
-def test_virtual_views_beside_cameras_are_refused(tmp_path, scene_path, cameras_path, capsys, command):
-    typed = [word.format(scene=scene_path, out=tmp_path / "out") for word in command]
-    given = ["--cameras", cameras_path, "--virtual-views", "8"]
-    fails(capsys, [*typed, *given], 2, "--virtual-views is for scenes without cameras: leave it out, or --cameras")
-    assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", "cameras.json"}
-
-
-@pytest.mark.parametrize("name", ["encode", "encode_ladder", "prune", "compact", "refit", "fit"])
-def test_virtual_views_beside_cameras_are_refused_from_python(tmp_path, name):
-    scene, cameras = random_scene(20, 0), ring_of_cameras(4)
-    more = {"encode_ladder": (tmp_path, "0.5"), "refit": (scene,), "fit": (scene,)}.get(name, ())
-    with pytest.raises(UsageError, match="for scenes without cameras"):
-        getattr(potr_cl, name)(scene, *more, cameras, virtual_views=8)
-    assert not list(tmp_path.iterdir())
