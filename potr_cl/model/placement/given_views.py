@@ -71,8 +71,8 @@ class GivenViews:
         """Which part of the given views shows a splat, on the average over those that any shows; None: none is shown.
 
         A view counts by the part of its picture that the splat takes up: whoever sees all of a city from afar sees
-        little of each house. With weights w of V views, the part is (Σ w)² / (V Σ w²), 1 if all show the splat alike and
-        1 / V if one alone does (Kish 1965, effective sample size).
+        little of each house. With weights w of V views, the part is (Σ w)² / (V Σ w²), 1 if all show the splat alike
+        and 1 / V if one alone does (Kish 1965, effective sample size).
         """
         distances = np.linalg.norm(self._matter.targets - self._places[:, None], axis=2)
         sizes = self._shown / (self._fields[:, None] * np.maximum(distances, 1e-6) ** 2)
