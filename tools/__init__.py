@@ -64,6 +64,7 @@ What happens at the limits (``stress``):
 =================  =====================================================================================================
 stress.run         every kernel against float64 on the worst inputs: what error is the kernel's own?
 stress.platforms   the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
+stress.simulated   does Oclgrind see a race, an access out of bounds or an uninitialised read in any kernel?
 stress.viewer      do the viewer's memory and time stay bounded, however long its cameras move?
 stress.fuzz        does any changed file do more than be refused or decode to finite numbers?
 stress.native      does the compiled decoder touch memory that is not its own, or differ from NumPy's, on changed files?

@@ -15,7 +15,7 @@ S = TypeVar("S")
 T = TypeVar("T")
 
 #: Threads that work ahead, unless more are asked for.
-_MOST_AHEAD = 8
+_MOST_AHEAD = 4
 
 #: Calls a function with each of some arguments and gives the results in their order, as :func:`map` does. No call needs
 #: another one's result.

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from queue import Empty, SimpleQueue
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -38,18 +40,49 @@ def morton_codes(means: NDArray[np.float32], run: Run = map) -> NDArray[np.uint6
     codes = np.empty(len(means), np.uint64)
     table = spread(np.arange(1 << _TABLED, dtype=np.uint64))
 
+    spare: SimpleQueue[_Room] = SimpleQueue()
+
     def place(start: int) -> None:
-        rows = slice(start, start + _ROWS)
-        within = means[rows] - corner
-        within *= (1 << BITS) / side
-        cells = np.clip(within, 0, (1 << BITS) - 1, out=within).T.astype(np.int64)
-        found = table[cells & (1 << _TABLED) - 1]
-        found |= table[cells >> _TABLED] << np.uint64(3 * _TABLED)
-        np.bitwise_or(found[0], found[1] << np.uint64(1), out=codes[rows])
-        codes[rows] |= found[2] << np.uint64(2)
+        try:
+            room = spare.get_nowait()
+        except Empty:
+            room = _Room(min(_ROWS, len(means)))
+        own = means[start : start + _ROWS]
+        count = slice(len(own))
+        within, cells, some = room.within[:, count], room.cells[:, count], room.some[:, count]
+        bits, more = room.bits[:, count], room.more[:, count]
+        np.subtract(own.T, corner[:, None], out=within)
+        np.multiply(within, (1 << BITS) / side, out=within)
+        np.clip(within, 0, (1 << BITS) - 1, out=within)
+        cells[:] = within
+        np.bitwise_and(cells, (1 << _TABLED) - 1, out=some)
+        np.take(table, some, out=bits, mode="clip")
+        np.right_shift(cells, _TABLED, out=cells)
+        np.take(table, cells, out=more, mode="clip")
+        np.left_shift(more, np.uint64(3 * _TABLED), out=more)
+        np.bitwise_or(bits, more, out=bits)
+        np.left_shift(bits, np.arange(3, dtype=np.uint64)[:, None], out=bits)
+        np.bitwise_or.reduce(bits, axis=0, out=codes[start : start + _ROWS])
+        spare.put(room)
 
     list(run(place, range(0, len(means), _ROWS)))
     return codes
+
+
+class _Room:
+    """Memory that a thread finds codes in: new memory takes longer than the work, where many threads ask for it.
+
+    Args:
+        rows: centres at a time.
+
+    Attributes:
+        within: (3, rows) places in the cube. cells, some: (3, rows) the same as numbers. bits, more: (3, rows).
+    """
+
+    def __init__(self, rows: int) -> None:
+        self.within = np.empty((3, rows))
+        self.cells, self.some = np.empty((2, 3, rows), np.int64)
+        self.bits, self.more = np.empty((2, 3, rows), np.uint64)
 
 
 def spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:

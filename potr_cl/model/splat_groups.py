@@ -52,13 +52,15 @@ class SplatGroups:
     """A scene's splats in groups of neighbours.
 
     Attributes:
-        order: (N,) the splats' numbers, group by group.
+        order: (N,) uint32 the splats' numbers, group by group.
+        group_of: (N,) uint32 the group of each splat.
         starts: (G + 1,) where each group begins in the order, and the end.
         centres, halves: (G, 3) float64, the middle of the box of a group's centres, and half its edges, world units.
         sizes: (G,) float64 largest standard deviation of a group, world units.
     """
 
-    order: Indices
+    order: NDArray[np.uint32]
+    group_of: NDArray[np.uint32]
     starts: Indices
     centres: F64
     halves: F64
@@ -79,7 +81,9 @@ class SplatGroups:
         large = logarithms > np.median(some) + math.log(_LARGE)
         codes = morton_codes(scene.means, run)
         codes |= large.astype(np.uint64) << np.uint64(3 * BITS)  # behind all others
-        order = ascending(codes, run)
+        numbers = ascending(codes, run)
+        del codes
+        order, group_of = np.empty((2, len(numbers)), np.uint32)
         n, small = len(order), len(order) - int(np.count_nonzero(large))
         starts = np.concatenate([np.arange(0, small, group), np.arange(small, n, group), [n]])
         low, high = np.empty((2, len(starts) - 1, 3))
@@ -89,7 +93,11 @@ class SplatGroups:
             """The boxes of some groups."""
             some = slice(first, min(first + _GROUPS, len(starts) - 1))
             begins = starts[some] - starts[first]
-            own = order[starts[first] : starts[some.stop]]
+            own = numbers[starts[first] : starts[some.stop]]
+            order[starts[first] : starts[some.stop]] = own
+            group_of[own] = np.repeat(
+                np.arange(first, some.stop, dtype=np.uint32), np.diff(starts[first : some.stop + 1])
+            )
             for axis, column in enumerate(np.ascontiguousarray(scene.means[own].T)):
                 low[some, axis] = np.minimum.reduceat(column, begins)
                 high[some, axis] = np.maximum.reduceat(column, begins)
@@ -98,23 +106,18 @@ class SplatGroups:
         for _ in run(bound, range(0, len(starts) - 1, _GROUPS)):
             pass
         # Halved each first: the sum of two large numbers may be infinite.
-        return SplatGroups(order, starts, low / 2 + high / 2, high / 2 - low / 2, np.exp(np.minimum(largest, 100)))
+        return SplatGroups(
+            order, group_of, starts, low / 2 + high / 2, high / 2 - low / 2, np.exp(np.minimum(largest, 100))
+        )
 
     @property
     def counts(self) -> Indices:
         """(G,) splats of each group."""
         return np.diff(self.starts)
 
-    @property
-    def group_of(self) -> NDArray[np.uint32]:
-        """(N,) the group of each splat."""
-        found = np.empty(len(self.order), np.uint32)
-        found[self.order] = np.repeat(np.arange(len(self.starts) - 1, dtype=np.uint32), self.counts)
-        return found
-
     def splats(self, groups: NDArray[np.bool_]) -> Indices:
         """The numbers of the splats of some groups, ascending; ``groups``: (G,)."""
-        return np.sort(self.order[np.repeat(groups, self.counts)])
+        return np.flatnonzero(groups[self.group_of])
 
     def only(self, groups: NDArray[np.bool_]) -> tuple[Indices, SplatGroups]:
         """Some groups as those of a scene that has their splats and no others; ``groups``: (G,), at least one.
@@ -123,11 +126,14 @@ class SplatGroups:
             The numbers of these splats, ascending, and the groups, which name them by their places there.
         """
         own = self.order[np.repeat(groups, self.counts)]
-        splats = np.sort(own)
-        places = np.empty(len(self.order), np.int64)
-        places[splats] = np.arange(len(splats))
+        splats = np.sort(own).astype(np.int64)
+        places = np.empty(len(self.order), np.uint32)
+        places[splats] = np.arange(len(splats), dtype=np.uint32)
         starts = np.concatenate([[0], np.cumsum(self.counts[groups])])
-        return splats, SplatGroups(places[own], starts, self.centres[groups], self.halves[groups], self.sizes[groups])
+        group_of = (np.cumsum(groups) - 1).astype(np.uint32)[self.group_of[splats]]
+        return splats, SplatGroups(
+            places[own], group_of, starts, self.centres[groups], self.halves[groups], self.sizes[groups]
+        )
 
     def visible_by(self, cameras: Sequence[Camera], near: float, run: Run = map) -> NDArray[np.bool_]:
         """(views, G) the groups of which views may draw a splat.

@@ -35,6 +35,8 @@ from potr_cl.raster.view_set import View, ViewSet
 
 #: Least room for intersections before anything is known of a view, and as a multiple of the splats.
 _FIRST_CAPACITY, _FIRST_CAPACITY_A_SPLAT = 1 << 16, 4
+#: Projected splats of the views that are rendered together. More take gigabytes, and a driver long to find them.
+_PROJECTED = 1 << 26
 
 
 class PreparingMemory(Owner):
@@ -206,7 +208,8 @@ class Rasterizer(Owner):
         self, cameras: Sequence[Camera], target: cl.Buffer, start: int, memory: Memory | None
     ) -> None:
         device = self.device
-        most = int(max((device.info.memory - device.allocated) // (512 * self.stride), 1))
+        room = (device.info.memory - device.allocated) // 512
+        most = int(max(min(room, _PROJECTED) // self.stride, 1))
         number = 0
         views: ViewSet | None = None
         try:
@@ -277,7 +280,9 @@ class Rasterizer(Owner):
             counts, bounds = self._zeroed_counts(views), self._room_for_bounds(views)
             self._enqueue_project(views, bounds)
             self._launcher.enqueue_offsets(views, bounds, counts)
-            found = views.read_counts()
+            # All of them, while there is nothing else to wait for: the lists are enqueued behind them.
+            views.found_offsets = views.read_offsets()
+            found = [int(offsets[-1]) for offsets in views.found_offsets]
             for view, count in zip(views.views, found, strict=True):
                 _accept(view, count)
             views.make_room(found)

@@ -21,6 +21,8 @@ SPLAT_GROUP = 256
 
 #: Splats whose parameters are uploaded at a time.
 _UPLOADED = 1 << 18
+#: Splats whose parameters are activated at a time.
+_ACTIVATED = 1 << 17
 
 
 class SceneBuffers(Owner):
@@ -249,7 +251,7 @@ class SceneBuffers(Owner):
 
         def activated(start: int) -> list[FloatArray]:
             """What is activated is there for some splats at a time: of all it would be as large as their geometry."""
-            some = slice(start, start + _UPLOADED)
+            some = slice(start, start + _ACTIVATED)
             return [
                 activated_scales(scene.log_scales[some]).astype(np.float32),
                 unit_quaternions(scene.quaternions[some]).astype(np.float32),
@@ -262,7 +264,7 @@ class SceneBuffers(Owner):
             (self.log2_opacities, "the opacities"),
         )
         # While threads activate the first splats, the others' own values are sent.
-        with Ahead(activated, range(0, self.splats, _UPLOADED)) as made:
+        with Ahead(activated, range(0, self.splats, _ACTIVATED)) as made:
             self.write_rows(self.means, scene.means, "the centres")
             self.write_sh(self.sh, scene.sh)
             for start, found in made:

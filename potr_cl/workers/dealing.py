@@ -23,20 +23,21 @@ class Shares:
     others: list[list[int]]
 
 
-def shares(pool: Pool, views: int, parts: int = 1) -> Shares:
+def shares(pool: Pool, views: int, parts: int = 1, own_speed: float = 1.0) -> Shares:
     """Share so many views out to a pool.
 
     Args:
         pool: the workers.
         views: how many there are.
-        parts: view k belongs to part k modulo this: each part alone is shared out evenly too.
+        parts: view k belongs to part k modulo this: each part alone is shared out in the same way.
+        own_speed: of the master against a worker, if it takes part.
 
     Raises:
         WorkerLost: no worker is left.
     """
     workers = pool.workers()
     speeds = [1.0] * len(workers) if pool.takes_part else speeds_of(workers)
-    speeds = [1.0, *speeds] if pool.takes_part else speeds
+    speeds = [own_speed, *speeds] if pool.takes_part else speeds
     dealt: list[list[int]] = [[] for _ in speeds]
     for part in range(parts):
         numbers = range(part, views, parts)

@@ -213,10 +213,10 @@ def test_pictures_of_several_views_in_one_buffer(
     rasterizer = Rasterizer(device, random_splats(500, 1, seed=5))
     prepare_set = Rasterizer.prepare_set
 
-    def at_most(self: Rasterizer, cameras: Sequence[Camera]) -> ViewSet:
+    def at_most(self: Rasterizer, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
         if most is not None and len(cameras) > most:
             raise DeviceMemoryError("too many views")
-        return prepare_set(self, cameras)
+        return prepare_set(self, cameras, memory)
 
     monkeypatch.setattr(Rasterizer, "prepare_set", at_most)
     cameras = [tilted_camera(1, 64, 64), tilted_camera(2, 50, 33), *(tilted_camera(seed, 17, 15) for seed in range(3))]
@@ -233,11 +233,11 @@ def test_sets_of_pictures_take_the_memory_of_those_before(monkeypatch: pytest.Mo
     device = open_device("gpu")
     prepare_set, made = Rasterizer.prepare_set, []
 
-    def at_most_two(self: Rasterizer, cameras: Sequence[Camera]) -> ViewSet:
+    def at_most_two(self: Rasterizer, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
         if len(cameras) > 2:
             raise DeviceMemoryError("too many views")
         made.append(len(cameras))
-        return prepare_set(self, cameras)
+        return prepare_set(self, cameras, memory)
 
     cameras = [tilted_camera(seed, 50, 33) for seed in range(4)]
     with Rasterizer(device, random_splats(500, 1, seed=5)) as rasterizer, Memory(device) as memory:

@@ -34,3 +34,9 @@ def test_parts_of_the_views_are_shared_out_too(devices, views):
         counts = [len(set(part) & set(each)) for each in dealt]
         assert max(counts) - min(counts) <= 1
     assert max(map(len, dealt)) - min(map(len, dealt)) <= 1
+
+
+def test_the_master_can_be_faster_than_its_workers():
+    with HostPool([open_device("gpu") for _ in range(3)]) as pool:
+        share = shares(pool, 300, 2, 1.5)
+    assert [len(each) for each in (share.own, *share.others)] == [128, 86, 86]

@@ -161,7 +161,7 @@ def _fitted(device: Device, scene: Scene, view: Camera) -> float:
 
 
 def _settled(device: Device, scene: Scene, view: Camera) -> float:
-    """1 for a value that is not finite after the choice of coefficients and both roundings, each with a fit behind it."""
+    """1 for a value that is not finite after coefficients are chosen and geometry is rounded, with fits in between."""
     views = _looked_at(view)
     bench = Workbench(_PARAMETERS, device=device)
     settling = Settling(choosing=0.5, rounding=0.5, start=1.0)

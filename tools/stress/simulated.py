@@ -88,20 +88,19 @@ Step = Callable[[Device], None]
 
 
 def _views(count: int = 2) -> list[Camera]:
-    return [tilted_camera(seed, 40, 24) for seed in range(count)]
+    return [tilted_camera(seed, 24, 16) for seed in range(count)]
 
 
 def pictures(device: Device) -> None:
     """Both rules, short lists and long ones, against float64."""
-    for rules in (INRIA, GSPLAT):
-        for size in (60, 400):
-            scene, view = random_splats(size, 3, seed=1), tilted_camera(1, 40, 24)
-            with Rasterizer(device, scene, rules) as rasterizer:
-                image, _ = rasterizer.render(view)
-                rasterizer.render_device(view)
-            wanted = reference.render(scene, view, rules)
-            error = np.abs(image - wanted.image)[wanted.margin > _CLEAR].max()
-            assert error <= _TOLERANCE, error
+    for rules, size in ((INRIA, 60), (GSPLAT, 400)):
+        scene, view = random_splats(size, 3, seed=1), tilted_camera(1, 40, 24)
+        with Rasterizer(device, scene, rules) as rasterizer:
+            image, _ = rasterizer.render(view)
+            rasterizer.render_device(view)
+        wanted = reference.render(scene, view, rules)
+        error = np.abs(image - wanted.image)[wanted.margin > _CLEAR].max()
+        assert error <= _TOLERANCE, error
 
 
 def long_lists(device: Device) -> None:
@@ -199,8 +198,8 @@ def some_of_a_scene(device: Device) -> None:
 
 def refit(device: Device) -> None:
     """With AC coefficients rounded in rounds; with the vectors on the device, and on the host in slices."""
-    # 300 splats: two slices of 256.
-    scene, views = random_splats(300, 3, seed=2), _views()
+    # Two slices: of 256 splats, and of the rest.
+    scene, views = random_splats(270, 1, seed=2), _views()
     rng = np.random.default_rng(0)
     steps = (0.1 * 2.0 ** rng.uniform(-1, 1, (2, len(scene)))).astype(np.float32)
     grid = ColourGrid(steps[0], steps[1], rng.permutation(len(scene)))

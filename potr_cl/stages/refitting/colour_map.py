@@ -31,6 +31,7 @@ from potr_cl.raster.view_set import TABLE_ENTRY, ViewSet
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.fixed_point import gathered_scale
+from potr_cl.stages.refitting.gathering import Gathered, Gathering
 from potr_cl.stages.refitting.launcher import Launcher
 from potr_cl.stages.refitting.prepared_views import PreparedViews
 from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
@@ -116,17 +117,7 @@ class ColourMap(Owner):
             constant: device.shared_kernel("refit/view_colours.cl", "view_colours", **layout.some(constant))
             for constant in (False, True)
         }
-        self._gathers = {
-            (constant, weights, some): device.shared_kernel(
-                "refit/gather.cl", "gather", WEIGHTS=int(weights), SOME_BLOCKS=int(some), **layout.some(constant)
-            )
-            for constant, weights, some in (
-                (False, False, False),
-                (False, True, False),
-                (False, True, True),
-                (True, False, False),
-            )
-        }
+        self._gathering = Gathering(device, layout)
         self.total_weight = 3 * REFERENCE_PIXELS * len(cameras)
         self._one = gathered_scale(cameras, [_weight(camera) for camera in cameras])
         fixed_points = self._launcher.fixed_point_scales(cameras)
@@ -393,24 +384,11 @@ class ColourMap(Owner):
 
         And to the blocks, if the sums have their part: of as many splats as there is room for, from the first one on.
         """
-        triangle = self._layout.sh_count * (self._layout.sh_count + 1) // 2
-        splats = self._layout.stride if blocks is None else blocks.size // (8 * triangle)
-        gather = self._gathers[constant, blocks is not None, splats < self._layout.stride]
-        gather.bind(
-            totals=self._totals,
-            means=self._means,
-            stride=self._layout.stride,
-            views=self._tables,
-            view_count=sum(map(len, group)),
-            scales=self._scales,
-            first_scale=group[0][0],
-            free=self._change,
-            result=self.sums,
-            first_block=first_block,
-            block_stride=splats,
-            blocks=self.sums if blocks is None else blocks,
-        )
-        self._layout.over_splats(gather)
+        gathered = Gathered(self._totals, self._means, self._tables, sum(map(len, group)), self._scales, group[0][0])
+        if blocks is not None:
+            self._gathering.with_blocks(gathered, self._change, self.sums, blocks, first_block)
+        else:
+            self._gathering.enqueue(gathered, self._change, self.sums, constant)
 
     def close(self) -> None:
         """Give all device memory back."""

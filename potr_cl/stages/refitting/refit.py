@@ -397,6 +397,7 @@ class ColourRefit(Owner):
         """
         coefficients, solver = self.coefficients, self._solver
         coefficients.write_sh(solver.x, sh)
+        coefficients.make_room()
         coefficients.activate(active)
         if active is not None and not hold:
             coefficients.keep_active(solver.x)

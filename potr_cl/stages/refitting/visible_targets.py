@@ -11,7 +11,7 @@ import pyopencl as cl
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.memory import Memory, Owner, Reused
 from potr_cl.raster.culling import Sights
-from potr_cl.raster.picked_splats import PickedSplats, Picker
+from potr_cl.raster.picked_splats import PickedSplats, Picker, Picks
 from potr_cl.raster.rasterizer import PreparingMemory, Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 
@@ -35,14 +35,16 @@ class VisibleTargets(Owner):
         self, whole: SceneBuffers, cameras: Sequence[Camera], sights: Sights, background: tuple[float, float, float]
     ) -> None:
         device = whole.device
-        self._whole, self._cameras, self._seen, self._background = whole, list(cameras), sights.seen, background
+        self._whole, self._cameras, self._background = whole, list(cameras), background
         with ExitStack() as owned:
             self._preparing = owned.enter_context(PreparingMemory(device))
             self._passing = Reused(device)
             owned.callback(self._passing.give_back)
-            self._picker = owned.enter_context(Picker(device, sights.groups.group_of))
+            memory = owned.enter_context(Memory(device))
+            picker = owned.enter_context(Picker(device, sights.groups.group_of))
+            self._picks = Picks(memory, picker, sights.seen)
             # Drawn where a view sees nothing: it is not in the picture either.
-            self._any = owned.enter_context(Memory(device)).upload(np.zeros(1, np.uint32), "the number of a splat")
+            self._any = memory.upload(np.zeros(1, np.uint32), "the number of a splat")
             self._owned = owned.pop_all()
 
     def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
@@ -51,8 +53,9 @@ class VisibleTargets(Owner):
         for number in numbers:
             camera = self._cameras[number]
             try:
-                picked, splats = self._picker.pick(self._passing, self._seen[number])
-                scene = PickedSplats(self._whole, picked, splats) if splats else PickedSplats(self._whole, self._any, 1)
+                splats = self._picks.counts[number]
+                picked = self._picks.numbers(self._passing, number) if splats else self._any
+                scene = PickedSplats(self._whole, picked, max(splats, 1))
                 with Rasterizer(
                     self._whole.device, scene, background=self._background, preparing=self._preparing
                 ) as rasterizer:
