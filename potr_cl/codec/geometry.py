@@ -126,6 +126,19 @@ class Geometry:
             check_positions(means, log_scales, tolerance, tree, order)
         return moved
 
+    def with_shapes_of(self, scene: Scene, run: Run = map) -> Geometry:
+        """The same centres with the scales, rotations and opacities of a scene, not rounded yet.
+
+        Args:
+            scene: in its order; its centres and colours are of no account.
+            run: as of :func:`quantise_geometry`.
+
+        Raises:
+            DataError: a value too large to quantise.
+        """
+        levels = splat_levels(scene, self.order, self.parameters, run)
+        return replace(self, scales=levels.scales, rotations=levels.rotations, opacities=levels.opacities, steps=None)
+
     def with_opacities_of(self, logits: NDArray[np.float32]) -> Geometry:
         """The same with other opacities: (N,) logits in the order of the scene, not rounded yet."""
         version, factor = VERSIONS[self.parameters.version], self.parameters.sf_opacity
@@ -189,18 +202,19 @@ def quantise_in_world_units(
     """
     absolute = VERSIONS[parameters.version].absolute_leaf_levels
 
-    def built(numbers: NDArray[np.int64] | None) -> tuple[octree.OctreeStreams, NDArray[np.int64]]:
+    def built(numbers: NDArray[np.int64] | None, run: Run = map) -> tuple[octree.OctreeStreams, NDArray[np.int64]]:
         own = slice(None) if numbers is None else numbers
         tolerance = np.maximum(world.gamma, world.beta * nearest[own])
-        tree, order = octree.build(scene.means[own], tolerance, absolute=absolute)
+        tree, order = octree.build(scene.means[own], tolerance, absolute, run)
         if may_be_coarse(tree):
             check_positions(scene.means[own], scene.log_scales[own], tolerance, tree, order)
         return tree, order
 
     parts = [None] if rows is None else rows
     found = []
-    # Threads share out the parts here, and each part's splats there.
-    for own, (tree, order) in zip(parts, run(built, parts), strict=True):
+    # Threads share out the parts here, and each part's splats there; or those of the only part in both places.
+    trees = [built(None, run)] if rows is None else run(built, parts)
+    for own, (tree, order) in zip(parts, trees, strict=True):
         levels = splat_levels(scene, order if own is None else own[order], world, run)
         found.append(
             Geometry(

@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.placement.sampling import spiral
 from potr_cl.model.placement.surface import points_on_splats
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import Scene, opacities_of
 from potr_cl.model.spherical_harmonics import ac_basis, energy, unit_coefficients
 
 F64 = NDArray[np.float64]
@@ -140,7 +140,7 @@ def sample(scene: Scene) -> Sample:
         scene: clean, at least one splat.
     """
     rows = looked_at(len(scene))
-    opaque = rows[scene.opacities[rows] > _OPAQUE]
+    opaque = rows[opacities_of(scene.opacity_logits[rows]) > _OPAQUE]
     scene = scene.subset(opaque if len(opaque) else rows)
     means = scene.means.astype(np.float64)
     centre = np.median(means, axis=0)

@@ -36,6 +36,9 @@ from potr_cl.stages.views_between import Between
 _SAMPLE = 4
 #: Plain encodes that a search takes the time of.
 _SEARCH = 3
+#: Of the time of a view of a step of the fit at q = 0.5, what is left at q = 0: with q, the splats that it moves become
+#: more, from a fifth of lego's at 0.3 to two fifths at 0.5.
+_NONE_LEFT = 0.25
 #: Bytes of the process with its libraries; a splat, on the host and on the device; a pixel, of the picture that a view
 #: is to have; and what is kept of views and besides, as a multiple of these and of what a view's own buffers take.
 _PROCESS, _HOST_SPLAT, _DEVICE_SPLAT, _PIXEL, _VIEWS = 180e6, 1550, 154, 12, 1.02
@@ -66,7 +69,7 @@ class Units:
         prepare, prune, compact, refit: once for each training view, as multiples of the time of one picture of the
             uncompressed scene.
         iteration, step: a pruning iteration and a step of the re-fit, for each view, besides.
-        fit: a view of a step of the fit.
+        fit: a view of a step of the fit, at q = 0.5; it is more where a larger q leaves more splats.
         once: pictures' times that the re-fit takes besides, whatever the number of views.
         compact_splat, refit_splat, code_splat: seconds that compaction, the re-fit and the coding take besides, for
             each splat of the uncompressed scene.
@@ -87,7 +90,7 @@ class Units:
 
 #: From tools.bench.forecast for CPUs, and from docs/benchmarks/encode.md for GPUs, where the host does a good part.
 UNITS: dict[Family, Units] = {
-    "cpu": Units(1.0, 3.0, 0.035, 0.9, 2.0, 4.7, 0.33, 20, 0, 0, 4e-6),
+    "cpu": Units(1.0, 3.0, 0.035, 1.7, 2.0, 4.7, 0.33, 20, 0, 0, 4e-6),
     "gpu": Units(0.9, 2.0, 0.042, 0.9, 0, 0, 0.45, 0, 3.5e-6, 1.45e-6, 1.5e-6),
 }
 
@@ -129,7 +132,7 @@ def forecast(
             steps += fit.photograph_steps_on(device.family, len(cameras))
         else:
             steps += fit.further_steps_on(device.family)
-        pictures += steps * fit.batch * units.fit
+        pictures += steps * fit.batch * units.fit * (_NONE_LEFT + (1 - _NONE_LEFT) * options.q / 0.5)
         pictures += views * (fit.views_on(device.family) + units.prepare + units.iteration * fit.iterations)
     if Compact.name in parts:
         pictures += views * units.compact

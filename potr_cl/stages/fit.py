@@ -160,6 +160,10 @@ class Fit(Stage):
     choosing: float = option(0.3)
     rounding: float = option(0.15)
     gentle: float = option(0.1)
+    through: float = option(0.0)
+    sparse: int = option(0)
+    choices: int = option(1)
+    gather: float = option(0.4)
     seed: int = option(FitOptions.seed)
 
     def __post_init__(self) -> None:
@@ -300,7 +304,15 @@ class Fit(Stage):
     def _settled(self, state: State, bench: Workbench, looking: Looking, asked: SupportsBool) -> State:
         """Choose coefficients and round geometry, with what is left fitted once more in between."""
         options = self._options(bench.opened.family, bench.memory)
-        settling = Settling(self.choosing, self.rounding, self.gentle)
+        settling = Settling(
+            self.choosing,
+            self.rounding,
+            self.gentle,
+            through=self.through,
+            sparse=bool(self.sparse),
+            choices=self.choices,
+            gather=self.gather,
+        )
         done, total = options.steps, options.steps + self.further_steps_on(bench.opened.family)
 
         def progress(steps: int) -> None:

@@ -154,6 +154,8 @@ class Prune(Stage):
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
         told = state.having_learnt("unseen", Unseen(splats, len(state.scene), area, kept))
+        if state.scene is state.source:
+            told = replace(told, sights=sights)
         if self.keep is None and self.count is None:
             told = told.having_learnt("price", bench.parameters.delta_mse_max)
         if not (kept and splats):

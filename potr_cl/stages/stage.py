@@ -26,6 +26,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output, Request, Rounded
 from potr_cl.outputs.potr import Potr
+from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene, PartOfKept
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.workers.pool import Pool
@@ -65,6 +66,7 @@ class State:
         views: the training views; empty if there are no cameras.
         added: how many of them, the last ones, a stage has put between those that were given.
         truth: what a stage has fitted to photographs, where it did; it may have fewer splats than ``source``.
+        sights: what each view may draw of ``source``, where a stage has found that this is little.
         cut: a scene that is these survivors of ``source`` as they are there; None: none is known to be.
         geometry: of ``scene`` as the file's readers will see it, once a stage has had it rounded. A stage that then
             changes anything but colours makes it None again.
@@ -82,6 +84,7 @@ class State:
     added: int = 0
     cut: Scene | None = None
     truth: Scene | None = None
+    sights: Sights | None = None
 
     @property
     def goal(self) -> Scene:

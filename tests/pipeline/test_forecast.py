@@ -43,6 +43,12 @@ def test_more_work_takes_longer(ahead):
     assert ahead(best, views=4) < 0.7 * whole
 
 
+def test_a_fit_of_more_splats_takes_longer(ahead):
+    fit = EncodeOptions.for_preset("best", fit={"steps": 1000})
+    assert ahead(fit.changed(q=0.5)) > 1.3 * ahead(fit.changed(q=0.3))
+    assert ahead(fit.changed(fit={"rounding": 1.0})) > 1.5 * ahead(fit), "steps after roundings count"
+
+
 def test_memory_is_that_of_views_and_stays_within_the_budget(device, plush_excerpt, plush_excerpt_cameras):
     views = train_views(plush_excerpt_cameras)
 

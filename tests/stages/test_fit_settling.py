@@ -13,8 +13,10 @@ from potr_cl.model.camera import resized, train_views
 from potr_cl.outputs.ply import Ply
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fit import Fit
-from potr_cl.stages.fitting.fit import FitOptions
+from potr_cl.stages.fitting.fit import FitOptions, fit_scene
+from potr_cl.stages.fitting.parameters import Factors, in_form_of_files
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
+from potr_cl.stages.fitting.views import share_out
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import State, Workbench
 from tests.devices import FAMILIES, open_device
@@ -63,6 +65,26 @@ def test_what_moves_makes_up_for_what_is_rounded(device, plush_excerpt, views):
     assert not np.array_equal(in_turns.means, at_once.means)
     assert np.array_equal(then.scene.means, plush_excerpt.means), "other steps start from what is not rounded"
     assert np.array_equal(then.scene.sh[:, 1:], plush_excerpt.sh[:, 1:])
+
+
+def test_a_fit_can_look_at_what_a_file_will_hold(device, plush_excerpt, views):
+    """Its kernel rounds shapes and opacities as the codec does."""
+    bench = Workbench(PARAMETERS, device=device)
+    geometry = bench.output.geometry(plush_excerpt, bench.request(State.of(plush_excerpt, views)))
+    decoded = dataclasses.replace(geometry.decoded(plush_excerpt.sh), means=plush_excerpt.means)
+    world = geometry.parameters
+    factors = Factors(world.sf_scale, world.sf_rotation, world.sf_opacity)
+    scene = in_form_of_files(plush_excerpt)
+    with Rasterizer(device, plush_excerpt) as rasterizer:
+        targets = RenderedTargets(rasterizer, views)
+        found = fit_scene(device, scene, views, targets, FitOptions(steps=0), factors=factors)
+        unrounded = fit_scene(device, scene, views, targets, FitOptions(steps=0))
+    _, held_out = share_out(len(views), 0)
+    expected = error_of(device, plush_excerpt, decoded, [views[k] for k in held_out])
+    assert found.errors[0] == pytest.approx(expected, rel=1e-3)
+    assert found.scene is not None
+    assert np.array_equal(found.scene.log_scales, scene.log_scales), "what lies behind is not rounded"
+    assert unrounded.errors[0] < 1e-3 * expected, "the form of files shows the same"
 
 
 def test_coefficients_are_chosen_and_the_rest_moves(device, plush_excerpt, views):

@@ -12,7 +12,7 @@ from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.culling import Sights
-from potr_cl.raster.picked_splats import PickedSplats, Picker
+from potr_cl.raster.picked_splats import PickedSplats, Picker, Picks
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import uploaded
@@ -178,6 +178,19 @@ def test_the_numbers_of_some_groups(device, splats):
         expected = np.flatnonzero(wanted[groups])
         assert count == len(expected)
         assert np.array_equal(device.download(numbers, (count,), np.uint32), expected)
+
+
+def test_the_numbers_of_several_choices_of_groups(device):
+    rng = np.random.default_rng(7)
+    groups = rng.integers(0, 40, 10_000).astype(np.uint32)
+    wanted = rng.random((5, 40)) < np.array([0.0, 0.1, 0.5, 0.9, 1.0])[:, None]
+    with Picker(device, groups) as picker, Memory(device) as memory:
+        picks = Picks(memory, picker, wanted)
+        for choice in (3, 0, 4, 1, 2):
+            expected = np.flatnonzero(wanted[choice][groups])
+            assert picks.counts[choice] == len(expected)
+            numbers = picks.numbers(memory, choice)
+            assert np.array_equal(device.download(numbers, (len(expected),), np.uint32), expected)
 
 
 def test_a_whole_encode_has_the_same_bytes(device, monkeypatch):

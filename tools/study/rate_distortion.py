@@ -1,13 +1,14 @@
 """Size against quality: encode at many qualities, decode, judge by all test views; then tables and plots.
 
     python -m tools.study.rate_distortion measure SCENE … --json OUT.json [--series NAME[:OPTION=VALUE,…] …] [options]
-    python -m tools.study.rate_distortion report OUT.json [--formats FORMATS.json] [--images DIR] [options]
+    python -m tools.study.rate_distortion report OUT.json … [--formats FORMATS.json] [--images DIR] [options]
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photographs in images. A series is a curve:
 the name it gets and the options of EncodeOptions in which it differs from the defaults, those of a stage with its name,
 as in exact:preset=best,prune.tolerance=0; photos=True stands for --photos with the folder images. ``measure`` writes
 its results after every encode and goes on where an existing file stops; with --seconds it begins no encode after that
-many. ``report`` prints Markdown and draws DIR/rate_distortion_SCENE.png; the points of other formats come from
+many. Several files of ``measure`` become one curve (tools.study.curves); --series takes some of their series alone,
+in that order. ``report`` prints Markdown and draws DIR/rate_distortion_SCENE.png; the points of other formats come from
 tools.study.compare_formats. With --json it keeps the tables of docs/benchmarks: the curves, the uncompressed scenes,
 and the seconds of each stage at quality 0.5; with --losses NAME too, another one instead: what each other series loses
 on photographs, and what the series NAME loses at the same PSNR against the uncompressed renders, by interpolation. With
@@ -36,6 +37,7 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
 from tools.results import Column, Results, circumstances, write_json
+from tools.study.curves import merged
 from tools.study.evaluation import EvaluatedScene
 from tools.workloads import study_parser
 
@@ -126,7 +128,7 @@ def _measure(args: argparse.Namespace) -> None:
                     if q in done or time.perf_counter() - began > args.seconds:
                         continue
                     point = measure_encode(evaluator, encode_options({**options, "q": q}, folder / "images"), device)
-                    curve["encodes"].append(point)
+                    curve["encodes"].append({**point, "commit": results["commit"]})
                     curve["encodes"].sort(key=lambda p: p["q"])
                     write_json(args.json, results)
                     print(
@@ -344,7 +346,7 @@ def keep_losses(measured: dict[str, Any], against: str, path: Path) -> None:
 
 
 def _report(args: argparse.Namespace) -> None:
-    results = json.loads(args.results.read_text())
+    results = merged([args.results, *args.more], args.series)
     if args.against is not None:
         for name, entry in results["scenes"].items():
             measured = {point["q"] for point in entry["series"].get(args.against, {"encodes": []})["encodes"]}
@@ -375,6 +377,8 @@ def main() -> None:
     measure.add_argument("--qualities", nargs="+", type=float, default=QUALITIES, metavar="Q")
     measure.add_argument("--seconds", type=float, default=math.inf, metavar="S")
     measure.add_argument("--series", nargs="+", default=["default"], metavar="NAME[:OPTION=VALUE,…]")
+    report.add_argument("more", nargs="*", type=Path, metavar="OUT.json", help="further files of measure")
+    report.add_argument("--series", nargs="+", default=[], metavar="NAME", help="these alone, in this order")
     report.add_argument("--formats", type=Path, help="what tools.study.compare_formats measured")
     report.add_argument("--images", type=Path, metavar="DIR", help="draw the curves too")
     report.add_argument("--json", type=Path, metavar="FILE", help="keep tables for docs/benchmarks")

@@ -8,6 +8,9 @@
 
    Macros: none. */
 
+/* What is nearer to 0 than this is 0 but for the rounding of R, G and B. */
+#define ZERO 1e-6f
+
 /* steps: for each column the length of a step, which is multiplied by `part`, and the least and the greatest value that
    it may reach.
    averages: of each parameter over the last steps: the newest value counts `newest` in it.
@@ -53,14 +56,49 @@ kernel void adam(
     averages[i] += newest * (parameters[i] - averages[i]);
 }
 
+/* The gradient of AC coefficients without what would make something of a Y, Co or Cg that is 0: called before a step,
+   one coefficient of one splat a work-item, get_global_id(1) is its number less 1.
+
+   Each of R, G and B has a step of its own, so what is left is along Y alone if that may move, along Co or Cg alone if
+   not; all of it if nothing is 0. */
+kernel void keep_zeros(
+    global const float *parameters, global float *gradient, uint splats, uint stride, uint first_ac)
+{
+    const size_t splat = get_global_id(0);
+    if (splat >= splats)
+        return;
+    const size_t r = (first_ac + 3 * get_global_id(1)) * (size_t)stride + splat, g = r + stride, b = g + stride;
+    const float luma = (parameters[r] + parameters[b]) * 0.25f + parameters[g] * 0.5f;
+    const float orange = (parameters[r] - parameters[b]) * 0.5f;
+    const float green = parameters[g] * 0.5f - (parameters[r] + parameters[b]) * 0.25f;
+    const bool has_y = fabs(luma) > ZERO, has_co = fabs(orange) > ZERO, has_cg = fabs(green) > ZERO;
+    if (has_y && has_co && has_cg)
+        return;
+    const float3 all = (float3)(gradient[r], gradient[g], gradient[b]);
+    const float3 way = has_y ? (float3)(1.0f) : has_co ? (float3)(1.0f, 0.0f, -1.0f) : (float3)(-1.0f, 1.0f, -1.0f);
+    const float part = has_y || has_co || has_cg ? dot(all, way) / dot(way, way) : 0.0f;
+    gradient[r] = part * way.x;
+    gradient[g] = part * way.y;
+    gradient[b] = part * way.z;
+}
+
 /* Parameters as the projection takes them (raster/project.cl), one splat a work-item: the scales' exponentials, unit
-   quaternions, log2 of the opacities. */
+   quaternions, log2 of the opacities.
+
+   sf_scale, sf_rotation, sf_opacity: where they are above 0, the parameters are rounded on the way, as a file would
+   have them: levels of 1 / sf_scale, but at least zero_scale of them; imaginary parts of a quaternion in steps by the
+   splat's largest scale; logits in steps from least_logit on. */
 kernel void activate(
     global const float *parameters,
     uint splats,
     uint stride,
     uint sh_columns,
     float largest_scale,
+    float sf_scale,
+    float zero_scale,
+    float sf_rotation,
+    float sf_opacity,
+    float least_logit,
     global float *means,
     global float *scales,
     global float *quaternions,
@@ -71,17 +109,42 @@ kernel void activate(
     if (splat >= splats)
         return;
     global const float *own = parameters + splat;
+    float largest_level = 1.0f;
     for (int i = 0; i < 3; ++i) {
         means[i * column + splat] = own[i * column];
-        scales[i * column + splat] = fmin(exp(fmin(own[(3 + i) * column], 80.0f)), largest_scale);
+        float scale = fmin(exp(fmin(own[(3 + i) * column], 80.0f)), largest_scale);
+        if (sf_scale > 0.0f) {
+            const float level = floor(scale * sf_scale + 0.5f);
+            largest_level = fmax(largest_level, level);
+            scale = fmax(level, zero_scale) / sf_scale;
+        }
+        scales[i * column + splat] = scale;
     }
     float length = 0.0f;
     for (int i = 6; i < 10; ++i)
         length += own[i * column] * own[i * column];
     length = sqrt(length);
+    float turned[4];
     for (int i = 0; i < 4; ++i)
-        quaternions[i * column + splat] = length > 1e-15f ? own[(6 + i) * column] / length : i == 0;
-    const float logit = own[10 * column];
+        turned[i] = length > 1e-15f ? own[(6 + i) * column] / length : i == 0;
+    if (sf_rotation > 0.0f) {
+        const float factor = sqrt(largest_level) * sf_rotation, sign = turned[0] < 0.0f ? -1.0f : 1.0f;
+        float rest = 1.0f, squared = 0.0f;
+        for (int i = 1; i < 4; ++i) {
+            turned[i] = floor(sign * turned[i] * factor + 0.5f) / factor;
+            rest -= turned[i] * turned[i];
+            squared += turned[i] * turned[i];
+        }
+        turned[0] = sqrt(fmax(rest, 0.0f));
+        if (rest < 0.0f) /* the imaginary parts alone are longer than 1 */
+            for (int i = 1; i < 4; ++i)
+                turned[i] /= sqrt(squared);
+    }
+    for (int i = 0; i < 4; ++i)
+        quaternions[i * column + splat] = turned[i];
+    float logit = own[10 * column];
+    if (sf_opacity > 0.0f)
+        logit = floor(fmax(logit - least_logit, 0.0f) * sf_opacity + 0.5f) / sf_opacity + least_logit;
     log2_opacities[splat] = (fmin(logit, 0.0f) - log1p(exp(-fabs(logit)))) * 1.44269504f;
     for (uint i = 0; i < sh_columns; ++i)
         sh[i * column + splat] = own[(11 + i) * column];

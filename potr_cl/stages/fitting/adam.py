@@ -14,7 +14,7 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
 from potr_cl.stages.fitting.derivatives import Columns
-from potr_cl.stages.fitting.parameters import Parameters
+from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, Parameters
 
 #: How fast the moments forget (Kingma and Ba, 2015), and the averages: after about so many steps.
 _DECAY_MEAN, _DECAY_SQUARE = 0.9, 0.999
@@ -70,15 +70,26 @@ class Adam(Parameters):
         columns: which parameter is in which column.
         rates: of a step.
         limits: of the parameters.
+        factors: what the rasterizer's scene is rounded with; the gradient is taken for that of the parameters, as if
+            nothing were (the straight-through estimator of Bengio et al., 2013).
+        sparse: AC coefficients whose Y, Co or Cg is 0 keep it so.
 
     Raises:
         DeviceError: it does not fit the device, or the kernels cannot be built.
     """
 
     def __init__(
-        self, device: Device, scene: Scene, buffers: SceneBuffers, columns: Columns, rates: Rates, limits: Limits
+        self,
+        device: Device,
+        scene: Scene,
+        buffers: SceneBuffers,
+        columns: Columns,
+        rates: Rates,
+        limits: Limits,
+        factors: Factors = UNROUNDED,
+        sparse: bool = False,
     ) -> None:
-        super().__init__(device, scene, buffers, columns)
+        super().__init__(device, scene, buffers, columns, factors)
         self._taken = 0
         try:
             nbytes = self.values.size
@@ -88,6 +99,7 @@ class Adam(Parameters):
             self._averages = self._memory.upload(self._start, "the averages")
             self._steps = self._memory.upload(_steps(columns, rates, limits), "the steps")
             self._step = device.shared_kernel("fit/adam.cl", "adam")
+            self._keep_zeros = device.shared_kernel("fit/adam.cl", "keep_zeros") if sparse else None
         except BaseException:
             self.close()
             raise
@@ -101,6 +113,16 @@ class Adam(Parameters):
         """
         self._taken += 1
         buffers, columns = self.buffers, self.columns
+        coefficients = (columns.count - columns.ac.start) // 3
+        if self._keep_zeros is not None and coefficients:
+            self._keep_zeros.bind(
+                parameters=self.values,
+                gradient=gradient,
+                splats=buffers.splats,
+                stride=buffers.stride,
+                first_ac=columns.ac.start,
+            )
+            self._keep_zeros.launch((buffers.stride, coefficients), (SPLAT_GROUP, 1))
         self._step.bind(
             parameters=self.values,
             gradient=gradient,

@@ -29,6 +29,7 @@ from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.judges import Judges
+from potr_cl.stages.fitting.parameters import UNROUNDED, Factors
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import batches, share_out
 from potr_cl.stages.refitting.targets import Targets
@@ -175,6 +176,8 @@ def fit_scene(
     asked: SupportsBool = False,
     held_out: Sequence[int] | None = None,
     fit_to: Sequence[int] | None = None,
+    factors: Factors = UNROUNDED,
+    sparse: bool = False,
 ) -> Fitted:
     """Fit all parameters of a scene to pictures of some views.
 
@@ -191,6 +194,9 @@ def fit_scene(
         asked: whether to end before the next step, with the best of the whole rounds; looked at after each.
         held_out: numbers of the views to judge by; None: some of the given ones.
         fit_to: numbers of the views to look at, where the judges are given; None: all others.
+        factors: what a file will round shapes and opacities with. All is looked at as it is rounded, but what comes of
+            it is not. The scene as :class:`potr_cl.stages.fitting.parameters.Parameters` takes it then.
+        sparse: AC coefficients whose Y, Co or Cg is 0 keep it so.
 
     Raises:
         UsageError: there are fewer than two given views, so that none can be held out.
@@ -213,8 +219,12 @@ def fit_scene(
         rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
         with (
             Judges(device, rasterizer, cameras, pictures, held_out) as judges,
-            Adam(device, scene, rasterizer.parameters, derivatives.columns, rates, _limits(scene)) as adam,
+            Adam(
+                device, scene, rasterizer.parameters, derivatives.columns, rates, _limits(scene), factors, sparse
+            ) as adam,
         ):
+            if factors != UNROUNDED:
+                adam.give()
             fit = _Fit(options, derivatives, adam, pictures, judges, cameras)
             return fit.run(fit_to, progress, tell or logger.debug, asked)
 

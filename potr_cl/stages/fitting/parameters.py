@@ -2,15 +2,37 @@
 
 from __future__ import annotations
 
+import dataclasses
+from dataclasses import dataclass
+
 import numpy as np
 import pyopencl as cl
 
+from potr_cl.codec.quantize import LEAST_LOGIT, ZERO_SCALE, canonical_rotations
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.activation import LARGEST_SCALE, unit_quaternions
 from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
 from potr_cl.stages.fitting.derivatives import Columns
+
+
+@dataclass(frozen=True)
+class Factors:
+    """What a file rounds shapes and opacities with: a step is 1 / factor. 0: they are not rounded.
+
+    Attributes:
+        scale: of standard deviations, world units.
+        rotation: of quaternions, times the root of the splat's largest scale level.
+        opacity: of logits.
+    """
+
+    scale: float = 0.0
+    rotation: float = 0.0
+    opacity: float = 0.0
+
+
+UNROUNDED = Factors()
 
 
 class Parameters(Owner):
@@ -21,6 +43,8 @@ class Parameters(Owner):
         scene: where they begin.
         buffers: of a rasterizer that has this scene.
         columns: which parameter is in which column.
+        factors: what :meth:`give` rounds with; ``values`` are never rounded. The scene has to be
+            :func:`in_form_of_files` then.
 
     Attributes:
         buffers, columns: as given.
@@ -30,8 +54,11 @@ class Parameters(Owner):
         DeviceError: they do not fit the device, or the kernels cannot be built.
     """
 
-    def __init__(self, device: Device, scene: Scene, buffers: SceneBuffers, columns: Columns) -> None:
+    def __init__(
+        self, device: Device, scene: Scene, buffers: SceneBuffers, columns: Columns, factors: Factors = UNROUNDED
+    ) -> None:
         self._device, self._scene, self.buffers, self.columns = device, scene, buffers, columns
+        self._factors = factors
         self._start = _columns_of(scene, columns, buffers.stride)
         self._memory = Memory(device)
         try:
@@ -55,6 +82,11 @@ class Parameters(Owner):
             stride=buffers.stride,
             sh_columns=self.columns.sh if colours else 0,
             largest_scale=LARGEST_SCALE,
+            sf_scale=self._factors.scale,
+            zero_scale=ZERO_SCALE,
+            sf_rotation=self._factors.rotation,
+            sf_opacity=self._factors.opacity,
+            least_logit=LEAST_LOGIT,
             means=buffers.means,
             scales=buffers.scales,
             quaternions=buffers.quaternions,
@@ -91,6 +123,14 @@ class Parameters(Owner):
     def close(self) -> None:
         """Give all device memory back."""
         self._memory.close()
+
+
+def in_form_of_files(scene: Scene) -> Scene:
+    """The same splats, of their equivalent forms each in the one that a file has: what :class:`Factors` are for."""
+    imaginary, log_scales = canonical_rotations(scene.quaternions, scene.log_scales)
+    real = np.sqrt(np.maximum(1 - (imaginary**2).sum(axis=1), 0))
+    quaternions = np.column_stack([real, imaginary]).astype(np.float32)
+    return dataclasses.replace(scene, quaternions=quaternions, log_scales=log_scales)
 
 
 def _columns_of(scene: Scene, columns: Columns, stride: int) -> FloatArray:

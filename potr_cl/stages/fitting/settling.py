@@ -18,12 +18,14 @@ from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 
 from potr_cl.codec.geometry import Geometry
+from potr_cl.codec.versions import VERSIONS, Version2
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.fit import FitOptions, SupportsBool, fit_scene
+from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_files
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import share_out
 from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
@@ -49,6 +51,10 @@ class Settling:
     rounding: float
     start: float
     last: float = 0.1
+    through: float = 0.0
+    sparse: bool = False
+    choices: int = 1
+    gather: float = 0.4
 
 
 @dataclass(frozen=True)
@@ -97,27 +103,40 @@ def settle(
     """
     errors: list[float] = []
 
-    def fitted(scene: Scene, part: float, still: Sequence[str]) -> Scene:
+    def fitted(
+        scene: Scene, part: float, still: Sequence[str], factors: Factors = UNROUNDED, start: float = settling.start
+    ) -> Scene:
         steps = max(round(part * options.steps), 1)
         rates: Rates = dataclasses.replace(options.rates, **dict.fromkeys(still, 0.0))
         more = dataclasses.replace(
-            options, steps=steps, rounds=3, rates=rates, start=settling.start, last=settling.last, patience=3
+            options, steps=steps, rounds=3, rates=rates, start=start, last=settling.last, patience=3
         )
         found = fit_scene(
             bench.opened, scene, looking.views, looking.targets, more, looking.added, bench.background,
-            tell=bench.tell, asked=asked,
+            tell=bench.tell, asked=asked, factors=factors, sparse=settling.sparse,
         )  # fmt: skip
         errors.append(found.error)
         progress(steps)
         return found.scene
 
-    still = ["ac"]
+    still = [] if settling.sparse else ["ac"]
     if settling.choosing and bench.parameters.drop and "compact" not in state.learnt:
-        scene = fitted(_with_chosen(state, bench, looking), settling.choosing, still)
-        state = dataclasses.replace(state, scene=scene, geometry=None)
+        for number in range(1, settling.choices + 1):
+            drop = bench.parameters.drop * settling.gather ** (settling.choices - number)
+            scene = fitted(_with_chosen(state, bench, looking, drop), settling.choosing / settling.choices, still)
+            state = dataclasses.replace(state, scene=scene, geometry=None)
     rounded = bench.output.geometry(state.scene, bench.request(state)) if settling.rounding else None
     if not isinstance(rounded, Geometry):
         return state, tuple(errors)
+    if settling.through and VERSIONS[bench.parameters.version].quantises_splats_as(Version2):
+        world = rounded.parameters
+        factors = Factors(world.sf_scale, world.sf_rotation, world.sf_opacity)
+        scene = fitted(in_form_of_files(state.scene), settling.rounding, still, factors, settling.through)
+        with thread_pool(bench.threads) as pool:
+            rounded = rounded.with_centres_of(scene.means, state.views, pool.map)
+        scene = dataclasses.replace(scene, means=rounded.decoded(scene.sh).means)
+        scene = fitted(scene, settling.rounding, [*still, "means"], factors, settling.through)
+        return dataclasses.replace(state.recoloured(scene.sh), geometry=rounded.with_shapes_of(scene)), tuple(errors)
     still += ["log_scales", "quaternions"]
     decoded = rounded.decoded(state.scene.sh)
     scene = dataclasses.replace(decoded, means=state.scene.means, opacity_logits=state.scene.opacity_logits)
@@ -130,11 +149,11 @@ def settle(
     return then, tuple(errors)
 
 
-def _with_chosen(state: State, bench: Workbench, looking: Looking) -> Scene:
+def _with_chosen(state: State, bench: Workbench, looking: Looking, drop: float) -> Scene:
     """The scene with the AC coefficients that are worth their bytes, solved for without a look at held-out views."""
     _, held_out = share_out(len(looking.views) - looking.added, looking.added)
     views = [view for number, view in enumerate(state.views) if number not in held_out]  # given ones come first in both
-    options = RefitOptions(steps=_CHOICE_STEPS, drop=bench.parameters.drop, memory=bench.memory)
+    options = RefitOptions(steps=_CHOICE_STEPS, drop=drop, memory=bench.memory)
     targets = RenderedTargets(looking.rasterizer, views)
     refitted = refit_colours(bench.opened, state.scene, views, targets, options, background=bench.background)
     return dataclasses.replace(state.scene, sh=refitted.sh)

@@ -39,8 +39,9 @@ from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
 LEAST_SPLATS = 1 << 21
 #: Parts must save this much of the splats that views project, for their own copies and for what each part costs.
 _WORTH_IT = 0.5
-#: Few of the splats, one in so many, tell whether it may be worth it; then a view sees no more than this part of them.
-_SAMPLED, LIKELY = 64, 0.6
+#: Few of the splats, one in so many, and so many views tell whether it may be worth it. The boxes of few splats are
+#: smaller, so views seem to see a little less than they do.
+_SAMPLED, _VIEWS, LIKELY = 64, 48, _WORTH_IT
 #: The parts' scenes stay on the device if they take no more than this part of the memory.
 _SCENES = 1 / 2
 #: The whole scene is on the device too where that has so many times as much memory.
@@ -53,12 +54,13 @@ _GROUP = 64
 
 
 def seen_part(scene: Scene, cameras: Sequence[Camera]) -> float:
-    """Which part of a scene a view may draw on the average, told from few of its splats; 1 for a small scene."""
+    """Which part of a scene a view may draw on the average, told from few of both; 1 for a small scene."""
     if len(scene) < LEAST_SPLATS or not cameras:
         return 1.0
     few = scene.subset(np.arange(0, len(scene), _SAMPLED))
     groups = SplatGroups.of(few, max(splat_groups.LARGEST // _SAMPLED, 1))
-    return float((groups.visible_by(cameras, INRIA.near) @ groups.counts).mean() / len(few))
+    some = [cameras[number] for number in range(0, len(cameras), -(-len(cameras) // _VIEWS))]
+    return float((groups.visible_by(some, INRIA.near) @ groups.counts).mean() / len(few))
 
 
 def groups_of_large(scene: Scene, run: Run = map) -> SplatGroups | None:
