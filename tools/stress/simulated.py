@@ -62,6 +62,7 @@ from potr_cl.stages.compaction.ridge import Compactor
 from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
+from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_files
 from potr_cl.stages.fitting.tangents import PictureTangents
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
@@ -70,6 +71,7 @@ from potr_cl.stages.pruning.survivors import Survivors
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView
 from potr_cl.stages.pruning.visible_parts import PartedRemoval
+from potr_cl.stages.refitting import coefficients, sliced_coefficients
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
@@ -80,6 +82,8 @@ from potr_cl.stages.refitting.vector_space import Layout
 KINDS = (("gpu", 1), ("cpu", 4), ("cpu", 8), ("cpu", 16))
 #: As in the tests: pixels that come no nearer, relatively, to 1/255 and 1e-4 cannot flip; and what those may be off by.
 _CLEAR, _TOLERANCE = 1e-4, 2e-5
+#: Work-items of a dot product: few of those that devices have, most of which would have nothing to do.
+_DOT_ITEMS = 1024
 
 Step = Callable[[Device], None]
 
@@ -220,7 +224,7 @@ def packing(device: Device) -> None:
         coefficients.activate(np.random.default_rng(1).random(scene.sh.shape) < 0.5)
         packs.take_flags()
         packs.give_flags(packs.flags())
-        x = coefficients.vector()
+        x = vectors.vector()
         coefficients.write(x, scene.sh)
         packs.set_floats(x, packs.floats(x))
         sums = memory.upload(np.ones((layout.columns, layout.stride), np.int64), "sums")
@@ -256,14 +260,15 @@ def _derivatives(device: Device, scene: Scene, views: list[Camera]) -> None:
 
 
 def fit(device: Device) -> None:
-    """Some steps, judged by views that are held out; antialiased, too."""
+    """Some steps, judged by views that are held out; of an antialiased scene, and rounded on the way."""
     source, views = random_splats(60, 3, seed=2), _views(5)
-    for antialiased in (False, True):
-        original = dataclasses.replace(source, antialiased=antialiased)
+    for antialiased, factors in ((False, UNROUNDED), (True, Factors(200, 500, 20))):
+        original = in_form_of_files(dataclasses.replace(source, antialiased=antialiased))
         scene = dataclasses.replace(original, means=original.means + np.float32(0.01))
         with Rasterizer(device, original) as rasterizer:
             targets = RenderedTargets(rasterizer, views)
-            fit_scene(device, scene, views, targets, FitOptions(steps=3, rounds=1))
+            options = FitOptions(steps=3, rounds=1)
+            fit_scene(device, scene, views, targets, options, factors=factors, sparse=antialiased)
 
 
 def compaction(device: Device) -> None:
@@ -361,6 +366,8 @@ def simulate(family: str, width: int, names: list[str], told: Path) -> None:
         patches.enter_context(patch.object(Device, "kernel", made))
         patches.enter_context(patch.object(Device, "launch", launched))
         patches.enter_context(patch.object(Device, "free", lambda _, buffer: freed.append(buffer)))
+        for module in (coefficients, sliced_coefficients):
+            patches.enter_context(patch.object(module, "DOT_ITEMS", _DOT_ITEMS))
         print("STEP probes", file=sys.stderr, flush=True)
         device = Device(simulated, family=family, build_options=["-DNO_PREFETCH"])  # type: ignore[arg-type]
         device.self_check()
