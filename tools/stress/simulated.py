@@ -220,7 +220,7 @@ def packing(device: Device) -> None:
     """What travels between devices that share a re-fit."""
     scene = random_splats(300, 2, seed=5)
     layout = Layout(300, 320, scene.sh.shape[1], 1)
-    with Memory(device) as memory, Coefficients(device, layout) as coefficients, Packing(coefficients) as packs:
+    with Memory(device) as memory, Coefficients(device, layout) as vectors, Packing(vectors) as packs:
         coefficients.activate(np.random.default_rng(1).random(scene.sh.shape) < 0.5)
         packs.take_flags()
         packs.give_flags(packs.flags())
