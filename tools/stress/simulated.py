@@ -221,11 +221,11 @@ def packing(device: Device) -> None:
     scene = random_splats(300, 2, seed=5)
     layout = Layout(300, 320, scene.sh.shape[1], 1)
     with Memory(device) as memory, Coefficients(device, layout) as vectors, Packing(vectors) as packs:
-        coefficients.activate(np.random.default_rng(1).random(scene.sh.shape) < 0.5)
+        vectors.activate(np.random.default_rng(1).random(scene.sh.shape) < 0.5)
         packs.take_flags()
         packs.give_flags(packs.flags())
         x = vectors.vector()
-        coefficients.write(x, scene.sh)
+        vectors.write(x, scene.sh)
         packs.set_floats(x, packs.floats(x))
         sums = memory.upload(np.ones((layout.columns, layout.stride), np.int64), "sums")
         packs.add_sums(sums, packs.sums(sums))
