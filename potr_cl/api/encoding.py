@@ -347,7 +347,9 @@ class Judge:
         watch("evaluate", 0.0)
         original = scene if self.kept is None else self.kept.drawable(self.device, scene)
         with Evaluator(self.device, original, self.views, self.background) as evaluator:
-            quality = quality_report(self.views, evaluator.compare(candidate, lambda _, done: watch("evaluate", done)))
+            comparison = evaluator.compare(candidate, lambda _, done: watch("evaluate", done))
+            beside = evaluator.psnr_of(self.views.beside, candidate) if self.views.beside else None
+            quality = quality_report(self.views, comparison, beside)
             shown = views_to_show(quality, chosen) if pictures else []
             pairs = evaluator.pictures(candidate, [view["name"] for _, view in shown])
         return quality, [

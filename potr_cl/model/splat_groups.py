@@ -119,6 +119,22 @@ class SplatGroups:
         """The numbers of the splats of some groups, ascending; ``groups``: (G,)."""
         return np.flatnonzero(groups[self.group_of])
 
+    def only(self, groups: NDArray[np.bool_]) -> tuple[Indices, SplatGroups]:
+        """Some groups as those of a scene that has their splats and no others; ``groups``: (G,), at least one.
+
+        Returns:
+            The numbers of these splats, ascending, and the groups, which name them by their places there.
+        """
+        own = self.order[np.repeat(groups, self.counts)]
+        splats = np.sort(own).astype(np.int64)
+        places = np.empty(len(self.order), np.uint32)
+        places[splats] = np.arange(len(splats), dtype=np.uint32)
+        starts = np.concatenate([[0], np.cumsum(self.counts[groups])])
+        group_of = (np.cumsum(groups) - 1).astype(np.uint32)[self.group_of[splats]]
+        return splats, SplatGroups(
+            places[own], group_of, starts, self.centres[groups], self.halves[groups], self.sizes[groups]
+        )
+
     def visible_by(self, cameras: Sequence[Camera], near: float, run: Run = map) -> NDArray[np.bool_]:
         """(views, G) the groups of which views may draw a splat.
 

@@ -161,6 +161,7 @@ class Fit(Stage):
     rounding: float = option(0.15)
     gentle: float = option(0.1)
     through: float = option(0.0)
+    cheap: float = option(0.0)
     sparse: int = option(0)
     choices: int = option(1)
     gather: float = option(0.4)
@@ -309,6 +310,7 @@ class Fit(Stage):
             self.rounding,
             self.gentle,
             through=self.through,
+            cheap=self.cheap,
             sparse=bool(self.sparse),
             choices=self.choices,
             gather=self.gather,

@@ -29,6 +29,7 @@ from potr_cl.outputs.potr import Potr
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene, PartOfKept
 from potr_cl.raster.scene_buffers import Drawable
+from potr_cl.raster.view_shares import ViewShares
 from potr_cl.workers.pool import Pool
 
 if TYPE_CHECKING:
@@ -165,9 +166,12 @@ class Workbench:
         """The same for the pool's workers: threads of this process have it from what is kept on their devices."""
         return self.placed(state) if self.pool is not None and self.pool.in_process else state.scene
 
-    def shared_source(self, state: State) -> Scene | KeptScene:
-        """A state's source for the pool's workers."""
+    def shared_source(self, state: State) -> Scene | KeptScene | ViewShares:
+        """A state's source for the pool's workers; where they have what their views see already, that."""
         in_process = self.pool is not None and self.pool.in_process
+        dealt: ViewShares | None = state.learnt.get("shares")
+        if dealt is not None and dealt.views is state.views and not in_process:
+            return dealt
         return self.kept if self.kept is not None and in_process and self.kept.is_of(state.source) else state.source
 
     def request(self, state: State, metadata: bytes = b"", entropy: EntropyCoder | None = None) -> Request:

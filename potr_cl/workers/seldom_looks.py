@@ -1,7 +1,7 @@
 """How often Dask looks at its own processes: seldom, while they work for an encode. See :func:`look_seldom_for`.
 
-A process of Dask looks at its event loop fifty times a second, at its memory and disks twice, and at what its threads do
-a hundred times. That takes 4 to 5 % of a processor for scheduler, worker and the worker's nanny, and dashboards alone
+A process of Dask looks at its event loop fifty times a second, at its memory and disks twice, and at what its threads
+do a hundred times. That takes 4 to 5 % of a processor for scheduler, worker and its nanny, and dashboards alone
 show it. What tells Dask who is alive, and the limits of memory, stay as they are.
 
 Everything goes through Dask's plugins (https://distributed.dask.org/en/stable/plugins.html). A process that cannot be
@@ -64,7 +64,7 @@ def look_as_before(server: Any) -> None:
         server.periodic_callbacks[name].callback_time = often
 
 
-class _OfWorkers(WorkerPlugin):
+class _OfWorkers(WorkerPlugin):  # type: ignore[misc]
     def setup(self, worker: Worker) -> None:
         look_seldom(worker)
 
@@ -72,7 +72,7 @@ class _OfWorkers(WorkerPlugin):
         look_as_before(worker)
 
 
-class _OfNannies(NannyPlugin):
+class _OfNannies(NannyPlugin):  # type: ignore[misc]
     def setup(self, nanny: Nanny) -> None:
         look_seldom(nanny)
 
@@ -80,7 +80,7 @@ class _OfNannies(NannyPlugin):
         look_as_before(nanny)
 
 
-class _OfScheduler(SchedulerPlugin):
+class _OfScheduler(SchedulerPlugin):  # type: ignore[misc]
     """Ends with the client, and ends the others.
 
     Args:

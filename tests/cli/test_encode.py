@@ -291,3 +291,41 @@ def test_virtual_views_beside_cameras_are_refused_from_python(tmp_path, name):
     with pytest.raises(UsageError, match="for scenes without cameras"):
         getattr(potr_cl, name)(scene, *more, cameras, virtual_views=8)
     assert not list(tmp_path.iterdir())
+
+
+def test_few_cameras_are_told_where_held_out_views_suffer(tmp_path, data, capsys):
+    """Not where training views show what held-out ones show."""
+    scene, every = data / "plush_excerpt.ply", json.loads((data / "plush_excerpt_cameras.json").read_text())
+    training = [camera for camera in every if camera["split"] == "train"]
+    few = [*training[:1], *(dict(camera, split="test") for camera in training[4:])]
+    same = [*training, *(dict(camera, id=100 + n, split="test") for n, camera in enumerate(training))]
+    told, gap = [], []
+    for name, cameras in (("few", few), ("same", same)):
+        path = tmp_path / f"{name}.json"
+        path.write_text(json.dumps(cameras))
+        arguments = ["encode", scene, "--cameras", path, "--iterations", "4", "-q", "0.3", "-o", tmp_path / "a.potr"]
+        told.append("the held-out views are matched" in run(capsys, *arguments))
+        quality = json.loads(run(capsys, *arguments, "--json"))["quality"]
+        assert quality["training"]["views"] == (1 if name == "few" else 4)
+        assert (quality["training"]["said"] is not None) == told[-1]
+        gap.append(quality["training"]["psnr"] - quality["psnr"])
+    assert told == [True, False], gap
+    assert gap[0] > 6 > gap[1]
+
+
+def test_training_views_that_judge_themselves_are_said_to_be_few(tmp_path, data, capsys):
+    training = [
+        camera for camera in json.loads((data / "plush_excerpt_cameras.json").read_text()) if camera["split"] == "train"
+    ]
+    more = [
+        dict(camera, id=100 * turn + n, position=[x + 0.001 * turn for x in camera["position"]])
+        for turn in range(3)
+        for n, camera in enumerate(training)
+    ]
+    scene, said = data / "plush_excerpt.ply", []
+    for name, cameras in (("few", training[:3]), ("more", more)):
+        path = tmp_path / f"{name}.json"
+        path.write_text(json.dumps(cameras))
+        text = run(capsys, "encode", scene, "--cameras", path, "--iterations", "2", "-o", tmp_path / "a.potr")
+        said.append("is shown by no more than 3 of them" in text)
+    assert said == [True, False]

@@ -104,7 +104,7 @@ def test_spared_splats_stay(device):
     scene, cameras = street()
     spared = np.random.default_rng(2).random(len(scene)) < 0.3
     parts = parts_of_views(scene, cameras, INRIA.near)
-    schedule = PruningOptions(1e-2, 8)
+    schedule = PruningOptions(1e-2, 4)
     for memory in (None, 0):
         options = SweepOptions(0.0, memory=memory)
         with PartedRemoval(device, scene, scene, cameras, parts, options) as removal:

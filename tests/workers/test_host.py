@@ -63,21 +63,21 @@ def family(request):
         OPTIONS.changed(prune={"keep": None}),  # a GPU decides itself
     ],
 )
-def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options):
+@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 3])
+def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options, count):
     cameras = few(plush_excerpt_cameras)
     alone = open_device(family)
     expected = encode(plush_excerpt, cameras, options, device=alone)
     assert expected.shared is None
-    for count in (2, 3):
-        devices = [open_device(family) for _ in range(count)]
-        with HostPool(devices) as pool:
-            found = encode(plush_excerpt, cameras, options, device=devices[0], pool=pool)
-        assert found.data == expected.data
-        assert found.shared is not None
-        assert len(found.shared.workers) == count
-        assert found.shared.sent > 0
-        assert found.shared.received > 0
-        assert [device.allocated for device in devices] == [0] * count
+    devices = [open_device(family) for _ in range(count)]
+    with HostPool(devices) as pool:
+        found = encode(plush_excerpt, cameras, options, device=devices[0], pool=pool)
+    assert found.data == expected.data
+    assert found.shared is not None
+    assert len(found.shared.workers) == count
+    assert found.shared.sent > 0
+    assert found.shared.received > 0
+    assert [device.allocated for device in devices] == [0] * count
 
 
 def test_steps_by_a_part_of_the_views_give_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, monkeypatch):

@@ -17,7 +17,7 @@ import sys
 from pathlib import Path
 from typing import Any
 
-from tools.make.benchmark_results import RESULTS, ResultError
+from tools.make.benchmark_results import RESULTS, ResultError, checked
 
 #: Parts of a result that the page has decided.
 _KEPT = ("title", "state", "transpose", "options")
@@ -54,7 +54,8 @@ def take(tables: dict[str, Any], path: Path, names: list[str], changes: dict[str
         changes: to the parts of every result that is replaced; a title of None is the table's own.
 
     Raises:
-        ResultError: there is no table of a name, or its columns are not those of the result that it replaces.
+        ResultError: there is no table of a name, its columns are not those of the result that it replaces, or it is not
+            what a result must be; then the file stays as it was.
     """
     text = path.read_text(encoding="utf-8") if path.exists() else "{}\n"
     results = json.loads(text)
@@ -62,6 +63,7 @@ def take(tables: dict[str, Any], path: Path, names: list[str], changes: dict[str
         if name not in tables:
             raise ResultError(f"there is no table '{name}', expected one of {', '.join(tables)}")
         results[new or name] = _renewed(results.get(new or name, {}), tables[name], changes)
+        checked(f"{path.name}, '{new or name}'", results[new or name])
     path.write_text(_written(results, text), encoding="utf-8")
 
 

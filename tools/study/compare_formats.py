@@ -154,10 +154,9 @@ def keep_tables(formats: dict[str, list[dict[str, Any]]], curves: dict[str, Any]
     """
     results = Results(None, path, curves)
     for scene, rows in formats.items():
-        curve = curves["scenes"].get(scene, {"series": {}})["series"].get(series)
-        if curve is None:
+        points = curves["scenes"].get(scene, {"series": {}})["series"].get(series, {"encodes": []})["encodes"]
+        if not points:
             raise UsageError(f"there is no curve '{series}' of {scene}")
-        points = curve["encodes"]
         table = results.table(
             scene,
             f"Preset {series} against other formats, by interpolation along its curve: {scene}",
@@ -166,20 +165,16 @@ def keep_tables(formats: dict[str, list[dict[str, Any]]], curves: dict[str, Any]
             Column("PSNR", "dB", ".2f"),
             Column(f"{series} at that PSNR", "MB", ".2f"),
             Column("times smaller", format=".1f"),
-            Column(f"{series}'s PSNR at that size", "dB", ".2f"),
             Column("lost", "dB", ".2f"),
             Column(f"{series} at that loss", "MB", ".2f"),
             Column("times smaller at that loss", format=".1f"),
-            Column(f"{series}'s loss at that size", "dB", ".2f"),
         )
         for row in rows:
             cells: list[Cell] = []
             for key in ("psnr", "psnr_loss"):
                 size = size_at(points, key, row[key])
-                largest = max(points, key=lambda p: int(p["bytes"]))
-                value = value_at(points, key, row["bytes"])
                 least = min(int(p["bytes"]) for p in points)
-                cells += [row[key], *_how_small(row, size, least), largest[key] if value is None else value]
+                cells += [row[key], *_how_small(row, size, least)]
             table.add(row["format"] + ("" if row["measured"] else " *"), row["bytes"] / 1e6, *cells)
 
 
@@ -191,7 +186,7 @@ def _how_small(row: dict[str, Any], size: float | None, least: int) -> tuple[Cel
 
 
 def _report(args: argparse.Namespace) -> None:
-    measured = merged([args.curves, *args.more])
+    measured = merged([args.curves, *args.more], [args.series] if args.json is not None else ())
     if args.json is not None:
         keep_tables(measured_formats(args.results), measured, args.series, args.json)
         return

@@ -25,19 +25,20 @@ def merged(paths: Sequence[Path], chosen: Sequence[str] = ()) -> dict[str, Any]:
 
     Returns:
         The same structure. "commit" names every commit and, if there are several, the series that each has measured;
-        "machine" and "command" hold each different one once.
+        "machine" and "command" are those of the files that a point is taken of, each once.
 
     Raises:
         UsageError: none of the files has a series of that name.
     """
     files = [json.loads(path.read_text()) for path in paths]
     together: dict[str, Any] = {**files[0], "scenes": {}}
-    for file in files:
+    for number, file in enumerate(files):
+        about = {"commit": file.get("commit", "unknown"), "file": number}
         for name, entry in file["scenes"].items():
             kept = together["scenes"].setdefault(name, {**entry, "series": {}})
             for series, curve in entry["series"].items():
                 points = {p["q"]: p for p in kept["series"].get(series, {"encodes": []})["encodes"]}
-                points |= {p["q"]: {"commit": file.get("commit", "unknown"), **p} for p in curve["encodes"]}
+                points |= {p["q"]: {**about, **p} for p in curve["encodes"]}
                 kept["series"][series] = {**curve, "encodes": [points[q] for q in sorted(points)]}
     for entry in together["scenes"].values():
         order = chosen or list(entry["series"])
@@ -45,10 +46,17 @@ def merged(paths: Sequence[Path], chosen: Sequence[str] = ()) -> dict[str, Any]:
     for name in chosen:
         if not any(name in entry["series"] for entry in together["scenes"].values()):
             raise UsageError(f"{', '.join(map(str, paths))}: there is no series '{name}'")
+    used = {
+        point.pop("file")
+        for entry in together["scenes"].values()
+        for curve in entry["series"].values()
+        for point in curve["encodes"]
+    }
     together["commit"] = _commits(together["scenes"])
+    sources = [file for number, file in enumerate(files) if number in used]
     for key, between in (("machine", "; "), ("date", ", ")):
-        together[key] = between.join(dict.fromkeys(file[key] for file in files if key in file))
-    together["command"] = list(dict.fromkeys(command for file in files for command in file.get("command", [])))
+        together[key] = between.join(dict.fromkeys(file[key] for file in sources if key in file))
+    together["command"] = list(dict.fromkeys(command for file in sources for command in file.get("command", [])))
     return together
 
 

@@ -11,9 +11,9 @@ many. Several files of ``measure`` become one curve (tools.study.curves); --seri
 in that order. ``report`` prints Markdown and draws DIR/rate_distortion_SCENE.png; the points of other formats come from
 tools.study.compare_formats. With --json it keeps the tables of docs/benchmarks: the curves, the uncompressed scenes,
 and the seconds of each stage at quality 0.5; with --losses NAME too, another one instead: what each other series loses
-on photographs, and what the series NAME loses at the same PSNR against the uncompressed renders, by interpolation. With
---against it prints instead how many bytes more or fewer each series takes at the PSNR that the series NAME has at
-quality Q, by interpolation, and how long its encodes take.
+on photographs, and what the series NAME loses at the same PSNR against the uncompressed renders, by interpolation; of
+all qualities, or of those of --qualities. With --against it prints instead how many bytes more or fewer each series
+takes at the PSNR that the series NAME has at quality Q, by interpolation, and how long its encodes take.
 """
 
 from __future__ import annotations
@@ -25,6 +25,7 @@ import json
 import math
 import statistics
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -319,8 +320,15 @@ def keep_tables(measured: dict[str, Any], path: Path) -> None:
                     )  # fmt: skip
 
 
-def keep_losses(measured: dict[str, Any], against: str, path: Path) -> None:
-    """The table "losses": what each series loses on photographs, beside what one of them loses at the same PSNR."""
+def keep_losses(measured: dict[str, Any], against: str, path: Path, qualities: Sequence[float] = ()) -> None:
+    """The table "losses": what each series loses on photographs, beside what one of them loses at the same PSNR.
+
+    Args:
+        measured: what ``measure`` has left.
+        against: the series whose curve is interpolated.
+        path: of the file to write.
+        qualities: of the rows; empty: all.
+    """
     table = Results(None, path, measured).table(
         "losses",
         f"What files lose on photographs, and what those of {against} lose at the same PSNR, all test views",
@@ -328,17 +336,19 @@ def keep_losses(measured: dict[str, Any], against: str, path: Path) -> None:
         Column("preset", default="{preset}"),
         Column("q", default="{quality:g}"),
         Column("bytes", format=","),
-        Column(f"bytes against {against} at this PSNR", "%", "+.1f"),
+        Column("bytes at equal PSNR", "%", "+.1f"),
         Column("PSNR against uncompressed", "dB", ".2f"),
         Column("lost on photographs", "dB", ".3f"),
-        Column(f"{against} at this PSNR", "dB", ".3f"),
+        Column(f"lost by {against} at this PSNR", "dB", ".3f"),
         Column("SSIM against photographs", format=".4f"),
-        Column(f"{against} at this PSNR", format=".4f"),
+        Column(f"SSIM of {against} at this PSNR", format=".4f"),
     )
     for name, entry in measured["scenes"].items():
         reference = entry["series"][against]["encodes"]
         for series, curve in entry["series"].items():
-            for p in curve["encodes"] if series != against else ():
+            if series == against:
+                continue
+            for p in [p for p in curve["encodes"] if not qualities or p["q"] in qualities]:
                 size = size_at(reference, "psnr", p["psnr"])
                 loss, ssim = (along_psnr(reference, key, p["psnr"]) for key in ("psnr_loss", "truth_ssim"))
                 gap = None if size is None else 100 * (p["bytes"] / size - 1)
@@ -357,7 +367,7 @@ def _report(args: argparse.Namespace) -> None:
     if args.losses is not None:
         if args.json is None:
             raise UsageError("--losses makes a table: say with --json where to keep it")
-        keep_losses(results, args.losses, args.json)
+        keep_losses(results, args.losses, args.json, args.qualities)
         return
     if args.json is not None:
         keep_tables(results, args.json)
@@ -384,6 +394,7 @@ def main() -> None:
     report.add_argument("--json", type=Path, metavar="FILE", help="keep tables for docs/benchmarks")
     report.add_argument("--against", metavar="NAME")
     report.add_argument("--losses", metavar="NAME")
+    report.add_argument("--qualities", nargs="+", type=float, default=(), metavar="Q", help="of the rows of --losses")
     report.add_argument("--at", type=float, default=0.5, metavar="Q")
     args = parser.parse_args()
     args.run(args)

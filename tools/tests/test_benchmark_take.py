@@ -89,4 +89,7 @@ def test_what_cannot_be_taken(call, tmp_path):
     thinner = {**NEW, "columns": NEW["columns"][:2], "rows": [[0.5, 50]]}
     with pytest.raises(SystemExit, match="has no column 'bytes', which another is derived from"):
         call("x", tables={"t": thinner})
+    twice = {**NEW, "columns": [NEW["columns"][0], *NEW["columns"]], "rows": [[1, 2, 3, 4]]}
+    with pytest.raises(SystemExit, match="two columns have the same name"):
+        call("x", "t=new", tables={"t": twice})
     assert (tmp_path / "x.json").read_text() == before

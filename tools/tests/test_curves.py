@@ -53,5 +53,7 @@ def test_series_in_the_order_asked_for(tmp_path):
     both = merged([a, b], ["paper", "best"])
     assert [list(entry["series"]) for entry in both["scenes"].values()] == [["paper", "best"], ["best"]]
     assert both["commit"] == "aaaaaaa"
+    c = run(tmp_path / "c", "ccccccc", ["s"], machine="c", other={0.5: 5})
+    assert merged([a, b, c], ["paper", "best"])["machine"] == "a", "a file of which nothing is taken is named"
     with pytest.raises(UsageError, match="there is no series 'slow'"):
         merged([a, b], ["slow"])

@@ -147,7 +147,7 @@ def test_tables_of_curves_and_formats(monkeypatch, folder, tmp_path, capsys):
     call(monkeypatch, compare_formats, "report", formats, out, "--json", kept, "--series", "fast")
     heads = [column["name"] for column in json.loads(kept.read_text())["excerpt"]["columns"]]
     assert "fast at that PSNR" in heads
-    with pytest.raises(UsageError, match="there is no curve 'smallest' of excerpt"):
+    with pytest.raises(UsageError, match="there is no series 'smallest'"):
         call(monkeypatch, compare_formats, "report", formats, out, "--json", kept, "--series", "smallest")
 
 
@@ -195,5 +195,7 @@ def test_losses_on_photographs_at_equal_psnr(monkeypatch, tmp_path):
     assert first[:4] == ["s", "smallest", 0.3, 1600]
     assert first[4:] == pytest.approx([-20, 42.0, 0.35, 0.3, 0.91, 0.92], rel=1e-4)
     assert second == ["s", "smallest", 0.5, 9000, None, 45.0, 0.1, None, 0.95, None], "beyond the ends of best"
+    call(monkeypatch, rate_distortion, "report", curves, "--losses", "best", "--json", kept, "--qualities", 0.5)
+    assert json.loads(kept.read_text())["losses"]["rows"] == [second]
     with pytest.raises(UsageError, match="--json"):
         call(monkeypatch, rate_distortion, "report", curves, "--losses", "best")

@@ -22,10 +22,14 @@ kernel void adam(
     global float *squares,
     global float *averages,
     global float *sh,
+    global const float *scales,
     uint splats,
     uint stride,
     uint first_sh,
     global const float4 *steps,
+    float usual_size,
+    float own_means,
+    float own_turns,
     float part,
     float decay_mean,
     float decay_square,
@@ -38,22 +42,32 @@ kernel void adam(
         return;
     const size_t i = get_global_id(1) * (size_t)stride + splat;
     const float4 step = steps[get_global_id(1)];
-    const float g = gradient[i];
+    /* All is read before anything is written: so these wait for memory together, and not one behind the other. */
+    const float g = gradient[i], former_mean = means[i], former_square = squares[i];
+    const float former = parameters[i], average = averages[i];
     gradient[i] = 0.0f;
-    const float mean = decay_mean * means[i] + (1.0f - decay_mean) * g;
-    const float square = decay_square * squares[i] + (1.0f - decay_square) * g * g;
+    const float mean = decay_mean * former_mean + (1.0f - decay_mean) * g;
+    const float square = decay_square * former_square + (1.0f - decay_square) * g * g;
     means[i] = mean;
     squares[i] = square;
     if (mean == 0.0f || !(square > 0.0f))
         return; /* and the average is what the parameter is */
-    const float value = parameters[i] - part * step.x * (mean * debias_mean) / sqrt(square * debias_square);
-    if (fabs(value) < 1e30f) {
-        const float kept = fmin(fmax(value, step.y), step.z);
+    float rate = part * step.x;
+    if (get_global_id(1) < 3 || (get_global_id(1) >= 6 && get_global_id(1) < 10)) {
+        const float a = scales[splat], b = scales[stride + splat], c = scales[2 * (size_t)stride + splat];
+        const float longest = fmax(a, fmax(b, c)), middle = fmax(fmin(a, b), fmin(fmax(a, b), c));
+        rate *= get_global_id(1) < 3 ? pow(fmin(fmax(middle / usual_size, 0.01f), 100.0f), own_means)
+                                     : pow(fmax(middle / longest, 0.01f), own_turns);
+    }
+    const float value = former - rate * (mean * debias_mean) / sqrt(square * debias_square);
+    const bool taken = fabs(value) < 1e30f;
+    const float kept = taken ? fmin(fmax(value, step.y), step.z) : former;
+    if (taken) {
         parameters[i] = kept;
         if (get_global_id(1) >= first_sh)
             sh[i - first_sh * (size_t)stride] = kept;
     }
-    averages[i] += newest * (parameters[i] - averages[i]);
+    averages[i] = average + newest * (kept - average);
 }
 
 /* The gradient of AC coefficients without what would make something of a Y, Co or Cg that is 0: called before a step,

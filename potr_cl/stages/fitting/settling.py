@@ -24,6 +24,8 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
+from potr_cl.stages.fitting.cheap_levels import with_cheap_levels
+from potr_cl.stages.fitting.curvature import curvatures
 from potr_cl.stages.fitting.fit import FitOptions, SupportsBool, fit_scene
 from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_files
 from potr_cl.stages.fitting.pictures import TargetPictures
@@ -34,6 +36,8 @@ from potr_cl.stages.stage import State, Workbench
 
 #: Steps of the solution that coefficients are chosen by; the last solution, of the re-fit, takes more.
 _CHOICE_STEPS = 4
+#: Bits that a coefficient takes in a file, about.
+_BITS = 7
 
 
 @dataclass(frozen=True)
@@ -52,6 +56,7 @@ class Settling:
     start: float
     last: float = 0.1
     through: float = 0.0
+    cheap: float = 0.0
     sparse: bool = False
     choices: int = 1
     gather: float = 0.4
@@ -136,7 +141,13 @@ def settle(
             rounded = rounded.with_centres_of(scene.means, state.views, pool.map)
         scene = dataclasses.replace(scene, means=rounded.decoded(scene.sh).means)
         scene = fitted(scene, settling.rounding, [*still, "means"], factors, settling.through)
-        return dataclasses.replace(state.recoloured(scene.sh), geometry=rounded.with_shapes_of(scene)), tuple(errors)
+        rounded = rounded.with_shapes_of(scene)
+        if settling.cheap and bench.parameters.drop:
+            scene = in_form_of_files(scene)
+            given = looking.views[: len(looking.views) - looking.added]
+            price = settling.cheap * bench.parameters.drop / _BITS
+            rounded = with_cheap_levels(rounded, scene, curvatures(bench.opened, scene, given, bench.background), price)
+        return dataclasses.replace(state.recoloured(scene.sh), geometry=rounded), tuple(errors)
     still += ["log_scales", "quaternions"]
     decoded = rounded.decoded(state.scene.sh)
     scene = dataclasses.replace(decoded, means=state.scene.means, opacity_logits=state.scene.opacity_logits)

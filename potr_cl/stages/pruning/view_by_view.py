@@ -56,8 +56,8 @@ _OWN, _TOGETHER = 70, 56
 #: Of the memory, what these may take; how many they are at most; and how many times as many splats as one of them (on
 #: the average) they see together at most.
 _PASSING, _MOST, _SPREAD = 1 / 5, 16, 4.0
-#: How much more than a tile they may lose, on the average.
-_PATIENCE = 2.0
+#: How much more than a tile they may lose, on the average, and in how many iterations at most.
+_PATIENCE, _LONGEST = 2.0, 48
 
 
 def can_go_by_view(scene: Drawable, device: Device, options: SweepOptions) -> TypeGuard[SceneBuffers]:
@@ -223,6 +223,8 @@ class ViewByView(Owner):
         #: Whether every splat is left, and has the colours of the targets.
         self._pristine = True
         self._targets_known = self._unkept_known = False
+        #: Iterations since the views that are not kept were measured.
+        self._unmeasured = 0
         self._seen = sights.seen
         own = np.ones(len(cameras), bool)
         if numbers is not None:
@@ -400,9 +402,10 @@ class ViewByView(Owner):
         for kept in self._kept:
             kept.add()
         if self._unkept:
+            self._unmeasured += 1
             if self._unkept_are_stale():
                 self._measure_unkept()
-                self._unkept_known = True
+                self._unkept_known, self._unmeasured = True, 0
             add = self.device.shared_kernel("prune/add_totals.cl", "add_totals")
             add.bind(totals=self.totals, more=self._totals_of_unkept, count=2 * self.splats)
             add.launch((-(-2 * self.splats // _GROUP) * _GROUP,), (_GROUP,))
@@ -454,7 +457,7 @@ class ViewByView(Owner):
 
     def _unkept_are_stale(self) -> bool:
         """Whether they have lost more than the tolerance since they were measured: a part of their area, on average."""
-        if not self._unkept_known or self._options.tolerance <= 0:
+        if not self._unkept_known or self._options.tolerance <= 0 or self._unmeasured >= _LONGEST:
             return True
         with Memory(self.device) as memory:
             words = memory.upload(np.zeros(1, np.int64), "the importance that has gone")

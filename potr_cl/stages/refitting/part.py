@@ -18,6 +18,7 @@ from potr_cl.opencl.relay import Lent
 from potr_cl.raster.kept_scene import KeptScene, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.view_shares import Excerpt
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
@@ -57,7 +58,8 @@ class ColourPart(Part):
         scene: whose geometry and opacities are used; its colours need no more than their constant coefficients.
         sh_count: M, coefficients of a channel.
         rules, background: of the rasterizer.
-        source: the scene whose pictures are the targets, perhaps kept on devices, or with pictures of it there.
+        source: the scene whose pictures are the targets, perhaps kept on devices, with pictures of it there, or what
+            these views see of it.
         cameras: all views.
         numbers: of the views of this part, ascending.
 
@@ -73,7 +75,7 @@ class ColourPart(Part):
         sh_count: int,
         rules: RasterRules,
         background: tuple[float, float, float],
-        source: Scene | KeptScene | PicturesAhead,
+        source: Scene | KeptScene | PicturesAhead | Excerpt,
         cameras: Sequence[Camera],
         numbers: Sequence[int],
     ) -> None:

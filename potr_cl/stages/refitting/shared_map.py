@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import ExitStack, contextmanager
 from dataclasses import replace
 
 import numpy as np
@@ -15,6 +15,7 @@ from potr_cl.opencl.memory import Owner, Staging
 from potr_cl.opencl.relay import Lent
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import parts_of
 from potr_cl.stages.refitting.packing import Packing
@@ -122,7 +123,7 @@ def colour_parts(
     scene: Scene,
     rules: RasterRules,
     background: tuple[float, float, float],
-    source: Scene | KeptScene | PicturesAhead,
+    source: Scene | KeptScene | PicturesAhead | ViewShares,
     cameras: Sequence[Camera],
     memory: int | None,
 ) -> Iterator[Parts]:
@@ -133,12 +134,21 @@ def colour_parts(
         share: who does which views.
         scene: whose colours are re-fitted.
         rules, background: of the rasterizer.
-        source: the scene whose pictures are the targets, perhaps kept on devices, or with pictures of it there.
+        source: the scene whose pictures are the targets, perhaps kept on devices, with pictures of it there, or what
+            the views see of it.
         cameras: all views.
         memory: bytes of a device's memory that prepared views and targets may take; None: the default.
     """
     constant = replace(scene, sh=np.ascontiguousarray(scene.sh[:, :1]))
-    with pool.shared(constant) as shape, pool.shared(source) as pictured:
-        given = [(shape, scene.sh.shape[1], rules, background, pictured, cameras, numbers) for numbers in share.others]
+    with ExitStack() as stack:
+        shape = stack.enter_context(pool.shared(constant))
+        if isinstance(source, ViewShares):
+            pictured = [stack.enter_context(pool.shared(each.excerpt)) for each in source.shares]
+        else:
+            pictured = [stack.enter_context(pool.shared(source))] * len(share.others)
+        given = [
+            (shape, scene.sh.shape[1], rules, background, own, cameras, numbers)
+            for own, numbers in zip(pictured, share.others, strict=True)
+        ]
         with Parts(pool, ColourPart, given, memory, [len(each) for each in share.others]) as parts:
             yield parts
