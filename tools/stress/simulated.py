@@ -419,6 +419,8 @@ def simulated(family: str, width: int, steps: list[str], api: bool = False) -> F
             if said:
                 findings.append(f"{step}: {said}")
             step, said = line.removeprefix("STEP "), ""
+        elif said and "Kernel:" in line and " in " not in said:
+            said += f" in {line.split('Kernel:')[1].strip()}"
         elif line.strip() and not said and not _HARMLESS.search(line):
             said = line.strip()
     if done.returncode:
