@@ -74,7 +74,8 @@ from potr_cl.stages.pruning.visible_parts import PartedRemoval
 from potr_cl.stages.refitting import coefficients, sliced_coefficients
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.packing import Packing
-from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
+from potr_cl.stages.refitting.refit import refit_colours
+from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.refitting.vector_space import Layout
 
