@@ -55,10 +55,12 @@ class EvaluationViews:
         Raises:
             UsageError: there is no camera.
         """
-        views, training = test_views(cameras), train_views(cameras)
+        views = test_views(cameras)
         if views:
+            training = [camera for camera in cameras if camera.split == "train"]
             beside = min(max(round(_BESIDE * len(views)), _LEAST_BESIDE), _MOST_BESIDE)
             return EvaluationViews(views, "test", len(views), tuple(_evenly(training, beside)))
+        training = train_views(cameras)
         return EvaluationViews(_evenly(training, _MOST_TRAINING_VIEWS), "train", len(training))
 
     def named(self, name: str) -> Camera:

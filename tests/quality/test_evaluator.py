@@ -45,6 +45,11 @@ def test_a_few_training_views_stand_beside_test_views():
     assert EvaluationViews.of(only_training(5)).beside == ()
 
 
+def test_views_may_all_be_held_out():
+    held_out = [dataclasses.replace(camera, split="test") for camera in CAMERAS]
+    assert (EvaluationViews.of(held_out).views, EvaluationViews.of(held_out).beside) == (held_out, ())
+
+
 def test_any_views_can_be_judged(evaluator):
     some = CAMERAS[1:3]
     expected = [
