@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.geometry import Geometry
-from potr_cl.codec.quantize import LEAST_LOGIT, ZERO_SCALE, Integers, canonical_rotations, level_type
+from potr_cl.codec.quantize import LEAST_LOGIT, RANGE_OF_LOGITS, ZERO_SCALE, Integers, canonical_rotations, level_type
 from potr_cl.codec.versions import VERSIONS
 from potr_cl.model.scene import Scene
 
@@ -41,7 +41,7 @@ def with_cheap_levels(geometry: Geometry, scene: Scene, curvatures: F64, price: 
         price: mean squared error that a bit is worth.
     """
     order, factors = geometry.order, geometry.parameters
-    logits = scene.opacity_logits[order].astype(np.float64)
+    logits = np.clip(scene.opacity_logits[order].astype(np.float64), *RANGE_OF_LOGITS)
     wanted = (logits - LEAST_LOGIT) * factors.sf_opacity
     opacities = _cheapest(wanted, curvatures[10, order] / factors.sf_opacity**2, price, lambda level: level)
     scales = []
