@@ -14,7 +14,9 @@ import pytest
 
 from potr_cl import Camera, Scene
 from potr_cl.formats import load_cameras, load_scene
-from potr_cl.model import agreement
+from potr_cl.model import agreement, virtual_cameras
+from potr_cl.model.placement.candidates import Candidates, Run
+from potr_cl.model.placement.matter import Frame, Matter
 
 DATA = Path(__file__).parent / "data"
 #: Where Chromium is, if it has another name than systems give it.
@@ -53,6 +55,25 @@ def judged_once() -> Iterator[None]:
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(agreement, "judge_cameras", judged)
         yield
+
+
+@pytest.fixture(scope="session", autouse=True)
+def candidates_once() -> Iterator[dict[bytes, Candidates]]:
+    """Places that virtual cameras could stand at are found once for the same scene: they take most of a second.
+
+    Gives what is known; a test that wants to see them found again empties it.
+    """
+    find, known = virtual_cameras.candidates_of, {}
+
+    def found(frame: Frame, matter: Matter, half_view: float, run: Run) -> Candidates:
+        key = hashlib.sha256(pickle.dumps((frame, matter, half_view))).digest()
+        if key not in known:
+            known[key] = find(frame, matter, half_view, run)
+        return known[key]
+
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(virtual_cameras, "candidates_of", found)
+        yield known
 
 
 @pytest.fixture(scope="session")

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import ast
 import importlib
+import importlib.util
 import re
 import shlex
 import shutil
@@ -26,7 +27,7 @@ PRESENT = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "docs/archit
 FOLDERS = sorted(path.name for path in (ROOT / "potr_cl").iterdir() if path.is_dir() and path.name != "__pycache__")
 #: Sections of docs/architecture.md, and the tests that must pass besides those that they bring.
 RECIPES = {
-    "Add a stage": ["tests/test_api.py"],
+    "Add a stage": ["tests/test_api.py", "tests/api/test_keywords.py"],
     "Add a kernel": ["tests/opencl/test_kernel.py"],
     "Try a variant of a kernel": [],
     "Add a format": ["tests/formats/test_registry.py"],
@@ -196,7 +197,7 @@ def changed(text: str, diff: str) -> str:
 def test_a_recipe_can_be_followed(title: str, checks: list[str], tmp_path: Path) -> None:
     """Its files and changes, put into a copy of the package, pass their own tests and those that it names.
 
-    And the commands that it shows do what they should.
+    And the commands that it shows do what they should, and the linter has nothing to say of what it adds.
     """
     for folder in ("potr_cl", "tests", "tools", "docs"):
         shutil.copytree(ROOT / folder, tmp_path / folder, ignore=shutil.ignore_patterns("__pycache__", "images"))
@@ -222,6 +223,8 @@ def test_a_recipe_can_be_followed(title: str, checks: list[str], tmp_path: Path)
     assert added <= 2, "an addition should take two lines elsewhere at the most"
     run = [line.split()[2:] for line in re.findall(r"^ {4}(python -m .+)$", section(title), re.MULTILINE)]
     run.append(["tools.make.docs"])
+    if importlib.util.find_spec("ruff"):
+        run.append(["ruff", "check", "--no-cache", "."])
     if tests or checks:
         run.append(["pytest", "-q", "-p", "no:cacheprovider", "-m", "not slow", *tests, *checks])
     assert len(run) > 1, "a recipe that nobody tries"

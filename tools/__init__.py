@@ -15,6 +15,7 @@ bench.compaction       speed of the compaction, and its error against float64
 bench.compact_at       when within the pruning schedule to compact?
 bench.decode           how fast does a file decode, by compiled code, NumPy or OpenCL, and in how much memory?
 bench.decode_parts     what is the time of a decode made of, part by part?
+bench.presets          what does each preset take, by stage and as a whole command, and what does it give?
 bench.whole_command    what is the time of a fresh command `encode` made of?
 bench.codec            speed, memory and size of the codec alone
 bench.search           what does encoding to a size or a PSNR cost, against one plain encode?
@@ -63,6 +64,7 @@ What happens at the limits (``stress``):
 =================  =====================================================================================================
 stress.run         every kernel against float64 on the worst inputs: what error is the kernel's own?
 stress.platforms   the rasterizer, the metrics and the re-fit on every OpenCL runtime of this machine
+stress.simulated   does Oclgrind see a race, an access out of bounds or an uninitialised read in any kernel?
 stress.viewer      do the viewer's memory and time stay bounded, however long its cameras move?
 stress.fuzz        does any changed file do more than be refused or decode to finite numbers?
 stress.native      does the compiled decoder touch memory that is not its own, or differ from NumPy's, on changed files?
@@ -82,13 +84,14 @@ make.other_tools      some splats in the formats of six tools, and how splat-tra
 make.golden_files     files that every later decoder must read to the same values
 make.native           the compiled part of the decoder, in the checkout
 make.docs             the pages and tables of README and docs that are made from the code (see CONTRIBUTING.md)
-make.benchmark_pages  the tables and plots of docs/benchmarks, from the results beside them
+make.benchmark_pages  the tables and plots of docs/benchmarks, from the results beside them; which tables are old
+make.benchmark_take   results for docs/benchmarks, from what a tool has kept with --json
 ====================  ==================================================================================================
 
 Shared: :mod:`tools.results` (tables that say what they are of), :mod:`tools.workloads` (scenes, views, repeated work),
 :mod:`tools.viewer_tab` (a browser's tab without the browser), :mod:`tools.study.evaluation` (what a candidate loses to
-its scene), :mod:`tools.study.pruning_baselines` (the orders of other pruners), :mod:`tools.stress.cases` (inputs at
-their worst), :mod:`tools.stress.precise` (what they give in float64). Tools import the package and its float64
-definitions (:mod:`potr_cl.reference`), never the tests; kernels of their own are given to a
-:class:`potr_cl.opencl.device.Device` as variants. Their own tests are in tools/tests.
+its scene), :mod:`tools.study.curves` (points of several runs as one curve), :mod:`tools.study.pruning_baselines` (the
+orders of other pruners), :mod:`tools.stress.cases` (inputs at their worst), :mod:`tools.stress.precise` (what they give
+in float64). Tools import the package and its float64 definitions (:mod:`potr_cl.reference`), never the tests; kernels
+of their own are given to a :class:`potr_cl.opencl.device.Device` as variants. Their own tests are in tools/tests.
 """

@@ -97,7 +97,7 @@ class PrunedScene(Edited):
     @property
     def said(self) -> str:
         part = 100 * self.pruned.kept / self.source_splats
-        splats = f"kept {self.pruned.kept} of {self.source_splats} splats ({part:.1f} %)"
+        splats = f"kept {self.pruned.kept:,} of {self.source_splats:,} splats ({part:.1f} %)"
         return f"{splats} in {self.pruned.iterations} iterations"
 
 
@@ -114,7 +114,7 @@ class CompactedScene(Edited):
     @property
     def said(self) -> str:
         before, after = (100 * part for part in self.sparsity)
-        return f"{len(self.scene)} splats, {after:.1f} % of the AC coefficients quantise to 0, {before:.1f} % before"
+        return f"{len(self.scene):,} splats, {after:.1f} % of the AC coefficients quantise to 0, {before:.1f} % before"
 
 
 @dataclass(frozen=True, repr=False)
@@ -140,7 +140,7 @@ class RefittedScene(Edited):
     def said(self) -> str:
         before, after = (decibels_of(error) for error in self.refitted.errors)
         views = f"PSNR {after} of {self.views} training views, {before} before"
-        return f"{len(self.scene)} splats re-fitted in {self.refitted.steps} steps, {views}"
+        return f"{len(self.scene):,} splats re-fitted in {self.refitted.steps} steps, {views}"
 
 
 def prune(
@@ -184,7 +184,7 @@ def prune(
     """
     options = stage_options(Prune, q, background, memory, choices).changed(cameras_anyway=cameras_anyway)
     write = scene_writer(output) if output is not None else None
-    views, what = cameras_of(cameras), scene_of(scene, trust, antialiased)
+    views, what = cameras_of(cameras, virtual_views), scene_of(scene, trust, antialiased)
     with contextlib.ExitStack() as stack:
         ranks = stack.enter_context(replacing(order)) if order is not None else None
         state, used = _run(what, views, virtual_views, options, Prune, device, progress)
@@ -227,7 +227,7 @@ def compact(
     """
     options = stage_options(Compact, q, background, memory, choices, sf_sh).changed(cameras_anyway=cameras_anyway)
     write = scene_writer(output) if output is not None else None
-    views, what = cameras_of(cameras), scene_of(scene, trust, antialiased)
+    views, what = cameras_of(cameras, virtual_views), scene_of(scene, trust, antialiased)
     state, used = _run(what, views, virtual_views, options, Compact, device, progress)
     if write is not None:
         write(state.scene)
@@ -320,7 +320,7 @@ def refit(
     if photos is not None and cameras is None:
         raise UsageError("--photos needs --cameras, the views that the photographs show")
     write = scene_writer(output) if output is not None else None
-    given = cameras_of(cameras)
+    given = cameras_of(cameras, virtual_views)
     if photos is not None and given is not None:
         given = within_photographs(given)
     ground_truth = GroundTruth(Path(photos), given, colour) if photos is not None and given is not None else None

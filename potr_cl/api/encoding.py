@@ -130,7 +130,7 @@ def encode(
     check_photographs_have_cameras(settings, cameras is not None)
     if report is None and report_view is not None:
         raise UsageError("report_view needs report, the page that shows it")
-    views = cameras_of(cameras)
+    views = cameras_of(cameras, virtual_views)
     with bounded(settings.memory):
         what = scene_of(scene, trust, antialiased)
     if views is None and virtual_views is not None and settings.look_at_views(what):
@@ -347,7 +347,9 @@ class Judge:
         watch("evaluate", 0.0)
         original = scene if self.kept is None else self.kept.drawable(self.device, scene)
         with Evaluator(self.device, original, self.views, self.background) as evaluator:
-            quality = quality_report(self.views, evaluator.compare(candidate, lambda _, done: watch("evaluate", done)))
+            comparison = evaluator.compare(candidate, lambda _, done: watch("evaluate", done))
+            beside = evaluator.psnr_of(self.views.beside, candidate) if self.views.beside else None
+            quality = quality_report(self.views, comparison, beside)
             shown = views_to_show(quality, chosen) if pictures else []
             pairs = evaluator.pictures(candidate, [view["name"] for _, view in shown])
         return quality, [

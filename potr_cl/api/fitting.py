@@ -101,7 +101,7 @@ def fit(
     colour = colour_of(background)
     options, budget = check_fit(steps, views_between), as_bytes(memory)
     write = scene_writer(output) if output is not None else None
-    given = cameras_of(cameras)
+    given = cameras_of(cameras, virtual_views)
     reduced, original = scene_of(scene, trust, antialiased), scene_of(reference, trust, antialiased)
     check_rendered_alike((str(name_of(scene)), reduced), (str(name_of(reference)), original))
     check_frame(original, given, cameras_anyway)

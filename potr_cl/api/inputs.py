@@ -172,14 +172,21 @@ def encoded_file(source: object) -> tuple[str, bytes] | None:
     return ".potr" if options is None else options.output.suffix, b"".join(pieces)
 
 
-def cameras_of(source: CamerasSource | None) -> list[Camera] | None:
+def cameras_of(source: CamerasSource | None, virtual_views: int | None = None) -> list[Camera] | None:
     """The cameras that a source stands for; None for None.
 
+    Args:
+        source: see :data:`CamerasSource`.
+        virtual_views: how many views the caller wants placed, which contradicts cameras.
+
     Raises:
-        UsageError: there is no camera; and as :func:`potr_cl.formats.load_cameras`.
+        UsageError: there is no camera, or views are to be placed beside them; and as
+            :func:`potr_cl.formats.load_cameras`.
     """
     if source is None:
         return None
+    if virtual_views is not None:
+        raise placed_beside_cameras("--virtual-views")
     if isinstance(source, (str, os.PathLike)):
         from potr_cl.formats import load_cameras
 
@@ -188,6 +195,11 @@ def cameras_of(source: CamerasSource | None) -> list[Camera] | None:
     if not cameras:
         raise UsageError("the list of cameras is empty: leave it out, and virtual ones are placed")
     return cameras
+
+
+def placed_beside_cameras(option: str) -> UsageError:
+    """What to raise where cameras are given, and an option asks for views that would be placed without."""
+    return UsageError(f"{option} is for scenes without cameras: leave it out, or --cameras")
 
 
 def device_of(source: DeviceSource) -> Device:

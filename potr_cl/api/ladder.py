@@ -83,7 +83,7 @@ def encode_ladder(
         memory=memory, threads=threads,
         source_bytes=bytes_of_source(scene), cameras_anyway=cameras_anyway,
     )  # fmt: skip
-    given = cameras_of(cameras)
+    given = cameras_of(cameras, virtual_views)
     with bounded(settings.memory):
         what = scene_of(scene, trust, antialiased)
     looks = settings.look_at_views(what)

@@ -7,6 +7,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from potr_cl.api.inputs import placed_beside_cameras
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera, camera_centres, focus
 from potr_cl.model.scene import Scene
@@ -83,7 +84,7 @@ class Viewpoints:
             UsageError: views are to be placed.
         """
         if self.asked_for:
-            raise UsageError(f"{self.asked_for[0]} is for scenes without cameras: leave it out, or --cameras")
+            raise placed_beside_cameras(self.asked_for[0])
 
 
 def told(cameras: Sequence[Camera]) -> str:

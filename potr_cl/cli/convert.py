@@ -44,7 +44,7 @@ def _convert_one(args: argparse.Namespace) -> None:
     before = size_of_file(args.scene)
     scene = read_scene(args, args.scene)
     after = write_scene(args.output, scene, args.to, args.spz_version)
-    said = f"{len(scene)} splats of SH degree {scene.sh_degree}, {after} bytes; {args.scene} has {before}"
+    said = f"{len(scene):,} splats of SH degree {scene.sh_degree}, {after:,} bytes; {args.scene} has {before:,}"
     say_done(f"{args.output}: {said}")
 
 

@@ -152,7 +152,7 @@ def _refit(args: argparse.Namespace) -> None:
             cameras_anyway=args.cameras_anyway,
         )  # fmt: skip
     write_scene(args.output, result.scene, args.to)
-    say_done(f"{args.output}: {len(scene)} splats re-fitted in {result.refitted.steps} steps on {result.device.info}")
+    say_done(f"{args.output}: {len(scene):,} splats re-fitted in {result.refitted.steps} steps on {result.device.info}")
     before, after = result.refitted.errors
     say_done(
         f"{result.views} training views: mean squared error {before:.3g} before, {after:.3g} after, "

@@ -32,14 +32,14 @@ def _decode_one(args: argparse.Namespace) -> None:
             splats = decode_block_by_block(file, args.output, args.trust, args.sh_degree)
             if splats is not None:
                 seconds = time.perf_counter() - started
-                say_done(f"{args.output}: {splats} splats, decoded and written in {seconds:.2f} s")
+                say_done(f"{args.output}: {splats:,} splats, decoded and written in {seconds:.2f} s")
                 return
         scene = decode(file, **trust(args), sh_degree=args.sh_degree, box=args.box and Box.of(args.box))
     decoded = time.perf_counter()
     write_scene(args.output, scene, args.to)
     written = time.perf_counter()
     say_done(
-        f"{args.output}: {len(scene)} splats, decoded in {decoded - started:.2f} s, "
+        f"{args.output}: {len(scene):,} splats, decoded in {decoded - started:.2f} s, "
         f"written in {written - decoded:.2f} s"
     )
 

@@ -69,12 +69,12 @@ def _viewpoints(args: argparse.Namespace) -> Viewpoints:
     return points
 
 
-def _cameras(args: argparse.Namespace, points: Viewpoints, scene: Scene) -> list[Camera]:
-    """The cameras that are given; or views placed for a scene, and a line that says so."""
+def _cameras(args: argparse.Namespace, points: Viewpoints, scene: Scene, hint: str = "") -> list[Camera]:
+    """The cameras that are given; or views placed for a scene, and a line that says so and ends in a hint."""
     if args.cameras is not None:
         return read_cameras(args)
     cameras = points.placed(scene)
-    note(f"no --cameras: {told(cameras)}")
+    note(f"no --cameras: {told(cameras)}{hint}")
     return cameras
 
 
@@ -139,7 +139,7 @@ def _compare(args: argparse.Namespace) -> None:
         drawables: list[Drawable] = []
         if cameras is None:
             scenes = [read_scene(args, path) for path in (args.a, args.b)]
-            cameras = _cameras(args, points, scenes[0])
+            cameras = _cameras(args, points, scenes[0], "; a scene encoded with cameras looks best from those")
             drawables += scenes
             views = chosen_views(cameras, args.views, args.split)
             device = Device(args.device)

@@ -6,6 +6,7 @@ import argparse
 from collections.abc import Sequence
 from pathlib import Path
 
+from potr_cl.api.inputs import placed_beside_cameras
 from potr_cl.cli.guard import ReadCameras, check_photographs
 from potr_cl.cli.options import CAMERAS_HELP
 from potr_cl.cli.parser import whole_number
@@ -37,8 +38,16 @@ def add_cameras_options(p: argparse.ArgumentParser) -> None:
 
 
 def given_cameras(args: argparse.Namespace) -> list[Camera] | None:
-    """The cameras of the file that ``--cameras`` names, if it names one."""
-    return None if args.cameras is None else read_cameras(args)
+    """The cameras of the file that ``--cameras`` names, if it names one.
+
+    Raises:
+        UsageError: virtual ones are asked for besides; and as :func:`read_cameras`.
+    """
+    if args.cameras is None:
+        return None
+    if args.virtual_views is not None:
+        raise placed_beside_cameras("--virtual-views")
+    return read_cameras(args)
 
 
 def read_cameras(args: argparse.Namespace) -> list[Camera]:

@@ -202,18 +202,19 @@ def quantise_in_world_units(
     """
     absolute = VERSIONS[parameters.version].absolute_leaf_levels
 
-    def built(numbers: NDArray[np.int64] | None) -> tuple[octree.OctreeStreams, NDArray[np.int64]]:
+    def built(numbers: NDArray[np.int64] | None, run: Run = map) -> tuple[octree.OctreeStreams, NDArray[np.int64]]:
         own = slice(None) if numbers is None else numbers
         tolerance = np.maximum(world.gamma, world.beta * nearest[own])
-        tree, order = octree.build(scene.means[own], tolerance, absolute=absolute)
+        tree, order = octree.build(scene.means[own], tolerance, absolute, run)
         if may_be_coarse(tree):
             check_positions(scene.means[own], scene.log_scales[own], tolerance, tree, order)
         return tree, order
 
     parts = [None] if rows is None else rows
     found = []
-    # Threads share out the parts here, and each part's splats there.
-    for own, (tree, order) in zip(parts, run(built, parts), strict=True):
+    # Threads share out the parts here, and each part's splats there; or those of the only part in both places.
+    trees = [built(None, run)] if rows is None else run(built, parts)
+    for own, (tree, order) in zip(parts, trees, strict=True):
         levels = splat_levels(scene, order if own is None else own[order], world, run)
         found.append(
             Geometry(

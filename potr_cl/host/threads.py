@@ -8,9 +8,14 @@ from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import FIRST_EXCEPTION, Future, ThreadPoolExecutor, wait
 from contextlib import contextmanager
 from functools import partial
-from typing import Any, TypeVar
+from itertools import islice
+from typing import Any, Generic, TypeVar
 
+S = TypeVar("S")
 T = TypeVar("T")
+
+#: Threads that work ahead, unless more are asked for.
+_MOST_AHEAD = 4
 
 #: Calls a function with each of some arguments and gives the results in their order, as :func:`map` does. No call needs
 #: another one's result.
@@ -34,6 +39,47 @@ def in_background(work: Callable[..., T], *args: Any) -> Future[T]:
     future = pool.submit(work, *args)
     pool.shutdown(wait=False)
     return future
+
+
+class Ahead(Generic[S, T]):
+    """Results in their order, while threads are at work on the next ones; few are there at a time.
+
+    ::
+
+        with Ahead(work, arguments) as results:  # they have begun
+            for argument, result in results:
+                ...
+
+    Args:
+        work: called with each of the arguments.
+        arguments: of which each is asked for only when its turn has come.
+        threads: 0: one a processor, at most :data:`_MOST_AHEAD`.
+    """
+
+    def __init__(self, work: Callable[[S], T], arguments: Iterable[S], threads: int = 0) -> None:
+        self._work, self._arguments = work, iter(arguments)
+        self._threads = threads or min(os.cpu_count() or 1, _MOST_AHEAD)
+        self._begun: deque[tuple[S, Future[T]]] = deque()
+
+    def __enter__(self) -> Iterator[tuple[S, T]]:
+        self._pool = ThreadPoolExecutor(self._threads)
+        for _ in range(self._threads):
+            self._begin()
+        return self._results()
+
+    def _begin(self) -> None:
+        for argument in islice(self._arguments, 1):
+            self._begun.append((argument, self._pool.submit(self._work, argument)))
+
+    def _results(self) -> Iterator[tuple[S, T]]:
+        while self._begun:
+            argument, future = self._begun.popleft()
+            result = future.result()
+            self._begin()
+            yield argument, result
+
+    def __exit__(self, *_: object) -> None:
+        self._pool.shutdown(cancel_futures=True)
 
 
 class SharedWork:

@@ -25,7 +25,7 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
-from potr_cl.model.motions import Motion, likely_motions
+from potr_cl.model.motions import LOOKING_BACK, Motion, likely_motions
 from potr_cl.model.scene import Scene
 from potr_cl.model.sightings import Poses, Sample, Sights, look, poses, sample
 
@@ -40,6 +40,8 @@ _PLAUSIBLE = -2.1
 #: and what one view needs on top, which falls with this power of their number. (One view may look at a bare wall.)
 _BETTER, _FITTED = 0.42, 1.2
 _ALONE, _FALL = 5.0, 1.5
+#: Cameras that see no more of the splats may look the wrong way. In rooms they see as much behind them: none can tell.
+_TURNED_AWAY = 0.05
 #: Of several motions that fit as well but for this, the most usual one is told.
 _AS_WELL = 0.35
 #: Part of a scene's splats that views must see at least, whatever the rest.
@@ -122,7 +124,7 @@ class Judgement:
         then = f"{_percent(moved.seen)} and {_percent(moved.covered)}"
         if moved.known is not None:
             then += f", {_percent(moved.known)} known"
-        return f"{text}; they fit if the scene was {self.motion.name} after training ({then})"
+        return f"{text}; they fit if {self.motion.condition} ({then})"
 
     @property
     def remedy(self) -> str:
@@ -131,6 +133,8 @@ class Judgement:
         if undone:
             return f"bring the scene back ({undone})"
         if self.motion is not None and self.gain >= self.needed:
+            if self.motion.looks_back:
+                return "write the cameras with x right, y down, z forward"
             return "give the cameras of this scene, or undo what moved it"
         return "give the cameras of this scene"
 
@@ -216,6 +220,8 @@ def _best_motion(at: Sample, cameras: Poses, fit: Fit) -> tuple[Motion, Fit] | N
     """The motion after which the cameras fit best, and how well; None if it is not plausible."""
     views = len(cameras.centres)
     motions = list(likely_motions(cameras, at))
+    if fit.seen < _TURNED_AWAY:
+        motions.append(LOOKING_BACK)
     rough = cameras.some(_spread(views, _FEW))
     totals = np.array([_fit(look(at, motion.of(rough))).total for motion in motions])
     best = _promising(totals, np.array([motion.fitted for motion in motions]))
@@ -243,7 +249,7 @@ def _promising(totals: NDArray[np.float64], fitted: NDArray[np.bool_]) -> NDArra
 
 
 def _needed(motion: Motion, views: int) -> float:
-    return (_FITTED if motion.fitted else _BETTER) + _ALONE * math.exp(-_FALL * math.log(views))
+    return (_FITTED if motion.fitted or motion.looks_back else _BETTER) + _ALONE * math.exp(-_FALL * math.log(views))
 
 
 def _spread(count: int, wanted: int) -> NDArray[np.int64]:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from queue import Empty, SimpleQueue
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -11,12 +13,14 @@ from potr_cl.model.order import ascending
 #: Of each coordinate, in a code of 64 bits.
 BITS = 21
 #: Centres whose codes are made at a time.
-_ROWS = 1 << 16
+_ROWS = 1 << 14
+#: Bits that a table spreads at a time.
+_TABLED = 11
 
 
 def morton_order(means: NDArray[np.float32], run: Run = map) -> NDArray[np.int64]:
     """(N,) the numbers of (N, 3) centres along a Morton curve (:func:`morton_codes`), those of one code by number."""
-    return ascending(morton_codes(means, run))
+    return ascending(morton_codes(means, run), run)
 
 
 def morton_codes(means: NDArray[np.float32], run: Run = map) -> NDArray[np.uint64]:
@@ -34,14 +38,51 @@ def morton_codes(means: NDArray[np.float32], run: Run = map) -> NDArray[np.uint6
     middle, side = (low + high) / 2, max(2 * float((high - low).max()), 1e-30)
     corner = middle - side / 2
     codes = np.empty(len(means), np.uint64)
+    table = spread(np.arange(1 << _TABLED, dtype=np.uint64))
+
+    spare: SimpleQueue[_Room] = SimpleQueue()
 
     def place(start: int) -> None:
-        rows = slice(start, start + _ROWS)
-        cells = np.clip((means[rows] - corner) * ((1 << BITS) / side), 0, (1 << BITS) - 1).astype(np.uint64)
-        codes[rows] = spread(cells[:, 0]) | spread(cells[:, 1]) << np.uint64(1) | spread(cells[:, 2]) << np.uint64(2)
+        try:
+            room = spare.get_nowait()
+        except Empty:
+            room = _Room(min(_ROWS, len(means)))
+        own = means[start : start + _ROWS]
+        count = slice(len(own))
+        within, cells, some = room.within[:, count], room.cells[:, count], room.some[:, count]
+        bits, more = room.bits[:, count], room.more[:, count]
+        np.subtract(own.T, corner[:, None], out=within)
+        np.multiply(within, (1 << BITS) / side, out=within)
+        np.clip(within, 0, (1 << BITS) - 1, out=within)
+        cells[:] = within
+        np.bitwise_and(cells, (1 << _TABLED) - 1, out=some)
+        np.take(table, some, out=bits, mode="clip")
+        np.right_shift(cells, _TABLED, out=cells)
+        np.take(table, cells, out=more, mode="clip")
+        np.left_shift(more, np.uint64(3 * _TABLED), out=more)
+        np.bitwise_or(bits, more, out=bits)
+        np.left_shift(bits, np.arange(3, dtype=np.uint64)[:, None], out=bits)
+        np.bitwise_or.reduce(bits, axis=0, out=codes[start : start + _ROWS])
+        spare.put(room)
 
     list(run(place, range(0, len(means), _ROWS)))
     return codes
+
+
+class _Room:
+    """Memory that a thread finds codes in: new memory takes longer than the work, where many threads ask for it.
+
+    Args:
+        rows: centres at a time.
+
+    Attributes:
+        within: (3, rows) places in the cube. cells, some: (3, rows) the same as numbers. bits, more: (3, rows).
+    """
+
+    def __init__(self, rows: int) -> None:
+        self.within = np.empty((3, rows))
+        self.cells, self.some = np.empty((2, 3, rows), np.int64)
+        self.bits, self.more = np.empty((2, 3, rows), np.uint64)
 
 
 def spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:

@@ -30,20 +30,32 @@ class Motion:
         scale: a factor.
         shift: (3,) world units of the scene as it is now.
         fitted: whether shift and scale were fitted to the cameras, which then need not be this scene's at all.
+        looks_back: it was not the scene: each camera has the axes of OpenGL, y up and z back, where y down and z
+            forward are meant, so that it looks away from what it should show.
     """
 
     axes: F64
     scale: float
     shift: F64
     fitted: bool
+    looks_back: bool = False
 
     def of(self, cameras: Poses) -> Poses:
         """Cameras that are moved along with the scene, all in world units."""
-        return cameras.moved(self.axes, self.scale, self.shift)
+        return cameras.turned_round() if self.looks_back else cameras.moved(self.axes, self.scale, self.shift)
+
+    @property
+    def condition(self) -> str:
+        """What must be so for it all to fit, to stand behind "they fit if"."""
+        if self.looks_back:
+            return "each camera's y and z axes are turned round, from OpenGL's to COLMAP's"
+        return f"the scene was {self.name} after training"
 
     @property
     def name(self) -> str:
         """What happened, to stand behind "the scene was"."""
+        if self.looks_back:
+            return "behind its cameras"
         said = [_turn(self.axes)] if not np.array_equal(self.axes, np.eye(3)) else []
         if self.fitted:
             return " and ".join([*said, "moved"])
@@ -54,12 +66,16 @@ class Motion:
     @property
     def undone(self) -> str:
         """What brings it back, to stand behind "bring the scene back:"; empty if that is not known."""
-        if self.fitted:
+        if self.fitted or self.looks_back:
             return ""
         said = [_turn(self.axes.T)] if not np.array_equal(self.axes, np.eye(3)) else []
         if self.scale != 1:
             said.append(f"scaled by {1 / self.scale:g}")
         return " and ".join(said)
+
+
+#: What is wrong where cameras were exported with the axes of another convention.
+LOOKING_BACK = Motion(np.eye(3), 1.0, np.zeros(3), fitted=False, looks_back=True)
 
 
 def likely_motions(world: Poses, at: Sample) -> Iterator[Motion]:

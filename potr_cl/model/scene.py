@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import dataclasses
 import os
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -253,26 +253,45 @@ class Scene:
             scene, report = dataclasses.replace(self, opacity_logits=logits).cleaned()
             return scene, dataclasses.replace(report, infinite_opacities=infinite_opacities)
         finite = np.ones(len(self), bool)
-        # Block by block: the temporaries stay in the cache, and a block without fault is done at the first look.
-        for start in range(0, len(self), _BLOCK):
+
+        def look(start: int) -> None:
+            """Block by block the temporaries stay in the cache, and one without fault is done at the first look."""
             rows = slice(start, start + _BLOCK)
             for array in (self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh):
                 ok = np.isfinite(array[rows])
                 if not ok.all():
                     finite[rows] &= ok.reshape(len(ok), -1).all(axis=1)
+
+        _over_blocks(look, len(self))
         dropped = len(self) - int(np.count_nonzero(finite))
         scene = self.subset(finite) if dropped else self
         if len(scene) == 0:
             raise DataError("the scene holds no splat with finite values: nothing to do")
-        # A length whose square underflows cannot be normalised either.
-        norm2 = np.einsum("ij,ij->i", scene.quaternions, scene.quaternions, dtype=np.float64)
-        zero = norm2 < 1e-30
+        zero = np.empty(len(scene), bool)
+
+        def measure(start: int) -> None:
+            """A length whose square underflows cannot be normalised either."""
+            some = scene.quaternions[start : start + _BLOCK]
+            zero[start : start + _BLOCK] = np.einsum("ij,ij->i", some, some, dtype=np.float64) < 1e-30
+
+        _over_blocks(measure, len(scene))
         zeros = int(np.count_nonzero(zero))
         if zeros:
             quaternions = scene.quaternions.copy()
             quaternions[zero] = (1, 0, 0, 0)
             scene = dataclasses.replace(scene, quaternions=quaternions)
         return scene, CleanReport(dropped, zeros, 0)
+
+
+def _over_blocks(work: Callable[[int], None], splats: int) -> None:
+    """Call something with the number of the first splat of each block; by threads, if there are many."""
+    starts = range(0, splats, _BLOCK)
+    if splats < _LARGE:
+        for start in starts:
+            work(start)
+        return
+    with thread_pool() as pool:
+        list(pool.map(work, starts))
 
 
 def joined(parts: Sequence[Scene]) -> Scene:

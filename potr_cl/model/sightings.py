@@ -17,7 +17,7 @@ from numpy.typing import NDArray
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.placement.sampling import spiral
 from potr_cl.model.placement.surface import points_on_splats
-from potr_cl.model.scene import Scene
+from potr_cl.model.scene import Scene, opacities_of
 from potr_cl.model.spherical_harmonics import ac_basis, energy, unit_coefficients
 
 F64 = NDArray[np.float64]
@@ -104,6 +104,10 @@ class Poses:
             centres = scale * self.centres @ axes.T + shift
         return Poses(centres, self.rotations @ axes.T, self.windows, self.near * scale)
 
+    def turned_round(self) -> Poses:
+        """The same cameras, each with its own y and z axes turned round: it looks the other way."""
+        return Poses(self.centres, np.array([[1.0], [-1.0], [-1.0]]) * self.rotations, self.windows, self.near)
+
     def within(self, of: Sample) -> Poses:
         """The same cameras in the units of a sample."""
         with np.errstate(over="ignore", invalid="ignore"):
@@ -136,7 +140,7 @@ def sample(scene: Scene) -> Sample:
         scene: clean, at least one splat.
     """
     rows = looked_at(len(scene))
-    opaque = rows[scene.opacities[rows] > _OPAQUE]
+    opaque = rows[opacities_of(scene.opacity_logits[rows]) > _OPAQUE]
     scene = scene.subset(opaque if len(opaque) else rows)
     means = scene.means.astype(np.float64)
     centre = np.median(means, axis=0)

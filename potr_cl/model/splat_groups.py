@@ -17,7 +17,8 @@ from numpy.typing import NDArray
 
 from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
-from potr_cl.model.morton import morton_order
+from potr_cl.model.morton import BITS, morton_codes
+from potr_cl.model.order import ascending
 from potr_cl.model.scene import Scene
 
 Indices = NDArray[np.int64]
@@ -27,8 +28,9 @@ F64 = NDArray[np.float64]
 LARGEST = 1024
 #: Groups whose boxes are found at a time.
 _GROUPS = 256
-#: Splats that are so many times as large as the median have groups of their own: they can be seen from everywhere.
-_LARGE = 8.0
+#: Splats that are so many times as large as the median of some have groups of their own: they can be seen from
+#: everywhere.
+_LARGE, _SAMPLED = 8.0, 100_000
 #: A splat reaches so many of its largest standard deviations on screen, sqrt(2 ln 255) and LEVEL_SLACK of splat.clh,
 #: with some room for single precision; and so many pixels through the low-pass filter, PIXEL_SLACK and the pixels'
 #: centres. No less than in unseen.py.
@@ -50,13 +52,15 @@ class SplatGroups:
     """A scene's splats in groups of neighbours.
 
     Attributes:
-        order: (N,) the splats' numbers, group by group.
+        order: (N,) uint32 the splats' numbers, group by group.
+        group_of: (N,) uint32 the group of each splat.
         starts: (G + 1,) where each group begins in the order, and the end.
         centres, halves: (G, 3) float64, the middle of the box of a group's centres, and half its edges, world units.
         sizes: (G,) float64 largest standard deviation of a group, world units.
     """
 
-    order: Indices
+    order: NDArray[np.uint32]
+    group_of: NDArray[np.uint32]
     starts: Indices
     centres: F64
     halves: F64
@@ -73,9 +77,13 @@ class SplatGroups:
         """
         group = group or LARGEST
         logarithms = largest_scales(scene.log_scales)
-        large = logarithms > np.median(logarithms) + math.log(_LARGE)
-        along = morton_order(scene.means, run)
-        order = np.concatenate([along[~large[along]], along[large[along]]])
+        some = logarithms[:: max(len(logarithms) // _SAMPLED, 1)]
+        large = logarithms > np.median(some) + math.log(_LARGE)
+        codes = morton_codes(scene.means, run)
+        codes |= large.astype(np.uint64) << np.uint64(3 * BITS)  # behind all others
+        numbers = ascending(codes, run)
+        del codes
+        order, group_of = np.empty((2, len(numbers)), np.uint32)
         n, small = len(order), len(order) - int(np.count_nonzero(large))
         starts = np.concatenate([np.arange(0, small, group), np.arange(small, n, group), [n]])
         low, high = np.empty((2, len(starts) - 1, 3))
@@ -84,66 +92,117 @@ class SplatGroups:
         def bound(first: int) -> None:
             """The boxes of some groups."""
             some = slice(first, min(first + _GROUPS, len(starts) - 1))
-            begins = starts[some]
-            own = order[begins[0] : starts[some.stop]]
-            for axis in range(3):
-                column = scene.means[own, axis].astype(np.float64)
-                low[some, axis] = np.minimum.reduceat(column, begins - begins[0])
-                high[some, axis] = np.maximum.reduceat(column, begins - begins[0])
-            largest[some] = np.maximum.reduceat(logarithms[own], begins - begins[0])
+            begins = starts[some] - starts[first]
+            own = numbers[starts[first] : starts[some.stop]]
+            order[starts[first] : starts[some.stop]] = own
+            group_of[own] = np.repeat(
+                np.arange(first, some.stop, dtype=np.uint32), np.diff(starts[first : some.stop + 1])
+            )
+            for axis, column in enumerate(np.ascontiguousarray(scene.means[own].T)):
+                low[some, axis] = np.minimum.reduceat(column, begins)
+                high[some, axis] = np.maximum.reduceat(column, begins)
+            largest[some] = np.maximum.reduceat(logarithms[own], begins)
 
         for _ in run(bound, range(0, len(starts) - 1, _GROUPS)):
             pass
         # Halved each first: the sum of two large numbers may be infinite.
-        return SplatGroups(order, starts, low / 2 + high / 2, high / 2 - low / 2, np.exp(np.minimum(largest, 100)))
+        return SplatGroups(
+            order, group_of, starts, low / 2 + high / 2, high / 2 - low / 2, np.exp(np.minimum(largest, 100))
+        )
 
     @property
     def counts(self) -> Indices:
         """(G,) splats of each group."""
         return np.diff(self.starts)
 
-    @property
-    def group_of(self) -> NDArray[np.uint32]:
-        """(N,) the group of each splat."""
-        found = np.empty(len(self.order), np.uint32)
-        found[self.order] = np.repeat(np.arange(len(self.starts) - 1, dtype=np.uint32), self.counts)
-        return found
-
     def splats(self, groups: NDArray[np.bool_]) -> Indices:
         """The numbers of the splats of some groups, ascending; ``groups``: (G,)."""
-        return np.sort(self.order[np.repeat(groups, self.counts)])
+        return np.flatnonzero(groups[self.group_of])
+
+    def only(self, groups: NDArray[np.bool_]) -> tuple[Indices, SplatGroups]:
+        """Some groups as those of a scene that has their splats and no others; ``groups``: (G,), at least one.
+
+        Returns:
+            The numbers of these splats, ascending, and the groups, which name them by their places there.
+        """
+        own = self.order[np.repeat(groups, self.counts)]
+        splats = np.sort(own).astype(np.int64)
+        places = np.empty(len(self.order), np.uint32)
+        places[splats] = np.arange(len(splats), dtype=np.uint32)
+        starts = np.concatenate([[0], np.cumsum(self.counts[groups])])
+        group_of = (np.cumsum(groups) - 1).astype(np.uint32)[self.group_of[splats]]
+        return splats, SplatGroups(
+            places[own], group_of, starts, self.centres[groups], self.halves[groups], self.sizes[groups]
+        )
 
     def visible_by(self, cameras: Sequence[Camera], near: float, run: Run = map) -> NDArray[np.bool_]:
-        """(views, G) :meth:`visible` of some views; ``run`` shares the work out."""
+        """(views, G) the groups of which views may draw a splat.
+
+        Args:
+            cameras: the views.
+            near: as in the rasterizer's rules.
+            run: shares the work out.
+        """
         found = np.zeros((len(cameras), len(self.starts) - 1), bool)
+        features, origin = self._features()
 
         def look(view: int) -> None:
-            found[view] = self.visible(cameras[view], near)
+            # Without BLAS, whose threads would wait for each other.
+            bounds = np.einsum("bf,fg->bg", _bounds(cameras[view], near, origin), features)
+            np.all(bounds >= 0, axis=0, out=found[view])
 
         for _ in run(look, range(len(cameras))):
             pass
         return found
 
     def visible(self, camera: Camera, near: float) -> NDArray[np.bool_]:
-        """(G,) the groups of which a view may draw a splat; ``near`` as in the rasterizer's rules."""
-        right, down, forward = camera.rotation
-        middle = self.centres - camera.centre
-        distance = np.linalg.norm(middle, axis=1) + np.linalg.norm(self.halves, axis=1)
-        slack = _ROUNDING * distance
+        """(G,) the same of one view."""
+        found: NDArray[np.bool_] = self.visible_by([camera], near)[0]
+        return found
 
-        def furthest(direction: F64) -> F64:
-            """Of each group's box, along a direction from the camera."""
-            found: F64 = middle @ direction + self.halves @ np.abs(direction)
-            return found
+    def _features(self) -> tuple[F64, F64]:
+        """(9, G) what bounds of views are linear in (:func:`_bounds`), of each group; and (3,) the scene's middle."""
+        origin = np.median(self.centres, axis=0)
+        middle = self.centres - origin
+        spans = np.linalg.norm(middle, axis=1) + np.linalg.norm(self.halves, axis=1)
+        features = np.empty((9, len(self.sizes)))
+        features[:3], features[3:6], features[6], features[7], features[8] = (
+            middle.T,
+            self.halves.T,
+            self.sizes,
+            spans,
+            1,
+        )
+        return features, origin
 
-        shown: NDArray[np.bool_] = furthest(forward) + slack > near
-        for axis, focal, before, pixels in (
-            (right, camera.fx, camera.cx, camera.width),
-            (down, camera.fy, camera.cy, camera.height),
-        ):
-            # All in pixels times depth, which is above 0: a position on screen is focal · along / depth + before.
-            steepest = max(_LIMIT * pixels / 2, abs(before) + _PIXELS, abs(pixels - before) + _PIXELS) / focal
-            reach = _REACH * focal * math.hypot(1, steepest) * self.sizes + focal * slack
-            shown &= furthest(focal * axis + (before + _PIXELS) * forward) + reach >= 0
-            shown &= furthest(-focal * axis + (pixels - before + _PIXELS) * forward) + reach >= 0
-        return shown
+
+def _bounds(camera: Camera, near: float, origin: F64) -> F64:
+    """(5, 9) what makes a group visible: none of these sums is negative.
+
+    In front of the near plane, in world units; and not beyond the left, right, upper and lower edge of the picture, in
+    pixels times depth, which is above 0: a position on screen is focal · along / depth + before. By the features of a
+    group: its box's middle from ``origin``, the box's half edges, its largest size, its span, that is more than how far
+    it is from ``origin``, and 1.
+    """
+    right, down, forward = camera.rotation
+    place = camera.centre - origin
+    away = float(np.linalg.norm(place))
+    rows = np.empty((5, 9))
+
+    def bound(row: int, direction: F64, offset: float, size: float, slack: float) -> None:
+        """How far a box reaches along a direction from the camera, and more."""
+        rows[row, :3], rows[row, 3:6] = direction, np.abs(direction)
+        # A group is no farther from the camera than its span and the camera from the origin are together.
+        rows[row, 6], rows[row, 7] = size, slack * _ROUNDING
+        rows[row, 8] = offset - direction @ place + slack * _ROUNDING * away
+
+    bound(0, forward, -near, 0.0, 1.0)
+    for row, axis, focal, before, pixels in (
+        (1, right, camera.fx, camera.cx, camera.width),
+        (3, down, camera.fy, camera.cy, camera.height),
+    ):
+        steepest = max(_LIMIT * pixels / 2, abs(before) + _PIXELS, abs(pixels - before) + _PIXELS) / focal
+        size = _REACH * focal * math.hypot(1, steepest)
+        bound(row, focal * axis + (before + _PIXELS) * forward, 0.0, size, focal)
+        bound(row + 1, -focal * axis + (pixels - before + _PIXELS) * forward, 0.0, size, focal)
+    return rows

@@ -111,7 +111,7 @@ class Reused(Memory):
         if self._taken == len(self._places):
             self._places.append(Scratch(self._device, what))
         place = self._places[self._taken]
-        if place.nbytes < nbytes:
+        if place.buffer is None or place.nbytes < nbytes:  # also for nothing: kernels want a buffer
             place.reserve(max(nbytes, min(int(_MARGIN * nbytes), self._device.info.largest_buffer)))
         self._taken += 1
         return place.buffer

@@ -42,8 +42,7 @@ class Lent:
         """Lend another buffer in its place, with the same content."""
         self.buffer = buffer
         with self.device.errors("failed while computing"):
-            self.ready: cl.Event = cl.enqueue_marker(self.device.queue)
-            self.device.queue.flush()
+            self.ready = done_so_far(self.device)
 
 
 class Relay(Owner):
@@ -61,7 +60,14 @@ class Relay(Owner):
         self._staging = Staging(device)
         self._slots = self._staging.array((_SLOTS, _SLICE), np.uint8)
 
-    def fetch(self, target: cl.Buffer, lent: Lent, start: int = 0, nbytes: int | None = None) -> None:
+    def fetch(
+        self,
+        target: cl.Buffer,
+        lent: Lent,
+        start: int = 0,
+        nbytes: int | None = None,
+        free: cl.Event | None = None,
+    ) -> None:
         """Copy what is lent, or a part of it, to the beginning of a buffer; it is there when the method returns.
 
         Args:
@@ -69,6 +75,8 @@ class Relay(Owner):
             lent: by another device, or by this one.
             start: first byte of the part.
             nbytes: of the part; None: all that follow.
+            free: when nobody looks any more at what the target held, see :func:`done_so_far`; None: when all is done
+                that has been enqueued on this device before.
 
         Raises:
             DeviceError: a device failed.
@@ -79,8 +87,7 @@ class Relay(Owner):
         device = self._device
         with device.errors("failed while computing"), lent.device.errors("failed while computing"):
             # Kernels that were enqueued before may still look at what the target held.
-            free = cl.enqueue_marker(device.queue)
-            device.queue.flush()
+            free = free or done_so_far(device)
             if lent.device is device:
                 waits = [free, lent.ready]
                 cl.enqueue_copy(
@@ -132,6 +139,13 @@ class Relay(Owner):
         self._staging.close()
         self._slots = np.empty((0, 0), np.uint8)
         self._queues = {}
+
+
+def done_so_far(device: Device) -> cl.Event:
+    """When all is done that has been enqueued on a device's own queue; other queues can wait for it."""
+    event = cl.enqueue_marker(device.queue)
+    device.queue.flush()
+    return event
 
 
 def _queue_beside(device: Device) -> Any:

@@ -26,9 +26,11 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import is_virtual, place_cameras
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.fallback import on_device
+from potr_cl.pipeline.host_memory import for_views
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.scene_buffers import Drawable
+from potr_cl.stages.between.price import priced
 from potr_cl.stages.fit import Fit, LeftOut
 from potr_cl.stages.fitting.fit import Fitted
 from potr_cl.stages.prune import Prune
@@ -337,7 +339,7 @@ class Run:
     def _one(self, stage: Stage, state: State) -> State:
         options = as_done(self._options, state)
         bench = Workbench(
-            options.parameters,
+            priced(options.parameters, state),
             memory=options.memory,
             background=options.background,
             threads=options.threads,
@@ -360,7 +362,8 @@ class Run:
 
         def work(device: Device, memory: int | None) -> State:
             pool = self._pool if self._pool is not None and device is self._pool.first else None
-            return stage.run(state, dataclasses.replace(bench, device=device, memory=memory, pool=pool))
+            room = for_views(device, memory, len(state.source))
+            return stage.run(state, dataclasses.replace(bench, device=device, memory=room, pool=pool))
 
         device = self.device or self._given or Device()
         state, self.device = on_device(device, options.memory, work)
@@ -391,7 +394,7 @@ class Run:
             options=self._options,
             source_splats=len(state.source),
             shared=None if self._pool is None else SharedOut.by(self._pool, self._before),
-            parameters=as_done(self._options, state).parameters,
+            parameters=priced(as_done(self._options, state).parameters, state),
             left_out=0 if coded.sh_degree is None else state.scene.sh_degree - coded.sh_degree,
         )
 
@@ -432,7 +435,7 @@ class Stopwatch:
 
 def _metadata(state: State, options: EncodeOptions) -> bytes:
     """What the file says of how it was made."""
-    parameters, views = options.parameters, state.views
+    parameters, views = priced(options.parameters, state), state.views
     by_name = {stage.name: stage for stage in options.stages if stage.on}
     prune = by_name.get("prune")
     by_threshold = isinstance(prune, Prune) and prune.count is None and prune.keep is None

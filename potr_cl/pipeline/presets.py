@@ -41,7 +41,7 @@ PRESETS: dict[Preset, tuple[Stage, ...]] = {
         Code(entropy="zstd", zstd_level=9),
     ),
     "paper": (
-        Between(views=0),
+        Between(views=0, weigh=False),
         Prune(),
         Fit(),
         Compact(),

@@ -310,9 +310,9 @@ def comparison_report(comparison: Comparison) -> dict[str, Any]:
 def format_sizes(a: SceneFile, b: SceneFile) -> str:
     """Sizes and splats of both files as lines."""
     width = max(len(str(a.path)), len(str(b.path)), 4)
-    lines = [f"   {'file':<{width}}{'bytes':>12}{'splats':>10}{'SH degree':>11}"]
+    lines = [f"   {'file':<{width}}{'bytes':>16}{'splats':>13}{'SH degree':>11}"]
     for name, scene in (("A", a), ("B", b)):
-        lines.append(f"{name}  {scene.path!s:<{width}}{scene.nbytes:>12}{scene.splats:>10}{scene.sh_degree:>11}")
+        lines.append(f"{name}  {scene.path!s:<{width}}{scene.nbytes:>16,}{scene.splats:>13,}{scene.sh_degree:>11}")
     if a.nbytes >= b.nbytes:
         lines.append(f"B is {a.nbytes / b.nbytes:.1f} times smaller")
     else:

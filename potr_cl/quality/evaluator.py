@@ -25,6 +25,8 @@ from potr_cl.raster.scene_buffers import Drawable
 
 #: So many training views, spread evenly, stand for all of them where there are no test views.
 _MOST_TRAINING_VIEWS = 32
+#: Beside held-out views so many training views are judged, as a part of them, and at least, and at most.
+_BESIDE, _LEAST_BESIDE, _MOST_BESIDE = 1 / 8, 4, 16
 #: Bytes of the uncompressed scene's pictures that are kept from one candidate to the next; others are rendered again.
 CACHED_PICTURES = 1 << 30
 
@@ -37,11 +39,14 @@ class EvaluationViews:
         views: at least one.
         kind: "test", held out of encoding, or "train", which encoding has looked at.
         available: how many of that kind the cameras hold.
+        beside: a few training views, which tell whether held-out ones are matched worse; none if there are none, or if
+            training views judge anyway.
     """
 
     views: list[Camera]
     kind: Literal["test", "train"]
     available: int
+    beside: tuple[Camera, ...] = ()
 
     @staticmethod
     def of(cameras: Sequence[Camera]) -> EvaluationViews:
@@ -52,10 +57,11 @@ class EvaluationViews:
         """
         views = test_views(cameras)
         if views:
-            return EvaluationViews(views, "test", len(views))
-        views = train_views(cameras)
-        some = np.linspace(0, len(views) - 1, min(len(views), _MOST_TRAINING_VIEWS)).round().astype(int)
-        return EvaluationViews([views[k] for k in some], "train", len(views))
+            training = [camera for camera in cameras if camera.split == "train"]
+            beside = min(max(round(_BESIDE * len(views)), _LEAST_BESIDE), _MOST_BESIDE)
+            return EvaluationViews(views, "test", len(views), tuple(_evenly(training, beside)))
+        training = train_views(cameras)
+        return EvaluationViews(_evenly(training, _MOST_TRAINING_VIEWS), "train", len(training))
 
     def named(self, name: str) -> Camera:
         """The view of a name.
@@ -74,6 +80,11 @@ class EvaluationViews:
             return f"{len(self.views)} held-out {what}{'s' if len(self.views) > 1 else ''}"
         which = "all" if len(self.views) == self.available else f"{len(self.views)} of"
         return f"{which} {self.available} training views, for the cameras name no test views"
+
+
+def _evenly(views: Sequence[Camera], most: int) -> list[Camera]:
+    """So many of some views at most, from the first to the last."""
+    return [views[k] for k in np.linspace(0, len(views) - 1, min(len(views), most)).round().astype(int)]
 
 
 class Evaluator(Owner):
@@ -103,17 +114,19 @@ class Evaluator(Owner):
         self._room = min(CACHED_PICTURES, device.info.memory // 16)
 
     def psnr(self, candidate: Drawable, most: int | None = None) -> float:
-        """Mean over the views of the PSNR against the uncompressed scene's pictures, in decibels.
+        """:meth:`psnr_of` the views, or of so many of them, spread evenly."""
+        views = self.views.views
+        return self.psnr_of(views if most is None else _evenly(views, most), candidate)
+
+    def psnr_of(self, views: Sequence[Camera], candidate: Drawable) -> float:
+        """Mean over some views of the PSNR against the uncompressed scene's pictures, in decibels.
 
         Identical pictures are left out of the mean; it is infinite if all are identical.
 
         Args:
+            views: any.
             candidate: to judge; where it is on a device, that is the evaluator's.
-            most: look at so many views only, spread evenly.
         """
-        views = self.views.views
-        if most is not None and most < len(views):
-            views = [views[k] for k in np.linspace(0, len(views) - 1, most).round().astype(int)]
         values: list[float] = []
         with Rasterizer(self.device, candidate, background=self._background) as rasterizer:
             for some in in_batches(self.device, views):

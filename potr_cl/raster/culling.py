@@ -12,11 +12,13 @@ from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.morton import morton_order
 from potr_cl.model.scene import Scene
-from potr_cl.model.splat_groups import Indices, SplatGroups
+from potr_cl.model.splat_groups import F64, Indices, SplatGroups
 
 #: A part's views see so many times as many splats together as three quarters of the views each at most, or this part of
 #: the scene. The others, which see more alone, are one part.
 _SPREAD, _QUANTILE, _LEAST_PART = 1.25, 0.75, 1 / 16
+#: So many groups tell well enough which views see the same.
+_COARSE = 4096
 
 
 @dataclass(frozen=True)
@@ -72,13 +74,64 @@ class Sights:
             middles = np.nan_to_num((self.seen * counts) @ self.groups.centres / (self.seen @ counts)[:, None])
         return morton_order(middles.astype(np.float32))
 
-    def parts(self) -> list[ViewPart]:
-        """All views, dealt out to parts that see much of the same, so that the splats of all parts are few."""
+    def dealt(self, speeds: Sequence[float]) -> list[list[int]]:
+        """The views for each of several workers, ascending, so that each sees little of the scene.
+
+        One worker after the other takes the view that adds least to what it sees, until it has its part of the work.
+
+        Args:
+            speeds: of the workers, above 0; their parts of the work are in proportion.
+        """
+        totals, seen, counts = self.totals + 1.0, *self._coarse()
+        wanted = np.cumsum(speeds) / np.sum(speeds) * float(totals.sum())
+        left = np.ones(len(totals), bool)
+        dealt: list[list[int]] = []
+        done = 0.0
+        for place, end in enumerate(wanted):
+            own: list[int] = []
+            together = np.zeros(len(counts), bool)
+            while left.any() and (done < end or place == len(wanted) - 1):
+                others = np.flatnonzero(left)
+                # Of those that see little more than what is there already, beside what they see at all.
+                more = (seen[others] & ~together) @ counts if own else totals[others] ** 2
+                best = int(others[np.argmin(more / totals[others])])
+                own.append(best)
+                left[best] = False
+                together |= seen[best]
+                done += totals[best]
+            dealt.append(sorted(own))
+        return dealt
+
+    def _coarse(self) -> tuple[NDArray[np.bool_], F64]:
+        """What views see by larger groups, of neighbours, and how many splats these have."""
+        first = np.arange(0, len(self.groups.counts), -(-len(self.groups.counts) // _COARSE))
+        return np.logical_or.reduceat(self.seen, first, axis=1), np.add.reduceat(
+            self.groups.counts.astype(float), first
+        )
+
+    def of_views(self, numbers: Sequence[int]) -> tuple[Indices, Sights]:
+        """What some views may draw, as a scene of its own.
+
+        Returns:
+            The numbers of the splats that these views may draw, ascending, and what all views may draw of these.
+        """
+        own = self._seen_by(numbers)
+        splats, groups = self.groups.only(own)
+        return splats, Sights(groups, self.seen[:, own])
+
+    def parts(self, numbers: Sequence[int] | None = None) -> list[ViewPart]:
+        """All views, dealt out to parts that see much of the same, so that the splats of all parts are few.
+
+        Args:
+            numbers: of the views that are meant; None: all.
+        """
         groups, seen = self.groups, self.seen
         counts = groups.counts.astype(np.float64)
         totals = seen @ counts
         most = max(_SPREAD * float(np.quantile(totals, _QUANTILE)), _LEAST_PART * len(groups.order))
         order = self.order()
+        if numbers is not None:
+            order = order[np.isin(order, list(numbers))]
         dealt: list[list[int]] = []
         together = np.zeros(len(counts), bool)
         for number in order[totals[order] <= most].tolist():
@@ -90,11 +143,14 @@ class Sights:
                 dealt.append([number])
                 together = seen[number]
         dealt.append(order[totals[order] > most].tolist())
-        return [
-            ViewPart(sorted(numbers), groups.splats(np.logical_or.reduce(seen[numbers])))
-            for numbers in dealt
-            if numbers
-        ]
+        return [ViewPart(sorted(own), groups.splats(self._seen_by(own))) for own in dealt if own]
+
+    def _seen_by(self, numbers: Sequence[int]) -> NDArray[np.bool_]:
+        """(G,) the groups that some views see together, at least one: a scene has splats."""
+        seen: NDArray[np.bool_] = np.logical_or.reduce(self.seen[list(numbers)])
+        if not seen.any():
+            seen[0] = True
+        return seen
 
 
 def parts_of_views(scene: Scene, cameras: Sequence[Camera], near: float) -> list[ViewPart]:

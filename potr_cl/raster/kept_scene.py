@@ -17,6 +17,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, gathered, uploaded
+from potr_cl.raster.view_shares import Excerpt
 
 #: A scene that takes more than this part of the device's memory is not kept: others may need the room.
 _PART = 10
@@ -101,7 +102,7 @@ class PartOfKept:
 
 
 @contextmanager
-def lying_on(device: Device, scene: Scene | KeptScene | PartOfKept) -> Iterator[Drawable]:
+def lying_on(device: Device, scene: Scene | KeptScene | PartOfKept | Excerpt) -> Iterator[Drawable]:
     """What to give to a rasterizer on a device for a scene, as long as the context lasts.
 
     Raises:
@@ -117,5 +118,7 @@ def lying_on(device: Device, scene: Scene | KeptScene | PartOfKept) -> Iterator[
             yield scene.scene
     elif isinstance(scene, KeptScene):
         yield scene.on(device)
+    elif isinstance(scene, Excerpt):
+        yield scene.gathered()
     else:
         yield scene

@@ -56,16 +56,21 @@ class Picker(Owner):
         device: that finds them.
         groups: (N,) the group of each splat.
 
+    Attributes:
+        device: as given. splats: N.
+        groups: as given, in the device's memory. count, write: the kernels.
+
     Raises:
         DeviceError: the device has no room.
     """
 
     def __init__(self, device: Device, groups: NDArray[np.uint32]) -> None:
-        self._device, self._splats = device, len(groups)
+        self.device = device
+        self.splats = len(groups)
         self._memory = Memory(device)
         with device.all_or_nothing():
-            self._groups = self._memory.upload(groups, "the splats' groups")
-            self._count, self._write = (device.kernel(_SOURCE, name) for name in ("count_wanted", "write_wanted"))
+            self.groups = self._memory.upload(groups, "the splats' groups")
+            self.count, self.write = (device.kernel(_SOURCE, name) for name in ("count_wanted", "write_wanted"))
 
     def pick(
         self, memory: Memory, wanted: NDArray[np.bool_], states: cl.Buffer | None = None, state: int = 0
@@ -84,28 +89,72 @@ class Picker(Owner):
         Raises:
             DeviceError: the device has no room.
         """
-        device, chunks = self._device, -(-self._splats // _CHUNK)
-        items = (max(chunks, 1) * _GROUP,)
-        with Memory(device) as own:
-            flags = own.upload(wanted.astype(np.uint8), "the groups that are wanted")
-            counts = own.allocate(4 * chunks, "the numbers of splats that are wanted")
-            arguments = {
-                "groups": self._groups,
-                "wanted": flags,
-                "states": flags if states is None else states,
-                "by_state": states is not None,
-                "state": state,
-                "splats": self._splats,
-            }
-            self._count.bind(**arguments, counts=counts).launch(items, (_GROUP,))
-            found = device.download(counts, (chunks,), np.uint32)
-            ends = np.cumsum(found, dtype=np.uint32)
-            numbers = memory.allocate(4 * int(ends[-1]), "the numbers of a view's splats")
-            starts = own.upload(ends - found, "where they begin")
-            self._write.bind(**arguments, starts=starts, numbers=numbers).launch(items, (_GROUP,))
-            with device.errors("failed while computing"):
-                device.queue.finish()
-        return numbers, int(ends[-1])
+        with Memory(self.device) as own:
+            picks = Picks(own, self, wanted[None], states, state)
+            numbers = picks.numbers(memory, 0)
+            with self.device.errors("failed while computing"):
+                self.device.queue.finish()
+        return numbers, picks.counts[0]
 
     def close(self) -> None:
         self._memory.close()
+
+
+class Picks:
+    """The numbers of the splats of several choices of groups, which are found without waiting for the device.
+
+    Args:
+        memory: to take what is needed for that from; the choices can be made as long as it is there.
+        picker: of the scene.
+        wanted: (choices, G) the groups of each.
+        states, state: as of :meth:`Picker.pick`.
+
+    Attributes:
+        counts: of each choice's splats.
+
+    Raises:
+        DeviceError: the device has no room.
+    """
+
+    def __init__(
+        self,
+        memory: Memory,
+        picker: Picker,
+        wanted: NDArray[np.bool_],
+        states: cl.Buffer | None = None,
+        state: int = 0,
+    ) -> None:
+        choices, groups = wanted.shape
+        chunks = max(-(-picker.splats // _CHUNK), 1)
+        self._write, self._items = picker.write, chunks * _GROUP
+        flags = memory.upload(wanted.view(np.uint8), "the groups that are wanted")
+        counts = memory.allocate(4 * chunks * choices, "the numbers of splats that are wanted")
+        self._arguments = {
+            "groups": picker.groups,
+            "wanted": flags,
+            "states": flags if states is None else states,
+            "by_state": states is not None,
+            "state": state,
+            "splats": picker.splats,
+            "group_count": groups,
+        }
+        picker.count.bind(**self._arguments, counts=counts).launch((self._items, choices), (_GROUP, 1))
+        found = picker.device.download(counts, (choices, chunks), np.uint32)
+        ends = np.cumsum(found, axis=1, dtype=np.uint32)
+        self.counts: list[int] = ends[:, -1].tolist()
+        self._starts = memory.upload(ends - found, "where they begin")
+
+    def numbers(self, memory: Memory, choice: int) -> cl.Buffer:
+        """The numbers of a choice's splats, uint32, ascending, once the device's queue has found them.
+
+        Args:
+            memory: that owns them.
+            choice: its number.
+
+        Raises:
+            DeviceError: the device has no room.
+        """
+        found = memory.allocate(4 * self.counts[choice], "the numbers of a view's splats")
+        write = self._write.bind(**self._arguments, choice=choice, starts=self._starts, numbers=found)
+        write.launch((self._items,), (_GROUP,))
+        return found

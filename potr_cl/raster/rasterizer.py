@@ -35,6 +35,8 @@ from potr_cl.raster.view_set import View, ViewSet
 
 #: Least room for intersections before anything is known of a view, and as a multiple of the splats.
 _FIRST_CAPACITY, _FIRST_CAPACITY_A_SPLAT = 1 << 16, 4
+#: Projected splats of the views that are rendered together. More take gigabytes, and a driver long to find them.
+_PROJECTED = 1 << 26
 
 
 class PreparingMemory(Owner):
@@ -45,15 +47,24 @@ class PreparingMemory(Owner):
 
     Attributes:
         bounds, counts, keys: the tiles that splats touch, the tiles' counters, and the lists while they are sorted.
+        image, transmittance: of pictures.
     """
 
     def __init__(self, device: Device) -> None:
         self.bounds = Scratch(device, "the projected splats' bounds")
         self.counts = Scratch(device, "the tile counts")
         self.keys = Scratch(device, "the tile lists' sort keys")
+        self.image = Scratch(device, "the image")
+        self.transmittance = Scratch(device, "the transmittance")
+
+    def rest(self) -> None:
+        """Give all back but the pictures."""
+        for scratch in (self.bounds, self.counts, self.keys):
+            scratch.close()
 
     def close(self) -> None:
-        for scratch in (self.bounds, self.counts, self.keys):
+        self.rest()
+        for scratch in (self.image, self.transmittance):
             scratch.close()
 
 
@@ -66,7 +77,7 @@ class Rasterizer(Owner):
             already, which stays the caller's.
         rules: of the rasterizer to follow.
         background: R, G, B behind everything.
-        preparing: memory to prepare views in, which stays the caller's; None: its own.
+        preparing: memory to prepare views and for their pictures, which stays the caller's; None: its own.
 
     Attributes:
         device, rules, background: as given.
@@ -113,8 +124,7 @@ class Rasterizer(Owner):
             )
         self._preparing = preparing or PreparingMemory(device)
         self._shares = preparing is not None
-        self._image = Scratch(device, "the image")
-        self._transmittance = Scratch(device, "the transmittance")
+        self._image, self._transmittance = self._preparing.image, self._preparing.transmittance
         self._frame: ViewSet | None = None
 
     @property
@@ -174,37 +184,71 @@ class Rasterizer(Owner):
             self._preparing.counts.close()  # maybe not zero
             raise
 
-    def render_into(self, cameras: Sequence[Camera], target: cl.Buffer) -> None:
-        """Render views one behind the other into ``target``, (pixels, 3) float32; on a GPU, several at a time."""
+    def render_into(
+        self, cameras: Sequence[Camera], target: cl.Buffer, start: int = 0, memory: Memory | None = None
+    ) -> None:
+        """Render views one behind the other into a buffer; on a GPU, several at a time.
+
+        Args:
+            cameras: of the views.
+            target: takes (pixels, 3) float32.
+            start: byte where they begin.
+            memory: on a GPU, to prepare views in, as of :meth:`prepare_set`.
+        """
         if self._launcher.whole_sets:
-            self._render_sets_into(cameras, target)
+            self._render_sets_into(cameras, target, start, memory)
             return
-        start = 0
         for camera in cameras:
             nbytes = 12 * camera.width * camera.height
             image, _ = self.render_device(camera)
             cl.enqueue_copy(self.device.queue, target, image, byte_count=nbytes, dst_offset=start)
             start += nbytes
 
-    def _render_sets_into(self, cameras: Sequence[Camera], target: cl.Buffer) -> None:
+    def _render_sets_into(
+        self, cameras: Sequence[Camera], target: cl.Buffer, start: int, memory: Memory | None
+    ) -> None:
         device = self.device
-        most = int(max((device.info.memory - device.allocated) // (512 * self.stride), 1))
-        number = start = 0
-        while number < len(cameras):
-            some = cameras[number : number + most]
-            try:
-                views = self.prepare_set(some)
-            except DeviceMemoryError:
-                if most == 1:
-                    raise
-                most //= 2
-                continue
-            with views:
+        room = (device.info.memory - device.allocated) // 512
+        most = int(max(min(room, _PROJECTED) // self.stride, 1))
+        number = 0
+        views: ViewSet | None = None
+        try:
+            while number < len(cameras):
+                # Sets of about one size: drivers take long to give memory back and to take it anew.
+                left = len(cameras) - number
+                sets = -(-left // most)
+                some = cameras[number : number - (-left // sets)]
+                try:
+                    former, views = views, None
+                    views = self._prepare_instead(former, some, memory)
+                except DeviceMemoryError:
+                    if most == 1:
+                        raise
+                    most = max(len(some) // 2, 1)
+                    continue
                 nbytes = 12 * views.pixels
                 self._enqueue_composite(views)
                 cl.enqueue_copy(device.queue, target, self._image.buffer, byte_count=nbytes, dst_offset=start)
-            number += len(some)
-            start += nbytes
+                number += len(some)
+                start += nbytes
+        finally:
+            if views is not None:
+                views.close()
+                if not self._shares:
+                    self._preparing.close()
+
+    def _prepare_instead(self, former: ViewSet | None, cameras: Sequence[Camera], memory: Memory | None) -> ViewSet:
+        """Prepared views, in the memory of others that nobody needs any more, if they fit in there."""
+        if former is not None:
+            fits = False
+            try:
+                fits = len(former.views) == len(cameras) and self.prepare_again(former, cameras)
+            finally:
+                if not fits:
+                    former.close()
+            if fits:
+                return former
+        return self.prepare_set(cameras, memory)
 
     def prepare(self, camera: Camera) -> View:
         """Find projection, tile lists and depth order of a view, which :meth:`composite` can use any number of times.
@@ -236,7 +280,9 @@ class Rasterizer(Owner):
             counts, bounds = self._zeroed_counts(views), self._room_for_bounds(views)
             self._enqueue_project(views, bounds)
             self._launcher.enqueue_offsets(views, bounds, counts)
-            found = views.read_counts()
+            # All of them, while there is nothing else to wait for: the lists are enqueued behind them.
+            views.found_offsets = views.read_offsets()
+            found = [int(offsets[-1]) for offsets in views.found_offsets]
             for view, count in zip(views.views, found, strict=True):
                 _accept(view, count)
             views.make_room(found)
@@ -247,7 +293,7 @@ class Rasterizer(Owner):
             raise
         finally:
             if len(cameras) > 1 and not self._shares:  # far more than a single view will need
-                self._preparing.close()
+                self._preparing.rest()
         return views
 
     def prepare_again(self, views: ViewSet, cameras: Sequence[Camera]) -> bool:
@@ -389,8 +435,6 @@ class Rasterizer(Owner):
             self._frame = None
         if not self._shares:
             self._preparing.close()
-        for scratch in (self._image, self._transmittance):
-            scratch.close()
 
     def close(self) -> None:
         if self._frame is not None:
@@ -399,8 +443,6 @@ class Rasterizer(Owner):
             *([self._scene] if self._owns else []),
             self._other_sh,
             *([] if self._shares else [self._preparing]),
-            self._image,
-            self._transmittance,
         ):
             owner.close()
 

@@ -9,6 +9,7 @@ import pyopencl as cl
 from numpy.typing import NDArray
 
 from potr_cl.errors import DeviceError
+from potr_cl.host.threads import Ahead
 from potr_cl.model.scene import LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
@@ -20,6 +21,8 @@ SPLAT_GROUP = 256
 
 #: Splats whose parameters are uploaded at a time.
 _UPLOADED = 1 << 18
+#: Splats whose parameters are activated at a time.
+_ACTIVATED = 1 << 17
 
 
 class SceneBuffers(Owner):
@@ -245,17 +248,28 @@ class SceneBuffers(Owner):
         Raises:
             DeviceError: there is no room for them beside the scene.
         """
-        self.write_rows(self.means, scene.means, "the centres")
-        # What is activated is there for some splats at a time: of all it would be as large as their geometry.
-        for start in range(0, self.splats, _UPLOADED):
-            some = slice(start, start + _UPLOADED)
-            for parameter, rows, what in (
-                (self.scales, activated_scales(scene.log_scales[some]), "the scales"),
-                (self.quaternions, unit_quaternions(scene.quaternions[some]), "the rotations"),
-                (self.log2_opacities, log2_opacities(scene.opacity_logits[some])[:, None], "the opacities"),
-            ):
-                self.write_rows(parameter, rows, what, start=start)
-        self.write_sh(self.sh, scene.sh)
+
+        def activated(start: int) -> list[FloatArray]:
+            """What is activated is there for some splats at a time: of all it would be as large as their geometry."""
+            some = slice(start, start + _ACTIVATED)
+            return [
+                activated_scales(scene.log_scales[some]).astype(np.float32),
+                unit_quaternions(scene.quaternions[some]).astype(np.float32),
+                log2_opacities(scene.opacity_logits[some])[:, None].astype(np.float32),
+            ]
+
+        parameters = (
+            (self.scales, "the scales"),
+            (self.quaternions, "the rotations"),
+            (self.log2_opacities, "the opacities"),
+        )
+        # While threads activate the first splats, the others' own values are sent.
+        with Ahead(activated, range(0, self.splats, _ACTIVATED)) as made:
+            self.write_rows(self.means, scene.means, "the centres")
+            self.write_sh(self.sh, scene.sh)
+            for start, found in made:
+                for (parameter, what), rows in zip(parameters, found, strict=True):
+                    self.write_rows(parameter, rows, what, start=start)
 
     def write_sh(self, parameter: cl.Buffer, sh: FloatArray) -> None:
         """Set SH coefficients, (N, M, 3) float32 of any strides.

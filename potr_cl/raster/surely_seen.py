@@ -1,9 +1,10 @@
-"""Most of the splats that views see, found on a device: :func:`surely_seen`, the quick part of
+"""Which splats views see, found on a device but for few: :func:`surely_seen`, the quick part of
 :func:`potr_cl.model.unseen.unseen_splats`."""
 
 from __future__ import annotations
 
 from collections.abc import Sequence
+from enum import IntEnum
 
 import numpy as np
 from numpy.typing import NDArray
@@ -17,15 +18,21 @@ from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
 _SOURCE = "raster/surely_seen.cl"
 
 
-def surely_seen(scene: SceneBuffers, cameras: Sequence[Camera]) -> NDArray[np.bool_]:
-    """Splats that reach into a view's picture, but not those where rounding could decide it.
+class Seen(IntEnum):
+    """What is known of a splat, ``enum`` of the kernel."""
+
+    NO, YES, UNDECIDED = range(3)
+
+
+def surely_seen(scene: SceneBuffers, cameras: Sequence[Camera]) -> NDArray[np.uint8]:
+    """Whether splats reach into a view's picture.
 
     Args:
         scene: the splats on a device.
         cameras: the views.
 
     Returns:
-        (N,) whether a splat is surely not among the unseen ones.
+        (N,) :class:`Seen` of each splat; undecided where rounding could decide it.
 
     Raises:
         DeviceError: the device has no room, or failed.
@@ -53,5 +60,5 @@ def surely_seen(scene: SceneBuffers, cameras: Sequence[Camera]) -> NDArray[np.bo
             seen=found,
         )
         kernel.launch((scene.stride,), (SPLAT_GROUP,))
-        seen: NDArray[np.bool_] = device.download(found, (scene.splats,), np.uint8).astype(bool)
+        seen: NDArray[np.uint8] = device.download(found, (scene.splats,), np.uint8)
     return seen

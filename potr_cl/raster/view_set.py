@@ -48,6 +48,7 @@ class ViewSet(Owner):
         tiles, pixels: of all views.
         capacity: room for intersections, of all views.
         intersection_starts: where each view's intersections begin, and their end.
+        found_offsets: each view's ``offsets`` on the host, as they were when its lists were prepared.
         table: where each view's part begins, ``SetView`` in cl/include/view_set.clh.
         shapes, colours, offsets, intersections: as :class:`View` has them, and N splats a view.
         subtiles: (capacity,), a bit for each sub-tile of its tile that an intersection touches
@@ -75,6 +76,7 @@ class ViewSet(Owner):
         self.tiles = sum(view.tiles for view in self.views)
         self.pixels = sum(view.pixels for view in self.views)
         self.capacity = 0
+        self.found_offsets: list[NDArray[np.uint32]] = []
         self.intersection_starts = [0] * (len(cameras) + 1)
         self._offset_starts = [0, *itertools.accumulate(view.tiles + 1 for view in self.views)]
         try:
@@ -98,7 +100,8 @@ class ViewSet(Owner):
             row["first_tile"], row["first_pixel"] = tile, pixel
             tile += view.tiles
             pixel += view.pixels
-        cl.enqueue_copy(self._device.queue, self.table, table, is_blocking=True)
+        # Nobody waits for it: an event that is replaced lets go of its table when that is there.
+        self._sent = cl.enqueue_copy(self._device.queue, self.table, table, is_blocking=False)
 
     def aim(self, camera: Camera) -> bool:
         """Point the only view at another camera, if that has as many tiles across and down.

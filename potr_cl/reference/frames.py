@@ -42,7 +42,14 @@ def wrong(
     """A scene and cameras that are not in its frame, each with what was done; ``others`` are of another scene."""
     for name, motion in MOTIONS.items():
         yield name, moved(scene, *motion), list(cameras)
+    yield "cameras with the axes of OpenGL", scene, [looking_back(camera) for camera in cameras]
     yield "another scene's cameras", scene, list(others)
+
+
+def looking_back(camera: Camera) -> Camera:
+    """The camera with its y and z axes turned round, as programs write it that have y up and z back."""
+    rotation = np.diag([1.0, -1.0, -1.0]) @ camera.rotation
+    return dataclasses.replace(camera, rotation=rotation, translation=-rotation @ camera.centre)
 
 
 def right(scene: Scene, cameras: Sequence[Camera], others: bool = True) -> Iterator[tuple[str, list[Camera]]]:

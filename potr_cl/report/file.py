@@ -179,7 +179,7 @@ def format_report(report: dict[str, Any]) -> str:
     """The report as lines for people."""
     low, high = report["bounding_box"]
     lines = [
-        f"splats          {report['splats']}",
+        f"splats          {report['splats']:,}",
         f"SH degree       {report['sh_degree']}",
         f"antialiased     {antialiasing(report)}",
         f"quality q       {'unknown' if report['q'] is None else report['q']}",
@@ -188,14 +188,14 @@ def format_report(report: dict[str, Any]) -> str:
         f"octree levels   {report['octree_levels']}",
         "steps a unit    " + ", ".join(f"{name} {factor:g}" for name, factor in report["scale_factors"].items()),
         f"colour steps    {_said_of_steps(report['colour_steps'], report['sections'])}",
-        f"size            {report['bytes']} bytes, {report['bytes_a_splat']:.2f} a splat",
-        f"as PLY          {report['ply_bytes']} bytes, {report['ratio_to_ply']:.1f} times as much",
+        f"size            {report['bytes']:,} bytes, {report['bytes_a_splat']:.2f} a splat",
+        f"as PLY          {report['ply_bytes']:,} bytes, {report['ratio_to_ply']:.1f} times as much",
     ]
     if report["blocks"] is not None:
         least, most = (choose(block["splats"] for block in report["blocks"]) for choose in (min, max))
-        lines.append(f"blocks          {len(report['blocks'])}, of {least} to {most} splats")
+        lines.append(f"blocks          {len(report['blocks'])}, of {least:,} to {most:,} splats")
     if report["ratio_to_source"] is not None:
-        lines.append(f"source file     {report['source_bytes']} bytes, {report['ratio_to_source']:.1f} times as much")
+        lines.append(f"source file     {report['source_bytes']:,} bytes, {report['ratio_to_source']:.1f} times as much")
     lines += [
         "",
         _ROW.format("section", "coder", "streams", "integers", "serialised", "bytes", "bits a splat", "share"),
@@ -207,9 +207,9 @@ def format_report(report: dict[str, Any]) -> str:
                 name,
                 ", ".join(entry["coders"]),
                 entry["streams"] or "",
-                entry["integers"] or "",
-                "-" if serialised is None else serialised,
-                entry["bytes"],
+                f"{entry['integers']:,}" if entry["integers"] else "",
+                "-" if serialised is None else f"{serialised:,}",
+                f"{entry['bytes']:,}",
                 f"{entry['bits_a_splat']:.2f}",
                 f"{100 * entry['bytes'] / report['bytes']:.1f}%",
             )
@@ -219,7 +219,9 @@ def format_report(report: dict[str, Any]) -> str:
         for number, block in enumerate(report["blocks"][:_MOST_BLOCKS]):
             bits = f"{8 * block['bytes'] / block['splats']:.2f}"
             lines.append(
-                _BLOCK_ROW.format(number, block["splats"], block["bytes"], bits, str(Box(*block["bounding_box"])))
+                _BLOCK_ROW.format(
+                    number, f"{block['splats']:,}", f"{block['bytes']:,}", bits, str(Box(*block["bounding_box"]))
+                )
             )
         if len(report["blocks"]) > _MOST_BLOCKS:
             lines.append(f"… and {len(report['blocks']) - _MOST_BLOCKS} more (--json lists all)")

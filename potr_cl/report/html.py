@@ -194,6 +194,9 @@ def _quality(quality: dict[str, Any] | str) -> str:
         rows.append([_text(view["name"]) + worst, decibels(view["psnr"]), bar, f"{view['ssim']:.4f}"])
     rows.append(["<b>mean</b>", f"<b>{decibels(quality['psnr'])}</b>", "", f"<b>{quality['ssim']:.4f}</b>"])
     said = f"<p>Against {_text(quality['against'])}, judged by {_text(quality['judged_by'])}.</p>"
+    training = quality.get("training")
+    if training is not None and training["said"] is not None:
+        said += f"<p>{_text(training['said'][0].upper() + training['said'][1:])}.</p>"
     return said + _table(["view", "PSNR", "", "SSIM"], rows)
 
 

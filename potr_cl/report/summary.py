@@ -19,6 +19,10 @@ from potr_cl.quality.compare import Comparison, Figures, mean_view
 from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.quality.ground_truth import PhotographFigures
 
+#: By how many decibels held-out views may be matched worse than training views before the reader is told why.
+_APART = 6.0
+#: Views that show the quarter of a scene which the fewest show: with fewer, training views say little of others.
+_FEW = 8
 #: Packages whose version may change the bytes.
 _PACKAGES = ("numpy", "pyopencl", "zstandard")
 
@@ -116,8 +120,14 @@ def search_report(target: Target, found: Found) -> dict[str, Any]:
     }
 
 
-def quality_report(views: EvaluationViews, comparison: Comparison) -> dict[str, Any]:
-    """The figures of the views that an encode was judged by."""
+def quality_report(views: EvaluationViews, comparison: Comparison, beside: float | None = None) -> dict[str, Any]:
+    """The figures of the views that an encode was judged by.
+
+    Args:
+        views: these.
+        comparison: what they show.
+        beside: mean PSNR on the training views beside them; None: there are none.
+    """
 
     def entry(name: str, figures: Figures) -> dict[str, Any]:
         """JSON knows no infinity: a PSNR of null means identical pictures."""
@@ -132,8 +142,21 @@ def quality_report(views: EvaluationViews, comparison: Comparison) -> dict[str, 
         "psnr": mean["psnr"],
         "ssim": mean["ssim"],
         "worst": judged[comparison.worst],
+        "training": None if beside is None else _training(mean["psnr"], beside, len(views.beside)),
         "views": judged,
     }
+
+
+def _training(judged: float | None, training: float, views: int) -> dict[str, Any]:
+    """How well training views are matched, and what that says of held-out ones."""
+    said = None
+    if judged is not None and training > judged + _APART:
+        how = f"{training - judged:.1f} dB worse than training views" if math.isfinite(training) else "worse"
+        said = (
+            f"the held-out views are matched {how}: they show much that the training views do not, or from elsewhere; "
+            "give more cameras, or --views-between 3"
+        )
+    return {"psnr": training if math.isfinite(training) else None, "views": views, "said": said}
 
 
 def photographs_report(encoded: Encoded, missing: str | None, figures: PhotographFigures) -> dict[str, Any]:
@@ -193,6 +216,15 @@ def format_encode_report(report: dict[str, Any]) -> str:
             f"           mean of {quality['judged_by']}",
             f"           worst view {worst['name']}: PSNR {decibels(worst['psnr'])}, SSIM {worst['ssim']:.4f}",
         ]
+        if quality.get("training") is not None and quality["training"]["said"] is not None:
+            lines.append(f"           {quality['training']['said']}")
+        elif quality["kind"] == "train" and report["views_between"] is not None:
+            shown_by = report["views_between"]["shown_by"]
+            if shown_by is not None and shown_by < _FEW:
+                lines.append(
+                    f"           a quarter of the scene is shown by no more than {shown_by:.0f} of them: "
+                    "from elsewhere it may be matched far worse"
+                )
     if report.get("fit") is not None:
         lines.append(f"fit        {report['fit']['said']}")
     photographs = report["photographs"]

@@ -14,6 +14,7 @@ from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import lying_on
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.raster.surely_seen import surely_seen
+from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.pruning.measured import Measured, Removal, measurement
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.schedule import Course, Pruned, PruningOptions
@@ -29,6 +30,8 @@ from potr_cl.stages.pruning.unseen import (
 )
 from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, LIKELY, groups_of_large, seen_part, sights_worth_it
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
+from potr_cl.workers.dealing import speeds_of
+from potr_cl.workers.pool import Pool
 
 
 @dataclass(frozen=True)
@@ -142,7 +145,8 @@ class Prune(Stage):
         """Remove splats, and leave a :class:`potr_cl.stages.pruning.schedule.Pruned` in ``learnt``.
 
         And as "unseen" a :class:`potr_cl.stages.pruning.unseen.Unseen`; and as "price", where the number of splats is
-        not given, the ΔMSE below which a splat has gone.
+        not given, the ΔMSE below which a splat has gone; and as "shares" the
+        :class:`potr_cl.raster.view_shares.ViewShares`, where workers elsewhere get what their views see.
         """
         with thread_pool(bench.threads) as pool, lying_on(bench.opened, bench.placed(state)) as placed:
             quick = partial(surely_seen, placed) if isinstance(placed, SceneBuffers) else None
@@ -154,6 +158,8 @@ class Prune(Stage):
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
         told = state.having_learnt("unseen", Unseen(splats, len(state.scene), area, kept))
+        if state.scene is state.source:
+            told = replace(told, sights=sights)
         if self.keep is None and self.count is None:
             told = told.having_learnt("price", bench.parameters.delta_mse_max)
         if not (kept and splats):
@@ -184,10 +190,14 @@ class Prune(Stage):
         sights: Sights | None = None,
         spared: NDArray[np.bool_] | None = None,
     ) -> State:
+        dealt = None
+        if sights is not None and bench.pool is not None and not bench.pool.in_process:
+            dealt = _dealt(state, bench.pool, sights)
+            state = state.having_learnt("shares", dealt)
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
         schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene))
         bench.progress("prepare views", 0.0)
-        with measurement(state, bench, self._sweep_options(bench.memory), sights, spared) as removal:
+        with measurement(state, bench, self._sweep_options(bench.memory), sights, spared, dealt) as removal:
             course = _Course(state, removal)
 
             def after_iteration(iteration: int) -> None:
@@ -207,6 +217,14 @@ class Prune(Stage):
                 if interlude.always:
                     course.visit(interlude, pruned.survivors, bench)
             return course.left(pruned.survivors).having_learnt(self.name, pruned)
+
+
+def _dealt(state: State, pool: Pool, sights: Sights) -> ViewShares:
+    """The views for a pool's workers, and which of the source's splats each gets, for this stage and others."""
+    speeds = speeds_of(pool.workers())
+    if state.is_cut:
+        return ViewShares.of(state.views, sights, speeds, state.source, state.survivors)
+    return ViewShares.of(state.views, sights, speeds, state.scene, np.arange(len(state.scene)))
 
 
 class _Course:

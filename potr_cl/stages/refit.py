@@ -11,12 +11,15 @@ from typing import Any
 from potr_cl.errors import UsageError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.opencl.device import Device
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
+from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import placed
 from potr_cl.stages.refitting.refit import (
     ColourRefit,
@@ -26,7 +29,9 @@ from potr_cl.stages.refitting.refit import (
     active_coefficients,
     refit_colours,
 )
+from potr_cl.stages.refitting.shared_map import colour_shares
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RememberedTargets, RenderedTargets, Targets
+from potr_cl.stages.refitting.visible_targets import VisibleTargets
 from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, option
 
 #: A scene that takes more than this part of the memory that is given makes room for the re-fit.
@@ -136,12 +141,6 @@ class Refit(Stage):
         folder = self.ground_truth if state.truth is None else None
         fits = 1 if folder is None else 2
 
-        geometry = state.geometry
-        if geometry is None or geometry.asked != parameters:
-            geometry = bench.output.geometry(state.scene, bench.request(state))
-        with thread_pool(bench.threads) as pool:
-            rounded, decoded = geometry, geometry.decoded(state.scene.sh, pool.map)
-
         def fitted(views: Sequence[Camera], targets: Targets, number: int) -> tuple[Refitted, Rounded]:
             geometry = rounded
 
@@ -162,17 +161,24 @@ class Refit(Stage):
             found = refit_colours(
                 bench.opened, decoded, views, targets, options, active, bench.background, progress,
                 fix_ac=None if on_grid or not bench.output.fixes_ac else fix_ac,
-                # Photographs lie where the master reads them.
-                help_from=HelpFrom(bench.pool, bench.shared_source(state) if state.truth is None else state.truth)
-                if bench.pool and isinstance(targets, RenderedTargets)
-                else None,
+                help_from=help_from if number == 0 else None,
                 colour_grid=colour_grid if on_grid else None,
             )  # fmt: skip
             return found, geometry
 
         with ExitStack() as stack:
             stack.callback(bench.progress, "refit", 1.0)
-            refitted, geometry = fitted(state.views, stack.enter_context(_pictures_of_goal(state, bench)), 0)
+            ahead = stack.enter_context(_pictures_ahead(state, bench))
+            rounded = _rounded(state, bench)
+            with thread_pool(bench.threads) as pool:
+                decoded = rounded.decoded(state.scene.sh, pool.map)
+            pictures = stack.enter_context(_pictures_of_goal(state, bench, ahead))
+            help_from = None
+            if bench.pool is not None:
+                goal = bench.shared_source(state) if state.truth is None else state.truth
+                help_from = HelpFrom(bench.pool, goal if ahead is None else ahead)
+            # With photographs nobody helps: these lie where the master reads them.
+            refitted, geometry = fitted(state.views, pictures, 0)
             choice = None
             if folder is not None:
                 given = state.views[: len(state.views) - state.added]
@@ -193,19 +199,60 @@ class Refit(Stage):
         return then if choice is None else then.having_learnt("photographs", choice)
 
 
+def _rounded(state: State, bench: Workbench) -> Rounded:
+    """The geometry of what is left of the scene as the file's readers will see it."""
+    geometry = state.geometry
+    if geometry is None or geometry.asked != bench.parameters:
+        geometry = bench.output.geometry(state.scene, bench.request(state))
+    return geometry
+
+
 @contextmanager
-def _pictures_of_goal(state: State, bench: Workbench) -> Iterator[Targets]:
+def _pictures_ahead(state: State, bench: Workbench) -> Iterator[PicturesAhead | None]:
+    """Pictures of the uncompressed scene, begun now, where it is kept on devices and no cluster helps; else None."""
+    device, pool = bench.opened, bench.pool
+    kept = bench.kept if state.truth is None and bench.memory is None else None
+    if kept is None or not kept.is_of(state.source) or (pool is not None and not pool.in_process):
+        yield None
+        return
+    numbers: dict[Device, Sequence[int]] = {device: range(len(state.views))}
+    if pool is not None and (share := colour_shares(pool, len(state.views))).others:
+        numbers = {device: share.own, **dict(zip(pool.devices, share.others, strict=False))}
+    with PicturesAhead(kept, bench.background, state.views, numbers, state.sights) as ahead:
+        yield ahead
+
+
+@contextmanager
+def _pictures_of_goal(state: State, bench: Workbench, ahead: PicturesAhead | None) -> Iterator[Targets]:
     """The pictures that colours are re-fitted to; where the re-fit needs its room, they are rendered before."""
     device, views = bench.opened, state.views
     little = placed(device, len(state.scene), state.scene.sh.shape[1], bench.memory) is not None
     little = little or (bench.memory is not None and state.source.nbytes > _LARGE * bench.memory)
-    with Rasterizer(device, bench.drawable(state.goal), background=bench.background) as rasterizer:
-        targets = RenderedTargets(rasterizer, views)
+    with _rendered(state, state.goal, bench) as targets:
+        if ahead is not None:
+            targets = ahead.before(device, targets)
         if not little or bench.pool is not None:
             yield targets
             return
         remembered = RememberedTargets(device, targets, views)
     yield remembered
+
+
+@contextmanager
+def _rendered(state: State, scene: Scene, bench: Workbench) -> Iterator[Targets]:
+    """The pictures of a scene in a state's views, which are rendered when they are asked for."""
+    device, drawable = bench.opened, bench.drawable(scene)
+    if (
+        state.sights is not None
+        and scene is state.source
+        and isinstance(drawable, SceneBuffers)
+        and device.family == "gpu"
+    ):
+        with VisibleTargets(drawable, state.views, state.sights, bench.background) as visible:
+            yield visible
+        return
+    with Rasterizer(device, drawable, background=bench.background) as rasterizer:
+        yield RenderedTargets(rasterizer, state.views)
 
 
 @dataclass(frozen=True)
@@ -219,13 +266,12 @@ class RefitOnTheWay(Stage):
 
     def run(self, state: State, bench: Workbench) -> State:
         bench.progress("refit", 0.0)
-        source = bench.drawable(state.source)
-        with Rasterizer(bench.opened, source, background=bench.background) as rasterizer:
+        with _rendered(state, state.source, bench) as targets:
             refitted = refit_colours(
                 bench.opened,
                 state.scene,
                 state.views,
-                RenderedTargets(rasterizer, state.views),
+                targets,
                 RefitOptions(steps=self.steps, memory=bench.memory),
                 background=bench.background,
                 progress=lambda done, steps: bench.progress("refit", 0.99 * done / steps),

@@ -26,8 +26,10 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output, Request, Rounded
 from potr_cl.outputs.potr import Potr
+from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene, PartOfKept
 from potr_cl.raster.scene_buffers import Drawable
+from potr_cl.raster.view_shares import ViewShares
 from potr_cl.workers.pool import Pool
 
 if TYPE_CHECKING:
@@ -65,6 +67,7 @@ class State:
         views: the training views; empty if there are no cameras.
         added: how many of them, the last ones, a stage has put between those that were given.
         truth: what a stage has fitted to photographs, where it did; it may have fewer splats than ``source``.
+        sights: what each view may draw of ``source``, where a stage has found that this is little.
         cut: a scene that is these survivors of ``source`` as they are there; None: none is known to be.
         geometry: of ``scene`` as the file's readers will see it, once a stage has had it rounded. A stage that then
             changes anything but colours makes it None again.
@@ -82,6 +85,7 @@ class State:
     added: int = 0
     cut: Scene | None = None
     truth: Scene | None = None
+    sights: Sights | None = None
 
     @property
     def goal(self) -> Scene:
@@ -162,9 +166,12 @@ class Workbench:
         """The same for the pool's workers: threads of this process have it from what is kept on their devices."""
         return self.placed(state) if self.pool is not None and self.pool.in_process else state.scene
 
-    def shared_source(self, state: State) -> Scene | KeptScene:
-        """A state's source for the pool's workers."""
+    def shared_source(self, state: State) -> Scene | KeptScene | ViewShares:
+        """A state's source for the pool's workers; where they have what their views see already, that."""
         in_process = self.pool is not None and self.pool.in_process
+        dealt: ViewShares | None = state.learnt.get("shares")
+        if dealt is not None and dealt.views is state.views and not in_process:
+            return dealt
         return self.kept if self.kept is not None and in_process and self.kept.is_of(state.source) else state.source
 
     def request(self, state: State, metadata: bytes = b"", entropy: EntropyCoder | None = None) -> Request:

@@ -14,6 +14,7 @@ from potr_cl.model.scene import Scene
 from potr_cl.model.views_between import SPREAD, views_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.stages.between.amount import needed, needed_of_virtual, views_where_few
+from potr_cl.stages.between.price import SHOWN
 from potr_cl.stages.between.room import room_for
 from potr_cl.stages.stage import Flag, Stage, State, Workbench, option
 
@@ -61,6 +62,8 @@ class Between(Stage):
         views: how many to add for each training view; 0.5: one for every second; 0: none; "auto": as many as the scene
             needs, and as fit the memory for views.
         spread: how far they are off the way to a neighbouring view, as a part of that way: one standard deviation.
+        weigh: whether what a splat may cost follows from the part of the views that show it
+            (:mod:`potr_cl.stages.between.price`). Then views are looked at even if none is added.
 
     Raises:
         UsageError: a value is out of range.
@@ -82,6 +85,7 @@ class Between(Stage):
         ),
     )
     spread: float = option(SPREAD)
+    weigh: bool = option(True)
 
     def __post_init__(self) -> None:
         if self.views != "auto" and not (isinstance(self.views, (int, float)) and 0 <= self.views <= _MOST_ASKED):
@@ -91,29 +95,36 @@ class Between(Stage):
 
     @property
     def asked_for(self) -> bool:
-        return self.on and self.views != 0
+        return self.on and (self.weigh or self.views != 0)
 
     def looks_at(self, scene: Scene) -> bool:
         return self.asked_for
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Add them; ``learnt`` gets an :class:`Added`."""
+        """Add them; ``learnt`` gets an :class:`Added`, if any are asked for.
+
+        And as "shown" by which part of the given views a splat is shown on the average, unless they are virtual: those
+        are placed so that many show it.
+        """
         given = len(state.views)
         if given < 2 or state.added:
             return state
         slow = bench.opened.info.kind == "cpu"
         virtual = is_virtual(state.views)
-        if virtual and self.views == "auto" and not needed_of_virtual(slow):
+        if virtual and (self.views == 0 or (self.views == "auto" and not needed_of_virtual(slow))):
             return state
         bench.progress("views between", 0.0)
         # More wait for each other longer than they work.
         with thread_pool(min(bench.threads or _THREADS, _THREADS)) as pool:
             known = GivenViews(state.source, state.views, pool.map)
+            parts = known.views_of_parts()
+            if self.weigh and not virtual and len(parts):
+                state = state.having_learnt(SHOWN, float(parts.mean()) / given)
             each, shown_by = self.views, None
             if each == "auto" and virtual:
                 each = needed_of_virtual(slow)
             elif each == "auto":
-                each, parts = 0.0, known.views_of_parts()
+                each = 0.0
                 if len(parts):
                     shown_by = views_where_few(parts)
                     each = needed(shown_by, given, slow)
@@ -121,6 +132,8 @@ class Between(Stage):
         if self.views == "auto":
             added = _evenly(added, room_for(added, state, bench))
         bench.progress("views between", 1.0)
+        if self.views == 0:
+            return state
         then = replace(state, views=(*state.views, *added), added=len(added))
         return then.having_learnt(self.name, Added(given, len(added), shown_by))
 

@@ -13,7 +13,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 from typing import TYPE_CHECKING, Any
 
@@ -58,9 +58,17 @@ class ClusterPool(Pool):
         self._closing = threading.Event()
         self._waiting = ThreadPoolExecutor(_MOST_WAITING, thread_name_prefix="potr_cl cluster")
         self._workers: list[_ClusterWorker] = []
-        self.client, self._is_own = _client_of(cluster)
+        self._owned = ExitStack()
+        self.client, is_own = _client_of(cluster)
+        if is_own:
+            self._owned.callback(self._leave_cluster)
         try:
             self._workers = self._met()
+            from potr_cl.workers import seldom_looks  # Dask is not installed everywhere
+
+            seldom_looks.look_seldom_for(self.client)
+            if not is_own:
+                self._owned.callback(seldom_looks.look_as_before_for, self.client)
         except BaseException:
             self.close()
             raise
@@ -86,9 +94,11 @@ class ClusterPool(Pool):
         self._waiting.shutdown(wait=False, cancel_futures=True)
         for worker in self._workers:
             worker.leave()
-        if self._is_own:
-            with suppress(Exception):
-                self.client.close(timeout=2)
+        self._owned.close()
+
+    def _leave_cluster(self) -> None:
+        with suppress(Exception):
+            self.client.close(timeout=2)
 
     # ------------------------------------------------------------------------------------------------ for the workers
 

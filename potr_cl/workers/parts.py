@@ -12,6 +12,7 @@ import time
 from collections.abc import Callable, Sequence
 from concurrent.futures import FIRST_COMPLETED, Future, wait
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from types import TracebackType
 from typing import Any
@@ -89,7 +90,7 @@ class Parts(Owner):
 
         Args:
             command: the parts' method.
-            args: of the method, the same for all parts.
+            args: of the method, the same for all parts where they are no :class:`Each`.
             logged: whether it changes the parts.
             anew: whether nothing that they were told before matters after it.
         """
@@ -153,6 +154,7 @@ class Parts(Owner):
     def _begin(self, place: int, command: str, args: Sequence[Any]) -> Future[Any]:
         held = self._held[place]
         assert held is not None, "a part is closed"
+        args = [each.args[place] if isinstance(each, Each) else each for each in args]
         self._pool.traffic.sent += nbytes(args)
         return held.begin(command, args)
 
@@ -246,6 +248,17 @@ class Parts(Owner):
 
     def _note(self, command: str, args: tuple[Any, ...]) -> None:
         self._log.append((command, args))
+
+
+@dataclass(frozen=True)
+class Each:
+    """An argument of a command that is another one for each part.
+
+    Attributes:
+        args: the parts', in their order.
+    """
+
+    args: Sequence[Any]
 
 
 class Pending:

@@ -12,8 +12,14 @@ from potr_cl.reference.captures import looking
 from potr_cl.reference.scenes import random_scene
 
 
-def street(houses: int = 5, splats: int = 300) -> tuple[Scene, list[Camera]]:
-    """Heaps in a row, each with views of its own, and one along the street."""
+def street(houses: int = 5, splats: int = 300, across: bool = False) -> tuple[Scene, list[Camera]]:
+    """Heaps in a row, each with views of its own, and one along the street.
+
+    Args:
+        houses: heaps.
+        splats: of each.
+        across: whether the heaps' views look across the street, and see no other heap.
+    """
     rng = np.random.default_rng(8)
     scene = random_scene(houses * splats, 1, seed=8)
     at = np.repeat(np.arange(houses) * 12.0, splats)
@@ -25,7 +31,7 @@ def street(houses: int = 5, splats: int = 300) -> tuple[Scene, list[Camera]]:
     cameras = []
     for house in range(houses):
         there = np.array([house * 12.0, 0, 0])
-        for turn in (0.4, 2.2, 4.5):
+        for turn in (1.4, 1.7, 4.5) if across else (0.4, 2.2, 4.5):
             here = there + 3 * np.array([np.cos(turn), np.sin(turn), 0.3])
             cameras.append(looking(here, there, name=f"{house}_{turn}", wide=0.4))
     cameras.append(looking(np.array([-6.0, 0, 0.2]), np.array([50.0, 0, 0]), name="along", wide=0.4))

@@ -12,22 +12,22 @@ from potr_cl.reference.scenes import ring_of_cameras
 KEEP = ["--no-prune", "--no-compact", "--refit", "off"]
 
 
-def cameras_json(path: Path) -> Path:
-    views = []
-    for k, c in enumerate(ring_of_cameras(8)):
-        views.append(
-            {
-                "id": k,
-                "img_name": c.name,
-                "width": c.width,
-                "height": c.height,
-                "position": c.centre.tolist(),
-                "rotation": c.rotation.T.tolist(),
-                "fx": c.fx,
-                "fy": c.fy,
-                "split": c.split,
-            }
-        )
+def cameras_json(path: Path, count: int = 8) -> Path:
+    """Write that many cameras around the origin."""
+    views = [
+        {
+            "id": number,
+            "img_name": camera.name,
+            "width": camera.width,
+            "height": camera.height,
+            "position": camera.centre.tolist(),
+            "rotation": camera.rotation.T.tolist(),
+            "fx": camera.fx,
+            "fy": camera.fy,
+            "split": camera.split,
+        }
+        for number, camera in enumerate(ring_of_cameras(count))
+    ]
     path.write_text(json.dumps(views))
     return path
 

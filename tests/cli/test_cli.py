@@ -109,8 +109,9 @@ def test_disk_full(tmp_path, scene_path, potr_path):
     )
     encode = ["encode", scene_path, "-o", tmp_path / "x.potr", *KEEP]
     for arguments in (encode, ["decode", potr_path, "-o", tmp_path / "x.ply"]):
+        # -B: compiled modules that it leaves would be cut off as well, and stop whoever imports them next.
         result = subprocess.run(
-            [sys.executable, "-c", script, *map(str, arguments)], capture_output=True, text=True, check=False
+            [sys.executable, "-B", "-c", script, *map(str, arguments)], capture_output=True, text=True, check=False
         )
         assert result.returncode == 1
         assert "cannot write" in result.stderr

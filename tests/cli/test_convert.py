@@ -15,7 +15,7 @@ pytest.importorskip("gsply", reason="the extra convert is not installed")
 def test_convert_there_and_back(tmp_path, data, plush_excerpt, capsys):
     potr, small, back = tmp_path / "a.potr", tmp_path / "a.spz", tmp_path / "b.ply"
     assert main(["convert", str(data / "plush_excerpt.ply"), str(small)]) == 0
-    assert "1500 splats" in capsys.readouterr().out
+    assert "1,500 splats" in capsys.readouterr().out
     encode = ["encode", str(small), "-o", str(potr), "--no-prune", "--refit", "off", "--no-compact", "--no-quality"]
     assert main(encode) == 0
     assert main(["convert", str(potr), str(back)]) == 0

@@ -9,13 +9,14 @@ import numpy as np
 import pytest
 from PIL import Image
 
+import potr_cl
 from potr_cl import cli
-from potr_cl.errors import DeviceError
+from potr_cl.errors import DeviceError, UsageError
 from potr_cl.formats import load_scene
 from potr_cl.formats.scenes import ply
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.amounts import size_in_bytes
-from potr_cl.reference.scenes import random_scene
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from tests.cli.calls import KEEP, cameras_json, fails, run
 
 
@@ -262,3 +263,69 @@ def test_encode_to_ground_truth(tmp_path, scene_path, capsys):
     fails(capsys, [*encode, "--photos", photos, "--refit", "off"], 2, "--photos", "re-fit")
     fails(capsys, ["encode", scene_path, "-o", out, "--photos", photos], 2, "--photos", "--cameras")
     fails(capsys, [*encode, "--photos", tmp_path / "nowhere"], 2, "nowhere")
+
+
+@pytest.mark.parametrize(
+    "command",
+    [
+        ["encode", "{scene}", "-o", "{out}.potr"],
+        ["encode", "{scene}", "-o", "{out}", "--ladder", "0.5"],
+        ["prune", "{scene}", "-o", "{out}.ply"],
+        ["compact", "{scene}", "-o", "{out}.ply"],
+        ["refit", "{scene}", "--reference", "{scene}", "-o", "{out}.ply"],
+        ["fit", "{scene}", "--reference", "{scene}", "-o", "{out}.ply"],
+    ],
+    ids=lambda words: words[0] + ("_ladder" if "--ladder" in words else ""),
+)
+def test_virtual_views_beside_cameras_are_refused(tmp_path, scene_path, cameras_path, capsys, command):
+    typed = [word.format(scene=scene_path, out=tmp_path / "out") for word in command]
+    given = ["--cameras", cameras_path, "--virtual-views", "8"]
+    fails(capsys, [*typed, *given], 2, "--virtual-views is for scenes without cameras: leave it out, or --cameras")
+    assert {path.name for path in tmp_path.iterdir()} == {"scene.ply", "cameras.json"}
+
+
+@pytest.mark.parametrize("name", ["encode", "encode_ladder", "prune", "compact", "refit", "fit"])
+def test_virtual_views_beside_cameras_are_refused_from_python(tmp_path, name):
+    scene, cameras = random_scene(20, 0), ring_of_cameras(4)
+    more = {"encode_ladder": (tmp_path, "0.5"), "refit": (scene,), "fit": (scene,)}.get(name, ())
+    with pytest.raises(UsageError, match="for scenes without cameras"):
+        getattr(potr_cl, name)(scene, *more, cameras, virtual_views=8)
+    assert not list(tmp_path.iterdir())
+
+
+def test_few_cameras_are_told_where_held_out_views_suffer(tmp_path, data, capsys):
+    """Not where training views show what held-out ones show."""
+    scene, every = data / "plush_excerpt.ply", json.loads((data / "plush_excerpt_cameras.json").read_text())
+    training = [camera for camera in every if camera["split"] == "train"]
+    few = [*training[:1], *(dict(camera, split="test") for camera in training[4:])]
+    same = [*training, *(dict(camera, id=100 + n, split="test") for n, camera in enumerate(training))]
+    told, gap = [], []
+    for name, cameras in (("few", few), ("same", same)):
+        path = tmp_path / f"{name}.json"
+        path.write_text(json.dumps(cameras))
+        arguments = ["encode", scene, "--cameras", path, "--iterations", "4", "-q", "0.3", "-o", tmp_path / "a.potr"]
+        told.append("the held-out views are matched" in run(capsys, *arguments))
+        quality = json.loads(run(capsys, *arguments, "--json"))["quality"]
+        assert quality["training"]["views"] == (1 if name == "few" else 4)
+        assert (quality["training"]["said"] is not None) == told[-1]
+        gap.append(quality["training"]["psnr"] - quality["psnr"])
+    assert told == [True, False], gap
+    assert gap[0] > 6 > gap[1]
+
+
+def test_training_views_that_judge_themselves_are_said_to_be_few(tmp_path, data, capsys):
+    training = [
+        camera for camera in json.loads((data / "plush_excerpt_cameras.json").read_text()) if camera["split"] == "train"
+    ]
+    more = [
+        dict(camera, id=100 * turn + n, position=[x + 0.001 * turn for x in camera["position"]])
+        for turn in range(3)
+        for n, camera in enumerate(training)
+    ]
+    scene, said = data / "plush_excerpt.ply", []
+    for name, cameras in (("few", training[:3]), ("more", more)):
+        path = tmp_path / f"{name}.json"
+        path.write_text(json.dumps(cameras))
+        text = run(capsys, "encode", scene, "--cameras", path, "--iterations", "2", "-o", tmp_path / "a.potr")
+        said.append("is shown by no more than 3 of them" in text)
+    assert said == [True, False]

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import argparse
-import json
 import os
 from collections.abc import Callable
 from pathlib import Path
@@ -16,6 +15,7 @@ from potr_cl.cli import guard
 from potr_cl.errors import UsageError
 from potr_cl.formats.scenes import ply
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from tests.cli.calls import cameras_json
 
 Link = Callable[[Path, Path], None]
 
@@ -47,20 +47,7 @@ def folder(tmp_path: Path) -> Path:
     (tmp_path / "x.potr").write_bytes(b"POTR, never read")
     cameras = tmp_path / "data"
     (cameras / "images").mkdir(parents=True)
-    views = [
-        {
-            "id": number,
-            "img_name": camera.name,
-            "width": camera.width,
-            "height": camera.height,
-            "position": camera.centre.tolist(),
-            "rotation": camera.rotation.T.tolist(),
-            "fx": camera.fx,
-            "fy": camera.fy,
-        }
-        for number, camera in enumerate(ring_of_cameras(3))
-    ]
-    (cameras / "cameras.json").write_text(json.dumps(views))
+    cameras_json(cameras / "cameras.json", 3)
     for camera in ring_of_cameras(3):
         Image.new("RGB", (camera.width, camera.height)).save(cameras / "images" / f"{camera.name}.png")
     return tmp_path

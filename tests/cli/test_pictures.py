@@ -121,6 +121,7 @@ def test_compare_without_cameras(scene_path, potr_path, capsys):
     assert "8 virtual views of 800 x 800 pixels" in captured.err
     placed = [line for line in captured.err.splitlines() if "no --cameras" in line]
     assert len(placed) == 1
+    assert placed[0].endswith("a scene encoded with cameras looks best from those")
     report = json.loads(run(capsys, "compare", scene_path, potr_path, "--json", "--virtual-views", 2, "--size", 64))
     assert (report["a"]["splats"], report["b"]["splats"]) == (200, 200)
     assert [view["name"] for view in report["views"]] == ["virtual_000", "virtual_001"]

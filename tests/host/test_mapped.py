@@ -113,8 +113,9 @@ def test_a_full_disk_is_told_before_anything_is_written(tmp_path):
         "try:\n    mapped((1 << 21,), np.uint8, 'numbers')\n"
         "except Exception as error:\n    print(type(error).__name__, error)\n"
     )
+    # -B: compiled modules that it leaves would be cut off as well, and stop whoever imports them next.
     done = subprocess.run(
-        [sys.executable, "-c", code], capture_output=True, text=True, env={**os.environ, "TMPDIR": str(tmp_path)}
+        [sys.executable, "-B", "-c", code], capture_output=True, text=True, env={**os.environ, "TMPDIR": str(tmp_path)}
     )
     assert done.returncode == 0, done.stderr
     assert done.stdout.startswith("PotrError no room for 0.0 GB of numbers")

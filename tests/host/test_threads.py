@@ -8,7 +8,7 @@ from concurrent.futures import Future
 
 import pytest
 
-from potr_cl.host.threads import SharedWork, first_error, thread_pool
+from potr_cl.host.threads import Ahead, SharedWork, first_error, thread_pool
 
 
 @pytest.mark.parametrize("threads", [1, 2, 5])
@@ -92,3 +92,40 @@ def test_the_first_error_is_the_first_in_order():
     futures[1].set_exception(ValueError("middle"))
     assert isinstance(first_error(futures), ValueError)
     assert first_error(futures[:1]) is None
+
+
+def test_results_come_in_their_order_and_few_are_made_ahead():
+    asked, done = [], []
+
+    def arguments():
+        for number in range(20):
+            asked.append(number)
+            yield number
+
+    def work(number: int) -> int:
+        time.sleep(0.01 if number % 3 == 0 else 0)
+        done.append(number)
+        return number * number
+
+    with Ahead(work, arguments(), 3) as results:
+        for number, result in results:
+            assert result == number * number
+            assert len(asked) <= number + 1 + 3
+    assert sorted(done) == list(range(20))
+
+
+def test_what_work_ahead_raises_is_raised_in_its_turn_and_the_rest_is_left():
+    begun = []
+
+    def work(number: int) -> int:
+        begun.append(number)
+        return 1 // (number - 4)
+
+    def use() -> None:
+        with Ahead(work, range(1000), 2) as results:
+            for number, _ in results:
+                assert number < 4
+
+    with pytest.raises(ZeroDivisionError):
+        use()
+    assert len(begun) < 20

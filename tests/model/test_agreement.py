@@ -14,9 +14,9 @@ from potr_cl.model.agreement import judge_cameras, require_agreement
 from potr_cl.model.camera import train_views
 from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.reference.captures import CAPTURES
-from potr_cl.reference.frames import MOTIONS, moved, right, without_directions, wrong
+from potr_cl.reference.frames import MOTIONS, looking_back, moved, right, without_directions, wrong
 from potr_cl.reference.raster import sh_basis
-from potr_cl.reference.scenes import ring_of_cameras
+from potr_cl.reference.scenes import random_scene, ring_of_cameras
 
 
 @pytest.fixture(scope="module")
@@ -88,6 +88,16 @@ def test_every_wrong_frame_of_a_whole_scene_is_found(name, request):
         found[what] = judged.motion.name
     for what in ("turned by 180 degrees about x", "scaled by 10", "scaled by 0.1"):
         assert found[what] == what
+    assert found["cameras with the axes of OpenGL"] == "behind its cameras"
+
+
+def test_cameras_with_the_axes_of_opengl_are_called_so():
+    scene, cameras = random_scene(2000, 0), ring_of_cameras(16, size=64)
+    assert not judge_cameras(scene, cameras).suspicious
+    judged = judge_cameras(scene, [looking_back(camera) for camera in cameras])
+    assert judged.suspicious
+    assert "they fit if each camera's y and z axes are turned round" in judged.finding
+    assert judged.remedy == "write the cameras with x right, y down, z forward"
 
 
 @pytest.mark.slow

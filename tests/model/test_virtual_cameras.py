@@ -132,7 +132,8 @@ def test_standpoints(around_ball):
     assert 0.1 < np.median(ratio) < 0.5
 
 
-def test_the_same_every_time(around_ball):
+def test_the_same_every_time(around_ball, candidates_once):
+    candidates_once.clear()
     again = place_cameras(BALL)
     assert all(np.array_equal(a.rotation, b.rotation) for a, b in zip(again, around_ball, strict=True))
     assert np.array_equal(camera_centres(again), camera_centres(around_ball))

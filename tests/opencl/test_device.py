@@ -476,6 +476,18 @@ def test_the_same_memory_is_taken_again(device: Device) -> None:
     assert device.allocated == before
 
 
+def test_memory_for_nothing_is_a_buffer(device: Device) -> None:
+    """Kernels want one, if only to leave it alone."""
+    before = device.allocated
+    memory = Reused(device)
+    for _ in range(2):
+        assert memory.allocate(0, "a test") is not None
+        assert memory.upload(np.zeros(0, np.uint32), "a test") is not None
+        memory.close()
+    memory.give_back()
+    assert device.allocated == before
+
+
 def test_scratch_grows_and_survives_failure(device: Device) -> None:
     before = device.allocated
     scratch = Scratch(device, "a test")

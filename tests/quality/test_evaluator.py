@@ -38,6 +38,28 @@ def test_test_views_judge_where_there_are_any():
     assert str(views) == "2 held-out test views"
 
 
+def test_a_few_training_views_stand_beside_test_views():
+    assert [view.name for view in EvaluationViews.of(CAMERAS).beside] == ["view_1", "view_3", "view_5", "view_7"]
+    assert len(EvaluationViews.of(ring_of_cameras(400)).beside) == 12
+    assert len(EvaluationViews.of(ring_of_cameras(4000)).beside) == 16
+    assert EvaluationViews.of(only_training(5)).beside == ()
+
+
+def test_views_may_all_be_held_out():
+    held_out = [dataclasses.replace(camera, split="test") for camera in CAMERAS]
+    assert (EvaluationViews.of(held_out).views, EvaluationViews.of(held_out).beside) == (held_out, ())
+
+
+def test_any_views_can_be_judged(evaluator):
+    some = CAMERAS[1:3]
+    expected = [
+        psnr(render(WORSE, camera, background=(0.2, 0, 0))[0], render(SCENE, camera, background=(0.2, 0, 0))[0])
+        for camera in some
+    ]
+    assert evaluator.psnr_of(some, WORSE) == pytest.approx(np.mean(expected), abs=1e-3)
+    assert evaluator.psnr_of(some, SCENE) == math.inf
+
+
 def test_training_views_stand_in_and_that_is_said():
     views = EvaluationViews.of(only_training(5))
     assert (views.kind, len(views.views)) == ("train", 5)

@@ -213,10 +213,10 @@ def test_pictures_of_several_views_in_one_buffer(
     rasterizer = Rasterizer(device, random_splats(500, 1, seed=5))
     prepare_set = Rasterizer.prepare_set
 
-    def at_most(self: Rasterizer, cameras: Sequence[Camera]) -> ViewSet:
+    def at_most(self: Rasterizer, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
         if most is not None and len(cameras) > most:
             raise DeviceMemoryError("too many views")
-        return prepare_set(self, cameras)
+        return prepare_set(self, cameras, memory)
 
     monkeypatch.setattr(Rasterizer, "prepare_set", at_most)
     cameras = [tilted_camera(1, 64, 64), tilted_camera(2, 50, 33), *(tilted_camera(seed, 17, 15) for seed in range(3))]
@@ -226,6 +226,28 @@ def test_pictures_of_several_views_in_one_buffer(
         buffer = memory.allocate(12 * pixels, "pictures")
         rasterizer.render_into(cameras, buffer)
         assert np.array_equal(device.download(buffer, (pixels, 3), np.float32), np.concatenate(wanted))
+
+
+def test_sets_of_pictures_take_the_memory_of_those_before(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Only the first of them takes memory, where the others have as many tiles; pictures are the same."""
+    device = open_device("gpu")
+    prepare_set, made = Rasterizer.prepare_set, []
+
+    def at_most_two(self: Rasterizer, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
+        if len(cameras) > 2:
+            raise DeviceMemoryError("too many views")
+        made.append(len(cameras))
+        return prepare_set(self, cameras, memory)
+
+    cameras = [tilted_camera(seed, 50, 33) for seed in range(4)]
+    with Rasterizer(device, random_splats(500, 1, seed=5)) as rasterizer, Memory(device) as memory:
+        wanted = [rasterizer.render(view)[0] for view in cameras]
+        buffer = memory.allocate(12 * 50 * 33 * 4, "pictures")
+        monkeypatch.setattr(Rasterizer, "prepare_set", at_most_two)
+        rasterizer.render_into(cameras, buffer)
+        assert np.array_equal(device.download(buffer, (4, 33, 50, 3), np.float32), wanted)
+    assert made == [2]
+    assert device.allocated == 0
 
 
 def test_lists_that_do_not_fit_are_made_again(device: Device) -> None:

@@ -98,6 +98,6 @@ def test_the_table_for_people():
     for report, coder in ((context, "bundles"), (zstd, "zstd")):
         entry = report["sections"]["rotation"]
         cells = row(report, "rotation")
-        assert cells[:3] == [coder, "3", str(3 * SPLATS)]
-        assert cells[3] == ("-" if coder == "bundles" else str(entry["serialised_bytes"]))
-        assert cells[4] == str(entry["bytes"])
+        assert cells[:3] == [coder, "3", f"{3 * SPLATS:,}"]
+        assert cells[3] == ("-" if coder == "bundles" else f"{entry['serialised_bytes']:,}")
+        assert cells[4] == f"{entry['bytes']:,}"

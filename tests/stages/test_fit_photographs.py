@@ -7,7 +7,6 @@ import dataclasses
 import numpy as np
 import pytest
 
-from potr_cl.formats.images import to_8_bits, write_png
 from potr_cl.model.camera import test_views as views_to_judge
 from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
@@ -15,8 +14,9 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from potr_cl.reference.scenes import ring_of_cameras
 from potr_cl.stages.refitting.photographs import hold_out
+from tests.cases.photographs import photographed_scene, photographs
 
 
 @pytest.fixture(scope="module")
@@ -26,8 +26,7 @@ def device():
 
 @pytest.fixture(scope="module")
 def scene():
-    scene = random_scene(200, 1)
-    return dataclasses.replace(scene, log_scales=np.full((200, 3), -2, np.float32))
+    return photographed_scene()
 
 
 @pytest.fixture(scope="module")
@@ -44,17 +43,10 @@ def cameras():
     return ring_of_cameras(32, size=48)
 
 
-def photographs(folder, device, scene, cameras, noise=0.0):
-    generator = np.random.default_rng(7)
-    with Rasterizer(device, scene) as rasterizer:
-        for camera in cameras:
-            picture = rasterizer.render(camera)[0]
-            # Where nothing is cut at black and white, noise has no mean that could be learnt.
-            room = np.minimum(picture, 1 - picture).clip(0, 1)
-            picture = picture + noise * room * generator.uniform(-1, 1, picture.shape)
-            with (folder / f"{camera.name}.png").open("wb") as file:
-                write_png(file, to_8_bits(picture))
-    return folder
+def noisy(picture, generator):
+    """Where nothing is cut at black and white, noise has no mean that could be learnt."""
+    room = np.minimum(picture, 1 - picture).clip(0, 1)
+    return picture + room * generator.uniform(-1, 1, picture.shape)
 
 
 def encoded(scene, cameras, device, folder, steps=60, fit=20, **changes):
@@ -105,7 +97,7 @@ def test_the_refit_comes_back_to_what_was_fitted(of_the_truth, device, moved, ca
 
 def test_photographs_of_noise_are_not_fitted_to(tmp_path, device, scene, cameras):
     """The file is then that of an encode that never heard of photographs, but for what the re-fit finds."""
-    folder = photographs(tmp_path, device, scene, cameras, noise=1.0)
+    folder = photographs(tmp_path, device, scene, cameras, noisy)
     made = encoded(scene, cameras, device, folder)
     told = made.fitted.photographs
     assert told.scene is None

@@ -8,11 +8,17 @@ import numpy as np
 import pytest
 
 from potr_cl.errors import UsageError
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA
 from potr_cl.reference.refit import LENGTHS, selection, to_rgb, to_ycocg
 from potr_cl.reference.refit_cases import Case, Linearised, Pictures
 from potr_cl.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
+from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.colour_map import ColourMap
+from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, active_coefficients, refit_colours
+from potr_cl.stages.refitting.vector_space import Layout
 from tests.devices import KERNELS, open_device
 
 
@@ -367,3 +373,44 @@ def test_views_that_are_not_kept_share_their_memory(case, monkeypatch):
         again = linear.normal(direction)
     assert np.array_equal(first, again)
     assert set(taken) <= {"the SH coefficients"}, "the vectors of this test"
+
+
+def test_nobody_waits_for_a_device_that_others_read_from(case, monkeypatch):
+    """While one thread waits in a driver, others may get nothing from that device: they would begin late."""
+    device, waited = case.device, []
+
+    class Others:
+        """Do no view, but count as busy between the beginning and the end of a product."""
+
+        busy = False
+
+        def begin_gradient(self, x, blocks, constant):
+            self.busy = True
+
+        def add(self, sums, blocks):
+            self.busy = False
+            return {}
+
+    others, download = Others(), device.download
+
+    def noted(*args):
+        waited.append(others.busy)
+        return download(*args)
+
+    rasterizer = Rasterizer(device, case.scene)
+    launcher = launcher_for(device, INRIA)
+    layout = Layout(len(case.scene), rasterizer.stride, case.scene.sh.shape[1], launcher.lanes)
+    with (
+        rasterizer,
+        Coefficients(device, layout) as vectors,
+        ColourMap(launcher, rasterizer, vectors, case.scene.means, case.cameras, helpers=others) as colour_map,
+    ):
+        x, result = vectors.vector(), vectors.vector()
+        vectors.write_sh(x, case.scene.sh)
+        vectors.zero(result)
+        monkeypatch.setattr(device, "download", noted)
+        error = colour_map.gradient(x, case.targets, result)
+    with Linearised(case) as linear:
+        assert error == linear.error
+    assert waited
+    assert not any(waited)

@@ -2,20 +2,16 @@
 
 from __future__ import annotations
 
-import dataclasses
-
-import numpy as np
 import pytest
 
 from potr_cl.errors import UsageError
-from potr_cl.formats.images import to_8_bits, write_png
 from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
-from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.reference.scenes import random_scene, ring_of_cameras
+from potr_cl.reference.scenes import ring_of_cameras
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
+from tests.cases.photographs import photographed_scene, photographs
 
 
 @pytest.fixture(scope="module")
@@ -25,8 +21,7 @@ def device():
 
 @pytest.fixture(scope="module")
 def scene():
-    scene = random_scene(200, 1)
-    return dataclasses.replace(scene, log_scales=np.full((200, 3), -2, np.float32))
+    return photographed_scene()
 
 
 @pytest.fixture(scope="module")
@@ -34,16 +29,13 @@ def cameras():
     return ring_of_cameras(12, size=48)
 
 
-def photographs(folder, device, scene, cameras, noise=0.0, factor=1.0):
-    """What a camera with that much noise and exposure sees of the scene."""
-    generator = np.random.default_rng(7)
-    with Rasterizer(device, scene) as rasterizer:
-        for camera in cameras:
-            picture = factor * rasterizer.render(camera)[0]
-            picture = picture + generator.normal(0, noise, picture.shape) if noise else picture
-            with (folder / f"{camera.name}.png").open("wb") as file:
-                write_png(file, to_8_bits(picture))
-    return folder
+def dimmed(picture, generator):
+    """What a camera of less exposure sees."""
+    return 0.7 * picture
+
+
+def noisy(picture, generator):
+    return picture + generator.normal(0, 0.3, picture.shape)
 
 
 def encoded(scene, cameras, device, folder, **changes):
@@ -53,7 +45,7 @@ def encoded(scene, cameras, device, folder, **changes):
 
 
 def test_photographs_that_agree_with_each_other_are_fitted_to(tmp_path, scene, cameras, device):
-    folder = photographs(tmp_path, device, scene, cameras, factor=0.7)
+    folder = photographs(tmp_path, device, scene, cameras, dimmed)
     choice = encoded(scene, cameras, device, folder).photographs
     assert choice.kept
     assert choice.held_out == 1
@@ -63,7 +55,7 @@ def test_photographs_that_agree_with_each_other_are_fitted_to(tmp_path, scene, c
 
 def test_added_views_do_not_hold_the_colours_back_from_photographs(tmp_path, scene, cameras, device):
     """Their renders, as targets beside photographs, would: held-out photographs were matched many decibels worse."""
-    folder = photographs(tmp_path, device, scene, cameras, factor=0.7)
+    folder = photographs(tmp_path, device, scene, cameras, dimmed)
     with_them, without = (encoded(scene, cameras, device, folder, between={"views": views}) for views in (2, 0))
     assert with_them.between.added > 0
     assert with_them.photographs.kept
@@ -72,7 +64,7 @@ def test_added_views_do_not_hold_the_colours_back_from_photographs(tmp_path, sce
 
 def test_photographs_of_noise_are_not_fitted_to(tmp_path, scene, cameras, device):
     """The file is then that of an encode that never heard of photographs."""
-    folder = photographs(tmp_path, device, scene, cameras, noise=0.3)
+    folder = photographs(tmp_path, device, scene, cameras, noisy)
     made = encoded(scene, cameras, device, folder)
     assert not made.photographs.kept
     assert made.photographs.fitted < made.photographs.rendered
@@ -82,7 +74,7 @@ def test_photographs_of_noise_are_not_fitted_to(tmp_path, scene, cameras, device
 
 
 def test_a_view_without_a_photograph_is_left_out(tmp_path, scene, cameras, device):
-    folder = photographs(tmp_path, device, scene, cameras, factor=0.7)
+    folder = photographs(tmp_path, device, scene, cameras, dimmed)
     (folder / f"{train_views(cameras)[3].name}.png").unlink()
     assert encoded(scene, cameras, device, folder).photographs.kept
 

@@ -349,8 +349,8 @@ def test_views_of_different_sizes_count_the_same(device):
 @pytest.mark.one_runtime
 def test_the_memory_budget_is_used_and_not_exceeded(device):
     """Lists first, then geometry of as many views as there is room for; the effects are the same whatever is kept."""
-    scene = visible_scene(3000, 0)
-    cameras = ring_of_cameras(40, size=48)
+    scene = visible_scene(1500, 0)
+    cameras = ring_of_cameras(40, size=40)
     with Rasterizer(device, scene) as rasterizer:
 
         def measured(memory):
@@ -358,12 +358,12 @@ def test_the_memory_budget_is_used_and_not_exceeded(device):
             with RemovalSweep(rasterizer, cameras, SweepOptions(memory=memory)) as removal:
                 taken = device.allocated - before
                 removal.measure()
-                removal.remove(np.arange(0, 3000, 3))
+                removal.remove(np.arange(0, 1500, 3))
                 return taken, np.stack(removal.measure())
 
         nothing, _ = measured(0)
         everything, expected = measured(None)
-        left = np.arange(3000) % 3 > 0
+        left = np.arange(1500) % 3 > 0
         for share in (0.2, 0.3, 0.5, 0.7, 0.95):
             budget = int(share * (everything - nothing))
             taken, effects = measured(budget)

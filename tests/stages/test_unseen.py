@@ -31,9 +31,14 @@ def half_seen(plush_excerpt: Scene) -> Scene:
     return together(plush_excerpt, dataclasses.replace(beyond, means=beyond.means + np.float32(30)))
 
 
-def test_they_are_kept_and_told_of(device, half_seen, plush_excerpt, plush_excerpt_cameras):
-    options = EncodeOptions.for_preset("fast", prune=FEW)
-    encoded = encode(half_seen, plush_excerpt_cameras, options, device=device)
+@pytest.fixture(scope="module")
+def both(device, half_seen, plush_excerpt_cameras):
+    """An encode of the seen and the unseen."""
+    return encode(half_seen, plush_excerpt_cameras, EncodeOptions.for_preset("fast", prune=FEW), device=device)
+
+
+def test_they_are_kept_and_told_of(both, half_seen, plush_excerpt):
+    encoded = both
     kept = encoded.order[encoded.order >= len(plush_excerpt)]
     assert sorted(kept) == list(range(1500, 1800))
     assert (encoded.unseen.splats, encoded.unseen.of, encoded.unseen.kept) == (300, 1800, True)
@@ -45,10 +50,9 @@ def test_they_are_kept_and_told_of(device, half_seen, plush_excerpt, plush_excer
     np.testing.assert_allclose(back.means[beyond], half_seen.means[encoded.order[beyond]], atol=0.2)
 
 
-def test_the_seen_ones_are_pruned_as_without_the_others(device, half_seen, plush_excerpt, plush_excerpt_cameras):
+def test_the_seen_ones_are_pruned_as_without_the_others(device, both, plush_excerpt, plush_excerpt_cameras):
     options = EncodeOptions.for_preset("fast", prune=FEW)
     alone = encode(plush_excerpt, plush_excerpt_cameras, options, device=device)
-    both = encode(half_seen, plush_excerpt_cameras, options, device=device)
     assert sorted(both.order[both.order < len(plush_excerpt)]) == sorted(alone.order)
     assert both.pruned.kept == alone.pruned.kept + 300
     assert sorted(both.pruned.order) == list(range(1800))

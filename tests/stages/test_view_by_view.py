@@ -12,7 +12,7 @@ from potr_cl.opencl.memory import Memory
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.raster.culling import Sights
-from potr_cl.raster.picked_splats import PickedSplats, Picker
+from potr_cl.raster.picked_splats import PickedSplats, Picker, Picks
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import uploaded
@@ -99,6 +99,21 @@ def test_removal_before_anything_was_measured(device):
         assert np.array_equal(wanted[0][np.arange(1, len(scene), 3)], found[0][np.arange(1, len(scene), 3)])
 
 
+@pytest.mark.parametrize("memory", [None, 0])
+def test_a_view_in_which_nothing_is_drawn(device, memory):
+    """Its splats are too faint: there is not one intersection of a splat and a tile."""
+    scene, cameras = street(2)
+    faint = dataclasses.replace(scene, opacity_logits=np.full(len(scene), -30, np.float32))
+    sights = Sights.of(faint, cameras, INRIA.near)
+    with (
+        uploaded(device, faint) as whole,
+        ViewByView(device, whole, cameras, sights, SweepOptions(0.0, memory=memory)) as removal,
+    ):
+        effects, importances = removal.measure()
+    assert not effects.any()
+    assert not importances.any()
+
+
 def test_views_that_are_not_kept_wait_until_they_have_lost_enough(device):
     scene, cameras = street()
     sights = Sights.of(scene, cameras, INRIA.near)
@@ -133,7 +148,7 @@ def test_spared_splats_stay(device, memory):
         for some in (None, spared):
             first = first_totals(len(scene), some)
             with ViewByView(device, whole, cameras, sights, options, first_totals=first) as removal:
-                kept.append(prune_scene(removal, PruningOptions(1e-2, 8)).survivors)
+                kept.append(prune_scene(removal, PruningOptions(1e-2, 4)).survivors)
     assert not np.isin(np.flatnonzero(spared), kept[0]).all()
     assert np.isin(np.flatnonzero(spared), kept[1]).all()
     assert len(kept[1]) < len(scene) - 100
@@ -163,6 +178,19 @@ def test_the_numbers_of_some_groups(device, splats):
         expected = np.flatnonzero(wanted[groups])
         assert count == len(expected)
         assert np.array_equal(device.download(numbers, (count,), np.uint32), expected)
+
+
+def test_the_numbers_of_several_choices_of_groups(device):
+    rng = np.random.default_rng(7)
+    groups = rng.integers(0, 40, 10_000).astype(np.uint32)
+    wanted = rng.random((5, 40)) < np.array([0.0, 0.1, 0.5, 0.9, 1.0])[:, None]
+    with Picker(device, groups) as picker, Memory(device) as memory:
+        picks = Picks(memory, picker, wanted)
+        for choice in (3, 0, 4, 1, 2):
+            expected = np.flatnonzero(wanted[choice][groups])
+            assert picks.counts[choice] == len(expected)
+            numbers = picks.numbers(memory, choice)
+            assert np.array_equal(device.download(numbers, (len(expected),), np.uint32), expected)
 
 
 def test_a_whole_encode_has_the_same_bytes(device, monkeypatch):

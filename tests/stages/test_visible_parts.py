@@ -14,6 +14,7 @@ from potr_cl.raster.culling import parts_of_views
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import gathered, uploaded
+from potr_cl.stages import prune
 from potr_cl.stages.pruning import measured, visible_parts
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
@@ -103,7 +104,7 @@ def test_spared_splats_stay(device):
     scene, cameras = street()
     spared = np.random.default_rng(2).random(len(scene)) < 0.3
     parts = parts_of_views(scene, cameras, INRIA.near)
-    schedule = PruningOptions(1e-2, 8)
+    schedule = PruningOptions(1e-2, 4)
     for memory in (None, 0):
         options = SweepOptions(0.0, memory=memory)
         with PartedRemoval(device, scene, scene, cameras, parts, options) as removal:
@@ -128,6 +129,21 @@ def test_unseen_splats_are_kept_without_a_copy_of_the_scene(device, monkeypatch)
     assert aside.unseen.splats > 300
     assert spared.unseen == aside.unseen
     assert spared.data == aside.data
+
+
+def test_groups_are_made_only_where_they_can_be_of_use(device, monkeypatch):
+    """Where few of the splats tell that a view sees more than half of them, all of them need not be looked at."""
+    scene, cameras = street(2, 300)
+    options = EncodeOptions.for_preset("best", between=False, prune={"iterations": 2}, refit=False, compact=False)
+    options = dataclasses.replace(options, cameras_anyway=True)
+    grouped = []
+    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(prune, "groups_of_large", lambda scene, run: grouped.append(scene))
+    for part in (0.55, 0.45):
+        monkeypatch.setattr(prune, "seen_part", lambda scene, views, part=part: part)
+        encode(scene, cameras, options, device=device)
+    assert len(grouped) == 1
+    assert 0.2 < visible_parts.seen_part(*street(5, 900)) < 0.45
 
 
 def test_a_whole_encode_has_the_same_bytes(device, monkeypatch):

@@ -16,10 +16,13 @@ import pytest
 import potr_cl
 from potr_cl.errors import DeviceError, UsageError
 from potr_cl.formats import load_cameras, load_scene
+from potr_cl.model import splat_groups
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.stages.pruning import visible_parts
 from potr_cl.workers.cluster import ClusterPool
+from tests.cases.streets import street
 
 distributed = pytest.importorskip("distributed", reason="needs the extra cluster")
 
@@ -89,6 +92,65 @@ def test_the_same_bytes(workers, scene, cameras, device, expected):
             assert potr_cl.encode(scene, cameras, OPTIONS, device=device, cluster=client).data == expected
             # A caller's client stays the caller's.
             assert client.submit(sum, [1, 2]).result(timeout=30) == 3
+
+
+@pytest.mark.slow
+def test_workers_get_what_their_views_see(device, monkeypatch):
+    """And no more of a large scene: the bytes are the same, and fewer travel."""
+    monkeypatch.setattr(splat_groups, "LARGEST", 32)
+    scene, cameras = street(8, 800, across=True)
+    options = dataclasses.replace(OPTIONS, cameras_anyway=True)
+    with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device) as pool:
+        every = encode(scene, cameras, options, device=device, pool=pool)
+        monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+        some = encode(scene, cameras, options, device=device, pool=pool)
+    assert some.data == every.data == encode(scene, cameras, options, device=device).data
+    assert some.shared is not None
+    assert every.shared is not None
+    assert some.shared.sent < every.shared.sent - 0.4 * scene.nbytes
+
+
+def looks(dask_worker):
+    """On a worker: milliseconds between two looks at itself."""
+    return [dask_worker.periodic_callbacks[name].callback_time for name in ("tick", "monitor", "profile")]
+
+
+def looks_of_scheduler(dask_scheduler):
+    names = ("tick", "monitor")
+    return [dask_scheduler.periodic_callbacks[name].callback_time for name in names], list(dask_scheduler.plugins)
+
+
+@pytest.mark.parametrize("own", [True, False], ids=["address", "client"])
+def test_dask_looks_at_its_processes_seldom_meanwhile(own, device):
+    with local_cluster(1) as cluster, distributed.Client(cluster, set_as_default=False) as watching:
+
+        def state():
+            return [*watching.run(looks).values()], watching.run_on_scheduler(looks_of_scheduler)
+
+        def in_nanny(dask_worker):
+            return dask_worker.periodic_callbacks["tick"].callback_time
+
+        before, (of_scheduler, plugins) = state()
+        with distributed.Client(cluster, set_as_default=False) as client:
+            with ClusterPool(cluster.scheduler_address if own else client, device):
+                (meanwhile,), (then, _) = state()
+                assert all(now >= 50 * often for now, often in zip(meanwhile[::2], before[0][::2], strict=True))
+                assert meanwhile[1] == 5000
+                assert then[0] >= 50 * of_scheduler[0]
+                assert set(watching.run(in_nanny, nanny=True).values()) == {1000}
+            # The caller's client stays, and the workers are as before; the scheduler is once the client has gone.
+            eventually(lambda: state()[0] == before)
+        eventually(lambda: state() == (before, (of_scheduler, plugins)))
+        assert set(watching.run(in_nanny, nanny=True).values()) == {of_scheduler[0]}
+
+
+def test_two_clients_do_not_make_it_seldom_for_ever(device):
+    with local_cluster(1) as cluster, distributed.Client(cluster, set_as_default=False) as watching:
+        before = watching.run(looks)
+        first = ClusterPool(cluster.scheduler_address, device)
+        with ClusterPool(cluster.scheduler_address, device):
+            first.close()
+        eventually(lambda: watching.run(looks) == before)
 
 
 def killing(processes, stage, how_many):

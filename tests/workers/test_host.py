@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import threading
 
 import numpy as np
 import pytest
@@ -17,7 +18,9 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.stages.pruning import measured, part, shared_removal, visible_parts
 from potr_cl.stages.pruning.part import RemovalPart
 from potr_cl.stages.pruning.view_by_view import ViewByView
+from potr_cl.stages.refitting import pictures_ahead
 from potr_cl.stages.refitting.part import ColourPart
+from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.workers.host import HostPool
 from potr_cl.workers.opening import open_workers
 from tests.cases.streets import street
@@ -60,21 +63,21 @@ def family(request):
         OPTIONS.changed(prune={"keep": None}),  # a GPU decides itself
     ],
 )
-def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options):
+@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 3])
+def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options, count):
     cameras = few(plush_excerpt_cameras)
     alone = open_device(family)
     expected = encode(plush_excerpt, cameras, options, device=alone)
     assert expected.shared is None
-    for count in (2, 3):
-        devices = [open_device(family) for _ in range(count)]
-        with HostPool(devices) as pool:
-            found = encode(plush_excerpt, cameras, options, device=devices[0], pool=pool)
-        assert found.data == expected.data
-        assert found.shared is not None
-        assert len(found.shared.workers) == count
-        assert found.shared.sent > 0
-        assert found.shared.received > 0
-        assert [device.allocated for device in devices] == [0] * count
+    devices = [open_device(family) for _ in range(count)]
+    with HostPool(devices) as pool:
+        found = encode(plush_excerpt, cameras, options, device=devices[0], pool=pool)
+    assert found.data == expected.data
+    assert found.shared is not None
+    assert len(found.shared.workers) == count
+    assert found.shared.sent > 0
+    assert found.shared.received > 0
+    assert [device.allocated for device in devices] == [0] * count
 
 
 def test_steps_by_a_part_of_the_views_give_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, monkeypatch):
@@ -89,6 +92,35 @@ def test_steps_by_a_part_of_the_views_give_the_same_bytes(plush_excerpt, plush_e
         devices = [open_device(family) for _ in range(count)]
         with HostPool(devices) as pool:
             assert encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).data == expected
+
+
+def test_pictures_are_rendered_ahead_by_the_device_that_needs_them(plush_excerpt, plush_excerpt_cameras, monkeypatch):
+    """Each its own, before the re-fit asks for any; nobody renders one again; and the bytes are those without."""
+    cameras = few(plush_excerpt_cameras)
+    options = OPTIONS.changed(prune={"iterations": 2}, compact=False, refit={"at": ()})
+    devices = [open_device("gpu") for _ in range(3)]
+    rendered, renderers = [], set()
+    into = RenderedTargets.into
+
+    def noted(self, numbers, buffer):
+        rendered.extend(numbers)
+        renderers.add(threading.current_thread().name)
+        into(self, numbers, buffer)
+
+    monkeypatch.setattr(RenderedTargets, "into", noted)
+    found = []
+    for room in (pictures_ahead._PART, 0):
+        monkeypatch.setattr(pictures_ahead, "_PART", room)
+        with HostPool(devices) as pool:
+            for some in (None, pool):
+                rendered.clear()
+                renderers.clear()
+                found.append(encode(plush_excerpt, cameras, options, device=devices[0], pool=some).data)
+                assert sorted(rendered) == list(range(5))
+                asking = {name for name in renderers if name.startswith(("MainThread", "potr_cl device"))}
+                assert asking == (set() if room else renderers)
+    assert len(set(found)) == 1
+    assert [device.allocated for device in devices] == [0] * 3
 
 
 def test_more_devices_than_views(plush_excerpt, plush_excerpt_cameras, family):

@@ -1,8 +1,10 @@
 """Time and memory of an encode against splats, views and workers, with the exponents that fit them.
 
-    python -m tools.bench.scaling SCENE … [--splats N …] [--views N …] [--workers N …] [--size WxH] [--json FILE]
+    python -m tools.bench.scaling SCENE … [--splats N …] [--views N …] [--workers N …] [--size WxH]
+        [--limit S] [--json FILE]
 
-Cities of the scenes (tools.make.city) are encoded, each in a process of its own. One number at a time is varied, the
+Cities of the scenes (tools.make.city) are encoded, each in a process of its own; those of one size one after the other,
+so that one city at a time lies on the disk. One number at a time is varied, the
 others have the middle ones of theirs. Workers are the devices that are there, the first so many; where there are fewer,
 the first is opened several times, which says what sharing out costs and not what it brings. Peaks are the kernel's
 figure of the process (Linux only), on CPU devices less the device's memory, which is the host's; and what was
@@ -22,7 +24,8 @@ import subprocess
 import sys
 import tempfile
 import time
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from itertools import groupby
 from pathlib import Path
 from typing import Any
 
@@ -36,11 +39,11 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.workers.host import HostPool
 from tools.bench.memory import reset_peak, resident
-from tools.make.city import City, building_of, write_city
+from tools.make.city import City, building_of, write_cameras, write_city
 from tools.results import Column, Results
 
 #: What is fitted, and the numbers that it is fitted with.
-FIGURES = ("seconds", "host", "device")
+FIGURES = ("seconds", "pruning", "refit", "host", "device", "left")
 NUMBERS = ("splats", "views", "workers")
 
 
@@ -64,6 +67,21 @@ class Point:
     device: float = 0.0
     left: int = 0
     stages: dict[str, float] = dataclasses.field(default_factory=dict)
+
+    @property
+    def pruning(self) -> float:
+        """Seconds of preparing views and of pruning."""
+        return self.stages.get("prepare views", 0.0) + self.stages.get("prune", 0.0)
+
+    @property
+    def refit(self) -> float:
+        """Seconds of the re-fit."""
+        return self.stages.get("refit", 0.0)
+
+    @property
+    def coding(self) -> float:
+        """Seconds of coding."""
+        return self.stages.get("octree", 0.0) + self.stages.get("quantise and code", 0.0)
 
 
 def devices(workers: int) -> list[Device]:
@@ -101,12 +119,12 @@ def measure(point: Point, folder: Path, rounds: int | None, memory: float | None
 
 
 def points(splats: Sequence[int], views: Sequence[int], workers: Sequence[int]) -> list[Point]:
-    """Those to measure: of each number all values, with the middle ones of the others."""
+    """Those to measure, by splats: of each number all values, with the middle ones of the others."""
     middle = [sorted(each)[(len(each) - 1) // 2] for each in (splats, views, workers)]
     keys = [(n, middle[1], middle[2]) for n in splats]
     keys += [(middle[0], n, middle[2]) for n in views]
     keys += [(middle[0], middle[1], n) for n in workers]
-    return [Point(*key) for key in dict.fromkeys(keys)]
+    return [Point(*key) for key in sorted(dict.fromkeys(keys), key=lambda key: key[0])]
 
 
 def exponents(measured: Sequence[Point], figure: str) -> tuple[dict[str, float], float]:
@@ -119,16 +137,33 @@ def exponents(measured: Sequence[Point], figure: str) -> tuple[dict[str, float],
     return dict(zip(varied, found[1:].tolist(), strict=True)), deviation
 
 
-def in_process(point: Point, scenes: Sequence[str], size: str, passed: Sequence[str]) -> Point:
-    """Make the city and encode it in a process of its own."""
+def measured_in_turn(
+    wanted: Sequence[Point], scenes: Sequence[str], size: str, passed: Sequence[str], limit: float | None
+) -> Iterator[Point]:
+    """Encode each point's city in a process of its own; after so many seconds none is begun any more."""
     width, height = map(int, size.split("x"))
-    with tempfile.TemporaryDirectory() as name:
-        folder = Path(name)
-        city = City([building_of(scene) for scene in scenes], point.splats)
-        write_city(folder, city, city.views(point.views, width, height))
-        key = [str(getattr(point, number)) for number in NUMBERS]
-        command = [sys.executable, "-m", "tools.bench.scaling", name, "--one", *key, *passed]
-        done = subprocess.run(command, capture_output=True, text=True, check=False)
+    began = time.monotonic()
+    buildings = [building_of(scene) for scene in scenes]
+    for splats, alike in groupby(wanted, key=lambda point: point.splats):
+        with tempfile.TemporaryDirectory() as name:
+            folder, city, written = Path(name), City(buildings, splats), False
+            for point in alike:
+                if limit is not None and time.monotonic() - began > limit:
+                    return
+                views = city.views(point.views, width, height)
+                if written:
+                    write_cameras(folder, views)
+                else:
+                    write_city(folder, city, views)
+                    written = True
+                yield in_process(point, folder, passed)
+
+
+def in_process(point: Point, folder: Path, passed: Sequence[str]) -> Point:
+    """Encode the city of a folder in a process of its own."""
+    key = [str(getattr(point, number)) for number in NUMBERS]
+    command = [sys.executable, "-m", "tools.bench.scaling", str(folder), "--one", *key, *passed]
+    done = subprocess.run(command, capture_output=True, text=True, check=False)
     if done.returncode:
         raise SystemExit(done.stderr.strip() or f"exit code {done.returncode}")
     return Point(**json.loads(done.stdout.splitlines()[-1]))
@@ -143,6 +178,7 @@ def main() -> None:
     parser.add_argument("--size", default="1600x1064", metavar="WxH")
     parser.add_argument("--iterations", type=int, metavar="N", help="of pruning; default: the preset's")
     parser.add_argument("--memory", type=float, metavar="GB", help="as encode's")
+    parser.add_argument("--limit", type=float, metavar="S", help="begin no encode after so many seconds")
     parser.add_argument("--json", type=Path, metavar="FILE")
     parser.add_argument("--one", type=int, nargs=3, help=argparse.SUPPRESS)
     args = parser.parse_args()
@@ -170,15 +206,12 @@ def main() -> None:
         Column("splats left", "", ",.0f"),
     )
     measured = []
-    for point in points([int(n) for n in args.splats], args.views, args.workers):
-        found = in_process(point, args.scenes, args.size, passed)
+    wanted = points([int(n) for n in args.splats], args.views, args.workers)
+    for found in measured_in_turn(wanted, args.scenes, args.size, passed, args.limit):
         measured.append(found)
-        stages = found.stages
         table.add(
-            found.splats, found.views, found.workers, found.seconds,
-            stages.get("prepare views", 0.0) + stages.get("prune", 0.0), stages.get("refit", 0.0),
-            stages.get("octree", 0.0) + stages.get("quantise and code", 0.0), found.host / 1e9, found.device / 1e9,
-            found.left,
+            found.splats, found.views, found.workers, found.seconds, found.pruning, found.refit, found.coding,
+            found.host / 1e9, found.device / 1e9, found.left,
         )  # fmt: skip
     fitted = results.table(
         "exponents",

@@ -77,7 +77,7 @@ def command_parts(args: argparse.Namespace, folder: Path) -> dict[str, float]:
     times: dict[str, list[float]] = {name: [] for name in pieces}
     for run in range(args.runs + 1):
         for name, piece in pieces.items():
-            seconds, said = _clocked(lambda piece=piece: _python(piece, folder))  # type: ignore[misc]
+            seconds, said = clocked(lambda piece=piece: fresh_python(piece, folder))  # type: ignore[misc]
             if run:  # the first builds the kernels, and compiles the modules
                 times[name].append(seconds)
                 if name == "whole command":
@@ -87,14 +87,16 @@ def command_parts(args: argparse.Namespace, folder: Path) -> dict[str, float]:
     return found
 
 
-def _python(arguments: list[str], folder: Path) -> str:
+def fresh_python(arguments: list[str], folder: Path) -> str:
+    """What a new interpreter prints that is called with these arguments; its compiled modules stay in the folder."""
     command = [sys.executable, *arguments]
     compiled = {"PYTHONDONTWRITEBYTECODE": "", "PYTHONPYCACHEPREFIX": str(folder / "compiled")}
     environment = {**os.environ, **compiled}
     return subprocess.run(command, check=True, capture_output=True, text=True, cwd=ROOT, env=environment).stdout
 
 
-def _clocked(work: Callable[[], str]) -> tuple[float, str]:
+def clocked(work: Callable[[], str]) -> tuple[float, str]:
+    """Seconds that some work takes, and what it returns."""
     began = time.perf_counter()
     said = work()
     return time.perf_counter() - began, said

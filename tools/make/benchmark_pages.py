@@ -1,4 +1,4 @@
-"""Fill the tables of docs/benchmarks and draw its plots: python -m tools.make.benchmark_pages [--check] [--tables]
+"""Fill the tables of docs/benchmarks and draw its plots: python -m tools.make.benchmark_pages [--check|--ages|--tables]
 
 The pages are prose with markers; between ``<!-- table: encode/stages -->`` and ``<!-- end -->`` this puts the table of
 that result (docs/benchmarks/results/encode.json) with its title, and a line with its machine, date and command. Between
@@ -7,6 +7,7 @@ that result (docs/benchmarks/results/encode.json) with its title, and a line wit
 --check writes nothing; it fails and says what is stale: tables that are not those of the results, plots drawn of other
 figures, results that no page shows, history outside of history.md, commands that name no module, links to nowhere.
 --tables leaves the plots alone, which need matplotlib (the extra "bench").
+--ages writes nothing either: it lists the tables by how much the package has changed since they were measured.
 """
 
 from __future__ import annotations
@@ -20,6 +21,7 @@ from functools import partial
 from pathlib import Path
 
 from tools.make import benchmark_plots
+from tools.make.benchmark_ages import ages
 from tools.make.benchmark_results import RESULTS, ROOT, Result, ResultError, circumstances, load, table
 
 PAGES = ROOT / "docs" / "benchmarks"
@@ -33,8 +35,12 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
     parser.add_argument("--check", action="store_true", help="write nothing, fail if a page or a plot is stale")
     parser.add_argument("--tables", action="store_true", help="do not draw the plots")
+    parser.add_argument("--ages", action="store_true", help="list the tables, the most outdated first")
     args = parser.parse_args()
     results = load()
+    if args.ages:
+        _print_ages(results)
+        return
     if args.check:
         found = problems(results)
         for problem in found:
@@ -45,6 +51,17 @@ def main() -> None:
     if not args.tables:
         for path in benchmark_plots.draw_all(results):
             print(path)
+
+
+def _print_ages(results: dict[str, Result]) -> None:
+    """A line for each table: commits of the package since, its date and commit, its name and page."""
+    texts = {path: path.read_text(encoding="utf-8") for path in sorted(PAGES.glob("*.md"))}
+    places = {name: link for path, text in texts.items() for name, (_, link) in _places(path, text).items()}
+    print("changes of the package since | date | commit | result | page")
+    for age in ages(results):
+        changes = "unknown" if age.changes is None else age.changes
+        commits = ", ".join(age.commits) or "not said"
+        print(f"{changes} | {age.date or 'unknown'} | {commits} | {age.name} | {places.get(age.name, '')}")
 
 
 def problems(results: dict[str, Result]) -> list[str]:

@@ -34,6 +34,7 @@ _STYLES: list[dict[str, Any]] = [
     {"color": "#e69f00", "marker": "X", "ls": (0, (3, 1, 1, 1))},
     {"color": "#56b4e9", "marker": "*", "ls": (0, (7, 2))},
 ]
+_PRESETS = ("best", "fast", "paper", "smallest")
 #: Of single points: shapes alone.
 _SHAPES = ["s", "D", "^", "v", "P", "X", "<", "*", ">"]
 
@@ -131,7 +132,7 @@ def _rate_distortion(results: Results, axes: Sequence[Any], against: str, other:
     full = {row["scene"]: row for row in results["rate_distortion/uncompressed"].records()}
     for scene, axis in zip(SCENES, axes, strict=True):
         rows = results[f"rate_distortion/{scene}"].records()
-        for preset, style in zip(("best", "fast", "paper"), _STYLES, strict=False):
+        for preset, style in zip(_PRESETS, _STYLES, strict=False):
             of_it = [row for row in rows if row["preset"] == preset]
             axis.plot([r["size"] for r in of_it], [r[f"PSNR against {against}"] for r in of_it], label=preset, **style)
         for row, shape in zip(results["other_formats/sizes"].records()[1:], _SHAPES, strict=False):
@@ -181,7 +182,8 @@ def _encode_presets(results: Results, axes: Sequence[Any]) -> None:
     seconds = {(row["scene"], row["preset"]): row["in all"] for row in results["encode/stages"].records()}
     for scene, style in zip(SCENES, _STYLES, strict=False):
         rows = results[f"rate_distortion/{scene}"].records()
-        by_preset = {p: [row for row in rows if row["preset"] == p] for p in ("best", "fast", "paper")}
+        timed = [preset for preset in _PRESETS if (scene, preset) in seconds]
+        by_preset = {p: [row for row in rows if row["preset"] == p] for p in timed}
         psnr = next(row["PSNR against uncompressed"] for row in by_preset["best"] if row["q"] == 0.5)
         points = sorted((seconds[scene, p], bytes_at(of_it, psnr), p) for p, of_it in by_preset.items())
         label = f"{scene}, at {psnr:.1f} dB against the uncompressed renders"

@@ -168,11 +168,16 @@ def load(folder: Path = RESULTS) -> dict[str, Result]:
         if path.stem == "headlines":
             continue
         for name, raw in json.loads(path.read_text(encoding="utf-8")).items():
-            found[f"{path.stem}/{name}"] = _result(f"{path.name}, '{name}'", raw)
+            found[f"{path.stem}/{name}"] = checked(f"{path.name}, '{name}'", raw)
     return found
 
 
-def _result(where: str, raw: dict[str, Any]) -> Result:
+def checked(where: str, raw: dict[str, Any]) -> Result:
+    """A result as its file holds it.
+
+    Raises:
+        ResultError: it is not what a result must be; ``where`` says which.
+    """
     raw = {"state": "current", **raw}
     unknown = set(raw) - {each.name for each in fields(Result)}
     if unknown:

@@ -143,8 +143,13 @@ class City:
 def write_city(folder: Path, city: City, cameras: Sequence[Camera]) -> None:
     """Write point_cloud.ply, copy by copy, and cameras.json."""
     folder.mkdir(parents=True, exist_ok=True)
-    (folder / "cameras.json").write_text(json.dumps([entry(number, view) for number, view in enumerate(cameras)]))
+    write_cameras(folder, cameras)
     ply.save_parts(folder / "point_cloud.ply", city.parts(), city.splats)
+
+
+def write_cameras(folder: Path, cameras: Sequence[Camera]) -> None:
+    """Write cameras.json alone."""
+    (folder / "cameras.json").write_text(json.dumps([entry(number, view) for number, view in enumerate(cameras)]))
 
 
 def _yaw(turn: int) -> F64:

@@ -7,11 +7,14 @@ import hashlib
 import json
 import os
 import sys
+from contextlib import suppress
 from pathlib import Path
 
 from PIL import Image
 
-from potr_cl.formats import save_scene
+from potr_cl.api.pictures import render
+from potr_cl.errors import DataError
+from potr_cl.formats import load_scene, save_scene
 from potr_cl.model.camera import Camera
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
@@ -30,12 +33,14 @@ class Command:
         arguments: after ``potr-cl``; those that begin with "in/" or "out/" are files.
         outputs: that it writes, in the folder "out".
         repeats: whether each run makes the same bytes; a report tells of times.
+        ends_early: whether the first SIGINT may only end a fit: what is written then is whole, and not the usual file.
     """
 
     name: str
     arguments: tuple[str, ...]
     outputs: tuple[str, ...]
     repeats: bool = True
+    ends_early: bool = False
 
     def argv(self) -> list[str]:
         return [sys.executable, "-m", "potr_cl", *self.arguments]
@@ -57,6 +62,21 @@ def commands() -> list[Command]:
         ),
         Command("encode --report", (*_ENCODE, "--report", "out/a.html"), ("scene.potr", "a.html"), repeats=False),
         Command("encode --max-size", (*_ENCODE, "--max-size", "12k", "--no-quality"), ("scene.potr",)),
+        Command("encode --min-psnr", (*_ENCODE, "--min-psnr", "35"), ("scene.potr",)),
+        Command(
+            "encode --ladder",
+            ("encode", "in/scene.ply", *_VIEWS, "-o", "out", "--ladder", "0.2,0.6"),
+            ("scene_q0.2.potr", "scene_q0.6.potr", "ladder.json"),
+        ),
+        Command(
+            "encode, preset smallest",
+            (*_ENCODE, "--preset", "smallest", "-q", "0.2", "--iterations", "8", "--fit", "150", "--no-quality"),
+            ("scene.potr",),
+            ends_early=True,
+        ),
+        Command(
+            "encode --photos", (*_ENCODE, "--photos", "in/photos", "--fit", "60"), ("scene.potr",), ends_early=True
+        ),
         Command(
             "prune --order",
             ("prune", "in/scene.ply", *_VIEWS, "-o", "out/a.ply", "--order", "out/a.npy"),
@@ -70,6 +90,7 @@ def commands() -> list[Command]:
             "fit",
             ("fit", "in/scene.potr", "--reference", "in/scene.ply", *_VIEWS, "-o", "out/a.ply", "--steps", "20"),
             ("a.ply",),
+            ends_early=True,
         ),
         Command("decode", ("decode", "in/scene.potr", "-o", "out/a.ply"), ("a.ply",)),
         *(
@@ -97,6 +118,7 @@ def prepare(folder: Path) -> dict[str, str]:
     coded = encode(scene, None, EncodeOptions().changed(prune=False, compact=False, refit=False))
     (inputs / "scene.potr").write_bytes(b"".join(coded.pieces))
     (inputs / "cameras.json").write_text(json.dumps([_entry(camera) for camera in cameras]))
+    render(scene, cameras, output=inputs / "photos")
     return hashes(inputs)
 
 
@@ -126,11 +148,14 @@ def hashes(folder: Path) -> dict[str, str]:
 
 
 def is_whole(path: Path) -> bool:
-    """Whether a file of which there is no equal copy is complete: a report, or a picture."""
+    """Whether a file of which there is no equal copy is complete: a report, a picture, or a scene."""
     if path.suffix == ".html":
         return path.read_bytes().rstrip().endswith(b"</html>")
     if path.suffix == ".png":
         with Image.open(path) as image:
             image.load()
         return True
+    if path.suffix in (".potr", ".ply"):
+        with suppress(DataError):
+            return len(load_scene(path)) > 0
     return False

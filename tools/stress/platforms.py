@@ -7,7 +7,7 @@ is checked: the device's self-check; small random scenes of every SH degree and 
 definition; the same bytes twice; SSIM, the re-fit's maps and its solution, and the derivatives of pictures against
 float64; and, where FOLDER holds scenes with reference renders, PSNR against them.
 
-Oclgrind, where installed, simulates small scenes under its race, bounds and initialisation checks. pip's PoCL, Debian's
+Oclgrind, where installed, simulates all kernels under its checks (tools.stress.simulated). pip's PoCL, Debian's
 PoCL (pocl-opencl-icd), Intel's (intel-opencl-rt) and Mesa's rusticl (mesa-opencl-icd) are found if they are there.
 """
 
@@ -18,25 +18,19 @@ import dataclasses
 import itertools
 import json
 import os
-import shutil
 import subprocess
 import sys
-import tempfile
 import time
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
 import numpy as np
-import pyopencl as cl
 
 from potr_cl.errors import DeviceError
 from potr_cl.formats import load_cameras, load_scene
-from potr_cl.model.camera import Camera, camera_centres
-from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, list_devices
-from potr_cl.opencl.memory import Memory, Owner
+from potr_cl.opencl.memory import Memory
 from potr_cl.quality.metrics import ssim
 from potr_cl.quality.metrics_device import Similarity
 from potr_cl.quality.pictures import Picture
@@ -47,22 +41,14 @@ from potr_cl.reference.derivatives import gradient
 from potr_cl.reference.refit import Array, to_ycocg
 from potr_cl.reference.refit_cases import Case, Linearised, Pictures
 from potr_cl.reference.scenes import (
-    plain_splats,
     random_splats,
     ring_of_cameras,
-    straight_camera,
     tilted_camera,
     visible_scene,
 )
-from potr_cl.stages.compaction.ridge import Compactor
-from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS, ViewWeights
+from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
-from potr_cl.stages.pruning.on_device import prune_scene
-from potr_cl.stages.pruning.removal import RemovalSweep
-from potr_cl.stages.pruning.schedule import PruningOptions
-from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
-from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.stages.refitting.refit import RefitOptions
 
 #: As in the tests: pixels that come no nearer, relatively, to 1/255 and 1e-4 cannot flip.
 CLEAR = 1e-4
@@ -202,101 +188,6 @@ def check_device(index: int, family: str, scenes: Path | None) -> dict[str, Any]
     return result
 
 
-def simulate(what: str) -> None:
-    """Inside Oclgrind: every kernel, every vector width, on scenes as small as it is slow.
-
-    Args:
-        what: the family of the kernels.
-
-    Nothing is freed: Oclgrind mistakes a new buffer in an old one's place for memory that no one has written. Nor does
-    it know that a filled buffer has been written.
-    """
-
-    def fill(queue: cl.CommandQueue, buffer: cl.Buffer, pattern: Any, offset: int, size: int) -> None:
-        cl.enqueue_copy(queue, buffer, np.full(size // pattern.itemsize, pattern), dst_offset=offset)
-
-    cl.enqueue_fill_buffer = fill
-    info = next(d for d in list_devices() if "oclgrind" in d.platform.lower())
-    kept: list[Rasterizer] = []
-    others: list[Owner] = []
-    freed: list[cl.Buffer] = []
-    for family, width in (("gpu", 1), ("cpu", 4), ("cpu", 8), ("cpu", 16)):
-        if what != family:
-            continue
-        simulated = dataclasses.replace(info, vector_width=width)
-        device = Device(simulated, family=family, build_options=["-DNO_PREFETCH"])  # type: ignore[arg-type]
-        device.free = freed.append  # type: ignore[method-assign, assignment]
-        for rules in (INRIA, GSPLAT):
-            for size in (60, 400):
-                scene, view = random_splats(size, 3, seed=1), tilted_camera(1, 40, 24)
-                kept.append(Rasterizer(device, scene, rules))
-                image, _ = kept[-1].render(view)
-                wanted = reference.render(scene, view, rules)
-                error = np.abs(image - wanted.image)[wanted.margin > CLEAR].max()
-                assert error <= TOLERANCE, f"{family}: {error}"
-        scene, views = random_splats(60, 3, seed=2), [tilted_camera(seed, 40, 24) for seed in range(2)]
-        kept.append(Rasterizer(device, scene))
-        removal = RemovalSweep(kept[-1], views, SweepOptions(0, 1))
-        removal.measure()
-        removal.remove(np.arange(0, 60, 5))
-        removal.measure()
-        prune_scene(RemovalSweep(kept[-1], views, SweepOptions(0, tighten=True)), PruningOptions(1e-4, 3))
-        _simulate_derivatives(device, scene, views, others)
-        refit_options = RefitOptions(steps=2, gain=0, drop=1e-9)
-        refit_colours(device, scene, views, RenderedTargets(kept[-1], views), refit_options)
-        weights = ViewWeights.from_importances(len(scene), removal.view_importances())
-        for degree in (1, 2, 3):
-            Compactor(device).compact(random_splats(60, degree, seed=2), camera_centres(views), weights)
-        centres = np.random.default_rng(0).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (5000, 3))
-        kept.append(Rasterizer(device, plain_splats(centres, sigma=1e-3, logit=1)))
-        kept[-1].render(straight_camera(16, 16))  # a list longer than local memory
-        _simulate_several_batches(device, kept, others)
-        check_similarity(device)
-
-
-def _simulate_derivatives(device: Device, scene: Scene, views: Sequence[Camera], others: list[Owner]) -> None:
-    pixels = sum(view.width * view.height for view in views)
-    target = device.upload(np.full((pixels, 3), 0.5, np.float32), "the targets")
-    derivatives = PictureDerivatives(device, scene)
-    others.append(derivatives)
-    derivatives.add(views, target)
-
-
-def _simulate_several_batches(device: Device, kept: list[Rasterizer], others: list[Owner]) -> None:
-    """Removal and re-fit of a tile whose list the GPU kernels take in three batches, whose pixels go on to the end."""
-    centres = np.random.default_rng(1).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (300, 3))
-    scene, views = plain_splats(centres, sigma=0.03, logit=-4), [straight_camera(16, 16)]
-    kept.append(Rasterizer(device, scene))
-    for tighten in (False, True):
-        removal = RemovalSweep(kept[-1], views, SweepOptions(0, tighten=tighten))
-        removal.measure()
-        removal.remove(np.arange(0, len(scene), 7))
-        removal.measure()
-    refit_colours(device, scene, views, RenderedTargets(kept[-1], views), RefitOptions(steps=1, gain=0, drop=1e-9))
-    _simulate_derivatives(device, scene, views, others)
-
-
-def run_oclgrind() -> str:
-    """One line: what Oclgrind found."""
-    # Looking for uninitialised values it crashes where vectors are loaded from a work-item's own array, and where a
-    # vector is made of shorter ones.
-    for what, checks in (("gpu", ["--data-races", "--uninitialized"]), ("cpu", ["--data-races"])):
-        with tempfile.TemporaryDirectory() as folder:
-            log = Path(folder) / "log"
-            # Its optimiser breaks stores of vectors; programs from pyopencl's cache lose their sources.
-            command = ["oclgrind", "--build-options", "-cl-opt-disable", *checks, "--log", str(log)]
-            run = subprocess.run(
-                [*command, sys.executable, "-m", "tools.stress.platforms", "--simulate", what],
-                env=os.environ | {"PYOPENCL_NO_CACHE": "1"}, capture_output=True, text=True, check=False,
-            )  # fmt: skip
-            found = log.read_text().strip() if log.exists() else ""
-        if run.returncode:
-            return f"the run failed: {[f'exit code {run.returncode}', *run.stderr.strip().splitlines()][-1]}"
-        if found:
-            return found.splitlines()[0]
-    return "no race, no access out of bounds, no uninitialised read (that of GPU kernels only)"
-
-
 def row(info: DeviceInfo, family: str, scenes: Path | None) -> str:
     """One line of the table."""
     command = [sys.executable, "-m", "tools.stress.platforms", "--device", str(info.index), "--family", family]
@@ -329,11 +220,7 @@ def main() -> None:
     parser.add_argument("--scenes", type=Path, help="folder with lego and plush")
     parser.add_argument("--device", type=int, help=argparse.SUPPRESS)
     parser.add_argument("--family", help=argparse.SUPPRESS)
-    parser.add_argument("--simulate", choices=("gpu", "cpu"), help=argparse.SUPPRESS)
     arguments = parser.parse_args()
-    if arguments.simulate is not None:
-        simulate(arguments.simulate)
-        return
     if arguments.device is not None:
         print(json.dumps(check_device(arguments.device, arguments.family, arguments.scenes)))
         return
@@ -344,8 +231,6 @@ def main() -> None:
     for info in list_devices():
         for family in ("gpu", "cpu") if info.family == "cpu" else ("gpu",):
             print(row(info, family, arguments.scenes), flush=True)
-    if shutil.which("oclgrind"):
-        print(f"\nOclgrind: {run_oclgrind()}")
 
 
 if __name__ == "__main__":

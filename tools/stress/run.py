@@ -46,13 +46,25 @@ from tools.stress.cases import (
     ridge_systems,
     small_scenes,
 )
-from tools.stress.measures import LIMIT, PROMISES, WHAT, Measures, Worst, limit, note, search, smallest_failure
+from tools.stress.measures import (
+    GPU_ONLY,
+    LIMIT,
+    PROMISES,
+    WHAT,
+    Measures,
+    Worst,
+    limit,
+    note,
+    search,
+    smallest_failure,
+)
 from tools.stress.solvers import check_refit, check_ridge
 from tools.stress.views import check
 
 
 def run_device(device: Device, examples: int, only: str = "") -> dict[str, Any]:
-    """All cases, then ``examples`` attempts at each measure whose name begins with ``only``."""
+    """All cases, then ``examples`` attempts at each measure whose name begins with one of ``only``, with commas."""
+    beginnings = tuple(only.split(","))
     worst: dict[str, Worst] = {}
 
     def view(case: Case) -> Measures:
@@ -72,24 +84,25 @@ def run_device(device: Device, examples: int, only: str = "") -> dict[str, Any]:
     for run, cases in lists:
         for case in cases:
             found = run(case)
-            if not any(measure.startswith(only) for measure in found):
+            if not any(measure.startswith(beginnings) for measure in found):
                 break  # the list is of other kernels
-            note(worst, {measure: pair for measure, pair in found.items() if measure.startswith(only)}, case.name)
+            note(worst, {measure: pair for measure, pair in found.items() if measure.startswith(beginnings)}, case.name)
     searches: dict[str, tuple[Callable[[Any], Measures], st.SearchStrategy[Any]]] = {
         measure: (view, small_scenes()) for measure in WHAT
     }
     searches["ridge"] = system, ridge_systems()
-    searches["re-fit: optimum"] = searches["re-fit: loss"] = problem, refit_problems()
+    for measure in ("re-fit: optimum", "re-fit: loss", "same bits: slices"):
+        searches[measure] = problem, refit_problems()
     failures = {}
     for measure, (run, strategy) in searches.items():
-        if not measure.startswith(only):
+        if not measure.startswith(beginnings) or (measure in GPU_ONLY and device.family != "gpu"):
             continue
         if examples:
             search(measure, strategy, run, worst, examples)
         if measure in worst and not worst[measure].ratio <= limit(measure):
             smallest = smallest_failure(measure, strategy, run, 10 * examples) if examples else None
             failures[measure] = smallest or worst[measure].ratio_at
-    kept = {name: dataclasses.asdict(w) for name, w in worst.items() if name.startswith(only)}
+    kept = {name: dataclasses.asdict(w) for name, w in worst.items() if name.startswith(beginnings)}
     return {"worst": kept, "failures": failures}
 
 
@@ -158,7 +171,7 @@ def main() -> None:
     parser.add_argument("--device", type=int, help="index of one device; default: every one there is")
     parser.add_argument("--family", choices=("cpu", "gpu"), help="one family of kernels; default: all that run")
     parser.add_argument("--examples", type=int, default=100, help="attempts of the search at every measure")
-    parser.add_argument("--only", default="", metavar="PREFIX", help="measures whose names begin so, such as fit")
+    parser.add_argument("--only", default="", metavar="PREFIX,…", help="measures whose names begin so, such as fit")
     parser.add_argument("--json", type=Path)
     parser.add_argument("--from", dest="kept", type=Path, nargs="+", help="results of earlier runs, instead of a run")
     args = parser.parse_args()

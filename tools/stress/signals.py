@@ -7,7 +7,7 @@ random from its usual run, or as soon as it has a file open in the folder of its
 processor: on a machine that is busy with other things a run may last many times as long as the one before. Afterwards
 every input must be what it was, each output absent or the old one or the whole new one, no other file may be in its
 folder or in the temporary one (but after SIGKILL), and the command must have exited with 130, 143 or 129, without a
-traceback.
+traceback. The first SIGINT may only end a fit early: the file is then another one, and whole.
 
 A signal that comes before the program's first lines have run, or after its last, meets the interpreter, which ends as
 it likes: such moments are told by /proc and counted apart; what is on the disk is checked all the same. Linux only.
@@ -188,6 +188,7 @@ def _disk(
     if hashes(folder / "in") != inputs:
         found.append("an input was harmed")
     there = hashes(folder / "out")
+    varies = not command.repeats or (command.ends_early and number == signal.SIGINT)
     fresh = 0
     for name in command.outputs:
         path = folder / "out" / name
@@ -197,7 +198,7 @@ def _disk(
         elif path.read_bytes() == _OLD:
             if name not in old:
                 found.append(f"'{name}' is not what it can be")
-        elif there[name] == usual.outputs[name] or (not command.repeats and is_whole(path)):
+        elif there[name] == usual.outputs[name] or (varies and is_whole(path)):
             fresh += 1
         else:
             found.append(f"'{name}' is neither the old file nor the new one, {path.stat().st_size} bytes")

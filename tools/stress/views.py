@@ -33,6 +33,7 @@ from tools.stress.precise import (
     rounded,
     stand_in,
 )
+from tools.stress.roads import check_roads
 
 Mask = NDArray[np.bool_]
 
@@ -68,6 +69,7 @@ def check(device: Device, case: Case) -> Measures:
     shown = np.isin(true.index, lists.intersections)
     sound = tellable(true.covariance[shown], true.colour[shown])
     draw = partial(stand_in, case)
+    found |= check_roads(device, case)
     return found | check_derivatives(device, case.scene, case.view, case.rules, tellable_pixels, sound, draw, DRAWS)
 
 

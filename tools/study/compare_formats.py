@@ -1,14 +1,14 @@
 """What people would use instead: other formats and codecs on the same scenes, against our rate-distortion curve.
 
     python -m tools.study.compare_formats measure SCENE … --json OUT.json [--transform COMMAND] [options]
-    python -m tools.study.compare_formats report OUT.json RATE_DISTORTION.json [--json RESULTS.json]
+    python -m tools.study.compare_formats report OUT.json RATE_DISTORTION.json … [--json RESULTS.json]
 
 ``measure`` writes each scene in each format with splat-transform (npm's @playcanvas/splat-transform), lets the same
 tool decode it to a PLY, and judges that by all test views. A format that does not finish in time is left out.
 The rows of :data:`EARLIER` are added. ``report`` prints Markdown: our size at their PSNR and our PSNR at their size,
 interpolated along the curve that tools.study.rate_distortion measured, linearly in the logarithm of the size. With
---json it keeps the tables of docs/benchmarks for preset best. There OUT.json may be the page's own results,
-docs/benchmarks/results/other_formats.json: other formats do not change as ours does.
+--json it keeps the tables of docs/benchmarks for the curve that --series names, by default best. There OUT.json may be
+the page's own results, docs/benchmarks/results/other_formats.json: other formats do not change as ours does.
 """
 
 from __future__ import annotations
@@ -28,6 +28,7 @@ from potr_cl.errors import UsageError
 from potr_cl.formats import load_scene
 from potr_cl.opencl.device import Device
 from tools.results import Cell, Column, Results, circumstances, write_json
+from tools.study.curves import merged
 from tools.study.evaluation import EvaluatedScene
 from tools.study.rate_distortion import size_at, value_at
 from tools.workloads import study_parser
@@ -145,33 +146,35 @@ def measured_formats(path: Path) -> dict[str, list[dict[str, Any]]]:
     return found
 
 
-def keep_tables(formats: dict[str, list[dict[str, Any]]], curves: dict[str, Any], path: Path) -> None:
-    """The tables of docs/benchmarks: preset best against each format, by interpolation along its curve."""
+def keep_tables(formats: dict[str, list[dict[str, Any]]], curves: dict[str, Any], series: str, path: Path) -> None:
+    """The tables of docs/benchmarks: a series against each format, by interpolation along its curve.
+
+    Raises:
+        UsageError: a scene has no curve of that name.
+    """
     results = Results(None, path, curves)
     for scene, rows in formats.items():
-        points = curves["scenes"][scene]["series"]["best"]["encodes"]
+        points = curves["scenes"].get(scene, {"series": {}})["series"].get(series, {"encodes": []})["encodes"]
+        if not points:
+            raise UsageError(f"there is no curve '{series}' of {scene}")
         table = results.table(
             scene,
-            f"Preset best against other formats, by interpolation along its curve: {scene}",
+            f"Preset {series} against other formats, by interpolation along its curve: {scene}",
             Column("format"),
             Column("size", "MB", ".2f"),
             Column("PSNR", "dB", ".2f"),
-            Column("best at that PSNR", "MB", ".2f"),
+            Column(f"{series} at that PSNR", "MB", ".2f"),
             Column("times smaller", format=".1f"),
-            Column("best's PSNR at that size", "dB", ".2f"),
             Column("lost", "dB", ".2f"),
-            Column("best at that loss", "MB", ".2f"),
+            Column(f"{series} at that loss", "MB", ".2f"),
             Column("times smaller at that loss", format=".1f"),
-            Column("best's loss at that size", "dB", ".2f"),
         )
         for row in rows:
             cells: list[Cell] = []
             for key in ("psnr", "psnr_loss"):
                 size = size_at(points, key, row[key])
-                largest = max(points, key=lambda p: int(p["bytes"]))
-                value = value_at(points, key, row["bytes"])
                 least = min(int(p["bytes"]) for p in points)
-                cells += [row[key], *_how_small(row, size, least), largest[key] if value is None else value]
+                cells += [row[key], *_how_small(row, size, least)]
             table.add(row["format"] + ("" if row["measured"] else " *"), row["bytes"] / 1e6, *cells)
 
 
@@ -183,11 +186,12 @@ def _how_small(row: dict[str, Any], size: float | None, least: int) -> tuple[Cel
 
 
 def _report(args: argparse.Namespace) -> None:
+    measured = merged([args.curves, *args.more], [args.series] if args.json is not None else ())
     if args.json is not None:
-        keep_tables(measured_formats(args.results), json.loads(args.curves.read_text()), args.json)
+        keep_tables(measured_formats(args.results), measured, args.series, args.json)
         return
     results = json.loads(args.results.read_text())
-    curves = json.loads(args.curves.read_text())["scenes"]
+    curves = measured["scenes"]
     print(f"{results['tool']}; rows with * were measured earlier with their authors' code.\n")
     for name, entry in results["scenes"].items():
         for series, curve in curves[name]["series"].items():
@@ -212,6 +216,8 @@ def main() -> None:
     measure.add_argument("--formats", nargs="+", choices=FORMATS, default=FORMATS)
     measure.add_argument("--timeout", type=float, default=3600, metavar="S", help="a format; default an hour")
     report.add_argument("curves", type=Path, help="what tools.study.rate_distortion measured")
+    report.add_argument("more", nargs="*", type=Path, metavar="RATE_DISTORTION.json", help="further ones")
+    report.add_argument("--series", default="best", metavar="NAME", help="of the tables that --json keeps")
     report.add_argument("--json", type=Path, metavar="FILE", help="keep tables for docs/benchmarks")
     args = parser.parse_args()
     args.run(args)

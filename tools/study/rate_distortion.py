@@ -1,18 +1,19 @@
 """Size against quality: encode at many qualities, decode, judge by all test views; then tables and plots.
 
     python -m tools.study.rate_distortion measure SCENE … --json OUT.json [--series NAME[:OPTION=VALUE,…] …] [options]
-    python -m tools.study.rate_distortion report OUT.json [--formats FORMATS.json] [--images DIR] [options]
+    python -m tools.study.rate_distortion report OUT.json … [--formats FORMATS.json] [--images DIR] [options]
 
 A SCENE is a folder with point_cloud.ply, cameras.json and, if it has any, photographs in images. A series is a curve:
 the name it gets and the options of EncodeOptions in which it differs from the defaults, those of a stage with its name,
 as in exact:preset=best,prune.tolerance=0; photos=True stands for --photos with the folder images. ``measure`` writes
 its results after every encode and goes on where an existing file stops; with --seconds it begins no encode after that
-many. ``report`` prints Markdown and draws DIR/rate_distortion_SCENE.png; the points of other formats come from
+many. Several files of ``measure`` become one curve (tools.study.curves); --series takes some of their series alone,
+in that order. ``report`` prints Markdown and draws DIR/rate_distortion_SCENE.png; the points of other formats come from
 tools.study.compare_formats. With --json it keeps the tables of docs/benchmarks: the curves, the uncompressed scenes,
 and the seconds of each stage at quality 0.5; with --losses NAME too, another one instead: what each other series loses
-on photographs, and what the series NAME loses at the same PSNR against the uncompressed renders, by interpolation. With
---against it prints instead how many bytes more or fewer each series takes at the PSNR that the series NAME has at
-quality Q, by interpolation, and how long its encodes take.
+on photographs, and what the series NAME loses at the same PSNR against the uncompressed renders, by interpolation; of
+all qualities, or of those of --qualities. With --against it prints instead how many bytes more or fewer each series
+takes at the PSNR that the series NAME has at quality Q, by interpolation, and how long its encodes take.
 """
 
 from __future__ import annotations
@@ -24,6 +25,7 @@ import json
 import math
 import statistics
 import time
+from collections.abc import Sequence
 from pathlib import Path
 from typing import Any
 
@@ -36,6 +38,7 @@ from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.report.file import file_report
 from tools.results import Column, Results, circumstances, write_json
+from tools.study.curves import merged
 from tools.study.evaluation import EvaluatedScene
 from tools.workloads import study_parser
 
@@ -126,7 +129,7 @@ def _measure(args: argparse.Namespace) -> None:
                     if q in done or time.perf_counter() - began > args.seconds:
                         continue
                     point = measure_encode(evaluator, encode_options({**options, "q": q}, folder / "images"), device)
-                    curve["encodes"].append(point)
+                    curve["encodes"].append({**point, "commit": results["commit"]})
                     curve["encodes"].sort(key=lambda p: p["q"])
                     write_json(args.json, results)
                     print(
@@ -317,8 +320,15 @@ def keep_tables(measured: dict[str, Any], path: Path) -> None:
                     )  # fmt: skip
 
 
-def keep_losses(measured: dict[str, Any], against: str, path: Path) -> None:
-    """The table "losses": what each series loses on photographs, beside what one of them loses at the same PSNR."""
+def keep_losses(measured: dict[str, Any], against: str, path: Path, qualities: Sequence[float] = ()) -> None:
+    """The table "losses": what each series loses on photographs, beside what one of them loses at the same PSNR.
+
+    Args:
+        measured: what ``measure`` has left.
+        against: the series whose curve is interpolated.
+        path: of the file to write.
+        qualities: of the rows; empty: all.
+    """
     table = Results(None, path, measured).table(
         "losses",
         f"What files lose on photographs, and what those of {against} lose at the same PSNR, all test views",
@@ -326,17 +336,19 @@ def keep_losses(measured: dict[str, Any], against: str, path: Path) -> None:
         Column("preset", default="{preset}"),
         Column("q", default="{quality:g}"),
         Column("bytes", format=","),
-        Column(f"bytes against {against} at this PSNR", "%", "+.1f"),
+        Column("bytes at equal PSNR", "%", "+.1f"),
         Column("PSNR against uncompressed", "dB", ".2f"),
         Column("lost on photographs", "dB", ".3f"),
-        Column(f"{against} at this PSNR", "dB", ".3f"),
+        Column(f"lost by {against} at this PSNR", "dB", ".3f"),
         Column("SSIM against photographs", format=".4f"),
-        Column(f"{against} at this PSNR", format=".4f"),
+        Column(f"SSIM of {against} at this PSNR", format=".4f"),
     )
     for name, entry in measured["scenes"].items():
         reference = entry["series"][against]["encodes"]
         for series, curve in entry["series"].items():
-            for p in curve["encodes"] if series != against else ():
+            if series == against:
+                continue
+            for p in [p for p in curve["encodes"] if not qualities or p["q"] in qualities]:
                 size = size_at(reference, "psnr", p["psnr"])
                 loss, ssim = (along_psnr(reference, key, p["psnr"]) for key in ("psnr_loss", "truth_ssim"))
                 gap = None if size is None else 100 * (p["bytes"] / size - 1)
@@ -344,7 +356,7 @@ def keep_losses(measured: dict[str, Any], against: str, path: Path) -> None:
 
 
 def _report(args: argparse.Namespace) -> None:
-    results = json.loads(args.results.read_text())
+    results = merged([args.results, *args.more], args.series)
     if args.against is not None:
         for name, entry in results["scenes"].items():
             measured = {point["q"] for point in entry["series"].get(args.against, {"encodes": []})["encodes"]}
@@ -355,7 +367,7 @@ def _report(args: argparse.Namespace) -> None:
     if args.losses is not None:
         if args.json is None:
             raise UsageError("--losses makes a table: say with --json where to keep it")
-        keep_losses(results, args.losses, args.json)
+        keep_losses(results, args.losses, args.json, args.qualities)
         return
     if args.json is not None:
         keep_tables(results, args.json)
@@ -375,11 +387,14 @@ def main() -> None:
     measure.add_argument("--qualities", nargs="+", type=float, default=QUALITIES, metavar="Q")
     measure.add_argument("--seconds", type=float, default=math.inf, metavar="S")
     measure.add_argument("--series", nargs="+", default=["default"], metavar="NAME[:OPTION=VALUE,…]")
+    report.add_argument("more", nargs="*", type=Path, metavar="OUT.json", help="further files of measure")
+    report.add_argument("--series", nargs="+", default=[], metavar="NAME", help="these alone, in this order")
     report.add_argument("--formats", type=Path, help="what tools.study.compare_formats measured")
     report.add_argument("--images", type=Path, metavar="DIR", help="draw the curves too")
     report.add_argument("--json", type=Path, metavar="FILE", help="keep tables for docs/benchmarks")
     report.add_argument("--against", metavar="NAME")
     report.add_argument("--losses", metavar="NAME")
+    report.add_argument("--qualities", nargs="+", type=float, default=(), metavar="Q", help="of the rows of --losses")
     report.add_argument("--at", type=float, default=0.5, metavar="Q")
     args = parser.parse_args()
     args.run(args)

@@ -91,7 +91,8 @@ def test_interpolation_along_a_curve():
 
 
 def test_the_report_on_formats(monkeypatch, tmp_path, capsys):
-    ours = [{"bytes": b, "psnr": p, "psnr_loss": 50 - p} for b, p in ((1_000_000, 30.0), (4_000_000, 40.0))]
+    sizes = ((0.3, 1_000_000, 30.0), (0.5, 4_000_000, 40.0))
+    ours = [{"q": q, "bytes": b, "psnr": p, "psnr_loss": 50 - p} for q, b, p in sizes]
     theirs = [
         {"format": ".a", "bytes": 4_000_000, "psnr": 35.0, "psnr_loss": 15.0, "measured": True},
         {"format": ".b", "bytes": 9_000_000, "psnr": 41.0, "psnr_loss": 9.0, "measured": True},
@@ -131,8 +132,8 @@ def test_tables_of_curves_and_formats(monkeypatch, folder, tmp_path, capsys):
         "columns": [{"name": n} for n in ("format", "excerpt: size", "excerpt: PSNR", "excerpt: lost")],
         "rows": [["PLY", 9.0, None, None], ["`.spz` (version 4)", 0.05, points[0]["psnr"], 0.1], ["Other", 1, 1, 1]],
     }
-    formats, curve = tmp_path / "formats.json", measured["scenes"]["excerpt"]["series"]["best"]["encodes"]
-    for point in curve:
+    formats, curves = tmp_path / "formats.json", measured["scenes"]["excerpt"]["series"]
+    for point in (*curves["best"]["encodes"], *curves["fast"]["encodes"]):
         point["psnr_loss"] = 50 - point["psnr"]
     out.write_text(json.dumps(measured))
     formats.write_text(json.dumps({"sizes": sizes}))
@@ -142,6 +143,12 @@ def test_tables_of_curves_and_formats(monkeypatch, folder, tmp_path, capsys):
     assert spz[3:5] == pytest.approx([points[0]["bytes"] / 1e6, 5e4 / points[0]["bytes"]])
     assert other[0] == "Other *"
     assert other[3].startswith("below")
+
+    call(monkeypatch, compare_formats, "report", formats, out, "--json", kept, "--series", "fast")
+    heads = [column["name"] for column in json.loads(kept.read_text())["excerpt"]["columns"]]
+    assert "fast at that PSNR" in heads
+    with pytest.raises(UsageError, match="there is no series 'smallest'"):
+        call(monkeypatch, compare_formats, "report", formats, out, "--json", kept, "--series", "smallest")
 
 
 def test_rgb_streams_keep_r_g_and_b():
@@ -188,5 +195,7 @@ def test_losses_on_photographs_at_equal_psnr(monkeypatch, tmp_path):
     assert first[:4] == ["s", "smallest", 0.3, 1600]
     assert first[4:] == pytest.approx([-20, 42.0, 0.35, 0.3, 0.91, 0.92], rel=1e-4)
     assert second == ["s", "smallest", 0.5, 9000, None, 45.0, 0.1, None, 0.95, None], "beyond the ends of best"
+    call(monkeypatch, rate_distortion, "report", curves, "--losses", "best", "--json", kept, "--qualities", 0.5)
+    assert json.loads(kept.read_text())["losses"]["rows"] == [second]
     with pytest.raises(UsageError, match="--json"):
         call(monkeypatch, rate_distortion, "report", curves, "--losses", "best")

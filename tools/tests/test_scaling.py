@@ -9,12 +9,12 @@ from pathlib import Path
 import pytest
 
 from tools.bench import scaling
-from tools.bench.scaling import Point, exponents, points
+from tools.bench.scaling import Point, exponents, measured_in_turn, points
 
 
 def test_one_number_at_a_time():
     found = [(p.splats, p.views, p.workers) for p in points([10, 20, 40], [3, 5], [1, 2])]
-    assert found == [(10, 3, 1), (20, 3, 1), (40, 3, 1), (20, 5, 1), (20, 3, 2)]
+    assert found == [(10, 3, 1), (20, 3, 1), (20, 5, 1), (20, 3, 2), (40, 3, 1)]
 
 
 def test_the_exponents():
@@ -35,6 +35,15 @@ def test_encodes_are_measured(data, tmp_path, monkeypatch, capsys):
     monkeypatch.chdir(Path(scaling.__file__).parents[2])
     scaling.main()
     results = json.loads((tmp_path / "a.json").read_text())
-    assert [row[0] for row in results["points"]["rows"]] == [2000, 4000, 2000]
+    assert [row[0] for row in results["points"]["rows"]] == [2000, 2000, 4000]
     assert all(row[3] > 0 and row[7] > 0 and row[8] > 0 for row in results["points"]["rows"])
-    assert {row[0] for row in results["exponents"]["rows"]} == {"seconds", "host", "device"}
+    assert {row[0] for row in results["exponents"]["rows"]} == set(scaling.FIGURES)
+
+
+def test_no_encode_begins_after_the_limit(data, monkeypatch):
+    source = f"{data / 'plush_excerpt.ply'},{data / 'plush_excerpt_cameras.json'}"
+    begun = []
+    monkeypatch.setattr(scaling, "in_process", lambda point, folder, passed: begun.append(point) or point)
+    wanted = points([2000, 4000], [4, 8], [1])
+    assert list(measured_in_turn(wanted, [source], "64x48", (), None)) == wanted == begun
+    assert not list(measured_in_turn(wanted, [source], "64x48", (), -1.0))

@@ -1,6 +1,7 @@
 /* The numbers of the splats of some groups that are in a given state, ascending. A work-group looks at CHUNK splats:
    count_wanted finds how many of them are wanted, and write_wanted puts their numbers behind those of the work-groups
-   before it. Both kernel families use it.
+   before it. Both kernel families use it. count_wanted does so for several choices of groups, one after another in
+   `wanted` and in `counts`: the second dimension of work-groups.
 
    Macros: none. */
 
@@ -29,10 +30,13 @@ void count_wanted(
     int by_state,
     uint state,
     uint splats,
+    uint group_count,
     global uint *counts)
 {
     local uint sum;
     const uint lid = get_local_id(0);
+    wanted += (size_t)get_group_id(1) * group_count;
+    counts += (size_t)get_group_id(1) * get_num_groups(0);
     if (lid == 0)
         sum = 0;
     barrier(CLK_LOCAL_MEM_FENCE);
@@ -49,7 +53,7 @@ void count_wanted(
         counts[get_group_id(0)] = sum;
 }
 
-/* starts[w] is where the numbers of work-group w begin. */
+/* starts[w] is where the numbers of work-group w begin. Of several choices of groups it is that of number `choice`. */
 kernel __attribute__((reqd_work_group_size(GROUP, 1, 1)))
 void write_wanted(
     global const uint *groups,
@@ -58,12 +62,15 @@ void write_wanted(
     int by_state,
     uint state,
     uint splats,
+    uint group_count,
+    uint choice,
     global const uint *starts,
     global uint *numbers)
 {
     local uint sums[GROUP];
     const uint lid = get_local_id(0);
-    uint start = starts[get_group_id(0)];
+    wanted += (size_t)choice * group_count;
+    uint start = starts[(size_t)choice * get_num_groups(0) + get_group_id(0)];
     for (uint round = 0; round < ROUNDS; ++round) {
         const size_t splat = get_group_id(0) * CHUNK + round * GROUP + lid;
         const uint flag = splat < splats ? is_wanted(groups, wanted, states, by_state, state, splat) : 0;

@@ -1,10 +1,15 @@
-/* Which splats reach into the picture of one view at least, without a doubt: potr_cl/model/unseen.py asks the same in
-   double precision, of which this is a quick part. One splat a work-item.
+/* Which splats reach into the picture of one view at least, and which into none, without a doubt: potr_cl/model/unseen.py
+   asks the same in double precision, of which this is a quick part. One splat a work-item.
 
    Macros: none. */
 
 /* Of a coordinate's terms: many times what single precision loses on their way through a view. */
 #define ROUNDING 1e-5f
+
+/* What is found of a splat: no view sees it, one does, or rounding could decide it. */
+enum { UNSEEN, SEEN, UNDECIDED };
+/* Standard deviations are cut short beyond this (raster/activation.py), world units. */
+#define LARGEST 1e12f
 
 /* A view: where it is, and the planes that bound its picture, for x and for y: along - low depth and
    along - high depth are the distances from them, times the root of 1 + low^2 and of 1 + high^2. */
@@ -28,23 +33,29 @@ kernel void surely_seen(
     if (i >= splats)
         return;
     const float x = means[i], y = means[stride + i], z = means[2 * stride + i];
-    /* A little less than it is. */
-    const float reach = 0.999f * reach_of_one * fmax(fmax(scales[i], scales[stride + i]), scales[2 * stride + i]);
+    const float largest = reach_of_one * fmax(fmax(scales[i], scales[stride + i]), scales[2 * stride + i]);
+    /* A little less than it is, and a little more. */
+    const float least = 0.999f * largest, most = 1.001f * largest;
     const float length = fabs(x) + fabs(y) + fabs(z);
-    uchar found = 0;
-    for (uint view = 0; view < views && !found; ++view) {
+    uchar found = UNSEEN;
+    for (uint view = 0; view < views && found != SEEN; ++view) {
         global const Seer *seer = seers + view;
         global const float *r = seer->rotation, *t = seer->translation;
         const float depth = r[6] * x + r[7] * y + r[8] * z + t[2];
         const float slack = ROUNDING * (length + fabs(t[0]) + fabs(t[1]) + fabs(t[2]));
-        int inside = depth > near + slack;
+        /* What is no number is neither. */
+        int inside = depth > near + slack, outside = depth < near - slack;
         for (int axis = 0; axis < 2; ++axis) {
             const float along = r[3 * axis] * x + r[3 * axis + 1] * y + r[3 * axis + 2] * z + t[axis];
             const float low = seer->low[axis], high = seer->high[axis];
-            inside &= along - low * depth > (1.0f + fabs(low)) * slack - reach * seer->low_length[axis];
-            inside &= along - high * depth < reach * seer->high_length[axis] - (1.0f + fabs(high)) * slack;
+            const float above = along - low * depth, below = high * depth - along;
+            const float low_slack = (1.0f + fabs(low)) * slack, high_slack = (1.0f + fabs(high)) * slack;
+            inside &= above > low_slack - least * seer->low_length[axis];
+            inside &= below > high_slack - least * seer->high_length[axis];
+            outside |= above < -low_slack - most * seer->low_length[axis];
+            outside |= below < -high_slack - most * seer->high_length[axis];
         }
-        found = inside != 0;
+        found = inside ? SEEN : outside ? found : UNDECIDED;
     }
-    seen[i] = found;
+    seen[i] = found == UNSEEN && !(largest < LARGEST) ? UNDECIDED : found;
 }

@@ -4,6 +4,9 @@
 
 #include "refit/coefficients.clh"
 
+/* Values that a work-item of a dot product loads together. */
+#define AT_ONCE 16
+
 /* sums += (lambda, on AC only, + prior) x coefficients, and 0 where a coefficient is not active. */
 kernel void regularise(
     global float *sums,
@@ -75,7 +78,25 @@ kernel void dot_parts(global const float *x, global const float *y, ulong count,
         largest = parts[items + first];
         lost = parts[2 * items + first];
     }
-    for (size_t i = first; i < count; i += items) {
+    size_t i = first;
+#if LANES == 1
+    /* A GPU waits long for what it loads: for many values at a time no longer than for one. */
+    for (; i + (AT_ONCE - 1) * items < count; i += AT_ONCE * items) {
+        float xs[AT_ONCE], ys[AT_ONCE];
+        for (int k = 0; k < AT_ONCE; ++k) {
+            xs[k] = x[i + k * items];
+            ys[k] = y[i + k * items];
+        }
+        for (int k = 0; k < AT_ONCE; ++k) {
+            const float term = MAD(xs[k], ys[k], -lost);
+            const float next = sum + term;
+            lost = (next - sum) - term;
+            sum = next;
+            largest = fmax(largest, fabs(xs[k]));
+        }
+    }
+#endif
+    for (; i < count; i += items) {
         /* Kahan's compensated sum. */
         const float term = MAD(x[i], y[i], -lost);
         const float next = sum + term;

@@ -117,6 +117,63 @@ kernel void gather(
             VSTORE(results[i], index, result + i * stride);
 }
 
+#if LANES == 1
+/* The blocks' part of what `gather` does with WEIGHTS, before that takes the totals away without: for `block_stride`
+   splats from number `first_block` on.
+
+   A work-item has row get_global_id(1) of a splat's block, and the row that is as far from the end, which together are
+   as long as any other two. It adds up all views before it writes. A GPU whose work-items each wrote a whole block
+   again for every view did nothing else. */
+kernel void gather_blocks(
+    global const long *totals,
+    global const float *means,
+    ulong stride,
+    global const SetView *views,
+    uint view_count,
+    global const float *scales,
+    uint first_scale,
+    ulong first_block,
+    ulong block_stride,
+    global long *blocks)
+{
+    const size_t block = get_global_id(0), index = first_block + block;
+    const int row = get_global_id(1), last = SH_COUNT - 1 - row;
+    if (block >= block_stride || index >= stride)
+        return;
+    /* Element j of the row, or, before its beginning, element SH_COUNT - 1 - j of the last row; and the latter's first
+       one, on the diagonal. */
+    long found[SH_COUNT], diagonal = 0;
+    for (int j = 0; j < SH_COUNT; ++j)
+        found[j] = 0;
+    int any = 0;
+    for (uint number = 0; number < view_count; ++number) {
+        const long total = totals[TOTALS * (number * stride + index) + 3];
+        if (!total)
+            continue;
+        any = 1;
+        const float weight = (float)total * scales[first_scale + number];
+        float basis[SH_COUNT], own = 0.0f, its = 0.0f;
+        basis_towards(means, stride, index, &views[number].view, basis);
+        for (int m = 0; m < SH_COUNT; ++m) {
+            own = m == row ? basis[m] : own;
+            its = m == last ? basis[m] : its;
+        }
+        for (int j = 0; j < SH_COUNT; ++j)
+            found[j] += to_fixed_lanes(weight * (j < row ? its : own) * basis[j < row ? SH_COUNT - 1 - j : j]);
+        diagonal += to_fixed_lanes(weight * its * its);
+    }
+    if (!any)
+        return;
+    for (int j = 0; j < SH_COUNT; ++j)
+        if (j >= row)
+            blocks[AT(row, j) * block_stride + block] += found[j];
+        else if (last != row)
+            blocks[AT(last, SH_COUNT - 1 - j) * block_stride + block] += found[j];
+    if (last != row)
+        blocks[AT(last, last) * block_stride + block] += diagonal;
+}
+#endif
+
 /* result += unit x sums from number `first` on, and these become 0. One number a work-item. */
 kernel void from_fixed(global long *sums, ulong first, float unit, global float *result)
 {

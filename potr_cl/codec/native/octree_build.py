@@ -9,6 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.native.arrays import address
+from potr_cl.host.threads import Run
+from potr_cl.model.order import are_many, over_ranges
 
 F32 = NDArray[np.float32]
 F64 = NDArray[np.float64]
@@ -18,6 +20,8 @@ U8 = NDArray[np.uint8]
 U64 = NDArray[np.uint64]
 
 _LEVELS_A_WORD = 21
+#: Centres whose words a thread finds at a time.
+_AT_A_TIME = 1 << 17
 _LEVELS = 54  # of counts
 
 
@@ -50,25 +54,26 @@ class OctreeBuilding:
         )
         return found[:3], found[3:6], limit, float(found[6])
 
-    def words(self, means: F32, low: F64, ratio: float, depth: int) -> U64:
+    def words(self, means: F32, low: F64, ratio: float, depth: int, run: Run = map) -> U64:
         """(words, n) Morton words of (n, 3) centres, the most significant first, 21 levels a word.
 
         Args:
             means: none is below ``low`` (3,). ratio: cells of the deepest level in a unit of length. depth: 0 to 52.
+            run: shares the work out.
         """
         n, number = len(means), max(-(-depth // _LEVELS_A_WORD), 1)
         words = np.empty((number, n), np.uint64)
-        self._c["potr_octree_words"](
-            address(means, np.float32, 3 * n),
-            n,
-            address(low, np.float64, 3),
-            ratio,
-            2.0**depth,
-            depth,
-            number,
-            n,
-            address(words, np.uint64, number * n, True),
-        )
+        points, corner = address(means, np.float32, 3 * n), address(low, np.float64, 3)
+        result = address(words, np.uint64, number * n, True)
+
+        def find(first: int) -> None:
+            some = min(_AT_A_TIME, n - first)
+            self._c["potr_octree_words"](
+                points + 12 * first, some, corner, ratio, 2.0**depth, depth, number, n, result + 8 * first
+            )
+
+        for _ in run(find, range(0, n, _AT_A_TIME)):
+            pass
         return words
 
     def wanted(self, limit: F64, half_diagonal: float, depth: int) -> I8:
@@ -83,8 +88,23 @@ class OctreeBuilding:
         )
         return levels
 
-    def order(self, words: U64) -> tuple[I64, U64]:
-        """(n,) the order of (words, n) Morton words, equal ones as they stand; and the words in that order."""
+    def order(self, words: U64, run: Run = map) -> tuple[I64, U64]:
+        """(n,) the order of (words, n) Morton words, equal ones as they stand; and the words in that order.
+
+        ``run`` shares the work on many out.
+        """
+        if not are_many(words.shape[1]):
+            return self._order(words)
+        ordered = np.empty_like(words)
+
+        def finish(members: I64, place: int) -> None:
+            order, own = self._order(np.ascontiguousarray(words[:, members]))
+            members[:] = members[order]
+            ordered[:, place : place + len(members)] = own
+
+        return over_ranges(words[0], finish, run), ordered
+
+    def _order(self, words: U64) -> tuple[I64, U64]:
         n = words.shape[1]
         scratch = np.empty(int(self._c["potr_octree_sorting"]()), np.uint8)
         order, other_order, other_keys = np.arange(n), np.empty(n, np.int64), np.empty(n, np.uint64)

@@ -8,6 +8,7 @@ from numpy.typing import NDArray
 from potr_cl.codec.native.library import native
 from potr_cl.codec.native.octree_build import OctreeBuilding
 from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, U64, OctreeStreams
+from potr_cl.host.threads import Run
 from potr_cl.model.morton import spread
 
 #: Splats worked on at a time where each stands for itself: the temporaries of a block stay in the cache.
@@ -19,7 +20,7 @@ F64 = NDArray[np.float64]
 
 
 def build(
-    means: NDArray[np.float32], tolerance: F64 | float, absolute: bool = False
+    means: NDArray[np.float32], tolerance: F64 | float, absolute: bool = False, run: Run = map
 ) -> tuple[OctreeStreams, NDArray[np.int64]]:
     """Build and serialise the octree of a scene's centres.
 
@@ -29,13 +30,14 @@ def build(
             Never taken finer than float32 can hold the coordinates themselves.
         absolute: leaves lie at the first level at which no point of a cell is farther than that from its centre, which
             the level of leaves nearby foretells; without, at the first whose centre happens to be near enough.
+        run: in place of :func:`map`, to work with several threads.
 
     Returns:
         The streams, and ``order`` (N,): the splats' indices in the order of the leaves.
     """
     functions = native()
     if absolute and functions is not None:
-        return _build_natively(functions.octree_build, means, tolerance)
+        return _build_natively(functions.octree_build, means, tolerance, run)
     n = len(means)
     axes, low, side, limit, depth, grid = _gridded(means, tolerance)
     words = _morton_words(grid, depth)
@@ -89,11 +91,11 @@ def leaf_order(means: NDArray[np.float32], tolerance: F64 | float) -> NDArray[np
 
 
 def _build_natively(
-    functions: OctreeBuilding, means: NDArray[np.float32], tolerance: F64 | float
+    functions: OctreeBuilding, means: NDArray[np.float32], tolerance: F64 | float, run: Run
 ) -> tuple[OctreeStreams, NDArray[np.int64]]:
     """:func:`build` with ``absolute``."""
-    low, side, limit, depth, words = _words_of(functions, means, tolerance)
-    order, words = functions.order(words)
+    low, side, limit, depth, words = _words_of(functions, means, tolerance, run)
+    order, words = functions.order(words, run)
     half_diagonal = _half_diagonal(side)
     wanted = functions.wanted(limit, half_diagonal, depth) if half_diagonal else np.zeros(len(limit), np.int8)
     unclear = np.flatnonzero(wanted < 0)
@@ -104,7 +106,7 @@ def _build_natively(
 
 
 def _words_of(
-    functions: OctreeBuilding, means: NDArray[np.float32], tolerance: F64 | float
+    functions: OctreeBuilding, means: NDArray[np.float32], tolerance: F64 | float, run: Run = map
 ) -> tuple[F64, float, F64, int, U64]:
     """The cube's corner and side; tolerances; the deepest level, and Morton words."""
     means = np.ascontiguousarray(means, np.float32)
@@ -112,7 +114,7 @@ def _words_of(
     low, high, limit, finest = functions.bounds(means, tolerances)
     side = float((high - low).max())
     depth = _depth_for(side, finest)
-    return low, side, limit, depth, functions.words(means, low, 2.0**depth / side if side > 0 else 0.0, depth)
+    return low, side, limit, depth, functions.words(means, low, 2.0**depth / side if side > 0 else 0.0, depth, run)
 
 
 def _gridded(

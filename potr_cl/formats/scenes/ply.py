@@ -19,9 +19,10 @@ from potr_cl.errors import DataError, UsageError
 from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.filter_3d import FILTER_3D, folded
 from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
+from potr_cl.formats.scenes.ply_rows import Target, read_rows
 from potr_cl.formats.scenes.scene_files import NO_EXTENT, cleaned, unfilled
 from potr_cl.host.atomic_write import replacing
-from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
+from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS, Scene
 
 _log = logging.getLogger("potr_cl")
 
@@ -226,37 +227,39 @@ def _read(path: str | os.PathLike[str], stream: io.FileIO, size: int) -> Scene:
         _log.warning("'%s' has two scales a splat (2DGS): the third is read as 1e-9 unit, along the third axis", path)
 
     scene = unfilled(count, 1 + kept // 3)
-    columns = _columns(scene, rest // 3)
+    targets = _targets(scene, rest // 3, scales)
     if scales < 3:
-        columns.pop("scale_2")[:] = NO_EXTENT
+        scene.log_scales[:, 2] = NO_EXTENT
     filters = np.empty(count, dtype=np.float32) if FILTER_3D in {p.name for p in vertex.properties} else None
     if filters is not None:
-        columns[FILTER_3D] = filters
-    start = 0
-    stream.seek(offset)
-    blocks = _text_blocks if header.text else _binary_blocks
-    # A float64 beyond float32 becomes infinite, and its splat is dropped with the other non-finite ones.
-    with np.errstate(over="ignore"):
-        for block in blocks(path, stream, header, vertex, count):
-            for name, column in columns.items():
-                column[start : start + len(block)] = block[name]
-            start += len(block)
+        targets.append(Target(filters[:, None], (FILTER_3D,)))
+    if header.text:
+        stream.seek(offset)
+        start = 0
+        with np.errstate(over="ignore"):
+            for block in _text_blocks(path, stream, header, vertex, count):
+                for target in targets:
+                    target.fill(start, block)
+                start += len(block)
+    else:
+        read_rows(path, stream, offset, vertex.dtype(header.byte_order), count, targets)
     if filters is not None:
         return folded(scene, filters)
     return marked(scene, header.comments)
 
 
-def _columns(scene: Scene, rest: int) -> dict[str, FloatArray]:
-    """Where in the scene's arrays each property belongs: views of N values. A channel has ``rest`` AC coefficients."""
-    columns = {name: scene.means[:, i] for i, name in enumerate("xyz")}
-    for channel in range(3):
-        columns[f"f_dc_{channel}"] = scene.sh[:, 0, channel]
-        for i in range(scene.sh.shape[1] - 1):
-            columns[f"f_rest_{channel * rest + i}"] = scene.sh[:, 1 + i, channel]
-    columns["opacity"] = scene.opacity_logits
-    columns |= {f"scale_{i}": scene.log_scales[:, i] for i in range(3)}
-    columns |= {f"rot_{i}": scene.quaternions[:, i] for i in range(4)}
-    return columns
+def _targets(scene: Scene, rest: int, scales: int) -> list[Target]:
+    """Where in the scene's arrays properties belong. A channel has ``rest`` AC coefficients, a splat 2 or 3 scales."""
+    own = range(scene.sh.shape[1] - 1)
+    sh = [f"f_dc_{channel}" for channel in range(3)]
+    sh += [f"f_rest_{channel * rest + i}" for i in own for channel in range(3)]
+    return [
+        Target(scene.means, ("x", "y", "z")),
+        Target(scene.sh.reshape(len(scene), -1), tuple(sh)),
+        Target(scene.opacity_logits[:, None], ("opacity",)),
+        Target(scene.log_scales[:, :scales], tuple(f"scale_{i}" for i in range(scales))),
+        Target(scene.quaternions, tuple(f"rot_{i}" for i in range(4))),
+    ]
 
 
 def _read_header(path: str | os.PathLike[str], stream: io.FileIO) -> _Header:
@@ -371,29 +374,10 @@ def _report_dropped(path: str | os.PathLike[str], header: _Header, vertex: PlyEl
         _log.warning("'%s': dropped %d unknown elements: %s", path, len(others), _shortened(", ".join(others)))
 
 
-def _binary_blocks(
-    path: str | os.PathLike[str], stream: io.FileIO, header: _Header, vertex: PlyElement, count: int
-) -> Iterator[NDArray[np.void]]:
-    """The rows of the vertices, a block at a time; a block is valid until the next one."""
-    dtype = vertex.dtype(header.byte_order)
-    height = max(1, _BLOCK_BYTES // dtype.itemsize)
-    rows = np.empty(min(height, count), dtype=dtype)
-    raw = rows.view(np.uint8).data
-    for start in range(0, count, height):
-        wanted = min(height, count - start) * dtype.itemsize
-        got = 0
-        while got < wanted:
-            n = stream.readinto(raw[got:wanted])
-            if not n:
-                raise DataError(f"'{path}' is truncated: it ends within splat {start + got // dtype.itemsize}")
-            got += n
-        yield rows[: wanted // dtype.itemsize]
-
-
 def _text_blocks(
     path: str | os.PathLike[str], stream: io.FileIO, header: _Header, vertex: PlyElement, count: int
 ) -> Iterator[NDArray[np.void]]:
-    """The same for ASCII, where the rows of earlier elements have to be skipped line by line."""
+    """The rows of the vertices of an ASCII file, a block at a time; earlier elements are skipped line by line."""
     # Every byte has a meaning in Latin-1, so a stray one is found where it stands, as a value that is no number.
     with io.TextIOWrapper(io.BufferedReader(stream), encoding="latin-1") as text:
         lines = (line for line in text if not line.isspace())

@@ -1,7 +1,8 @@
 """How many added views fit the memory that views may fill (:func:`room_for`).
 
 A view that does not fit is made again for each measurement. So added views that take the room of others cost many times
-what they should, and only as many are added as there is room for.
+what they should, and only as many are added as there is room for. Where views are made again in batches, each with what
+it may draw (:mod:`potr_cl.stages.pruning.view_by_view`), they cost little more than others: all may be added.
 """
 
 from __future__ import annotations
@@ -10,20 +11,27 @@ from collections.abc import Sequence
 
 import numpy as np
 
+from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
+from potr_cl.raster.culling import Sights
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA
+from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.pruning.prepared_views import PreparedViews
 from potr_cl.stages.pruning.sweep_options import default_memory
+from potr_cl.stages.pruning.visible_parts import SCENES, WORTH_IT, fits_whole, groups_of_large, seen_part
 from potr_cl.stages.stage import State, Workbench
 
 #: More bytes than a view takes, for each splat and each pixel: where there are so many, nothing has to be measured.
 _SPLAT, _PIXEL = 500, 200
 #: Views whose memory is measured.
 _SAMPLE = 3
+#: Views that tell how much of the scene a view sees.
+_LOOKED = 32
 #: Bytes that are enough for them.
 _PLENTY = 1e18
-#: By how much the others may take more.
-_MARGIN = 1.1
+#: By how much the others may take more; and how much more, where views of a part share its splats.
+_MARGIN, _MARGIN_OF_PARTS = 1.1, 1.6
 
 
 def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
@@ -43,16 +51,47 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
     pixels = sum(view.width * view.height for view in (*state.views, *added))
     if budget > _SPLAT * len(state.source) * (len(state.views) + len(added)) + _PIXEL * pixels:
         return len(added)
-    with Rasterizer(bench.opened, bench.drawable(state.source), background=bench.background) as rasterizer:
-        own, more = (_nbytes(rasterizer, views) for views in (state.views, added))
-    left = budget - _MARGIN * own * len(state.views)
-    return int(min(max(left // (_MARGIN * more), 0), len(added)))
+    sampled = _evenly(state.views, _SAMPLE), _evenly(added, _SAMPLE)
+    if seen_part(state.source, _evenly(state.views, _LOOKED)) <= WORTH_IT:
+        if _by_view(state, bench):
+            return len(added)
+        own, more = (_nbytes_of_parts(state, bench, views) for views in sampled)
+        left, margin = budget - min(SCENES * budget, state.source.nbytes), _MARGIN_OF_PARTS
+    else:
+        own, more = (_nbytes(bench, bench.drawable(state.source), views) for views in sampled)
+        left, margin = budget, _MARGIN
+    left -= margin * own * len(state.views)
+    return int(min(max(left // (margin * more), 0), len(added)))
 
 
-def _nbytes(rasterizer: Rasterizer, views: Sequence[Camera]) -> float:
-    """Bytes that is kept of a view while splats are removed: the mean of a few."""
-    chosen = [views[round(place)] for place in np.linspace(0, len(views) - 1, min(_SAMPLE, len(views)))]
-    with PreparedViews(rasterizer, chosen, _PLENTY, 1):
-        held = rasterizer.device.allocated
-    # What the rasterizer works with is there before and after.
-    return (held - rasterizer.device.allocated) / len(chosen)
+def _by_view(state: State, bench: Workbench) -> bool:
+    """Whether views that do not fit are made again in batches."""
+    shared = bench.pool is None or bench.pool.in_process
+    return shared and bench.opened.family == "gpu" and fits_whole(bench.opened, bench.drawable(state.source))
+
+
+def _evenly(views: Sequence[Camera], count: int) -> list[Camera]:
+    """So many of some views at most, from the first to the last."""
+    return [views[round(place)] for place in np.linspace(0, len(views) - 1, min(count, len(views)))]
+
+
+def _nbytes_of_parts(state: State, bench: Workbench, views: Sequence[Camera]) -> float:
+    """Bytes that is kept of a view where it is looked at with what it may draw and no more: the mean of some."""
+    source = state.source
+    with thread_pool(bench.threads) as pool:
+        sights = Sights.of(source, views, INRIA.near, groups_of_large(source, pool.map), pool.map)
+    held = [
+        _nbytes(bench, source.subset(sights.groups.splats(seen)), [view])
+        for view, seen in zip(views, sights.seen, strict=True)
+        if seen.any()
+    ]
+    return float(np.mean(held)) if held else 1.0
+
+
+def _nbytes(bench: Workbench, scene: Drawable, views: Sequence[Camera]) -> float:
+    """Bytes that is kept of a view while splats are removed: the mean of some."""
+    with Rasterizer(bench.opened, scene, background=bench.background) as rasterizer:
+        with PreparedViews(rasterizer, views, _PLENTY, 1):
+            held = rasterizer.device.allocated
+        # What the rasterizer works with is there before and after.
+        return (held - rasterizer.device.allocated) / len(views)

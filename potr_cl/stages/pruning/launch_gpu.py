@@ -103,9 +103,12 @@ class _GpuKernels:
         self._removal, self._staleness = removal, staleness
         self._tiles = tiles
         self._lists_above = math.inf
+        self._start = 0
 
     def sweep(self, start: int, count: int, queue: cl.CommandQueue | None = None) -> None:
-        self._removal.set(start=start)
+        if start != self._start:
+            self._start = start
+            self._removal.set(start=start)
         self._removal.launch((count * _GROUP,), (_GROUP,), queue)
 
     def sweep_all(self) -> None:

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import ExitStack, contextmanager
-from typing import TypeAlias
+from typing import Any, TypeAlias
 
 import numpy as np
 from numpy.typing import NDArray
@@ -12,6 +12,7 @@ from numpy.typing import NDArray
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import lying_on
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.pruning.part import RemovalPart
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.shared_removal import SharedRemoval
@@ -19,7 +20,7 @@ from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView, can_go_by_view
 from potr_cl.stages.pruning.visible_parts import PartedRemoval, first_totals, whole_on_device
 from potr_cl.stages.stage import State, Workbench
-from potr_cl.workers.dealing import shares
+from potr_cl.workers.dealing import Shares, shares
 from potr_cl.workers.parts import Parts
 
 #: What measures: one device, perhaps part by part or view by view, or several together.
@@ -33,6 +34,7 @@ def measurement(
     options: SweepOptions,
     sights: Sights | None = None,
     spared: NDArray[np.bool_] | None = None,
+    dealt: ViewShares | None = None,
 ) -> Iterator[Removal]:
     """A removal sweep over the views of a state, its splats numbered as in the state's scene.
 
@@ -40,6 +42,7 @@ def measurement(
         state, bench, options: of the stage.
         sights: what the views see, where each had better be looked at with what it sees.
         spared: as of :class:`~potr_cl.stages.pruning.visible_parts.PartedRemoval`; only with ``sights``.
+        dealt: the views, for a pool whose workers get what these see and no more of the scene.
 
     Raises:
         DeviceError: the scene or a view does not fit the device.
@@ -55,32 +58,41 @@ def measurement(
         if pool is None or share is None or not share.others:
             if sights is not None:
                 whole = stack.enter_context(whole_on_device(device, bench.drawable(state.scene)))
-                given = (options, bench.background, progress)
+                others_given = (options, bench.background, progress)
                 if can_go_by_view(whole, device, options):
                     first = None if spared is None else first_totals(len(state.scene), spared)
-                    yield stack.enter_context(ViewByView(device, whole, views, sights, *given, first))
+                    yield stack.enter_context(ViewByView(device, whole, views, sights, *others_given, first))
                 else:
                     parts = sights.parts()
-                    yield stack.enter_context(PartedRemoval(device, state.scene, whole, views, parts, *given, spared))
+                    yield stack.enter_context(
+                        PartedRemoval(device, state.scene, whole, views, parts, *others_given, spared)
+                    )
                 return
             drawable = stack.enter_context(lying_on(device, bench.placed(state)))
             rasterizer = stack.enter_context(Rasterizer(device, drawable, background=bench.background))
             yield stack.enter_context(RemovalSweep(rasterizer, views, options, progress))
             return
-        scene = stack.enter_context(pool.shared(bench.shared(state)))
-        # Other processes would have to be sent as much as the sights save.
-        sights = sights if pool.in_process else None
-        each = [(scene, views, options, bench.background, numbers, sights) for numbers in share.others]
+        given: list[tuple[Any, ...]] = []
+        if dealt is not None:
+            share = Shares([], [each.numbers for each in dealt.shares])
+            for part in dealt.shares:
+                excerpt = stack.enter_context(pool.shared(part.excerpt))
+                given.append((excerpt, views, options, bench.background, part.numbers, part.sights))
+        else:
+            scene = stack.enter_context(pool.shared(bench.shared(state)))
+            sights = sights if pool.in_process else None
+            given = [(scene, views, options, bench.background, numbers, sights) for numbers in share.others]
         others = stack.enter_context(
-            Parts(pool, RemovalPart, each, options.memory, [len(each) for each in share.others])
+            Parts(pool, RemovalPart, given, options.memory, [len(each) for each in share.others])
         )
         own: RemovalSweep | ViewByView | None = None
         stride = len(state.scene)
         if share.own:
             drawable = stack.enter_context(lying_on(device, bench.placed(state)))
             if sights is not None and can_go_by_view(drawable, device, options):
-                given = (options, bench.background, progress)
-                own = ViewByView(device, drawable, views, sights, *given, numbers=share.own)
+                own = ViewByView(
+                    device, drawable, views, sights, options, bench.background, progress, numbers=share.own
+                )
                 stride = drawable.stride
             else:
                 rasterizer = stack.enter_context(Rasterizer(device, drawable, background=bench.background))
@@ -90,7 +102,9 @@ def measurement(
         others.ready()
         steers = all(others.ask(place, "can_steer") for place in range(len(others)))
         steers = steers and (device.family == "gpu" if own is None else own.steering is not None)
-        yield stack.enter_context(SharedRemoval(device, len(state.scene), stride, views, own, others, pool, steers))
+        numbers = None if dealt is None else [each.splats for each in dealt.shares]
+        shared = SharedRemoval(device, len(state.scene), stride, views, own, others, pool, steers, numbers)
+        yield stack.enter_context(shared)
 
 
 class Measured:

@@ -17,10 +17,12 @@ from potr_cl.opencl.relay import Lent
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.view_shares import Excerpt
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.survivors import Bits
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView, can_go_by_view
+from potr_cl.stages.pruning.visible_parts import PartedRemoval, whole_on_device
 from potr_cl.workers.pool import Part
 
 Indices = NDArray[np.int64]
@@ -32,12 +34,13 @@ class RemovalPart(Part):
     Args:
         device: to compute on.
         memory: bytes of its memory that the views may take; None: the default.
-        scene: the uncompressed scene, perhaps kept on devices.
+        scene: the uncompressed scene, perhaps kept on devices; or of it what these views may draw
+            (:mod:`potr_cl.raster.view_shares`).
         cameras: all views.
         options: speed/accuracy trade-offs.
         background: R, G, B behind the scene.
         numbers: of the views of this part, ascending.
-        sights: what all views see, where each had better be looked at with what it sees; None: with all splats.
+        sights: what all views see of it, where each had better be looked at with what it sees; None: with all splats.
 
     Raises:
         DeviceError: the scene or a view does not fit the device.
@@ -47,7 +50,7 @@ class RemovalPart(Part):
         self,
         device: Device,
         memory: int | None,
-        scene: Scene | KeptScene | PartOfKept,
+        scene: Scene | KeptScene | PartOfKept | Excerpt,
         cameras: Sequence[Camera],
         options: SweepOptions,
         background: tuple[float, float, float],
@@ -57,9 +60,14 @@ class RemovalPart(Part):
         options = SweepOptions(**{**vars(options), "memory": memory})
         with ExitStack() as owned:
             drawable = owned.enter_context(lying_on(device, scene))
-            self._sweep: RemovalSweep | ViewByView
+            self._sweep: RemovalSweep | ViewByView | PartedRemoval
+            if sights is not None:
+                drawable = owned.enter_context(whole_on_device(device, drawable))
             if sights is not None and can_go_by_view(drawable, device, options):
                 self._sweep = ViewByView(device, drawable, cameras, sights, options, background, numbers=numbers)
+            elif sights is not None and isinstance(drawable, Scene):
+                dealt = sights.parts(numbers)
+                self._sweep = PartedRemoval(device, drawable, drawable, cameras, dealt, options, background)
             else:
                 rasterizer = owned.enter_context(Rasterizer(device, drawable, background=background))
                 self._sweep = RemovalSweep(rasterizer, cameras, options, numbers=numbers)

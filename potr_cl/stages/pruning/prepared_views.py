@@ -146,9 +146,10 @@ class PreparedSet(Owner):
     Args:
         rasterizer: that prepared them.
         numbers: of the views among the cameras.
-        views: projection and lists, this object's from now on.
+        views: projection and lists, as they were prepared for the first time; this object's from now on.
         memory: to take the rest from, which is closed with this object; None: memory of its own.
         target: the pictures before any removal, which stay the caller's; None: memory for them.
+        pending: as of :meth:`potr_cl.opencl.device.Device.upload`.
 
     Attributes:
         numbers, views: as given.
@@ -168,14 +169,16 @@ class PreparedSet(Owner):
         views: ViewSet,
         memory: Memory | None = None,
         target: cl.Buffer | None = None,
+        pending: list[cl.Event] | None = None,
     ) -> None:
         self._device = device = rasterizer.device
         self._memory = memory or Memory(device)
         self.numbers, self.views = numbers, views
         self.first_tile = 0
         try:
-            lengths = np.concatenate([np.diff(offsets) for offsets in views.read_offsets()])
-            self.lengths = self._memory.upload(lengths, "the tile lists")
+            lengths = np.concatenate([np.diff(offsets) for offsets in views.found_offsets])
+            views.found_offsets = []
+            self.lengths = self._memory.upload(lengths, "the tile lists", pending)
             self.sums = self._memory.allocate(8 * views.capacity, "the tiles' removal effects")
             self.target = target or self._memory.allocate(12 * views.pixels, "the target images")
         except BaseException:

@@ -24,9 +24,9 @@ from potr_cl.opencl.relay import Lent, Relay
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
 from potr_cl.stages.pruning.steering import Steered, Steering
-from potr_cl.stages.pruning.survivors import Survivors
+from potr_cl.stages.pruning.survivors import Bits, Survivors
 from potr_cl.stages.pruning.view_by_view import ViewByView
-from potr_cl.workers.parts import Parts, Pending
+from potr_cl.workers.parts import Each, Parts, Pending
 from potr_cl.workers.pool import Pool
 
 #: Splats a work-group of the kernel that adds totals.
@@ -44,6 +44,8 @@ class SharedRemoval(Owner):
         others: parts, each a :class:`potr_cl.stages.pruning.part.RemovalPart`, that measure the rest.
         pool: of their workers.
         steers: whether the choice of splats is the master's device's, as with the views on one GPU.
+        numbers: of each part's splats, (n,) int64, ascending, where it has no others and knows them by their places;
+            None: all parts have all.
 
     Attributes:
         splats, steering: as of a :class:`~potr_cl.stages.pruning.removal.RemovalSweep`.
@@ -62,9 +64,12 @@ class SharedRemoval(Owner):
         others: Parts,
         pool: Pool,
         steers: bool,
+        numbers: Sequence[Indices] | None = None,
     ) -> None:
         self.splats = splats
         self._own, self._others, self._sparse, self._in_process = own, others, pool.sparse, pool.in_process
+        self._numbers = numbers
+        assert numbers is None or pool.sparse
         self._fixed_point = FixedPoint.of_views(cameras)
         #: What the others have found; of removed splats anything.
         self._found = np.zeros((splats, 2), np.int64)
@@ -78,7 +83,8 @@ class SharedRemoval(Owner):
     @property
     def alive(self) -> NDArray[np.bool_]:
         """(N,) which splats are left."""
-        return self._alive if self.steering is None else self.steering.alive
+        # Where the number of splats is given, the host chooses though the device could.
+        return self._alive if self.steering is None else self._alive & self.steering.alive
 
     def measure(self) -> tuple[F64, F64]:
         """ΔMSE_k and I_k of all N splats, float64; the values of removed splats mean nothing."""
@@ -89,7 +95,7 @@ class SharedRemoval(Owner):
 
     def remove(self, splats: Indices) -> None:
         """Take splats out for good."""
-        pending = self._others.begin("remove", splats)
+        pending = self._others.begin("remove", self._places(splats))
         self._alive[splats] = False
         if self._own is not None:
             self._own.remove(splats)
@@ -97,7 +103,8 @@ class SharedRemoval(Owner):
 
     def replace_sh(self, sh: FloatArray) -> None:
         """Continue with other colours, (N, M, 3) float32 of the same degree. The target pictures stay as they are."""
-        pending = self._others.begin("replace_sh", sh)
+        numbers = self._numbers
+        pending = self._others.begin("replace_sh", sh if numbers is None else Each([sh[own] for own in numbers]))
         if self._own is not None:
             self._own.replace_sh(sh)
         pending.results()
@@ -116,8 +123,24 @@ class SharedRemoval(Owner):
         place = 0
         while (found := self._others.ask(part, "importances", place)) is not None:
             number, seen, importances = found
-            yield number, seen.astype(np.int64), importances
+            yield number, seen.astype(np.int64) if self._numbers is None else self._numbers[part][seen], importances
             place += 1
+
+    def _places(self, splats: Indices) -> Indices | Each:
+        """What tells the parts about these splats."""
+        if self._numbers is None:
+            return splats
+        meant = np.zeros(self.splats, bool)
+        meant[splats] = True
+        return Each([np.flatnonzero(meant[own]) for own in self._numbers])
+
+    def tell_marked(self, marked: Bits) -> None:
+        """Have the others remove what a device has marked, without waiting for them."""
+        told: Bits | Each = marked
+        if self._numbers is not None:
+            meant = np.unpackbits(marked, count=self.splats, bitorder="little")
+            told = Each([np.packbits(meant[own], bitorder="little") for own in self._numbers])
+        self._others.begin("remove_marked", told)
 
     def begin_measuring(self) -> Pending:
         """Have the others measure."""
@@ -126,8 +149,8 @@ class SharedRemoval(Owner):
     def found_by_others(self, pending: Pending) -> NDArray[np.int64]:
         """(N, 2) int64, what they found; valid until the next call."""
         if self._sparse:
-            for splats, changes in pending.results():
-                self._found[splats] += changes
+            for part, (splats, changes) in enumerate(pending.results()):
+                self._found[splats if self._numbers is None else self._numbers[part][splats]] += changes
             return self._found
         totals: list[NDArray[np.int64]] = pending.results()
         found = totals[0]
@@ -199,7 +222,7 @@ class _SharedSteering(Owner):
     def remove_marked(self) -> None:
         marked = (self._marks or self._own).just_marked()  # type: ignore[union-attr]
         # The others go on with it while the master's device does its own, and whoever tells them more waits for them.
-        self._shared._others.begin("remove_marked", marked)
+        self._shared.tell_marked(marked)
         if self._own is not None:
             self._own.remove_marked()
         else:

@@ -15,6 +15,7 @@ from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
+from potr_cl.raster.surely_seen import Seen
 from potr_cl.stages.pruning.schedule import Course, Pruned
 from potr_cl.stages.stage import State
 
@@ -67,7 +68,7 @@ def find_unseen(
     state: State,
     groups: SplatGroups | None = None,
     run: Run = map,
-    surely_seen: Callable[[Sequence[Camera]], NDArray[np.bool_]] | None = None,
+    surely_seen: Callable[[Sequence[Camera]], NDArray[np.uint8]] | None = None,
 ) -> tuple[NDArray[np.bool_], float]:
     """Which splats of a state no given training view sees, and their part of the opacity-weighted area.
 
@@ -77,14 +78,16 @@ def find_unseen(
         state: whose scene and views.
         groups: of the scene, where they are known.
         run: shares the work out.
-        surely_seen: finds quickly, for some views, (N,) most of the splats that they see; the rest are looked at here.
+        surely_seen: finds quickly which splats some views see, (N,) :class:`potr_cl.raster.surely_seen.Seen`; those
+            that it leaves undecided are looked at here.
     """
     views, scene = state.views[: len(state.views) - state.added], state.scene
     if surely_seen is None:
         unseen = unseen_splats(scene, views, groups, run)
     else:
-        unseen = ~surely_seen(views)
-        rest = np.flatnonzero(unseen)
+        found = surely_seen(views)
+        unseen = found == Seen.NO
+        rest = np.flatnonzero(found == Seen.UNDECIDED)
         if len(rest):
             unseen[rest] = unseen_splats(scene.subset(rest), views, None, run)
     if not unseen.any():  # as usual

@@ -29,7 +29,7 @@ from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner, Reused, Scratch
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.macros import totals_limits
-from potr_cl.raster.picked_splats import PickedSplats, Picker
+from potr_cl.raster.picked_splats import PickedSplats, Picker, Picks
 from potr_cl.raster.rasterizer import PreparingMemory, Rasterizer
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 from potr_cl.raster.view_set import TILE
@@ -56,8 +56,8 @@ _OWN, _TOGETHER = 70, 56
 #: Of the memory, what these may take; how many they are at most; and how many times as many splats as one of them (on
 #: the average) they see together at most.
 _PASSING, _MOST, _SPREAD = 1 / 5, 16, 4.0
-#: How much more than a tile they may lose, on the average.
-_PATIENCE = 2.0
+#: How much more than a tile they may lose, on the average, and in how many iterations at most.
+_PATIENCE, _LONGEST = 2.0, 48
 
 
 def can_go_by_view(scene: Drawable, device: Device, options: SweepOptions) -> TypeGuard[SceneBuffers]:
@@ -223,6 +223,8 @@ class ViewByView(Owner):
         #: Whether every splat is left, and has the colours of the targets.
         self._pristine = True
         self._targets_known = self._unkept_known = False
+        #: Iterations since the views that are not kept were measured.
+        self._unmeasured = 0
         self._seen = sights.seen
         own = np.ones(len(cameras), bool)
         if numbers is not None:
@@ -248,7 +250,8 @@ class ViewByView(Owner):
             )
             self.marks: cl.Buffer = self._survivors.buffer
             self._picker = owned.enter_context(Picker(device, sights.groups.group_of))
-            self._prepare_all(sights, own, progress)
+            with Memory(device) as picking:
+                self._prepare_all(sights, own, Picks(picking, self._picker, sights.seen), progress)
             self._owned = owned.pop_all()
         self.kept_views = len(self._kept)
 
@@ -260,7 +263,11 @@ class ViewByView(Owner):
     # --------------------------------------------------------------------------------------------- preparing views
 
     def _prepare_all(
-        self, sights: Sights, mine: NDArray[np.bool_], progress: Callable[[int, int], None] | None
+        self,
+        sights: Sights,
+        mine: NDArray[np.bool_],
+        picks: Picks,
+        progress: Callable[[int, int], None] | None,
     ) -> None:
         device, memory = self.device, self._memory
         totals = np.where(mine, sights.totals, 0)
@@ -276,12 +283,13 @@ class ViewByView(Owner):
         if _SPLAT * int(totals.sum()) + int(targets.sum()) > left:
             left -= passing + 16 * self._whole.stride
             reserved = int(targets.sum())
+        self._pending: list[cl.Event] = []
         first_tile, others = 0, []
         for done, number in enumerate(sights.order().tolist()):
             own = int(targets[number])
             reserved = max(reserved - own, 0)
             if totals[number]:
-                kept = self._keep(number, int(totals[number]), left - reserved, first_tile)
+                kept = self._keep(number, picks, left - reserved, first_tile)
                 if kept:
                     first_tile += tiles[number]
                     left -= kept
@@ -291,6 +299,8 @@ class ViewByView(Owner):
             if progress is not None:
                 progress(done + 1, len(self._cameras))
         self._list_everything()
+        self._finish()
+        self._pending.clear()
         if others:
             self._totals_of_unkept = memory.allocate(16 * self._whole.stride, "the effects in views that are not kept")
             self._unkept = self._dealt_out(others, sights, targets, passing)
@@ -319,17 +329,19 @@ class ViewByView(Owner):
             batches.append(_Batch([number], wanted))
         return batches
 
-    def _keep(self, number: int, splats: int, room: int, first_tile: int) -> int:
+    def _keep(self, number: int, picks: Picks, room: int, first_tile: int) -> int:
         """Prepare a view, and keep it if it takes no more than the room; returns the bytes that it takes, or 0."""
-        device, camera = self.device, self._cameras[number]
+        device, camera, splats = self.device, self._cameras[number], picks.counts[number]
         if 2 / 3 * _SPLAT * splats + _PIXEL * camera.width * camera.height > room:
             return 0
         before = device.allocated
         with suppress(DeviceMemoryError), ExitStack() as stack:
             memory = stack.enter_context(Memory(device))
-            view = _View(number, camera, splats, self._picker.pick(memory, self._seen[number])[0])
+            view = _View(number, camera, splats, picks.numbers(memory, number))
             rasterizer = stack.enter_context(self._rasterizer(view.numbers, splats))
-            prepared = PreparedSet(rasterizer, range(number, number + 1), rasterizer.prepare_set([camera]))
+            views = rasterizer.prepare_set([camera])
+            # The device sorts its lists while the next view is made ready.
+            prepared = PreparedSet(rasterizer, range(number, number + 1), views, pending=self._pending)
             stack.enter_context(prepared)
             rasterizer.rest()
             marks = memory.allocate(rasterizer.stride, "a view's splats that are left")
@@ -390,9 +402,10 @@ class ViewByView(Owner):
         for kept in self._kept:
             kept.add()
         if self._unkept:
+            self._unmeasured += 1
             if self._unkept_are_stale():
                 self._measure_unkept()
-                self._unkept_known = True
+                self._unkept_known, self._unmeasured = True, 0
             add = self.device.shared_kernel("prune/add_totals.cl", "add_totals")
             add.bind(totals=self.totals, more=self._totals_of_unkept, count=2 * self.splats)
             add.launch((-(-2 * self.splats // _GROUP) * _GROUP,), (_GROUP,))
@@ -444,7 +457,7 @@ class ViewByView(Owner):
 
     def _unkept_are_stale(self) -> bool:
         """Whether they have lost more than the tolerance since they were measured: a part of their area, on average."""
-        if not self._unkept_known or self._options.tolerance <= 0:
+        if not self._unkept_known or self._options.tolerance <= 0 or self._unmeasured >= _LONGEST:
             return True
         with Memory(self.device) as memory:
             words = memory.upload(np.zeros(1, np.int64), "the importance that has gone")
@@ -512,11 +525,11 @@ class ViewByView(Owner):
             stack.enter_context(prepared)
             own_totals.reserve(16 * rasterizer.stride)
             device.fill(own_totals.buffer, np.uint32(0), 16 * rasterizer.stride)
-            for scratch in (tiles, stale):
-                scratch.reserve(4 * views.tiles)
-            everything = np.arange(views.tiles, dtype=np.uint32)
-            with device.errors("failed while computing"):
-                cl.enqueue_copy(device.queue, tiles.buffer, everything, is_blocking=True)
+            stale.reserve(4 * views.tiles)
+            if tiles.reserve(4 * views.tiles):  # all of them: nobody writes to it
+                everything = np.arange(views.tiles, dtype=np.uint32)
+                with device.errors("failed while computing"):
+                    cl.enqueue_copy(device.queue, tiles.buffer, everything, is_blocking=True)
             buffers = SweepBuffers(self.marks, tiles.buffer, stale.buffer, self._counts, own_totals.buffer)
             launcher = launcher_for(rasterizer, self._options, self._fixed_point)
             kernels = launcher.bind(prepared, (views.shapes, views.colours), buffers, first_time=True)

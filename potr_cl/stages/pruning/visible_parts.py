@@ -32,17 +32,18 @@ from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, up
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
 from potr_cl.stages.pruning.steering import Steering
-from potr_cl.stages.pruning.survivors import Survivors
+from potr_cl.stages.pruning.survivors import Bits, Survivors
 from potr_cl.stages.pruning.sweep_options import SweepOptions, default_memory
 
 #: Scenes of fewer splats are projected faster than parted.
 LEAST_SPLATS = 1 << 21
 #: Parts must save this much of the splats that views project, for their own copies and for what each part costs.
-_WORTH_IT = 0.5
-#: Few of the splats, one in so many, tell whether it may be worth it; then a view sees no more than this part of them.
-_SAMPLED, LIKELY = 64, 0.6
+WORTH_IT = 0.5
+#: Few of the splats, one in so many, and so many views tell whether it may be worth it. The boxes of few splats are
+#: smaller, so views seem to see a little less than they do.
+_SAMPLED, _VIEWS, LIKELY = 64, 48, WORTH_IT
 #: The parts' scenes stay on the device if they take no more than this part of the memory.
-_SCENES = 1 / 2
+SCENES = 1 / 2
 #: The whole scene is on the device too where that has so many times as much memory.
 _WHOLE = 3
 #: The total that spares a splat: a ΔMSE of about 1, by the bounds of :class:`FixedPoint`; and what limits it is beyond.
@@ -53,12 +54,13 @@ _GROUP = 64
 
 
 def seen_part(scene: Scene, cameras: Sequence[Camera]) -> float:
-    """Which part of a scene a view may draw on the average, told from few of its splats; 1 for a small scene."""
+    """Which part of a scene a view may draw on the average, told from few of both; 1 for a small scene."""
     if len(scene) < LEAST_SPLATS or not cameras:
         return 1.0
     few = scene.subset(np.arange(0, len(scene), _SAMPLED))
     groups = SplatGroups.of(few, max(splat_groups.LARGEST // _SAMPLED, 1))
-    return float((groups.visible_by(cameras, INRIA.near) @ groups.counts).mean() / len(few))
+    some = [cameras[number] for number in range(0, len(cameras), -(-len(cameras) // _VIEWS))]
+    return float((groups.visible_by(some, INRIA.near) @ groups.counts).mean() / len(few))
 
 
 def groups_of_large(scene: Scene, run: Run = map) -> SplatGroups | None:
@@ -86,7 +88,7 @@ def sights_worth_it(
     if len(scene) < LEAST_SPLATS or options.sample < 1 or not cameras:
         return None
     sights = Sights.of(scene, cameras, INRIA.near, groups, run)
-    return sights if sights.totals.sum() <= _WORTH_IT * len(scene) * len(cameras) else None
+    return sights if sights.totals.sum() <= WORTH_IT * len(scene) * len(cameras) else None
 
 
 def first_totals(splats: int, spared: NDArray[np.bool_] | None) -> NDArray[np.int64]:
@@ -102,15 +104,21 @@ def first_totals(splats: int, spared: NDArray[np.bool_] | None) -> NDArray[np.in
     return totals
 
 
+def fits_whole(device: Device, scene: Drawable) -> bool:
+    """Whether a whole scene is to lie on a device: on a GPU with memory of its own that it fits, or it does already."""
+    if isinstance(scene, SceneBuffers):
+        return True
+    if device.info.kind == "cpu" or device.info.integrated:
+        return False
+    return _WHOLE * scene.nbytes <= device.info.memory - device.allocated
+
+
 @contextmanager
 def whole_on_device(device: Device, scene: Drawable) -> Iterator[Drawable]:
     """The same scene where parts are filled from it quickest: on a GPU with memory of its own, if it fits."""
-    if isinstance(scene, SceneBuffers) or device.info.kind == "cpu" or device.info.integrated:
-        yield scene
-        return
     found: Drawable = scene
     with ExitStack() as stack:
-        if _WHOLE * scene.nbytes <= device.info.memory - device.allocated:
+        if not isinstance(scene, SceneBuffers) and fits_whole(device, scene):
             with suppress(DeviceMemoryError):
                 found = stack.enter_context(uploaded(device, scene))
         yield found
@@ -151,6 +159,7 @@ class PartedRemoval(Owner):
 
     Attributes:
         splats, steering: as of a :class:`~potr_cl.stages.pruning.removal.RemovalSweep`.
+        kept_views: views that stay prepared.
 
     Raises:
         DeviceError: a part's scene or a view does not fit the device.
@@ -178,7 +187,7 @@ class PartedRemoval(Owner):
         left = default_memory(device) if options.memory is None else options.memory
         sizes = [len(part.splats) * scene.nbytes // max(len(scene), 1) for part in parts]
         #: Whether the parts' scenes are on the device only where they are needed.
-        self._rest = sum(sizes) > _SCENES * left
+        self._rest = sum(sizes) > SCENES * left
         left = max(left - (max(sizes) if self._rest else sum(sizes)), 0)
         done = 0
 
@@ -206,6 +215,7 @@ class PartedRemoval(Owner):
             if all(part.sweep.steering is not None for part in self._parts):
                 self.steering = owned.enter_context(_PartedSteering(self, device))
             self._owned = owned.pop_all()
+        self.kept_views = sum(part.sweep.cached_views for part in self._parts)
 
     @contextmanager
     def awake(self, part: _Part) -> Iterator[None]:
@@ -234,11 +244,15 @@ class PartedRemoval(Owner):
 
     def measure(self) -> tuple[F64, F64]:
         """ΔMSE_k and I_k of all N splats, float64; the values of removed splats mean nothing."""
+        return self._fixed_point.values(self.measure_totals())
+
+    def measure_totals(self) -> NDArray[np.int64]:
+        """The same as (N, 2) int64 in units of the fixed point: the sums over all parts."""
         totals = self._first_totals.copy()
         for part in self._parts:
             with self.awake(part):
                 totals[part.splats] += part.sweep.measure_totals()
-        return self._fixed_point.values(totals)
+        return totals
 
     def remove(self, splats: Indices) -> None:
         """Take splats out for good."""
@@ -260,9 +274,22 @@ class PartedRemoval(Owner):
 
     def view_importances(self) -> Iterator[tuple[int, Indices, F64]]:
         """See :meth:`potr_cl.stages.pruning.removal.RemovalSweep.view_importances`."""
+        self.sweep_changed()
+        yield from self.known_importances()
+
+    def sweep_everything(self) -> None:
+        """Have the next measurement sweep every tile, whatever has changed."""
+        for part in self._parts:
+            part.sweep.sweep_everything()
+
+    def sweep_changed(self) -> None:
+        """Measure whatever anything was removed from since it was last measured."""
         for part in self._parts:
             with self.awake(part):
                 part.sweep.sweep_changed()
+
+    def known_importances(self) -> Iterator[tuple[int, Indices, F64]]:
+        """:meth:`view_importances` right after :meth:`sweep_changed`."""
         yield from heapq.merge(*map(self._importances, self._parts), key=lambda found: found[0])
 
     def _importances(self, part: _Part) -> Iterator[tuple[int, Indices, F64]]:
@@ -318,6 +345,10 @@ class _PartedSteering(Owner):
             self._mark.launch((-(-count // _GROUP) * _GROUP,), (_GROUP,))
             steering.remove_marked()
         self._survivors.marked_by_device()
+
+    def mark(self, splats: Bits) -> None:
+        """See :meth:`potr_cl.stages.pruning.steering.Steering.mark`."""
+        self._survivors.mark(splats)
 
     def close(self) -> None:
         self._survivors.close()

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+from concurrent.futures import Future
 from typing import Any
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.host.threads import in_background
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory
@@ -46,6 +48,7 @@ class Coefficients(VectorSpace):
         self._from_fixed = device.shared_kernel(
             "refit/gather.cl", "from_fixed", WEIGHTS=0, SOME_BLOCKS=0, **layout.macros
         )
+        self._made: Future[FloatArray] | None = None
         self._memory = Memory(device)
         try:
             self.active = self._memory.allocate(8 * layout.stride, "the active coefficients")
@@ -172,13 +175,19 @@ class Coefficients(VectorSpace):
     def read_sh(self, x: cl.Buffer) -> FloatArray:
         """(N, M, 3) float32, a vector in R, G, B; each coefficient contiguous in memory."""
         layout, device = self.layout, self.device
-        sh = np.empty((layout.sh_count, 3, layout.splats), np.float32)
+        made, self._made = self._made, None
+        sh = np.empty((layout.sh_count, 3, layout.splats), np.float32) if made is None else made.result()
         with Memory(device) as memory:
             rgb = memory.allocate(4 * self.length, "the SH coefficients")
             self.to_rgb(x, rgb)
             with device.errors("failed while computing"):
                 cl.enqueue_copy(device.queue, sh, rgb, is_blocking=True, **self._as_columns(sh))
         return sh.transpose(2, 0, 1)
+
+    def make_room(self) -> None:
+        """See :meth:`VectorSpace.make_room`."""
+        if self._made is None and not (self.device.info.kind == "cpu" or self.device.info.integrated):
+            self._made = in_background(np.full, (self.layout.sh_count, 3, self.layout.splats), np.float32(0))
 
     def to_rgb(self, x: cl.Buffer, result: cl.Buffer) -> None:
         """Enqueue: result = x in R, G, B."""
@@ -214,4 +223,5 @@ class Coefficients(VectorSpace):
 
     def close(self) -> None:
         """Give all device memory back, that of the vectors included."""
+        self._made = None
         self._memory.close()

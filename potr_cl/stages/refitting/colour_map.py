@@ -27,15 +27,17 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.raster.view_set import TABLE_ENTRY, TILE, ViewSet
+from potr_cl.raster.view_set import TABLE_ENTRY, ViewSet
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.fixed_point import gathered_scale
+from potr_cl.stages.refitting.gathering import Gathered, Gathering
 from potr_cl.stages.refitting.launcher import Launcher
 from potr_cl.stages.refitting.prepared_views import PreparedViews
 from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
 from potr_cl.stages.refitting.targets import TargetCache, Targets
 from potr_cl.stages.refitting.vector_space import Vector, VectorSpace
+from potr_cl.stages.refitting.view_errors import ViewErrors
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
 _CHANGE, _TOTALS = 16, 32
@@ -115,22 +117,12 @@ class ColourMap(Owner):
             constant: device.shared_kernel("refit/view_colours.cl", "view_colours", **layout.some(constant))
             for constant in (False, True)
         }
-        self._gathers = {
-            (constant, weights, some): device.shared_kernel(
-                "refit/gather.cl", "gather", WEIGHTS=int(weights), SOME_BLOCKS=int(some), **layout.some(constant)
-            )
-            for constant, weights, some in (
-                (False, False, False),
-                (False, True, False),
-                (False, True, True),
-                (True, False, False),
-            )
-        }
+        self._gathering = Gathering(device, layout)
         self.total_weight = 3 * REFERENCE_PIXELS * len(cameras)
         self._one = gathered_scale(cameras, [_weight(camera) for camera in cameras])
         fixed_points = self._launcher.fixed_point_scales(cameras)
         self._views_of_all = len(cameras)
-        self.parts = _PARTS if len(cameras) >= _PARTS * ENOUGH else 1
+        self.parts = parts_of(len(cameras))
         own_numbers = range(len(cameras)) if numbers is None else numbers
         # Launches, and what is gathered together, are of one part.
         self._numbers = sorted(own_numbers, key=lambda number: (number % self.parts, number))
@@ -168,8 +160,8 @@ class ColourMap(Owner):
             coefficients.clear(self._totals)
             self.sums = self._memory.allocate(8 * layout.columns * layout.stride, "the sums over views")
             coefficients.clear(self.sums)
-            tiles = max((sum(_tiles(cameras[number]) for number in numbers) for numbers in launches), default=0)
-            self._errors = self._memory.allocate(4 * tiles, "the tiles' errors")
+            self._errors = ViewErrors(device, cameras, self._weights, self._numbers, launches)
+            self._owned.append(self._errors)
             # By what each view's sums are multiplied on their way to the coefficients.
             pairs = zip(self._weights, self._fixed_points, strict=True)
             scales = np.array([self._one * weight / fixed_point for weight, fixed_point in pairs], np.float32)
@@ -217,10 +209,11 @@ class ColourMap(Owner):
             sums = self._block_sums(memory, len(ranges[0])) if ranges else None
             on_device = self._coefficients.on_device(x)
             if self._helpers is not None:
+                self.prepare(targets)  # it waits for this device, from which the others then read x
                 self._helpers.begin_gradient(on_device, blocks is not None, constant)
-            errors = self.sum_gradient(on_device, targets, sums, constant)
-            if self._helpers is not None:
-                errors |= self._helpers.add(self.sums, sums)
+            self.sum_gradient(on_device, targets, sums, constant)
+            errors = {} if self._helpers is None else self._helpers.add(self.sums, sums)
+            errors |= self.found_errors()
             self._coefficients.add_fixed(result, self.sums, 1 / self._one, constant)
             if blocks is not None:
                 blocks.add_fixed(ranges[0], sums, 1 / self._one)
@@ -234,19 +227,21 @@ class ColourMap(Owner):
                 self._device.queue.finish()
         return math.fsum(errors[number] for number in sorted(errors))
 
-    def sum_gradient(
-        self, x: cl.Buffer, targets: Targets, blocks: cl.Buffer | None, constant: bool = False
-    ) -> dict[int, float]:
-        """The part of :meth:`gradient` that is a sum over this device's views: it is added to :attr:`sums`.
+    def prepare(self, targets: Targets) -> None:
+        """Have the pictures of this device's views that are kept there, before the first gradient asks for them.
+
+        Raises:
+            DeviceError: the device failed. What the targets raise.
+        """
+        self._targets.fill(targets)
+
+    def sum_gradient(self, x: cl.Buffer, targets: Targets, blocks: cl.Buffer | None, constant: bool = False) -> None:
+        """Enqueue the part of :meth:`gradient` that is a sum over this device's views: it is added to :attr:`sums`.
 
         Args:
             x, targets, constant: as of :meth:`gradient`.
             blocks: (M (M + 1) / 2, n) int64, the same of the first n splats' own blocks; None: they are not wanted.
-
-        Returns:
-            The squared error by W of each view, by number.
         """
-        errors: dict[int, float] = {}
         for group in self._groups_of(None):
             for slot, numbers in zip(self._slots, group, strict=False):
                 with self._views.ready(numbers) as (views, _):
@@ -257,9 +252,12 @@ class ColourMap(Owner):
                     nbytes = _CHANGE * self._layout.stride * len(numbers)
                     cl.enqueue_copy(self._device.queue, slot.change, views.colours, byte_count=nbytes)
                     self._enqueue_table(numbers, group, views)
-                    errors |= self._found_errors(numbers, views)
+                    self._errors.keep(numbers)
             self._enqueue_gather(group, blocks, constant)
-        return errors
+
+    def found_errors(self) -> dict[int, float]:
+        """The squared error by W of each of this device's views after :meth:`sum_gradient`, by number."""
+        return self._errors.found()
 
     def _sum_blocks(self, blocks: cl.Buffer, first: int) -> None:
         """The blocks' part of :meth:`sum_gradient` alone, of the splats from one on."""
@@ -368,7 +366,7 @@ class ColourMap(Owner):
             (0.0, 0.0, 0.0) if target is None else self._background,
             target,
             self._fixed_points[numbers[0]],
-            self._errors,
+            self._errors.latest,
             slot.totals,
             weights,
         )
@@ -386,34 +384,11 @@ class ColourMap(Owner):
 
         And to the blocks, if the sums have their part: of as many splats as there is room for, from the first one on.
         """
-        triangle = self._layout.sh_count * (self._layout.sh_count + 1) // 2
-        splats = self._layout.stride if blocks is None else blocks.size // (8 * triangle)
-        gather = self._gathers[constant, blocks is not None, splats < self._layout.stride]
-        gather.bind(
-            totals=self._totals,
-            means=self._means,
-            stride=self._layout.stride,
-            views=self._tables,
-            view_count=sum(map(len, group)),
-            scales=self._scales,
-            first_scale=group[0][0],
-            free=self._change,
-            result=self.sums,
-            first_block=first_block,
-            block_stride=splats,
-            blocks=self.sums if blocks is None else blocks,
-        )
-        self._layout.over_splats(gather)
-
-    def _found_errors(self, numbers: range, views: ViewSet) -> dict[int, float]:
-        """The squared error by W that the last sweep found in each of these views, by its number among all."""
-        tiles = self._device.download(self._errors, (views.tiles,), np.float32)
-        ends = np.cumsum([view.tiles for view in views.views])
-        parts = np.split(tiles, ends[:-1])
-        return {
-            self._numbers[number]: self._weights[number] * float(part.sum(dtype=np.float64))
-            for number, part in zip(numbers, parts, strict=True)
-        }
+        gathered = Gathered(self._totals, self._means, self._tables, sum(map(len, group)), self._scales, group[0][0])
+        if blocks is not None:
+            self._gathering.with_blocks(gathered, self._change, self.sums, blocks, first_block)
+        else:
+            self._gathering.enqueue(gathered, self._change, self.sums, constant)
 
     def close(self) -> None:
         """Give all device memory back."""
@@ -435,6 +410,11 @@ class _Slot:
     totals: cl.Buffer
 
 
+def parts_of(views: int) -> int:
+    """Into how many parts so many views are divided; view k is in part k modulo this."""
+    return _PARTS if views >= _PARTS * ENOUGH else 1
+
+
 def _part(buffer: cl.Buffer, number: int, parts: int) -> cl.Buffer:
     """One of some equal parts of a buffer."""
     nbytes = buffer.size // parts
@@ -444,8 +424,3 @@ def _part(buffer: cl.Buffer, number: int, parts: int) -> cl.Buffer:
 def _weight(camera: Camera) -> float:
     """What a pixel of a view counts."""
     return REFERENCE_PIXELS / (camera.width * camera.height)
-
-
-def _tiles(camera: Camera) -> int:
-    """Tiles that cover a view."""
-    return -(-camera.width // TILE) * -(-camera.height // TILE)

@@ -8,7 +8,7 @@ from numpy.typing import NDArray
 
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.memory import Owner, Scratch, Staging
-from potr_cl.opencl.relay import Lent, Relay
+from potr_cl.opencl.relay import Lent, Relay, done_so_far
 from potr_cl.stages.refitting.coefficients import Coefficients
 
 _SOURCE = "refit/packing.cl"
@@ -54,6 +54,9 @@ class Packing(Owner):
         self._places = Scratch(device, "the coefficients' places")
         self._starts = Scratch(device, "the coefficients' places")
         self._packed = Scratch(device, "the packed coefficients")
+        # What comes from others has a place of its own: it arrives while the device still computes.
+        self._arrived = Scratch(device, "the packed coefficients")
+        self._free: cl.Event | None = None  # when that place is looked at no more
 
     def take_flags(self) -> None:
         """Pack by the flags as they are on the device from now on."""
@@ -103,7 +106,8 @@ class Packing(Owner):
     def set_floats(self, x: cl.Buffer, packed: FloatArray | Lent) -> None:
         """Set a vector; coefficients that are not active become 0."""
         self._take(packed, 4)
-        self._launch("unpack_floats", x)
+        self._launch("unpack_floats", x, self._arrived)
+        self._free = done_so_far(self._coefficients.device)
 
     def sums(self, columns: cl.Buffer) -> NDArray[np.int64]:
         """(count,) int64, sums over views of active coefficients; valid until something else is packed.
@@ -124,26 +128,28 @@ class Packing(Owner):
     def add_sums(self, columns: cl.Buffer, packed: NDArray[np.int64] | Lent) -> None:
         """Add to sums over views."""
         self._take(packed, 8)
-        self._launch("add_sums", columns)
+        self._launch("add_sums", columns, self._arrived)
+        self._free = done_so_far(self._coefficients.device)
 
     def add_rows(self, sums: cl.Buffer, row: int, more: NDArray[np.int64]) -> None:
         """Add whole rows, (rows, stride) int64, to sums from a row on."""
-        self._packed.reserve(more.nbytes)
-        self._copy_to(self._packed, more)
-        self._add_packed(sums, row * more.shape[1], more.size)
+        self._make_room(more.nbytes)
+        self._copy_to(self._arrived, more)
+        self._add_arrived(sums, row * more.shape[1], more.size)
 
     def add_lent(self, sums: cl.Buffer, more: Lent) -> None:
         """Add all of a device's sums, as many int64 as there are here, some at a time."""
         for start in range(0, more.nbytes, _AT_ONCE):
             nbytes = min(_AT_ONCE, more.nbytes - start)
-            self._packed.reserve(nbytes)
-            self._relay.fetch(self._packed.buffer, more, start, nbytes)
-            self._add_packed(sums, start // 8, nbytes // 8)
+            self._make_room(nbytes)
+            self._relay.fetch(self._arrived.buffer, more, start, nbytes, self._free)
+            self._add_arrived(sums, start // 8, nbytes // 8)
 
-    def _add_packed(self, sums: cl.Buffer, start: int, count: int) -> None:
+    def _add_arrived(self, sums: cl.Buffer, start: int, count: int) -> None:
         kernel = self._kernels["add_rows"]
-        kernel.bind(sums=sums, start=start, more=self._packed.buffer, count=count)
+        kernel.bind(sums=sums, start=start, more=self._arrived.buffer, count=count)
         kernel.launch((-(-count // _GROUP) * _GROUP,), (_GROUP,))
+        self._free = done_so_far(self._coefficients.device)
 
     def fetch(self, x: cl.Buffer, lent: Lent) -> None:
         """Take a whole vector from another device, which lays it out in the same way."""
@@ -153,11 +159,16 @@ class Packing(Owner):
         """Have packed coefficients of so many bytes each on the device."""
         if packed.nbytes != nbytes * self.count:
             raise ValueError(f"{packed.nbytes // nbytes} packed coefficients, where {self.count} are active")
-        self._packed.reserve(packed.nbytes)
+        self._make_room(packed.nbytes)
         if isinstance(packed, Lent):
-            self._relay.fetch(self._packed.buffer, packed)
+            self._relay.fetch(self._arrived.buffer, packed, free=self._free)
         else:
-            self._copy_to(self._packed, packed)
+            self._copy_to(self._arrived, packed)
+
+    def _make_room(self, nbytes: int) -> None:
+        """For what arrives."""
+        if self._arrived.reserve(nbytes):
+            self._free = done_so_far(self._coefficients.device)
 
     def _copy_to(self, scratch: Scratch, array: NDArray[np.generic]) -> None:
         if array.nbytes:
@@ -170,7 +181,7 @@ class Packing(Owner):
         kernel.bind(active=self._coefficients.active, stride=layout.stride, splats=layout.splats, **buffers)
         kernel.launch((-(-layout.splats // (_RUN * _GROUP)) * _GROUP,), (_GROUP,))
 
-    def _launch(self, name: str, columns: cl.Buffer) -> None:
+    def _launch(self, name: str, columns: cl.Buffer, packed: Scratch | None = None) -> None:
         layout, kernel = self._coefficients.layout, self._kernels[name]
         kernel.bind(
             columns=columns,
@@ -178,7 +189,7 @@ class Packing(Owner):
             stride=layout.stride,
             splats=layout.splats,
             places=self._places.buffer,
-            packed=self._packed.buffer,
+            packed=(packed or self._packed).buffer,
         )
         kernel.launch((-(-layout.splats // _GROUP) * _GROUP,), (_GROUP,))
 
@@ -187,5 +198,6 @@ class Packing(Owner):
         self._places.close()
         self._starts.close()
         self._packed.close()
+        self._arrived.close()
         self._staging.close()
         self._relay.close()

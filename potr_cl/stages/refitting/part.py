@@ -18,11 +18,13 @@ from potr_cl.opencl.relay import Lent
 from potr_cl.raster.kept_scene import KeptScene, lying_on
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.view_shares import Excerpt
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.packing import Packing
-from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
+from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.refitting.vector_space import Layout
 from potr_cl.workers.pool import Part
 
@@ -56,7 +58,8 @@ class ColourPart(Part):
         scene: whose geometry and opacities are used; its colours need no more than their constant coefficients.
         sh_count: M, coefficients of a channel.
         rules, background: of the rasterizer.
-        source: the scene whose pictures are the targets, perhaps kept on devices.
+        source: the scene whose pictures are the targets, perhaps kept on devices, with pictures of it there, or what
+            these views see of it.
         cameras: all views.
         numbers: of the views of this part, ascending.
 
@@ -72,14 +75,15 @@ class ColourPart(Part):
         sh_count: int,
         rules: RasterRules,
         background: tuple[float, float, float],
-        source: Scene | KeptScene,
+        source: Scene | KeptScene | PicturesAhead | Excerpt,
         cameras: Sequence[Camera],
         numbers: Sequence[int],
     ) -> None:
         self._device = device
         with ExitStack() as owned:
             rasterizer = owned.enter_context(Rasterizer(device, scene, rules))
-            pictured = owned.enter_context(lying_on(device, source))
+            ahead, kept = (source, source.source) if isinstance(source, PicturesAhead) else (None, source)
+            pictured = owned.enter_context(lying_on(device, kept))
             of_source = owned.enter_context(Rasterizer(device, pictured, background=background))
             launcher = launcher_for(device, rules)
             layout = Layout(len(scene), rasterizer.stride, sh_count, launcher.lanes)
@@ -89,7 +93,10 @@ class ColourPart(Part):
             self._map = owned.enter_context(
                 ColourMap(launcher, rasterizer, self._coefficients, scene.means, cameras, background, memory, numbers)
             )
-            self._targets = RenderedTargets(of_source, cameras)
+            self._targets: Targets = RenderedTargets(of_source, cameras)
+            if ahead is not None:
+                self._targets = ahead.before(device, self._targets)
+            self._map.prepare(self._targets)
             self._staging = owned.enter_context(Staging(device))
             self._blocks = owned.enter_context(Memory(device))
             self._block_sums: cl.Buffer | None = None
@@ -118,11 +125,12 @@ class ColourPart(Part):
             triangle = layout.sh_count * (layout.sh_count + 1) // 2
             self._block_sums = self._blocks.allocate(8 * triangle * layout.stride, "the splats' normal equations")
             self._coefficients.zero(self._block_sums)
-        errors = self._map.sum_gradient(self._x, self._targets, self._block_sums, constant)
+        self._map.sum_gradient(self._x, self._targets, self._block_sums, constant)
         if isinstance(x, Lent):
+            sums = self._packing.lend_sums(self._map.sums)
             lent = None if self._block_sums is None else Lent(self._device, self._block_sums, self._block_sums.size)
-            return Gradient(errors, self._packing.lend_sums(self._map.sums), lent)
-        return Gradient(errors, self._packing.sums(self._map.sums))
+            return Gradient(self._map.found_errors(), sums, lent)
+        return Gradient(self._map.found_errors(), self._packing.sums(self._map.sums))
 
     def block_rows(self, first: int, rows: int) -> NDArray[np.int64]:
         """Some rows of the sums of the splats' own blocks after a gradient; valid until the next call.

@@ -31,16 +31,18 @@ from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
+from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
 from potr_cl.stages.refitting.launcher import launcher_for
+from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import blocks_of, left_for_views, placed, rounding_of, vectors_of
 from potr_cl.stages.refitting.rounding import ROUNDS
-from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts
+from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
 from potr_cl.stages.refitting.targets import Targets
 from potr_cl.stages.refitting.vector_space import Layout, Ridge, Vector
-from potr_cl.workers.dealing import shares
+from potr_cl.workers.dealing import Shares
 from potr_cl.workers.pool import Pool
 
 #: Steps in which the constant coefficients are solved for once more, after the others have been rounded.
@@ -256,11 +258,22 @@ class HelpFrom:
 
     Attributes:
         pool: the workers.
-        source: the scene whose pictures are the targets, perhaps kept on devices.
+        source: the scene whose pictures are the targets, perhaps kept on devices, or with pictures of it there; or who
+            does which views, and has what these see of it.
     """
 
     pool: Pool
-    source: Scene | KeptScene
+    source: Scene | KeptScene | PicturesAhead | ViewShares
+
+    def shares(self, views: int) -> Shares:
+        """Who does which of so many views.
+
+        Raises:
+            WorkerLost: no worker is left.
+        """
+        if isinstance(self.source, ViewShares):
+            return Shares([], [share.numbers for share in self.source.shares])
+        return colour_shares(self.pool, views)
 
 
 class ColourRefit(Owner):
@@ -300,7 +313,7 @@ class ColourRefit(Owner):
         with ExitStack() as owned:
             own, others = None, None
             if help_from is not None:
-                share = shares(help_from.pool, len(cameras))
+                share = help_from.shares(len(cameras))
                 if share.others:
                     own = share.own
                     others = owned.enter_context(
@@ -384,6 +397,7 @@ class ColourRefit(Owner):
         """
         coefficients, solver = self.coefficients, self._solver
         coefficients.write_sh(solver.x, sh)
+        coefficients.make_room()
         coefficients.activate(active)
         if active is not None and not hold:
             coefficients.keep_active(solver.x)

@@ -70,9 +70,9 @@ class RememberedTargets:
 
     def __init__(self, device: Device, targets: Targets, cameras: Sequence[Camera]) -> None:
         self._device = device
-        self._ends = np.cumsum([0, *(_nbytes(camera) // 4 for camera in cameras)])
+        self._ends = np.cumsum([0, *(nbytes(camera) // 4 for camera in cameras)])
         self._pictures = mapped.array((int(self._ends[-1]),), np.float32, "pictures")
-        largest = max(map(_nbytes, cameras))
+        largest = max(map(nbytes, cameras))
         # On a GPU several at a time are rendered faster.
         together = 1 if device.family == "cpu" else min(max(_TOGETHER // largest, 1), len(cameras))
         with Memory(device) as memory:
@@ -97,7 +97,8 @@ class RememberedTargets:
         return self._pictures[self._ends[number] : self._ends[number + 1]]
 
 
-def _nbytes(camera: Camera) -> int:
+def nbytes(camera: Camera) -> int:
+    """Bytes of a view's picture."""
     return 12 * camera.width * camera.height
 
 
@@ -168,28 +169,33 @@ class TargetCache(Owner):
         numbers: Sequence[int],
     ) -> None:
         self._numbers = numbers
-        self._nbytes = {launch: sum(_nbytes(cameras[number]) for number in launch) for launch in launches}
+        self._nbytes = {launch: sum(nbytes(cameras[number]) for number in launch) for launch in launches}
         self._budget = budget
         self._memory = Memory(device)
         self._others = self._memory.allocate(max(self._nbytes.values(), default=0), "the target images")
         self._kept: dict[range, cl.Buffer] = {}
         self._kept_of: Targets | None = None
 
+    def fill(self, targets: Targets) -> None:
+        """Have those pictures of these targets that are kept."""
+        self._keep_only(targets)
+        for launch, size in self._nbytes.items():
+            if launch not in self._kept and size <= self._budget.room:
+                self.pictures(targets, launch)
+
     def pictures(self, targets: Targets, numbers: range) -> cl.Buffer:
         """(pixels, 3) float32, what the views of a launch should show, one behind the other.
 
         They are valid until the next call. Other targets than at the last call take the place of what was kept.
         """
-        if targets is not self._kept_of:
-            self._forget()
-            self._kept_of = targets
+        self._keep_only(targets)
         if numbers in self._kept:
             return self._kept[numbers]
-        nbytes = self._nbytes[numbers]
-        if nbytes > self._budget.room:
+        size = self._nbytes[numbers]
+        if size > self._budget.room:
             targets.into(self._among_all(numbers), self._others)
             return self._others
-        buffer = self._memory.allocate(nbytes, "the target images")
+        buffer = self._memory.allocate(size, "the target images")
         self._budget.room -= buffer.size
         self._kept[numbers] = buffer
         try:
@@ -198,6 +204,11 @@ class TargetCache(Owner):
             self._drop(numbers)
             raise
         return buffer
+
+    def _keep_only(self, targets: Targets) -> None:
+        if targets is not self._kept_of:
+            self._forget()
+            self._kept_of = targets
 
     def _among_all(self, numbers: range) -> list[int]:
         return [self._numbers[number] for number in numbers]

@@ -183,6 +183,9 @@ class VectorSpace(Owner):
     def read_sh(self, x: Vector) -> FloatArray:
         """(N, M, 3) float32, a vector in R, G, B; each coefficient contiguous in memory."""
 
+    def make_room(self) -> None:
+        """Begin to take the host's memory for the next :meth:`read_sh`: that can take longer than to fill it."""
+
     # ------------------------------------------------------------------------------------------ which may change
 
     def keep_active(self, x: Vector) -> None:

@@ -177,4 +177,4 @@ def test_convert_tells_the_bytes_of_all_files_of_a_folder(tmp_path, data, capsys
     assert main(["convert", str(data / "plush_excerpt.ply"), str(tmp_path / "meta.json")]) == 0
     whole = sum(path.stat().st_size for path in tmp_path.iterdir())
     told = capsys.readouterr()
-    assert f"{whole} bytes" in told.out + told.err
+    assert f"{whole:,} bytes" in told.out + told.err

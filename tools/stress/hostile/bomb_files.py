@@ -378,9 +378,9 @@ BOMBS: dict[str, dict[str, Callable[[], Files]]] = {
         "65,535² pixels, no rows": _png(65_535, 65_535),
         "2³¹ x 1 pixels, no rows": _png((1 << 31) - 1, 1),
         "64 MB behind a pixel": _png(1, 1, rows=_LONG),
-        "64 MB as a text": _png(8, 8, _packed(b"zTXt", b"a\0\0"), rows=25 * 8),
-        "64 MB as an international text": _png(8, 8, _packed(b"iTXt", b"a\0\1\0\0\0"), rows=25 * 8),
-        "64 MB as a colour profile": _png(8, 8, _packed(b"iCCP", b"a\0\0"), rows=25 * 8),
+        "64 MB as a text": lambda: _png(8, 8, _packed(b"zTXt", b"a\0\0"), rows=25 * 8)(),
+        "64 MB as an international text": lambda: _png(8, 8, _packed(b"iTXt", b"a\0\1\0\0\0"), rows=25 * 8)(),
+        "64 MB as a colour profile": lambda: _png(8, 8, _packed(b"iCCP", b"a\0\0"), rows=25 * 8)(),
         "an animation of 10⁹ frames": _png(
             8, 8, picture_files.chunk(b"acTL", struct.pack(">II", 10**9, 0)), rows=25 * 8
         ),

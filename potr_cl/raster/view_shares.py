@@ -1,0 +1,94 @@
+"""Views dealt out to computers, each of which gets of a large scene what its views may draw: :class:`ViewShares`.
+
+Pictures, and what a view measures, are the same bits with these splats as with all: those left out reach no pixel, and
+the others keep their order.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from dataclasses import dataclass
+
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+from potr_cl.model.splat_groups import Indices
+from potr_cl.raster.culling import Sights
+
+
+@dataclass(frozen=True)
+class Excerpt:
+    """Some splats of a scene. They are gathered on their way to another process, where they arrive as a scene.
+
+    Attributes:
+        scene: the scene.
+        splats: (n,) int64, their numbers there, ascending.
+    """
+
+    scene: Scene
+    splats: Indices
+
+    @property
+    def nbytes(self) -> int:
+        """Bytes of these splats."""
+        return self.scene.nbytes * len(self.splats) // max(len(self.scene), 1)
+
+    def gathered(self) -> Scene:
+        """A scene of them."""
+        return self.scene.subset(self.splats)
+
+    def __reduce__(self) -> tuple[Callable[[Scene], Scene], tuple[Scene]]:
+        return _as_it_is, (self.gathered(),)
+
+
+def _as_it_is(scene: Scene) -> Scene:
+    return scene
+
+
+@dataclass(frozen=True)
+class ViewShare:
+    """What one of them does, and gets.
+
+    Attributes:
+        numbers: of its views, ascending.
+        splats: (n,) int64, the numbers of the splats that these may draw, ascending, in the scene that is worked on.
+        excerpt: these splats, whose places are their numbers from now on.
+        sights: what all views may draw of them.
+    """
+
+    numbers: list[int]
+    splats: Indices
+    excerpt: Excerpt
+    sights: Sights
+
+
+@dataclass(frozen=True)
+class ViewShares:
+    """All views, dealt out.
+
+    Attributes:
+        views: all views.
+        shares: who does which of them; each has some.
+    """
+
+    views: Sequence[Camera]
+    shares: tuple[ViewShare, ...]
+
+    @staticmethod
+    def of(
+        views: Sequence[Camera], sights: Sights, speeds: Sequence[float], source: Scene, numbers: Indices
+    ) -> ViewShares:
+        """Deal views out, neighbours to the same.
+
+        Args:
+            views: at least one.
+            sights: what they see of the scene that is worked on.
+            speeds: of those that are to do them.
+            source: a scene that has that one's splats as they are.
+            numbers: (N,) of these there, ascending.
+        """
+        shares = []
+        for own in sights.dealt(speeds):
+            if own:
+                splats, of_these = sights.of_views(own)
+                shares.append(ViewShare(own, splats, Excerpt(source, numbers[splats]), of_these))
+        return ViewShares(views, tuple(shares))

@@ -1,0 +1,110 @@
+"""How often Dask looks at its own processes: seldom, while they work for an encode. See :func:`look_seldom_for`.
+
+A process of Dask looks at its event loop fifty times a second, at its memory and disks twice, and at what its threads
+do a hundred times. That takes 4 to 5 % of a processor for scheduler, worker and its nanny, and dashboards alone
+show it. What tells Dask who is alive, and the limits of memory, stay as they are.
+
+Everything goes through Dask's plugins (https://distributed.dask.org/en/stable/plugins.html). A process that cannot be
+reached, or does not know this package, goes on as before.
+"""
+
+from __future__ import annotations
+
+import asyncio
+import weakref
+from contextlib import suppress
+from typing import TYPE_CHECKING, Any
+
+from distributed import Nanny, NannyPlugin, SchedulerPlugin, Worker, WorkerPlugin
+
+if TYPE_CHECKING:
+    from distributed import Client, Scheduler
+
+#: Milliseconds between two looks. A loop that is looked at less often than every three seconds seems to hang.
+_SELDOM = {"tick": 1000.0, "monitor": 5000.0, "profile": 2000.0}
+_NAME = "potr_cl seldom looks"
+
+#: Milliseconds of each server of this process as they were, while it looks seldom.
+_before: weakref.WeakKeyDictionary[Any, dict[str, float]] = weakref.WeakKeyDictionary()
+
+
+def look_seldom_for(client: Client) -> None:
+    """Have the processes of a client's cluster look at themselves seldom, until the client leaves or is lost.
+
+    Workers that come later do so too.
+    """
+    name = f"{_NAME} {client.id}"
+    with suppress(Exception):
+        # The scheduler first: it sees to the end of all of them.
+        client.register_plugin(_OfScheduler(client.id, name), name)
+        client.register_plugin(_OfWorkers(), name)
+        client.register_plugin(_OfNannies(), name)
+
+
+def look_as_before_for(client: Client) -> None:
+    """Undo :func:`look_seldom_for` for a client that stays; the scheduler waits until it leaves."""
+    if client.status == "running":
+        for nanny in (False, True):
+            with suppress(Exception):
+                client.unregister_worker_plugin(f"{_NAME} {client.id}", nanny=nanny)
+
+
+def look_seldom(server: Any) -> None:
+    """Have a server of Dask look at itself seldom; more than once does no harm."""
+    before = _before.setdefault(server, {})
+    for name, seldom in _SELDOM.items():
+        look = server.periodic_callbacks.get(name)
+        if look is not None and look.callback_time < seldom:
+            before[name], look.callback_time = look.callback_time, seldom
+
+
+def look_as_before(server: Any) -> None:
+    """Undo :func:`look_seldom`."""
+    for name, often in _before.pop(server, {}).items():
+        server.periodic_callbacks[name].callback_time = often
+
+
+class _OfWorkers(WorkerPlugin):  # type: ignore[misc]
+    def setup(self, worker: Worker) -> None:
+        look_seldom(worker)
+
+    def teardown(self, worker: Worker) -> None:
+        look_as_before(worker)
+
+
+class _OfNannies(NannyPlugin):  # type: ignore[misc]
+    def setup(self, nanny: Nanny) -> None:
+        look_seldom(nanny)
+
+    def teardown(self, nanny: Nanny) -> None:
+        look_as_before(nanny)
+
+
+class _OfScheduler(SchedulerPlugin):  # type: ignore[misc]
+    """Ends with the client, and ends the others.
+
+    Args:
+        client: whose work it is.
+        name: of all three plugins.
+    """
+
+    idempotent = True
+
+    def __init__(self, client: str, name: str) -> None:
+        self._client, self._name = client, name
+        self._ending: asyncio.Task[None] | None = None
+
+    async def start(self, scheduler: Scheduler) -> None:
+        look_seldom(scheduler)
+
+    def remove_client(self, scheduler: Scheduler, client: str) -> None:
+        if client == self._client:
+            self._ending = asyncio.ensure_future(self._end(scheduler))
+
+    async def _end(self, scheduler: Scheduler) -> None:
+        look_as_before(scheduler)
+        with suppress(ValueError):
+            scheduler.remove_plugin(self._name)
+        for leave in (scheduler.unregister_worker_plugin, scheduler.unregister_nanny_plugin):
+            with suppress(Exception):
+                await leave(None, self._name)

@@ -1,0 +1,62 @@
+"""Stable orders of many numbers, found by threads."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from potr_cl.host.threads import thread_pool
+from potr_cl.model import morton, order
+from potr_cl.model.morton import BITS, morton_codes, morton_order
+from potr_cl.model.order import ascending
+
+
+@pytest.fixture(autouse=True)
+def _small_ranges(monkeypatch):
+    """So that a few thousand numbers are many."""
+    monkeypatch.setattr(order, "_LARGE", 1000)
+    monkeypatch.setattr(order, "_RANGE", 128)
+    monkeypatch.setattr(order, "_DEALT", 700)
+    monkeypatch.setattr(morton, "_ROWS", 300)
+
+
+def scores(kind: str, count: int) -> np.ndarray:
+    rng = np.random.default_rng(3)
+    if kind == "all equal":
+        return np.full(count, 7, np.uint64)
+    if kind == "few values":
+        return rng.integers(0, 5, count).astype(np.uint64)
+    if kind == "large":
+        return rng.integers(0, 1 << 64, count, dtype=np.uint64)
+    if kind == "sorted":
+        return np.arange(count, dtype=np.uint64)
+    return rng.normal(size=count)
+
+
+@pytest.mark.parametrize("kind", ["all equal", "few values", "large", "sorted", "normal"])
+@pytest.mark.parametrize("count", [0, 1, 999, 1000, 5000, 50_021])
+def test_it_is_the_stable_order(kind, count):
+    score = scores(kind, count)
+    wanted = np.argsort(score, kind="stable")
+    assert np.array_equal(ascending(score), wanted)
+    with thread_pool(3) as pool:
+        assert np.array_equal(ascending(score, pool.map), wanted)
+
+
+def test_morton_codes_have_the_bits_of_three_coordinates_in_turn():
+    rng = np.random.default_rng(4)
+    means = rng.normal(size=(2000, 3)).astype(np.float32)
+    means[5], means[6] = 1e30, -1e30
+    codes = morton_codes(means)
+    low, high = np.percentile(means.astype(np.float64), (2, 98), axis=0)
+    side = 2 * (high - low).max()
+    cells = np.clip((means - ((low + high) / 2 - side / 2)) * ((1 << BITS) / side), 0, (1 << BITS) - 1).astype(
+        np.uint64
+    )
+    for bit in range(BITS):
+        for axis in range(3):
+            assert np.array_equal(
+                codes >> np.uint64(3 * bit + axis) & np.uint64(1), cells[:, axis] >> np.uint64(bit) & np.uint64(1)
+            )
+    assert not (codes >> np.uint64(3 * BITS)).any()
+    assert np.array_equal(morton_order(means), np.argsort(codes, kind="stable"))

@@ -1,0 +1,98 @@
+"""What a splat may cost in scenes of which a view shows a part."""
+
+from __future__ import annotations
+
+import dataclasses
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+
+from potr_cl.codec.decoder import decode
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.model.camera import Camera, train_views
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encode import Encoded, encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.search import encode_to_target
+from potr_cl.pipeline.target import Target
+from potr_cl.quality.metrics import psnr
+from potr_cl.raster.rasterizer import Rasterizer
+
+#: So far apart that no copy's views show another one, in world units.
+APART = 200.0
+
+
+@pytest.fixture(scope="module")
+def device():
+    return Device()
+
+
+def row(scene: Scene, cameras: Sequence[Camera], copies: int) -> tuple[Scene, list[Camera]]:
+    """Copies of a scene beside each other, each with its own views."""
+    places = [np.array([APART * copy, 0, 0]) for copy in range(copies)]
+    every = scene.subset(np.tile(np.arange(len(scene)), copies))
+    means = every.means + np.repeat(places, len(scene), axis=0).astype(np.float32)
+    views = [
+        dataclasses.replace(view, name=f"{copy}_{view.name}", translation=view.translation - view.rotation @ place)
+        for copy, place in enumerate(places)
+        for view in cameras
+    ]
+    return dataclasses.replace(every, means=means), views
+
+
+def encoded(device, scene, cameras, preset="best", **between) -> Encoded:
+    options = EncodeOptions.for_preset(
+        preset, cameras_anyway=True, prune={"iterations": 8}, refit=False, between={"views": 0, **between}
+    )
+    return encode(scene, cameras, options, device=device)
+
+
+def match(device, scene, cameras, file: Encoded) -> float:
+    """Mean PSNR of some views."""
+    with Rasterizer(device, scene) as source, Rasterizer(device, decode(file.data)) as decoded:
+        return float(np.mean([psnr(source.render(c)[0], decoded.render(c)[0]) for c in cameras[::5]]))
+
+
+def test_copies_keep_about_as_many_splats_as_one(device, plush_excerpt, plush_excerpt_cameras):
+    given, copies = train_views(plush_excerpt_cameras), 12
+    alone = len(encoded(device, plush_excerpt, given).order)
+    scene, cameras = row(plush_excerpt, given, copies)
+    before, weighed = (encoded(device, scene, cameras, weigh=weigh) for weigh in (False, True))
+    lost_before, lost = (alone - len(each.order) / copies for each in (before, weighed))
+    assert lost_before > 0.1 * alone, (alone, lost_before, lost)
+    assert lost < 0.5 * lost_before, (alone, lost_before, lost)
+    assert match(device, scene, cameras, weighed) > match(device, scene, cameras, before) + 0.3
+
+
+def test_the_thresholds_follow_the_part_of_the_views_that_show_a_splat(device, plush_excerpt, plush_excerpt_cameras):
+    scene, cameras = row(plush_excerpt, train_views(plush_excerpt_cameras), 12)
+    asked = HyperParameters.from_quality(0.5, "best")
+    taken = encoded(device, scene, cameras).parameters
+    part = taken.delta_mse_max / asked.delta_mse_max
+    assert 1 / 12 <= part < 1 / 3
+    assert taken.drop == pytest.approx(part * asked.drop)
+    assert dataclasses.replace(taken, delta_mse_max=asked.delta_mse_max, drop=asked.drop) == asked
+
+
+def test_scenes_that_are_seen_whole_and_the_papers_preset_stay_as_they_are(
+    device, plush_excerpt, plush_excerpt_cameras
+):
+    given = train_views(plush_excerpt_cameras)
+    files = {encoded(device, plush_excerpt, given, weigh=weigh).data for weigh in (True, False)}
+    assert len(files) == 1
+    scene, cameras = row(plush_excerpt, given, 12)
+    options = EncodeOptions.for_preset("paper", cameras_anyway=True, prune={"iterations": 2})
+    paper = encode(scene, cameras, options, device=device)
+    assert paper.parameters == HyperParameters.from_quality(0.5, "paper")
+
+
+def test_a_search_and_an_encode_with_what_it_found_are_the_same(device, plush_excerpt, plush_excerpt_cameras):
+    scene, cameras = row(plush_excerpt, train_views(plush_excerpt_cameras), 4)
+    options = EncodeOptions.for_preset("best", cameras_anyway=True, prune={"iterations": 4}, refit={"steps": 2})
+    options = options.changed(between={"views": 0})
+    found = encode_to_target(scene, cameras, Target(max_bytes=100_000), options, device=device)
+    again = encode(scene, cameras, found.options, device=device)
+    assert again.parameters.delta_mse_max < HyperParameters.from_quality(found.options.q, "best").delta_mse_max
+    assert again.data == found.encoded.data

@@ -1,0 +1,82 @@
+"""How many views between the training views fit, in scenes of which a view sees a part."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.model import splat_groups
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+from potr_cl.raster.culling import parts_of_views
+from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.rules import INRIA
+from potr_cl.stages.between.room import room_for
+from potr_cl.stages.pruning import visible_parts
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.visible_parts import PartedRemoval
+from potr_cl.stages.stage import State, Workbench
+from tests.cases.streets import street
+from tests.devices import open_device
+
+
+@pytest.fixture(autouse=True)
+def _large(monkeypatch):
+    """The street counts as a large scene."""
+    monkeypatch.setattr(splat_groups, "LARGEST", 32)
+    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(visible_parts, "_SAMPLED", 2)
+
+
+def houses() -> tuple[Scene, list[Camera]]:
+    """A street without the view along it, which sees all."""
+    scene, cameras = street(10, 3000)
+    return scene, [camera for camera in cameras if camera.name != "along"]
+
+
+def rooms(device, memories, kept: bool = False) -> list[int]:
+    """How many of the second half of the street's views fit beside the first half's, with so much memory."""
+    scene, cameras = houses()
+    own, more = cameras[::2], cameras[1::2]
+    state = State.of(scene, own)
+    found = []
+    for memory in memories:
+        with KeptScene(device, scene) as on_device:
+            bench = Workbench(
+                HyperParameters.from_quality(0.5), device=device, memory=memory, kept=on_device if kept else None
+            )
+            found.append(room_for(more, state, bench))
+    assert device.allocated == 0
+    return found
+
+
+def test_all_are_added_where_views_are_made_again_in_batches():
+    device = open_device("gpu")
+    _, cameras = houses()
+    assert rooms(device, [0, 1 << 20], kept=True) == [len(cameras[1::2])] * 2
+
+
+def test_elsewhere_as_many_as_fit_with_what_each_may_draw(monkeypatch):
+    device = open_device("cpu")
+    memories = [k << 20 for k in range(0, 60, 3)]
+    by_parts = rooms(device, memories)
+    assert by_parts == sorted(by_parts)
+    assert by_parts[0] == 0
+    # More than if each view needed room for the whole scene.
+    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1 << 30)
+    assert sum(by_parts) > sum(rooms(device, memories)) + 5
+
+
+def test_what_is_added_is_kept():
+    """No view is made again for each measurement, with the memory that the estimate was made for."""
+    device = open_device("cpu")
+    scene, cameras = houses()
+    own, more = cameras[::2], cameras[1::2]
+    memories = [k << 20 for k in range(0, 60, 3)]
+    found = rooms(device, memories)
+    some = int(np.flatnonzero((np.array(found) > 0) & (np.array(found) < len(more)))[0])
+    views = [*own, *more[: found[some]]]
+    parts, options = parts_of_views(scene, views, INRIA.near), SweepOptions(memory=memories[some])
+    with PartedRemoval(device, scene, scene, views, parts, options) as removal:
+        assert removal.kept_views == len(views)

@@ -1,0 +1,84 @@
+"""Target pictures of a large scene, each with what its view may draw: the same bits as with all splats."""
+
+from __future__ import annotations
+
+import dataclasses
+
+import numpy as np
+import pytest
+
+from potr_cl.model import splat_groups
+from potr_cl.opencl.memory import Memory
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.culling import Sights
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA
+from potr_cl.raster.scene_buffers import uploaded
+from potr_cl.stages import refit
+from potr_cl.stages.pruning import visible_parts
+from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.stages.refitting.visible_targets import VisibleTargets
+from tests.cases.streets import street
+from tests.devices import KERNELS, open_device
+
+
+@pytest.fixture(scope="module", params=[kernels for kernels in KERNELS if "gpu" in str(kernels)])
+def device(request):
+    device = open_device(request.param)
+    yield device
+    assert device.allocated == 0, "targets did not give all their memory back"
+
+
+@pytest.fixture(autouse=True)
+def _small_groups(monkeypatch):
+    monkeypatch.setattr(splat_groups, "LARGEST", 32)
+
+
+def test_the_same_pictures(device):
+    """Of views of two sizes, one of which looks at nothing."""
+    scene, cameras = street()
+    away = dataclasses.replace(cameras[0], rotation=np.diag([1.0, -1.0, -1.0]) @ cameras[0].rotation)
+    away = dataclasses.replace(away, translation=-away.rotation @ (cameras[0].centre + 1000), width=50)
+    cameras = [*cameras, away, cameras[1]]
+    sights = Sights.of(scene, cameras, INRIA.near)
+    assert sights.totals[-2] == 0
+    assert sights.totals.sum() < 0.5 * len(scene) * len(cameras)
+    pixels = [3 * camera.width * camera.height for camera in cameras]
+    background = (0.1, 0.2, 0.3)
+    with (
+        uploaded(device, scene) as whole,
+        Rasterizer(device, whole, background=background) as rasterizer,
+        VisibleTargets(whole, cameras, sights, background) as visible,
+        Memory(device) as memory,
+    ):
+        buffers = [memory.allocate(4 * sum(pixels), "pictures") for _ in range(2)]
+        orders = [list(range(len(cameras))), [3, len(cameras) - 2, 1]]
+        for numbers in orders:
+            size = sum(pixels[number] for number in numbers)
+            RenderedTargets(rasterizer, cameras).into(numbers, buffers[0])
+            visible.into(numbers, buffers[1])
+            wanted, got = (device.download(buffer, (size,), np.float32) for buffer in buffers)
+            assert np.array_equal(wanted, got)
+            assert wanted.std() > 0.05
+        device.queue.finish()
+
+
+@pytest.mark.parametrize("memory", [None, 3_000_000], ids=["all memory", "little"])
+def test_a_refit_takes_them_and_the_bytes_stay(device, monkeypatch, memory):
+    scene, cameras = street(6, 400)
+    options = EncodeOptions.for_preset("best", memory=memory, cameras_anyway=True).changed(prune={"iterations": 4})
+    wanted = encode(scene, cameras, options, device=device)
+    made = []
+
+    class Noting(VisibleTargets):
+        def __init__(self, *args: object) -> None:
+            made.append(self)
+            super().__init__(*args)  # type: ignore[arg-type]
+
+    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+    monkeypatch.setattr(refit, "VisibleTargets", Noting)
+    got = encode(scene, cameras, options, device=device)
+    assert len(made) == 1
+    if memory is None:  # otherwise other views fit
+        assert got.data == wanted.data

@@ -1,0 +1,142 @@
+"""Workers elsewhere get of a large scene what their views may draw, and the file is the same."""
+
+from __future__ import annotations
+
+import dataclasses
+import pickle
+from itertools import chain
+
+import numpy as np
+import pytest
+
+from potr_cl.model import splat_groups
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.raster.culling import Sights
+from potr_cl.raster.rules import INRIA
+from potr_cl.raster.view_shares import Excerpt, ViewShares
+from potr_cl.stages.pruning import part, visible_parts
+from potr_cl.stages.refitting.part import ColourPart
+from tests.cases.elsewhere import ElsewherePool
+from tests.cases.streets import street
+from tests.devices import FAMILIES, open_device
+
+#: Splats go, colours are made sparse and re-fitted on the way, coefficients are given up, and AC is rounded.
+OPTIONS = dataclasses.replace(
+    EncodeOptions.for_preset(
+        "best", q=0.3, prune={"keep": 0.4, "iterations": 6}, refit={"at": (0.4,), "steps": 2, "drop": 1e-7},
+        compact=True, between=False,
+    ),
+    cameras_anyway=True,
+)  # fmt: skip
+
+
+@pytest.fixture(autouse=True)
+def _small_groups(monkeypatch):
+    monkeypatch.setattr(splat_groups, "LARGEST", 32)
+    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1)
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def family(request):
+    return request.param
+
+
+def with_a_house_that_nobody_sees(scene):
+    behind = scene.subset(np.arange(200))
+    behind = dataclasses.replace(behind, means=behind.means - np.float32([500, 0, 0]))
+    together = (np.concatenate([getattr(each, f.name) for each in (scene, behind)]) for f in array_fields(scene))
+    named = dict(zip([f.name for f in array_fields(scene)], together, strict=True))
+    return dataclasses.replace(scene, **named)
+
+
+def array_fields(scene):
+    return [f for f in dataclasses.fields(scene) if isinstance(getattr(scene, f.name), np.ndarray)]
+
+
+@pytest.mark.parametrize(
+    "options",
+    [
+        OPTIONS,
+        OPTIONS.changed(memory=0, prune={"tolerance": 0.0}),  # nothing is kept of any view
+        OPTIONS.changed(prune={"keep": None}),  # a GPU decides itself, and what nobody sees stays
+    ],
+    ids=["by number", "little memory", "by threshold"],
+)
+def test_the_same_bytes(family, options, monkeypatch):
+    scene, cameras = street(5, 500, across=True)
+    scene = with_a_house_that_nobody_sees(scene)
+    expected = encode(scene, cameras, options, device=open_device(family)).data
+    made = []
+
+    class Noting(part.RemovalPart):
+        def __init__(self, device, memory, given, *more):
+            made.append(len(given))
+            super().__init__(device, memory, given, *more)
+
+    class NotingColours(ColourPart):
+        def __init__(self, device, memory, constant, sh_count, rules, background, source, *more):
+            made.append(len(source))
+            super().__init__(device, memory, constant, sh_count, rules, background, source, *more)
+
+    monkeypatch.setattr("potr_cl.stages.pruning.measured.RemovalPart", Noting)
+    monkeypatch.setattr("potr_cl.stages.refitting.shared_map.ColourPart", NotingColours)
+    devices = [open_device(family) for _ in range(4)]
+    with ElsewherePool(devices) as pool:
+        assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected
+        # Of five houses and one that nobody sees, a worker has half or less, but for the view along the street.
+        assert len(made) == 9  # of three workers, for pruning and two re-fits
+        assert sorted(made)[5] < 0.6 * len(scene)
+        # These travelled once: the rest is what the re-fits need of the splats that are left.
+        constant = 2 * 56 * len(scene)
+        assert pool.scenes < sum(made[:3]) * scene.nbytes / len(scene) + constant
+    assert [device.allocated for device in devices] == [0] * 4
+
+
+def test_neighbours_go_to_the_same():
+    scene, cameras = street(across=True)
+    sights = Sights.of(scene, cameras, INRIA.near)
+    dealt = ViewShares.of(cameras, sights, [1.0, 1.0], scene, np.arange(len(scene)))
+    numbers = [share.numbers for share in dealt.shares]
+    assert sorted(chain(*numbers)) == list(range(len(cameras)))
+    assert all(own == sorted(own) for own in numbers)
+    least = min(len(share.splats) for share in dealt.shares)
+    assert least < 0.75 * len(scene)
+    in_turn = [sights.of_views(range(first, len(cameras), 2))[0] for first in range(2)]
+    assert sum(len(share.splats) for share in dealt.shares) < 0.9 * sum(map(len, in_turn))
+
+
+def test_twice_as_fast_gets_twice_as_much():
+    scene, cameras = street(8, across=True)
+    sights = Sights.of(scene, cameras, INRIA.near)
+    work = [int(sights.totals[own].sum()) for own in sights.dealt([2.0, 1.0])]
+    assert 1.4 < work[0] / work[1] < 2.8
+
+
+def test_a_share_names_its_splats_by_their_places():
+    scene, cameras = street(across=True)
+    sights = Sights.of(scene, cameras, INRIA.near)
+    splats, own = sights.of_views([3, 4])
+    assert np.array_equal(splats, sights.groups.splats(sights.seen[3] | sights.seen[4]))
+    assert own.totals[3] == sights.totals[3]
+    assert own.totals[4] == sights.totals[4]
+    assert np.array_equal(splats[own.groups.splats(own.seen[3])], sights.groups.splats(sights.seen[3]))
+
+
+def test_views_that_see_nothing_have_a_share_too():
+    scene, cameras = street(across=True)
+    away = dataclasses.replace(cameras[0], translation=cameras[0].translation + np.array([0, 0, -500.0]))
+    sights = Sights.of(scene, [*cameras, away, away], INRIA.near)
+    assert sights.totals[-1] == 0
+    splats, _ = sights.of_views([len(cameras)])
+    assert len(splats) > 0
+    assert all(len(each.splats) for each in sights.parts([len(cameras), len(cameras) + 1]))
+
+
+def test_an_excerpt_arrives_as_a_scene():
+    scene, _ = street(across=True)
+    sent = Excerpt(scene, np.array([3, 5, 900]))
+    there = pickle.loads(pickle.dumps(sent))
+    assert type(there) is type(scene)
+    assert np.array_equal(there.sh, scene.sh[[3, 5, 900]])
+    assert sent.nbytes == there.nbytes

@@ -1,0 +1,183 @@
+"""Other roads to the same result, at their worst (:func:`check_roads`): a part of tools.stress.run.
+
+Scenes that are large, or that come from a file, take roads of their own: splats are drawn out of a larger scene,
+removal effects are measured view by view, a re-fit's vectors go through the device in slices, values are spread over a
+device's memory. Each must give the bits of the plain road, whatever the scene is. And the fit's steps, with the choice
+of coefficients and the roundings after them, may leave nothing that is not finite, and no worse scene than they got.
+"""
+
+from __future__ import annotations
+
+import dataclasses
+from unittest.mock import patch
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec import encoder
+from potr_cl.codec.decoder import decode, open_file
+from potr_cl.codec.encoder import code_scene
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.errors import DataError
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
+from potr_cl.model.unseen import unseen_splats
+from potr_cl.ondevice.decode import decode_to_device
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Memory
+from potr_cl.raster.culling import Sights
+from potr_cl.raster.picked_splats import PickedSplats
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA
+from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
+from potr_cl.raster.surely_seen import surely_seen
+from potr_cl.stages.fitting.fit import FitOptions, fit_scene
+from potr_cl.stages.fitting.settling import Looking, Settling, settle
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.view_by_view import ViewByView
+from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.stages.stage import State, Workbench
+from tools.stress.cases import Case
+from tools.stress.measures import Measures
+
+#: Steps of the fit that are tried, and what a held-out view may lose: nothing.
+_STEPS = FitOptions(steps=6, rounds=2, batch=1)
+_PARAMETERS = HyperParameters.from_quality(0.3, "best")
+
+
+def check_roads(device: Device, case: Case) -> Measures:
+    """The measures "same bits: …", "surely seen" and "fit: steps", "fit: settling" of a view."""
+    scene, view = case.scene, case.view
+    found = {
+        "surely seen": (_wrongly_seen(device, scene, view), 1.0),
+        "fit: steps": (_fitted(device, scene, view), 1e-9),
+        "fit: settling": (_settled(device, scene, view), 1.0),
+    }
+    differing = _to_device(device, scene)
+    if differing is not None:
+        found["same bits: to a device"] = differing, 1.0
+    if device.family == "gpu":  # which alone takes these roads
+        found["same bits: picked splats"] = _picked(device, case), 1.0
+        found["same bits: view by view"] = _by_view(device, scene, view), 1.0
+    return found
+
+
+def differing(one: NDArray[np.generic], other: NDArray[np.generic]) -> float:
+    """How many values of two arrays are not the same; two that are no numbers are."""
+    same = (one == other) | ((one != one) & (other != other))
+    return float(same.size - np.count_nonzero(same))
+
+
+def _picked(device: Device, case: Case) -> float:
+    """Pixels of every second splat, drawn from where the scene lies, that differ from those of a scene of its own."""
+    numbers = np.arange(0, len(case.scene), 2)
+    with uploaded(device, case.scene) as whole, Memory(device) as memory:
+        there = memory.upload(numbers.astype(np.uint32), "some splats")
+        with (
+            Rasterizer(device, PickedSplats(whole, there, len(numbers)), case.rules) as one,
+            Rasterizer(device, case.scene.subset(numbers), case.rules) as other,
+        ):
+            return differing(one.render(case.view)[0], other.render(case.view)[0])
+
+
+def _by_view(device: Device, scene: Scene, view: Camera) -> float:
+    """Removal effects and importances of a view that is not kept, and of one that is, that differ from the sweep's."""
+    views = [view, dataclasses.replace(view, name="the same again")]
+    gone = np.arange(0, len(scene), 3)
+    left = np.setdiff1d(np.arange(len(scene)), gone)
+
+    def measured(removal: RemovalSweep | ViewByView) -> NDArray[np.float64]:
+        before = np.stack(removal.measure())
+        removal.remove(gone)
+        after = np.stack(removal.measure())
+        return np.concatenate([before, after[:, left]], axis=1)
+
+    with Rasterizer(device, scene) as rasterizer, RemovalSweep(rasterizer, views, SweepOptions(0.0)) as sweep:
+        wanted = measured(sweep)
+    number = 0.0
+    sights = Sights.of(scene, views, INRIA.near)
+    for memory in (None, 0):
+        options = SweepOptions(0.0, memory=memory)
+        with uploaded(device, scene) as whole, ViewByView(device, whole, views, sights, options) as removal:
+            number += differing(measured(removal), wanted)
+    return number
+
+
+def _wrongly_seen(device: Device, scene: Scene, view: Camera) -> float:
+    """Splats that are said to be seen, and are not by float64."""
+    with uploaded(device, scene) as there:
+        return float(np.count_nonzero(surely_seen(there, [view]) & unseen_splats(scene, [view])))
+
+
+def _to_device(device: Device, scene: Scene) -> float | None:
+    """Values of a file on the device that differ from those of the scene on the host; None where no file holds it."""
+    try:
+        with patch.object(encoder, "_FEW", 0):  # the coder of large scenes
+            data = b"".join(code_scene(scene, _PARAMETERS).pieces)
+    except DataError:
+        return None
+    with uploaded(device, decode(data)) as wanted, decode_to_device(open_file(data), device) as found:
+        pairs = zip(_values(wanted), _values(found), strict=True)
+        return sum(differing(one, other) for one, other in pairs)
+
+
+def _values(buffers: SceneBuffers) -> list[NDArray[np.uint32]]:
+    parameters = (buffers.means, buffers.scales, buffers.quaternions, buffers.log2_opacities, buffers.sh)
+    return [buffers.device.download(each, (each.size // 4,), np.uint32) for each in parameters]
+
+
+def _looked_at(view: Camera) -> list[Camera]:
+    """A view to fit to, and the same to judge by."""
+    return [view, dataclasses.replace(view, name="the same again")]
+
+
+def _shaken(scene: Scene) -> Scene:
+    """The scene with errors that a fit could mend; what is not finite after it is left."""
+    rng = np.random.default_rng(0)
+    with np.errstate(over="ignore"):
+        means = (scene.means * (1 + 1e-3 * rng.normal(size=scene.means.shape))).astype(np.float32)
+        sh = (scene.sh * (1 + 0.05 * rng.normal(size=scene.sh.shape))).astype(np.float32)
+    return dataclasses.replace(
+        scene,
+        means=np.where(np.isfinite(means), means, scene.means),
+        sh=np.where(np.isfinite(sh), sh, scene.sh),
+    )
+
+
+def _fitted(device: Device, scene: Scene, view: Camera) -> float:
+    """How much worse the scene that a fit keeps is than the one it was given; infinite if it is not finite.
+
+    Squares of colours beyond 1e19 have no number in single precision: then the given scene is kept.
+    """
+    views = _looked_at(view)
+    with Rasterizer(device, scene) as rasterizer:
+        fitted = fit_scene(device, _shaken(scene), views, RenderedTargets(rasterizer, views), _STEPS)
+    if not is_finite(fitted.scene):
+        return np.inf
+    if not np.isfinite(fitted.errors[0]):
+        return 0.0 if fitted.kept == 0 else np.inf
+    return max(fitted.error / max(fitted.errors[0], 1e-20) - 1, 0.0)
+
+
+def _settled(device: Device, scene: Scene, view: Camera) -> float:
+    """1 for a value that is not finite after coefficients are chosen and geometry is rounded, with fits in between."""
+    views = _looked_at(view)
+    bench = Workbench(_PARAMETERS, device=device)
+    settling = Settling(choosing=0.5, rounding=0.5, start=1.0)
+    with Rasterizer(device, scene) as rasterizer:
+        looking = Looking(views, 0, RenderedTargets(rasterizer, views), rasterizer)
+        try:
+            state, _ = settle(State.of(scene, views), bench, looking, settling, _STEPS)
+        except DataError:  # no file holds such a scene, and the encode says so
+            return 0.0
+    finite = is_finite(state.scene)
+    if state.geometry is not None:
+        finite &= is_finite(state.geometry.decoded(state.scene.sh))
+    return 0.0 if finite else 1.0
+
+
+def is_finite(scene: Scene) -> bool:
+    """Whether all parameters of a scene are."""
+    arrays = (scene.means, scene.log_scales, scene.quaternions, scene.opacity_logits, scene.sh)
+    return all(bool(np.isfinite(each).all()) for each in arrays)

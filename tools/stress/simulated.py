@@ -1,0 +1,471 @@
+"""Every kernel inside Oclgrind, which sees races, accesses out of bounds and uninitialised reads.
+
+    python -m tools.stress.simulated [--family gpu|cpu] [--step NAME …]
+
+Needs Oclgrind (Debian: oclgrind). It is hundreds of times as slow as a device, so the scenes are as small as they can
+be while every kernel has all its ways to go: lists longer than local memory, several batches, vectors of every width.
+Each family and vector width runs in a process of its own. A line of the table names the step, what Oclgrind found in
+it, and how many of the package's kernels were run in all; those that no step runs are named.
+"""
+
+from __future__ import annotations
+
+import argparse
+import dataclasses
+import json
+import os
+import re
+import shutil
+import subprocess
+import sys
+import tempfile
+import time
+from collections.abc import Callable
+from contextlib import ExitStack
+from pathlib import Path
+from typing import Any
+from unittest.mock import patch
+
+import numpy as np
+import pyopencl as cl
+
+import potr_cl
+from potr_cl.clustering.kmeans import cluster
+from potr_cl.codec import encoder
+from potr_cl.codec.decoder import open_file
+from potr_cl.codec.encoder import code_scene
+from potr_cl.codec.native.library import VARIABLE
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.errors import DeviceError
+from potr_cl.model import splat_groups
+from potr_cl.model.camera import Camera, camera_centres
+from potr_cl.model.scene import Scene
+from potr_cl.ondevice.decode import decode_to_device
+from potr_cl.opencl import device as opencl_device
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import list_devices
+from potr_cl.opencl.kernel import Kernel
+from potr_cl.opencl.memory import Memory
+from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.quality.metrics import ssim
+from potr_cl.quality.metrics_device import Similarity
+from potr_cl.quality.pictures import Picture
+from potr_cl.raster.culling import Sights, parts_of_views
+from potr_cl.raster.picked_splats import Picker
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import GSPLAT, INRIA
+from potr_cl.raster.scene_buffers import gathered, uploaded
+from potr_cl.raster.surely_seen import surely_seen
+from potr_cl.reference import raster as reference
+from potr_cl.reference.scenes import plain_splats, random_splats, straight_camera, tilted_camera
+from potr_cl.stages.compaction.ridge import Compactor
+from potr_cl.stages.compaction.view_weights import ViewWeights
+from potr_cl.stages.fitting.derivatives import PictureDerivatives
+from potr_cl.stages.fitting.fit import FitOptions, fit_scene
+from potr_cl.stages.fitting.tangents import PictureTangents
+from potr_cl.stages.pruning.on_device import prune_scene
+from potr_cl.stages.pruning.removal import RemovalSweep
+from potr_cl.stages.pruning.schedule import PruningOptions
+from potr_cl.stages.pruning.survivors import Survivors
+from potr_cl.stages.pruning.sweep_options import SweepOptions
+from potr_cl.stages.pruning.view_by_view import ViewByView
+from potr_cl.stages.pruning.visible_parts import PartedRemoval
+from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.packing import Packing
+from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
+from potr_cl.stages.refitting.targets import RenderedTargets
+from potr_cl.stages.refitting.vector_space import Layout
+
+#: Kernel families and vector widths.
+KINDS = (("gpu", 1), ("cpu", 4), ("cpu", 8), ("cpu", 16))
+#: As in the tests: pixels that come no nearer, relatively, to 1/255 and 1e-4 cannot flip; and what those may be off by.
+_CLEAR, _TOLERANCE = 1e-4, 2e-5
+
+Step = Callable[[Device], None]
+
+
+# ------------------------------------------------------------------------------------------ what is run
+
+
+def _views(count: int = 2) -> list[Camera]:
+    return [tilted_camera(seed, 24, 16) for seed in range(count)]
+
+
+def pictures(device: Device) -> None:
+    """Both rules, short lists and long ones, against float64."""
+    for rules, size in ((INRIA, 60), (GSPLAT, 400)):
+        scene, view = random_splats(size, 3, seed=1), tilted_camera(1, 40, 24)
+        with Rasterizer(device, scene, rules) as rasterizer:
+            image, _ = rasterizer.render(view)
+            rasterizer.render_device(view)
+        wanted = reference.render(scene, view, rules)
+        error = np.abs(image - wanted.image)[wanted.margin > _CLEAR].max()
+        assert error <= _TOLERANCE, error
+
+
+def long_lists(device: Device) -> None:
+    """A list longer than local memory."""
+    centres = np.random.default_rng(0).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (5000, 3))
+    with Rasterizer(device, plain_splats(centres, sigma=1e-3, logit=1)) as rasterizer:
+        rasterizer.render(straight_camera(16, 16))
+
+
+def pruning(device: Device) -> None:
+    """Removal effects, and a pruning that the device steers where it can."""
+    scene, views = random_splats(60, 3, seed=2), _views()
+    with Rasterizer(device, scene) as rasterizer:
+        with RemovalSweep(rasterizer, views, SweepOptions(0, 1)) as removal:
+            removal.measure()
+            removal.remove(np.arange(0, 60, 5))
+            removal.measure()
+        with RemovalSweep(rasterizer, views, SweepOptions(0, tighten=True)) as removal:
+            prune_scene(removal, PruningOptions(1e-4, 3))
+
+
+def several_batches(device: Device) -> None:
+    """Removal, re-fit and derivatives of a tile whose list GPU kernels take in three batches, whose pixels go on to the
+    end."""
+    scene, views = _tower()
+    with Rasterizer(device, scene) as rasterizer:
+        for tighten in (False, True):
+            with RemovalSweep(rasterizer, views, SweepOptions(0, tighten=tighten)) as removal:
+                removal.measure()
+                removal.remove(np.arange(0, len(scene), 7))
+                removal.measure()
+        options = RefitOptions(steps=1, gain=0, drop=1e-9)
+        refit_colours(device, scene, views, RenderedTargets(rasterizer, views), options)
+    _derivatives(device, scene, views)
+
+
+def _tower() -> tuple[Scene, list[Camera]]:
+    centres = np.random.default_rng(1).uniform((-0.1, -0.1, 1), (0.1, 0.1, 3), (300, 3))
+    return plain_splats(centres, sigma=0.03, logit=-4), [straight_camera(16, 16)]
+
+
+def view_by_view(device: Device) -> None:
+    """Pruning of a scene of which views see little: on GPUs view by view, with picked splats; with views that are kept,
+    and with none."""
+    if device.family != "gpu":
+        return
+    scene, views = _apart()
+    with patch.object(splat_groups, "LARGEST", 8), uploaded(device, scene) as whole:
+        sights = Sights.of(scene, views, INRIA.near)
+        for memory in (None, 0):
+            with ViewByView(device, whole, views, sights, SweepOptions(0.0, memory=memory)) as removal:
+                removal.measure()
+                removal.remove(np.arange(0, len(scene), 5))
+                removal.measure()
+            with ViewByView(device, whole, views, sights, SweepOptions(0.05, memory=memory)) as removal:
+                prune_scene(removal, PruningOptions(1e-2, 3))
+
+
+def part_by_part(device: Device) -> None:
+    """The same scene in parts that see much of the same."""
+    scene, views = _apart()
+    with patch.object(splat_groups, "LARGEST", 8):
+        parts = parts_of_views(scene, views, INRIA.near)
+        assert len(parts) > 1
+        with PartedRemoval(device, scene, scene, views, parts, SweepOptions(0.0)) as removal:
+            removal.measure()
+            prune_scene(removal, PruningOptions(1e-2, 3))
+
+
+def _apart() -> tuple[Scene, list[Camera]]:
+    """Three heaps, each with a view that sees no other."""
+    rng = np.random.default_rng(4)
+    heaps = np.repeat(np.arange(3) * 50.0, 40)
+    means = rng.normal(0, 0.3, (120, 3)) + np.stack([heaps, np.zeros(120), np.full(120, 3.0)], axis=1)
+    views = [
+        dataclasses.replace(straight_camera(24, 24), translation=np.array([-50.0 * k, 0, 0]), name=f"view {k}")
+        for k in range(3)
+    ]
+    return plain_splats(means, 0.1, -1, rng.uniform(0, 1, (120, 3))), views
+
+
+def some_of_a_scene(device: Device) -> None:
+    """Splats picked by their groups, gathered, and told to be seen."""
+    scene, views = random_splats(5000, 1, seed=3), _views()
+    groups = np.random.default_rng(0).integers(0, 9, len(scene)).astype(np.uint32)
+    wanted = np.arange(9) % 2 == 0
+    with uploaded(device, scene) as whole, Picker(device, groups) as picker, Memory(device) as memory:
+        numbers, count = picker.pick(memory, wanted)
+        expected = np.flatnonzero(wanted[groups])
+        assert np.array_equal(device.download(numbers, (count,), np.uint32), expected)
+        surely_seen(whole, views)
+        with gathered(whole, expected[:100]) as part, Rasterizer(device, part) as rasterizer:
+            rasterizer.render(views[0])
+
+
+def refit(device: Device) -> None:
+    """With AC coefficients rounded in rounds; with the vectors on the device, and on the host in slices."""
+    # Two slices: of 256 splats, and of the rest.
+    scene, views = random_splats(270, 1, seed=2), _views()
+    rng = np.random.default_rng(0)
+    steps = (0.1 * 2.0 ** rng.uniform(-1, 1, (2, len(scene)))).astype(np.float32)
+    grid = ColourGrid(steps[0], steps[1], rng.permutation(len(scene)))
+    found = []
+    with Rasterizer(device, scene) as rasterizer:
+        targets = RenderedTargets(rasterizer, views)
+        for slices in (None, 256):
+            options = RefitOptions(steps=2, gain=0, drop=1e-9, slices=slices)
+            found.append(refit_colours(device, scene, views, targets, options, colour_grid=lambda _: grid).sh)
+    assert np.array_equal(found[0], found[1])
+
+
+def packing(device: Device) -> None:
+    """What travels between devices that share a re-fit."""
+    scene = random_splats(300, 2, seed=5)
+    layout = Layout(300, 320, scene.sh.shape[1], 1)
+    with Memory(device) as memory, Coefficients(device, layout) as coefficients, Packing(coefficients) as packs:
+        coefficients.activate(np.random.default_rng(1).random(scene.sh.shape) < 0.5)
+        packs.take_flags()
+        packs.give_flags(packs.flags())
+        x = coefficients.vector()
+        coefficients.write(x, scene.sh)
+        packs.set_floats(x, packs.floats(x))
+        sums = memory.upload(np.ones((layout.columns, layout.stride), np.int64), "sums")
+        packs.add_sums(sums, packs.sums(sums))
+        packs.add_rows(sums, 1, np.ones((1, layout.stride), np.int64))
+
+
+def marks(device: Device) -> None:
+    """The bits of splats that go, and back."""
+    with Survivors(device, 61, 64, device.queue.finish) as survivors:
+        survivors.remove(np.arange(0, 61, 3))
+        survivors.mark(survivors.just_marked())
+
+
+def derivatives(device: Device) -> None:
+    """Jᵀ v and J x."""
+    scene, views = random_splats(60, 3, seed=2), _views()
+    _derivatives(device, scene, views)
+
+
+def _derivatives(device: Device, scene: Scene, views: list[Camera]) -> None:
+    pixels = sum(view.width * view.height for view in views)
+    with PictureDerivatives(device, scene) as found, Memory(device) as memory:
+        target = memory.upload(np.full((pixels, 3), 0.5, np.float32), "the targets")
+        found.add(views, target)
+        columns = np.ones((11 + scene.sh[0].size, found.rasterizer.stride), np.float32)
+        direction = memory.upload(columns, "the direction")
+        result = memory.allocate(12 * pixels, "the changes")
+        with PictureTangents(device, found.rasterizer) as tangents:
+            for view in views:
+                with found.rasterizer.prepare_set([view]) as prepared:
+                    tangents.of(prepared, direction, result)
+
+
+def fit(device: Device) -> None:
+    """Some steps, judged by views that are held out; antialiased, too."""
+    source, views = random_splats(60, 3, seed=2), _views(5)
+    for antialiased in (False, True):
+        original = dataclasses.replace(source, antialiased=antialiased)
+        scene = dataclasses.replace(original, means=original.means + np.float32(0.01))
+        with Rasterizer(device, original) as rasterizer:
+            targets = RenderedTargets(rasterizer, views)
+            fit_scene(device, scene, views, targets, FitOptions(steps=3, rounds=1))
+
+
+def compaction(device: Device) -> None:
+    """The ridge of every SH degree."""
+    views = _views()
+    with (
+        Rasterizer(device, random_splats(60, 3, seed=2)) as rasterizer,
+        RemovalSweep(rasterizer, views, SweepOptions(0, 1)) as removal,
+    ):
+        removal.measure()
+        weights = ViewWeights.from_importances(60, removal.view_importances())
+    for degree in (1, 2, 3):
+        Compactor(device).compact(random_splats(60, degree, seed=2), camera_centres(views), weights)
+
+
+def decoding(device: Device) -> None:
+    """Files to the device's memory: bundles, packed or not, and look-up tables."""
+    scene = random_splats(300, 3, seed=8)
+    for preset, by_c in (("best", "1"), ("best", "0"), ("paper", "0")):
+        with patch.object(encoder, "_FEW", 0), patch.dict(os.environ, {VARIABLE: by_c}):
+            data = b"".join(code_scene(scene, HyperParameters.from_quality(0.5, preset)).pieces)  # type: ignore[arg-type]
+            with decode_to_device(open_file(data), device) as buffers, Rasterizer(device, buffers) as rasterizer:
+                rasterizer.render(tilted_camera(1, 24, 24))
+
+
+def clusters(device: Device) -> None:
+    """k-means of a palette."""
+    generator = np.random.default_rng(1)
+    points = generator.normal(size=(700, 3, 3)).astype(np.float32)
+    cluster(device, points, generator.uniform(0.1, 2, (700, 3)).astype(np.float32), 550)
+
+
+def similarity(device: Device) -> None:
+    """SSIM of noisy, flat and bright pictures against float64.
+
+    Raises:
+        DeviceError: it is more than 1e-6 away.
+    """
+    rng = np.random.default_rng(0)
+    for level, noise in ((0.5, 0.2), (0.98, 1e-3)):
+        a, b = (np.float32(level) + noise * rng.standard_normal((37, 50, 3), np.float32) for _ in range(2))
+        pair = Picture(device.upload(a, "a picture"), 0, 50, 37), Picture(device.upload(b, "a picture"), 0, 50, 37)
+        ((_, found),) = Similarity(device)([pair])
+        if abs(found - ssim(a, b)) > 1e-6:
+            raise DeviceError(f"SSIM is {found}, not {ssim(a, b)}")
+
+
+def filling(device: Device) -> None:
+    """A buffer that a kernel fills, as large ones are."""
+    with patch.object(opencl_device, "_FILLED", 0), Memory(device) as memory:
+        for value, count in ((np.uint8(3), 1001), (np.float32(2), 77), (np.int64(1 << 40), 33)):
+            buffer = memory.allocate(count * value.nbytes, "values")
+            device.fill(buffer, value, count * value.nbytes)
+            assert (device.download(buffer, (count,), value.dtype) == value).all()
+
+
+STEPS: tuple[Step, ...] = (
+    pictures, long_lists, pruning, several_batches, view_by_view, part_by_part, some_of_a_scene, refit, packing, marks,
+    derivatives, fit, compaction, decoding, clusters, similarity, filling,
+)  # fmt: skip
+
+
+# ------------------------------------------------------------------------------------------ in the simulator
+
+
+def simulate(family: str, width: int, names: list[str], told: Path) -> None:
+    """Inside Oclgrind: run steps, and keep in a file which kernels were run.
+
+    Nothing is freed: Oclgrind mistakes a new buffer in an old one's place for memory that no one has written. Nor does
+    it know that a filled buffer has been written.
+    """
+
+    def fill(queue: cl.CommandQueue, buffer: cl.Buffer, pattern: Any, offset: int, size: int) -> None:
+        cl.enqueue_copy(queue, buffer, np.full(size // pattern.itemsize, pattern), dst_offset=offset)
+
+    run: set[str] = set()
+    sources: dict[int, str] = {}
+    freed: list[cl.Buffer] = []
+    info = next(d for d in list_devices() if "oclgrind" in d.platform.lower())
+    simulated = dataclasses.replace(info, vector_width=width)
+    make, launch = Device.kernel, Device.launch
+    kept: list[Kernel] = []
+
+    def made(device: Device, source: str, name: str, **defines: str | int | float) -> Kernel:
+        kept.append(make(device, source, name, **defines))
+        sources[id(kept[-1])] = source
+        return kept[-1]
+
+    def launched(device: Device, kernel: Kernel, *given: Any, **more: Any) -> None:
+        run.add(f"{sources[id(kernel)]}: {kernel.name}")
+        launch(device, kernel, *given, **more)
+
+    with ExitStack() as patches:
+        patches.enter_context(patch.object(cl, "enqueue_fill_buffer", fill))
+        patches.enter_context(patch.object(Device, "kernel", made))
+        patches.enter_context(patch.object(Device, "launch", launched))
+        patches.enter_context(patch.object(Device, "free", lambda _, buffer: freed.append(buffer)))
+        print("STEP probes", file=sys.stderr, flush=True)
+        device = Device(simulated, family=family, build_options=["-DNO_PREFETCH"])  # type: ignore[arg-type]
+        device.self_check()
+        for step in STEPS:
+            if step.__name__ in names:
+                # On the error stream, where Oclgrind writes too: what it says comes after the name of the step.
+                print(f"STEP {step.__name__}", file=sys.stderr, flush=True)
+                step(device)
+    told.write_text(json.dumps(sorted(run)))
+
+
+# ------------------------------------------------------------------------------------------ outside of it
+
+
+@dataclasses.dataclass(frozen=True)
+class Found:
+    """What a run of one family and vector width told.
+
+    Attributes:
+        findings: a line each: the step, and what Oclgrind or the step itself said first.
+        kernels: "file: name" of those that were run.
+        seconds: that it took.
+    """
+
+    findings: list[str]
+    kernels: set[str]
+    seconds: float
+
+
+def simulated(family: str, width: int, steps: list[str], api: bool = False) -> Found:
+    """Run steps in Oclgrind, in a process of its own."""
+    # Looking for uninitialised values it crashes where vectors are loaded from a work-item's own array, and where a
+    # vector is made of shorter ones.
+    checks = ["--data-races", *(["--uninitialized"] if family == "gpu" else []), *(["--check-api"] if api else [])]
+    began = time.perf_counter()
+    with tempfile.TemporaryDirectory() as folder:
+        told = Path(folder) / "kernels.json"
+        # Its optimiser breaks stores of vectors; programs from pyopencl's cache lose their sources.
+        command = ["oclgrind", "--build-options", "-cl-opt-disable", *checks]
+        command += [sys.executable, "-m", "tools.stress.simulated", "--inside", family, str(width), str(told)]
+        done = subprocess.run(
+            [*command, *(word for step in steps for word in ("--step", step))],
+            env=os.environ | {"PYOPENCL_NO_CACHE": "1"}, capture_output=True, text=True, check=False,
+        )  # fmt: skip
+        kernels = set(json.loads(told.read_text())) if told.exists() else set()
+    findings, step, said = [], "before the first step", ""
+    for line in [*done.stderr.splitlines(), "STEP the end"]:
+        if line.startswith("STEP "):
+            if said:
+                findings.append(f"{step}: {said}")
+            step, said = line.removeprefix("STEP "), ""
+        elif line.strip() and not said and not _HARMLESS.search(line):
+            said = line.strip()
+    if done.returncode:
+        last = [f"exit code {done.returncode}", *done.stderr.strip().splitlines()][-1]
+        findings.append(f"the run failed: {last}")
+    return Found(findings, kernels, time.perf_counter() - began)
+
+
+#: What pyopencl and Python say besides.
+_HARMLESS = re.compile(r"CompilerWarning|prg\.build|_create_built_program|warn\(|^\s+|UserWarning")
+
+
+def all_kernels() -> set[str]:
+    """ "file: name" of every kernel of the package."""
+    folder = Path(potr_cl.__file__).parent / "cl"
+    pattern = re.compile(r"^kernel\b[^{;]*?\bvoid\s+(\w+)\s*\(", re.MULTILINE)
+    return {
+        f"{path.relative_to(folder).as_posix()}: {name}"
+        for path in sorted(folder.rglob("*.cl"))
+        for name in pattern.findall(path.read_text())
+    }
+
+
+def main() -> None:
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.RawDescriptionHelpFormatter)
+    parser.add_argument("--family", choices=("gpu", "cpu"), help="default: both")
+    names = [step.__name__ for step in STEPS]
+    parser.add_argument("--step", action="append", dest="steps", choices=names, help="default: all")
+    parser.add_argument("--check-api", action="store_true", help="have Oclgrind check calls of OpenCL, too")
+    parser.add_argument("--inside", nargs=3, help=argparse.SUPPRESS)
+    args = parser.parse_args()
+    steps = args.steps or names
+    if args.inside is not None:
+        family, width, told = args.inside
+        simulate(family, int(width), steps, Path(told))
+        return
+    if shutil.which("oclgrind") is None:
+        sys.exit("Oclgrind is not installed (Debian: apt-get install oclgrind)")
+    print("| kernels | vector | steps | found | kernels run | s |\n" + "|---" * 6 + "|")
+    run: set[str] = set()
+    findings: list[str] = []
+    for family, width in KINDS:
+        if args.family in (None, family):
+            found = simulated(family, width, steps, args.check_api)
+            run |= found.kernels
+            findings += found.findings
+            said = "; ".join(found.findings) or "nothing"
+            numbers = f"{len(steps)} | {said} | {len(found.kernels)} | {found.seconds:.0f}"
+            print(f"| {family} | {width if family == 'cpu' else ''} | {numbers} |", flush=True)
+    if args.family is None and args.steps is None and (left := sorted(all_kernels() - run)):
+        findings.append(f"no step runs {', '.join(left)}")
+        print(f"\n{findings[-1]}")
+    sys.exit(1 if findings else 0)
+
+
+if __name__ == "__main__":
+    main()
