@@ -160,11 +160,9 @@ class Fit(Stage):
     choosing: float = option(0.3)
     rounding: float = option(0.15)
     gentle: float = option(0.1)
-    through: float = option(0.0)
+    through: float = option(0.3)
     cheap: float = option(0.0)
     sparse: int = option(0)
-    choices: int = option(1)
-    gather: float = option(0.4)
     seed: int = option(FitOptions.seed)
 
     def __post_init__(self) -> None:
@@ -306,14 +304,7 @@ class Fit(Stage):
         """Choose coefficients and round geometry, with what is left fitted once more in between."""
         options = self._options(bench.opened.family, bench.memory)
         settling = Settling(
-            self.choosing,
-            self.rounding,
-            self.gentle,
-            through=self.through,
-            cheap=self.cheap,
-            sparse=bool(self.sparse),
-            choices=self.choices,
-            gather=self.gather,
+            self.choosing, self.rounding, self.gentle, self.through, cheap=self.cheap, sparse=bool(self.sparse)
         )
         done, total = options.steps, options.steps + self.further_steps_on(bench.opened.family)
 
