@@ -87,7 +87,7 @@ class _Room:
 
 
 def spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Move bit i to bit 3 i, for 21 bits."""
+    """Move bit i to bit 3 i, for 21 bits, in uint64 of any shape."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),
