@@ -17,8 +17,8 @@ from potr_cl.host.threads import thread_pool
 
 FloatArray = NDArray[np.float32]
 
-#: Splats looked at at a time where values are checked.
-_BLOCK = 1 << 14
+#: Splats looked at at a time where values are checked, and where threads do it, which wait for the interpreter.
+_BLOCK, _THREAD_BLOCK = 1 << 14, 1 << 17
 #: So many splats are copied by threads, an eighth of them at a time.
 _LARGE = 1 << 19
 
@@ -291,13 +291,14 @@ class Scene:
             return scene, dataclasses.replace(report, infinite_opacities=infinite_opacities)
         finite = np.ones(len(self), bool)
 
-        def look(start: int) -> None:
+        def look(start: int, stop: int) -> None:
             """Block by block the temporaries stay in the cache, and one without fault is done at the first look."""
-            rows = slice(start, start + _BLOCK)
-            for array in (self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh):
-                ok = np.isfinite(array[rows])
-                if not ok.all():
-                    finite[rows] &= ok.reshape(len(ok), -1).all(axis=1)
+            for first in range(start, stop, _BLOCK):
+                rows = slice(first, min(first + _BLOCK, stop))
+                for array in (self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh):
+                    ok = np.isfinite(array[rows])
+                    if not ok.all():
+                        finite[rows] &= ok.reshape(len(ok), -1).all(axis=1)
 
         _over_blocks(look, len(self))
         dropped = len(self) - int(np.count_nonzero(finite))
@@ -306,10 +307,10 @@ class Scene:
             raise DataError("the scene holds no splat with finite values: nothing to do")
         zero = np.empty(len(scene), bool)
 
-        def measure(start: int) -> None:
+        def measure(start: int, stop: int) -> None:
             """A length whose square underflows cannot be normalised either."""
-            some = scene.quaternions[start : start + _BLOCK]
-            zero[start : start + _BLOCK] = np.einsum("ij,ij->i", some, some, dtype=np.float64) < 1e-30
+            some = scene.quaternions[start:stop]
+            zero[start:stop] = np.einsum("ij,ij->i", some, some, dtype=np.float64) < 1e-30
 
         _over_blocks(measure, len(scene))
         zeros = int(np.count_nonzero(zero))
@@ -320,15 +321,14 @@ class Scene:
         return scene, CleanReport(dropped, zeros, 0)
 
 
-def _over_blocks(work: Callable[[int], None], splats: int) -> None:
-    """Call something with the number of the first splat of each block; by threads, if there are many."""
-    starts = range(0, splats, _BLOCK)
+def _over_blocks(work: Callable[[int, int], None], splats: int) -> None:
+    """Call something with where each block of splats begins and ends; by threads, if there are many."""
     if splats < _LARGE:
-        for start in starts:
-            work(start)
+        work(0, splats)
         return
+    starts = range(0, splats, _THREAD_BLOCK)
     with thread_pool() as pool:
-        list(pool.map(work, starts))
+        list(pool.map(work, starts, (min(start + _THREAD_BLOCK, splats) for start in starts)))
 
 
 def joined(parts: Sequence[Scene]) -> Scene:

@@ -19,17 +19,12 @@ from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
+from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import placed
-from potr_cl.stages.refitting.refit import (
-    ColourRefit,
-    HelpFrom,
-    RefitOptions,
-    Refitted,
-    active_coefficients,
-    refit_colours,
-)
+from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.shared_map import colour_shares
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RememberedTargets, RenderedTargets, Targets
 from potr_cl.stages.refitting.visible_targets import VisibleTargets
@@ -130,7 +125,7 @@ class Refit(Stage):
         return [Interlude(after, RefitOnTheWay(steps=self.at_steps)) for after in times]
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Re-fit the colours, and leave a :class:`potr_cl.stages.refitting.refit.Refitted` in ``learnt``.
+        """Re-fit the colours, and leave a :class:`potr_cl.stages.refitting.refit_options.Refitted` in ``learnt``.
 
         With photographs, also a :class:`potr_cl.stages.refitting.photographs.PhotographChoice` as "photographs".
         """

@@ -168,8 +168,12 @@ class Parts(Owner):
     # ------------------------------------------------------------------------------------------------ their parts
 
     def _begin(self, place: int, command: str, args: Sequence[Any]) -> Future[Any]:
-        held = self._held[place]
+        held, by = self._held[place], self._by[place]
         assert held is not None, "a part is closed"
+        if by is not None and by.lost:  # another work has waited for it
+            gone: Future[Any] = Future()
+            gone.set_exception(WorkerLost("it has been given up before"))
+            return gone
         args = [each.args[place] if isinstance(each, Each) else each for each in args]
         self._pool.traffic.sent += nbytes(args)
         return held.begin(command, args)
@@ -226,10 +230,8 @@ class Parts(Owner):
             worker = self._by[place]
             assert worker is not None
             self._unfit.add(worker.name)
-            try:
-                left = self._able()
-            except WorkerLost:
-                left = []
+            worker.lost = worker.lost or isinstance(last, WorkerLost)
+            left = self._able()
             if not left:
                 raise last
             loads = [sum(by is each for by in self._by) for each in left]

@@ -10,7 +10,7 @@ import pytest
 
 from potr_cl.errors import DeviceMemoryError, UsageError
 from potr_cl.workers.dealing import shares
-from potr_cl.workers.parts import Parts
+from potr_cl.workers.parts import Each, Parts
 from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, WorkerLost
 
 
@@ -125,6 +125,28 @@ def test_all_are_lost():
 
 def test_a_silent_worker_is_given_up():
     assert course(FakePool(FakeWorker("a", 4, silent=True), FakeWorker("b"), patience=0.3)) == EXPECTED
+
+
+@pytest.mark.parametrize("lost_at", [None, 1, 2, 3, 4])
+def test_parts_can_be_told_different_things(lost_at):
+    """And those that are made again are told again what was theirs."""
+    pool = FakePool(FakeWorker("a", lost_at), FakeWorker("b"))
+    with Parts(pool, Sum, [(0, 1), (0, 2), (0, 3)]) as parts:
+        assert parts.tell("add", Each([1, 10, 100])) == [1, 20, 300]
+        assert parts.tell("add", 5) == [6, 30, 315]
+        assert parts.tell("add", Each([7, 0, 2])) == [13, 30, 321]
+
+
+def test_a_worker_that_is_silent_in_one_work_is_not_waited_for_in_another():
+    a, b = FakeWorker("a", 3, silent=True), FakeWorker("b")
+    pool = FakePool(a, b, patience=0.5)
+    with Parts(pool, Sum, [(0, 1), (0, 1)]) as first, Parts(pool, Sum, [(0, 1), (0, 1)]) as second:
+        assert first.tell("add", 1) == second.tell("add", 1) == [1, 1]
+        assert first.tell("add", 1) == [2, 2]
+        began = time.monotonic()
+        assert second.tell("add", 1) == [2, 2]
+        assert time.monotonic() - began < 0.4
+        assert a.commands == 3
 
 
 def test_a_refusal_is_no_loss():

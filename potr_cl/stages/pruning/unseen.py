@@ -11,7 +11,6 @@ from typing import Any
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.host import mapped
 from potr_cl.host.threads import Run, in_background
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
@@ -137,12 +136,12 @@ def without_directions(state: State, unseen: NDArray[np.int64]) -> State:
     """The state after some splats have lost what of their colours depends on the direction, as :func:`put_back` does.
 
     Args:
-        state: whose scene is.
+        state: whose scene it is; nobody else may have its colours, which change in place: a copy would take as much
+            memory as a large scene has left.
         unseen: their numbers in the source, ascending; those that are not left do not matter.
     """
     own = np.isin(state.survivors, unseen, assume_unique=True)
-    copied = mapped.rows(state.scene.sh, None, "SH coefficients")
-    sh = state.scene.sh.copy() if copied is None else copied
+    sh = state.scene.sh
     sh[own, 1:] = 0
     return state.recoloured(sh)
 
