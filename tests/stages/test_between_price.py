@@ -50,6 +50,18 @@ def encoded(device, scene, cameras, preset="best", **between) -> Encoded:
     return encode(scene, cameras, options, device=device)
 
 
+@pytest.fixture(scope="module")
+def twelve(plush_excerpt, plush_excerpt_cameras):
+    """Copies of the excerpt, and the views of all of them."""
+    return row(plush_excerpt, train_views(plush_excerpt_cameras), 12)
+
+
+@pytest.fixture(scope="module")
+def weighed(device, twelve):
+    """What they are encoded to."""
+    return encoded(device, *twelve)
+
+
 def match(device, scene, cameras, file: Encoded) -> float:
     """Mean PSNR of some views."""
     with Rasterizer(device, scene) as source, Rasterizer(device, decode(file.data)) as decoded:
@@ -84,21 +96,19 @@ def test_views_that_show_nothing_tell_nothing(plush_excerpt, plush_excerpt_camer
     assert GivenViews(plush_excerpt, [away, away]).part_of_views() is None
 
 
-def test_copies_keep_about_as_many_splats_as_one(device, plush_excerpt, plush_excerpt_cameras):
-    given, copies = train_views(plush_excerpt_cameras), 12
-    alone = len(encoded(device, plush_excerpt, given).order)
-    scene, cameras = row(plush_excerpt, given, copies)
-    before, weighed = (encoded(device, scene, cameras, weigh=weigh) for weigh in (False, True))
-    lost_before, lost = (alone - len(each.order) / copies for each in (before, weighed))
+def test_copies_keep_about_as_many_splats_as_one(device, plush_excerpt, plush_excerpt_cameras, twelve, weighed):
+    alone = len(encoded(device, plush_excerpt, train_views(plush_excerpt_cameras)).order)
+    scene, cameras = twelve
+    before = encoded(device, scene, cameras, weigh=False)
+    lost_before, lost = (alone - len(each.order) / 12 for each in (before, weighed))
     assert lost_before > 0.1 * alone, (alone, lost_before, lost)
     assert lost < 0.5 * lost_before, (alone, lost_before, lost)
     assert match(device, scene, cameras, weighed) > match(device, scene, cameras, before) + 0.3
 
 
-def test_the_thresholds_follow_the_part_of_the_views_that_show_a_splat(device, plush_excerpt, plush_excerpt_cameras):
-    scene, cameras = row(plush_excerpt, train_views(plush_excerpt_cameras), 12)
+def test_the_thresholds_follow_the_part_of_the_views_that_show_a_splat(weighed):
     asked = HyperParameters.from_quality(0.5, "best")
-    taken = encoded(device, scene, cameras).parameters
+    taken = weighed.parameters
     part = taken.delta_mse_max / asked.delta_mse_max
     assert 1 / 12 <= part < 1 / 3
     assert taken.drop == pytest.approx(part * asked.drop)
@@ -106,12 +116,12 @@ def test_the_thresholds_follow_the_part_of_the_views_that_show_a_splat(device, p
 
 
 def test_scenes_that_are_seen_whole_and_the_papers_preset_stay_as_they_are(
-    device, plush_excerpt, plush_excerpt_cameras
+    device, plush_excerpt, plush_excerpt_cameras, twelve
 ):
     given = train_views(plush_excerpt_cameras)
     files = {encoded(device, plush_excerpt, given, weigh=weigh).data for weigh in (True, False)}
     assert len(files) == 1
-    scene, cameras = row(plush_excerpt, given, 12)
+    scene, cameras = twelve
     options = EncodeOptions.for_preset("paper", cameras_anyway=True, prune={"iterations": 2})
     paper = encode(scene, cameras, options, device=device)
     assert paper.parameters == HyperParameters.from_quality(0.5, "paper")
