@@ -15,7 +15,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Scratch, Staging
 from potr_cl.opencl.relay import Lent
 from potr_cl.raster.culling import Sights
-from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on
+from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on, whole_on_device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_shares import Excerpt
 from potr_cl.stages.pruning.alive_packing import AlivePacking
@@ -23,7 +23,7 @@ from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.survivors import Bits
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView, can_go_by_view
-from potr_cl.stages.pruning.visible_parts import PartedRemoval, whole_on_device
+from potr_cl.stages.pruning.visible_parts import PartedRemoval
 from potr_cl.workers.pool import Part
 
 Indices = NDArray[np.int64]
