@@ -299,8 +299,8 @@ def decoding(device: Device) -> None:
 def clusters(device: Device) -> None:
     """k-means of a palette."""
     generator = np.random.default_rng(1)
-    points = generator.normal(size=(700, 3, 3)).astype(np.float32)
-    cluster(device, points, generator.uniform(0.1, 2, (700, 3)).astype(np.float32), 550)
+    points = generator.normal(size=(150, 3, 3)).astype(np.float32)
+    cluster(device, points, generator.uniform(0.1, 2, (150, 3)).astype(np.float32), 40)
 
 
 def similarity(device: Device) -> None:
