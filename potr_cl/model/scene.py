@@ -222,6 +222,43 @@ class Scene:
             sh=sh,
         )
 
+    def joined(self, other: Scene, order: NDArray[np.int64]) -> Scene:
+        """The splats of this scene and of another one of the same SH degree, each once.
+
+        Args:
+            other: the other one.
+            order: their numbers, those of the other one's splats counted on from this one's.
+        """
+        given = [
+            (self.means, other.means),
+            (self.log_scales, other.log_scales),
+            (self.quaternions, other.quaternions),
+            (self.opacity_logits, other.opacity_logits),
+            (self.sh, other.sh),
+        ]
+        made = [np.empty((len(order), *own.shape[1:]), np.float32) for own, _ in given[:-1]]
+        made.append(mapped.array((len(order), *self.sh.shape[1:]), np.float32, "SH coefficients"))
+
+        def take(first: int) -> None:
+            numbers = order[first : first + _LARGE // 8]
+            mine = numbers < len(self)
+            for (own, its), result in zip(given, made, strict=True):
+                some = result[first : first + len(numbers)]
+                some[mine], some[~mine] = own[numbers[mine]], its[numbers[~mine] - len(self)]
+
+        # Threads share what is new of the memory, which takes longer than the copies.
+        with thread_pool() as pool:
+            list(pool.map(take, range(0, len(order), _LARGE // 8)))
+        means, log_scales, quaternions, opacity_logits, sh = made
+        return dataclasses.replace(
+            self,
+            means=means,
+            log_scales=log_scales,
+            quaternions=quaternions,
+            opacity_logits=opacity_logits,
+            sh=sh,
+        )
+
     def put(self, first: int, part: Scene) -> None:
         """Replace the splats from number ``first`` on by those of another scene of the same SH degree, in place."""
         own = slice(first, first + len(part))

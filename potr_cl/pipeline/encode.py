@@ -135,7 +135,7 @@ class SharedOut:
 
     def __str__(self) -> str:
         megabytes = f"{self.sent / 1e6:,.0f} MB sent, {self.received / 1e6:,.0f} MB received"
-        return f"views shared out to {len(self.workers)} workers: {megabytes}"
+        return f"views shared out to {len(self.workers)} worker{'s' if len(self.workers) != 1 else ''}: {megabytes}"
 
 
 @dataclass(frozen=True)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import os
 import subprocess
@@ -548,3 +549,19 @@ def test_a_launch_that_finds_no_memory(device: Device, monkeypatch: pytest.Monke
     monkeypatch.setattr(cl, "enqueue_nd_range_kernel", refuse)
     with pytest.raises(DeviceMemoryError):
         kernel.launch((64,))
+
+
+def test_memory_in_use_is_given_back_when_the_device_is_done() -> None:
+    """Where a driver would wait itself, and hold up all threads, it is waited for before."""
+    info = choose_device()
+    there = Device(dataclasses.replace(info, platform="NVIDIA CUDA"), family=info.family)
+    add = there.kernel("prune/add_totals.cl", "add_totals")
+    count = 1 << 20
+    totals, more = (there.upload(np.zeros(count, np.int64), "a test") for _ in range(2))
+    for _ in range(50):
+        add.bind(totals=totals, more=more, count=count).launch((count,), (64,))
+    last = cl.enqueue_marker(there.queue)
+    there.free(totals)
+    assert last.command_execution_status == cl.command_execution_status.COMPLETE
+    there.free(more)
+    assert there.allocated == 0

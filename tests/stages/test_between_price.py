@@ -11,6 +11,7 @@ import pytest
 from potr_cl.codec.decoder import decode
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model.camera import Camera, train_views
+from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import Encoded, encode
@@ -65,6 +66,34 @@ def match(device, scene, cameras, file: Encoded) -> float:
     """Mean PSNR of some views."""
     with Rasterizer(device, scene) as source, Rasterizer(device, decode(file.data)) as decoded:
         return float(np.mean([psnr(source.render(c)[0], decoded.render(c)[0]) for c in cameras[::5]]))
+
+
+def test_the_part_of_the_views_that_shows_a_splat(plush_excerpt, plush_excerpt_cameras):
+    given = train_views(plush_excerpt_cameras)
+    part = GivenViews(plush_excerpt, given).part_of_views()
+    assert part is not None
+    assert 0.6 < part <= 1
+    assert GivenViews(plush_excerpt, given[:1] * 5).part_of_views() == pytest.approx(1)
+    for copies in (2, 12):
+        found = GivenViews(*row(plush_excerpt, given, copies)).part_of_views()
+        assert found == pytest.approx(part / copies, rel=0.05)
+
+
+def test_a_view_from_afar_counts_little(plush_excerpt, plush_excerpt_cameras):
+    near = train_views(plush_excerpt_cameras)[0]
+    middle = plush_excerpt.means.mean(axis=0)
+    away = middle + 20 * (near.centre - middle)
+    far = dataclasses.replace(near, name="far", translation=-near.rotation @ away)
+    assert GivenViews(plush_excerpt, [near, far]).part_of_views() == pytest.approx(0.5, abs=0.02)
+    # Unless its picture is as narrow.
+    same = dataclasses.replace(far, fx=20 * near.fx, fy=20 * near.fy)
+    assert GivenViews(plush_excerpt, [near, same]).part_of_views() > 0.9
+
+
+def test_views_that_show_nothing_tell_nothing(plush_excerpt, plush_excerpt_cameras):
+    view = train_views(plush_excerpt_cameras)[0]
+    away = dataclasses.replace(view, translation=view.translation - np.array([0, 0, 1e4]))
+    assert GivenViews(plush_excerpt, [away, away]).part_of_views() is None
 
 
 def test_copies_keep_about_as_many_splats_as_one(device, plush_excerpt, plush_excerpt_cameras, twelve, weighed):

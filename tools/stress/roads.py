@@ -166,7 +166,7 @@ def _settled(device: Device, scene: Scene, view: Camera) -> float:
     """1 for a value that is not finite after coefficients are chosen and geometry is rounded, with fits in between."""
     views = _looked_at(view)
     bench = Workbench(_PARAMETERS, device=device)
-    through = Settling(choosing=0.5, rounding=0.5, start=1.0, sparse=True, through=1.0)
+    through = Settling(choosing=0.5, rounding=0.5, gentle=1.0, through=1.0, cheap=1.0, sparse=True)
     one_by_one = dataclasses.replace(through, sparse=False, through=0.0)
     with Rasterizer(device, scene) as rasterizer:
         looking = Looking(views, 0, RenderedTargets(rasterizer, views), rasterizer)

@@ -30,7 +30,7 @@ from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import blocks_of, left_for_views, placed, rounding_of, vectors_of
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.rounding import ROUNDS
-from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
+from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares, colourless
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
 from potr_cl.stages.refitting.targets import Targets
 from potr_cl.stages.refitting.vector_space import Layout, Ridge, Vector
@@ -111,8 +111,7 @@ class ColourRefit(Owner):
                             help_from.pool, share, scene, rules, background, help_from.source, cameras, memory
                         )
                     )  # fmt: skip
-            # The rasterizer's own colours are never looked at.
-            rasterizer = owned.enter_context(Rasterizer(device, replace(scene, sh=scene.sh[:, :1]), rules))
+            rasterizer = owned.enter_context(Rasterizer(device, colourless(scene), rules))
             launcher = launcher_for(device, rules)
             layout = Layout(len(scene), rasterizer.stride, scene.sh.shape[1], launcher.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.
@@ -135,6 +134,8 @@ class ColourRefit(Owner):
                     launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory, own, helpers
                 )
             )
+            if others is not None:
+                owned.callback(others.begin_to_close)
             self._unrounded: Vector | None = None
             self._owned = owned.pop_all()
 
