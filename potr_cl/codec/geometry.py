@@ -139,11 +139,6 @@ class Geometry:
         levels = splat_levels(scene, self.order, self.parameters, run)
         return replace(self, scales=levels.scales, rotations=levels.rotations, opacities=levels.opacities, steps=None)
 
-    def with_opacities_of(self, logits: NDArray[np.float32]) -> Geometry:
-        """The same with other opacities: (N,) logits in the order of the scene, not rounded yet."""
-        version, factor = VERSIONS[self.parameters.version], self.parameters.sf_opacity
-        return replace(self, opacities=version.quantize_opacities(logits[self.order].astype(np.float64), factor))
-
     def with_colour_steps(self, parameters: quantize.HyperParameters) -> Geometry:
         """The same for parameters that differ in the steps of colours alone, which geometry does not depend on."""
         world = replace(self.parameters, sf_dc=parameters.sf_dc, sf_sh=parameters.sf_sh)

@@ -122,8 +122,8 @@ class Fit(Stage):
         photograph_steps: in which what came of it is fitted to photographs, where the re-fit has some; 0: it is not.
             "auto": as many as pay on the device.
         photograph_rate: by what the rates are multiplied for photographs.
-        choosing, rounding, gentle: how far what is left is fitted once more after the choice of coefficients and the
-            rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`).
+        choosing, rounding, gentle, through, cheap, sparse: how far what is left is fitted once more after the choice of
+            coefficients and the rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`).
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -160,11 +160,9 @@ class Fit(Stage):
     choosing: float = option(0.3)
     rounding: float = option(0.15)
     gentle: float = option(0.1)
-    through: float = option(0.0)
-    cheap: float = option(0.0)
+    through: float = option(0.3)
+    cheap: float = option(0.5)
     sparse: int = option(0)
-    choices: int = option(1)
-    gather: float = option(0.4)
     seed: int = option(FitOptions.seed)
 
     def __post_init__(self) -> None:
@@ -177,7 +175,13 @@ class Fit(Stage):
             raise UsageError(f"the fit's photograph rate is {self.photograph_rate:g}, it must be above 0, at most 100")
         if not 0 <= self.finer <= 1:
             raise UsageError(f"the fit's finer quality is {self.finer:g}, it must be from 0 to 1")
-        for name, least, most in (("choosing", 0, 10), ("rounding", 0, 10), ("gentle", 1e-6, 1)):
+        for name, least, most in (
+            ("choosing", 0, 10),
+            ("rounding", 0, 10),
+            ("gentle", 1e-6, 1),
+            ("through", 1e-6, 1),
+            ("cheap", 0, 1e6),
+        ):
             if not least <= getattr(self, name) <= most:
                 raise UsageError(f"the fit's {name} is {getattr(self, name):g}, it must be from {least:g} to {most}")
         for name in ("cycles", "iterations"):
@@ -306,14 +310,7 @@ class Fit(Stage):
         """Choose coefficients and round geometry, with what is left fitted once more in between."""
         options = self._options(bench.opened.family, bench.memory)
         settling = Settling(
-            self.choosing,
-            self.rounding,
-            self.gentle,
-            through=self.through,
-            cheap=self.cheap,
-            sparse=bool(self.sparse),
-            choices=self.choices,
-            gather=self.gather,
+            self.choosing, self.rounding, self.gentle, self.through, cheap=self.cheap, sparse=bool(self.sparse)
         )
         done, total = options.steps, options.steps + self.further_steps_on(bench.opened.family)
 

@@ -48,7 +48,7 @@ def test_decoded_before_it_is_coded(kind, preset, cameras):
 
 
 @pytest.mark.parametrize("kind", ["any", "balls", "coincident", "one splat"])
-def test_centres_and_opacities_move_while_the_rest_stays_rounded(kind):
+def test_centres_move_while_the_rest_stays_rounded_and_shapes_after_them(kind):
     scene = some_scene(kind)
     parameters = EncodeOptions(q=0.3).parameters
     views = train_views(ring_of_cameras(8))
@@ -63,9 +63,13 @@ def test_centres_and_opacities_move_while_the_rest_stays_rounded(kind):
     at_once = quantise_geometry(dataclasses.replace(scene, means=means), parameters, views).decoded(scene.sh)
     errors = [np.linalg.norm(each.means - means, axis=1) for each in (seen, at_once)]
     assert errors[0].max() == pytest.approx(errors[1].max(), rel=0.1)
-    third = second.with_opacities_of(scene.opacity_logits - 1).decoded(scene.sh)
-    expected = quantise_geometry(dataclasses.replace(scene, opacity_logits=scene.opacity_logits - 1), parameters, views)
-    assert np.array_equal(third.opacity_logits, expected.decoded(scene.sh).opacity_logits)
+    changed = dataclasses.replace(
+        scene, opacity_logits=scene.opacity_logits - 1, quaternions=scene.quaternions[::-1].copy()
+    )
+    third = second.with_shapes_of(changed).decoded(scene.sh)
+    expected = quantise_geometry(changed, parameters, views).decoded(scene.sh)
+    for name in ("log_scales", "quaternions", "opacity_logits"):
+        assert np.array_equal(getattr(third, name), getattr(expected, name)), name
     assert np.array_equal(third.means, seen.means)
 
 

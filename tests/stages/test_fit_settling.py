@@ -61,7 +61,9 @@ def test_what_moves_makes_up_for_what_is_rounded(device, plush_excerpt, views):
     in_turns = then.geometry.decoded(then.scene.sh)
     found = [error_of(device, plush_excerpt, scene, views) for scene in (at_once, in_turns)]
     assert found[1] < 0.8 * found[0]
-    assert np.array_equal(in_turns.log_scales, at_once.log_scales), "what was rounded moved again"
+    levels = np.exp(in_turns.log_scales.astype(np.float64)) * then.geometry.parameters.sf_scale
+    assert np.all(np.abs(levels - np.rint(levels))[levels > 0.5] < 1e-3), "what the file holds is rounded"
+    assert 0 < np.mean(in_turns.log_scales != at_once.log_scales) < 0.5, "some take the next level"
     assert not np.array_equal(in_turns.means, at_once.means)
     assert np.array_equal(then.scene.means, plush_excerpt.means), "other steps start from what is not rounded"
     assert np.array_equal(then.scene.sh[:, 1:], plush_excerpt.sh[:, 1:])

@@ -12,7 +12,8 @@ as users have it, with --fit 1000: it removes more splats by itself and decides 
 scene's renders; bytes at equal PSNR are against the scene without a fit at the --plain qualities, interpolated in the
 logarithm of the bytes. PSNR before and after the fit are of what is not yet coded.
 
---ladder Q … measures instead what each part of the fit brings: encodes with all of it, then each time without one part.
+--ladder Q … measures instead what each part of the fit brings: encodes with all of it, then each time without one part;
+--parts N … only some of these.
 
 --fraction F takes all pictures smaller, --every N takes every N-th training view, and --iterations N prunes in fewer
 iterations: for a CPU, not for publication. --limit S begins nothing new after so many seconds.
@@ -41,6 +42,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.stages.code import Code
+from potr_cl.stages.fit import STEPS as FIT_STEPS
 from potr_cl.stages.fit import Fit
 from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.fit import RATES
@@ -56,7 +58,7 @@ from tools.workloads import read, scaled, scene_parser
 SHIFTS = (0.2, 0.4, 0.6)
 QUALITIES = (0.3, 0.5, 0.7)
 PLAIN = (0.0, 0.1, 0.2, 0.3, 0.4, 0.5, 0.6, 0.7)
-STEPS = 1000
+STEPS = FIT_STEPS["gpu"]
 COLUMNS = (
     Column("scene"),
     Column("course"),
@@ -126,7 +128,8 @@ def _without(*groups: str) -> Rates:
 _PARTS: dict[str, dict[str, Any]] = {
     "everything": {},
     "coefficients chosen by the re-fit alone": {"choosing": 0.0},
-    "geometry rounded at once": {"rounding": 0.0},
+    "shapes rounded at once": {"rounding": 0.0},
+    "all levels the nearest": {"cheap": 0.0},
     "positions stay": {"rates": _without("means")},
     "scales stay": {"rates": _without("log_scales")},
     "rotations stay": {"rates": _without("quaternions")},
@@ -139,9 +142,10 @@ _PARTS: dict[str, dict[str, Any]] = {
 }
 
 
-def ladder(qualities: Sequence[float]) -> list[Course]:
-    """Encodes as users have them with a fit, and each time without one part of it."""
-    return [Course(part, ((None, STEPS),), options, tuple(qualities)) for part, options in _PARTS.items()]
+def ladder(qualities: Sequence[float], numbers: Sequence[int] | None = None) -> list[Course]:
+    """Encodes as users have them with a fit, and each time without one part of it; or some of them, by number."""
+    courses = [Course(part, ((None, STEPS),), options, tuple(qualities)) for part, options in _PARTS.items()]
+    return courses if numbers is None else [courses[number] for number in numbers]
 
 
 def usual_courses() -> list[Course]:
@@ -247,6 +251,7 @@ def main() -> None:
     chosen = parser.add_mutually_exclusive_group()
     chosen.add_argument("--courses", nargs="+", type=Course.of, default=usual_courses())
     chosen.add_argument("--ladder", nargs="+", type=float, metavar="Q")
+    parser.add_argument("--parts", nargs="+", type=int, metavar="N", help="of the ladder, from 0; all by default")
     parser.add_argument("--plain", nargs="*", type=float, default=PLAIN, metavar="Q")
     parser.add_argument("--preset", default="best")
     parser.add_argument("--fraction", type=float, default=1.0, metavar="F")
@@ -263,7 +268,7 @@ def main() -> None:
     with ExitStack() as stack:
         benches = [stack.enter_context(Bench(folder, device, args)) for folder in args.scenes]
         plain = [Course.of(f"q{q:g}/0@{q:g}") for q in args.plain]
-        for course in [*plain, *(ladder(args.ladder) if args.ladder else args.courses)]:
+        for course in [*plain, *(ladder(args.ladder, args.parts) if args.ladder else args.courses)]:
             for bench in benches:
                 if time.perf_counter() - began > args.limit:
                     return

@@ -15,7 +15,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.geometry import Geometry
-from potr_cl.codec.quantize import LEAST_LOGIT, ZERO_SCALE, Integers, canonical_rotations, level_type
+from potr_cl.codec.quantize import LEAST_LOGIT, RANGE_OF_LOGITS, ZERO_SCALE, Integers, canonical_rotations, level_type
 from potr_cl.codec.versions import VERSIONS
 from potr_cl.model.scene import Scene
 
@@ -24,6 +24,8 @@ I64 = NDArray[np.int64]
 
 #: How many levels below and above the nearest are tried, and how often, each time with what levels take by then.
 _SPAN, _ROUNDS = 4, 2
+#: Levels from here on, of splats unlike the others, stay the nearest.
+_MOST = 1 << 12
 #: A level that nobody uses yet is counted as so often used.
 _UNUSED = 0.3
 #: Errors of a scale below so many levels count as of this one: its logarithm changes too fast to say.
@@ -41,7 +43,7 @@ def with_cheap_levels(geometry: Geometry, scene: Scene, curvatures: F64, price: 
         price: mean squared error that a bit is worth.
     """
     order, factors = geometry.order, geometry.parameters
-    logits = scene.opacity_logits[order].astype(np.float64)
+    logits = np.clip(scene.opacity_logits[order].astype(np.float64), *RANGE_OF_LOGITS)
     wanted = (logits - LEAST_LOGIT) * factors.sf_opacity
     opacities = _cheapest(wanted, curvatures[10, order] / factors.sf_opacity**2, price, lambda level: level)
     scales = []
@@ -63,10 +65,12 @@ def _cheapest(wanted: F64, curvatures: F64, price: float, value_of: Callable[[I6
         price: of a bit.
         value_of: what a level stands for.
     """
-    nearest = np.maximum(np.floor(wanted + 0.5), 0).astype(np.int64)
+    all_nearest = np.maximum(np.floor(wanted + 0.5), 0).astype(np.int64)
+    small = np.flatnonzero(all_nearest < _MOST)
+    nearest, wanted, curvatures = all_nearest[small], wanted[small], curvatures[small]
     chosen = nearest
     for _ in range(_ROUNDS):
-        used = np.bincount(chosen, minlength=int(nearest.max(initial=0)) + _SPAN + 1) + _UNUSED
+        used = np.bincount(chosen, minlength=_MOST + _SPAN) + _UNUSED
         bits = np.log2(used.sum()) - np.log2(used)
         least = np.full(len(wanted), np.inf)
         better = nearest.copy()
@@ -76,5 +80,6 @@ def _cheapest(wanted: F64, curvatures: F64, price: float, value_of: Callable[[I6
             some = cost < least
             least[some], better[some] = cost[some], level[some]
         chosen = better
-    found: Integers = chosen.astype(level_type(float(chosen.max(initial=0))))
+    all_nearest[small] = chosen
+    found: Integers = all_nearest.astype(level_type(float(all_nearest.max(initial=0))))
     return found

@@ -4,11 +4,13 @@ A file gives up most AC coefficients and rounds all the rest. Done at once, that
 do. Here it comes one kind after the other, and what may still move makes up for it:
 
 1. AC coefficients are chosen as the re-fit of the colours does; all but them moves on.
-2. Scales and rotations are rounded to the file's steps; centres, opacities and constant colours move on.
-3. Centres are rounded; opacities and constant colours move on.
+2. All but them goes on moving, but what the pictures show is scales, rotations and opacities as the file rounds them:
+   what lies behind a level moves until another level suits the other splats' better.
+3. Centres are rounded; the others move on in this way.
+4. Opacities and scales take the levels that are worth their bits.
 
-The re-fit then solves for the colours, on just this geometry. Held-out views watch over every step of it: a fit that
-does not help them is not taken.
+The re-fit then solves for the colours, on just this geometry. Held-out views watch over every fit: one that does not
+help them is not taken.
 """
 
 from __future__ import annotations
@@ -30,7 +32,8 @@ from potr_cl.stages.fitting.fit import FitOptions, SupportsBool, fit_scene
 from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_files
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import share_out
-from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
+from potr_cl.stages.refitting.refit import refit_colours
+from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.stage import State, Workbench
 
@@ -45,21 +48,23 @@ class Settling:
     """How far what is left is fitted once more.
 
     Attributes:
-        choosing, rounding: steps after coefficients have been chosen, and after each of the two roundings, as parts of
-            those of the fit. 0: that is left to the re-fit and the coder.
-        start: part of the fit's first rates that these fits begin with.
-        last: part of these that is left at the end of each.
+        choosing, rounding: steps after coefficients have been chosen, and in each of the two fits that look at what is
+            rounded, as parts of those of the fit. 0: that is left to the re-fit and the coder.
+        gentle, through: part of the fit's first rates that the fit after the choice begins with, and those that look at
+            what is rounded.
+        cheap: price of a bit of opacities and scales, as a multiple of what one of a coefficient is worth; 0: they take
+            the nearest levels.
+        sparse: whether AC coefficients that are not 0 move too.
+        last: part of the first rates of each fit that is left at its end.
     """
 
     choosing: float
     rounding: float
-    start: float
-    last: float = 0.1
-    through: float = 0.0
+    gentle: float
+    through: float = 0.3
     cheap: float = 0.0
     sparse: bool = False
-    choices: int = 1
-    gather: float = 0.4
+    last: float = 0.1
 
 
 @dataclass(frozen=True)
@@ -108,9 +113,7 @@ def settle(
     """
     errors: list[float] = []
 
-    def fitted(
-        scene: Scene, part: float, still: Sequence[str], factors: Factors = UNROUNDED, start: float = settling.start
-    ) -> Scene:
+    def fitted(scene: Scene, part: float, start: float, still: Sequence[str], factors: Factors = UNROUNDED) -> Scene:
         steps = max(round(part * options.steps), 1)
         rates: Rates = dataclasses.replace(options.rates, **dict.fromkeys(still, 0.0))
         more = dataclasses.replace(
@@ -124,47 +127,34 @@ def settle(
         progress(steps)
         return found.scene
 
-    still = [] if settling.sparse else ["ac"]
+    still = () if settling.sparse else ("ac",)
     if settling.choosing and bench.parameters.drop and "compact" not in state.learnt:
-        for number in range(1, settling.choices + 1):
-            drop = bench.parameters.drop * settling.gather ** (settling.choices - number)
-            scene = fitted(_with_chosen(state, bench, looking, drop), settling.choosing / settling.choices, still)
-            state = dataclasses.replace(state, scene=scene, geometry=None)
+        scene = fitted(_with_chosen(state, bench, looking), settling.choosing, settling.gentle, still)
+        state = dataclasses.replace(state, scene=scene, geometry=None)
     rounded = bench.output.geometry(state.scene, bench.request(state)) if settling.rounding else None
-    if not isinstance(rounded, Geometry):
+    if not isinstance(rounded, Geometry) or not VERSIONS[rounded.parameters.version].quantises_splats_as(Version2):
         return state, tuple(errors)
-    if settling.through and VERSIONS[bench.parameters.version].quantises_splats_as(Version2):
-        world = rounded.parameters
-        factors = Factors(world.sf_scale, world.sf_rotation, world.sf_opacity)
-        scene = fitted(in_form_of_files(state.scene), settling.rounding, still, factors, settling.through)
-        with thread_pool(bench.threads) as pool:
-            rounded = rounded.with_centres_of(scene.means, state.views, pool.map)
-        scene = dataclasses.replace(scene, means=rounded.decoded(scene.sh).means)
-        scene = fitted(scene, settling.rounding, [*still, "means"], factors, settling.through)
-        rounded = rounded.with_shapes_of(scene)
-        if settling.cheap and bench.parameters.drop:
-            scene = in_form_of_files(scene)
-            given = looking.views[: len(looking.views) - looking.added]
-            price = settling.cheap * bench.parameters.drop / _BITS
-            rounded = with_cheap_levels(rounded, scene, curvatures(bench.opened, scene, given, bench.background), price)
-        return dataclasses.replace(state.recoloured(scene.sh), geometry=rounded), tuple(errors)
-    still += ["log_scales", "quaternions"]
-    decoded = rounded.decoded(state.scene.sh)
-    scene = dataclasses.replace(decoded, means=state.scene.means, opacity_logits=state.scene.opacity_logits)
-    scene = fitted(scene, settling.rounding, still)
+    world = rounded.parameters
+    factors = Factors(world.sf_scale, world.sf_rotation, world.sf_opacity)
+    scene = fitted(in_form_of_files(state.scene), settling.rounding, settling.through, still, factors)
     with thread_pool(bench.threads) as pool:
         rounded = rounded.with_centres_of(scene.means, state.views, pool.map)
-    scene = dataclasses.replace(rounded.decoded(scene.sh), opacity_logits=scene.opacity_logits)
-    scene = fitted(scene, settling.rounding, [*still, "means"])
-    then = dataclasses.replace(state.recoloured(scene.sh), geometry=rounded.with_opacities_of(scene.opacity_logits))
-    return then, tuple(errors)
+    scene = dataclasses.replace(scene, means=rounded.decoded(scene.sh).means)
+    scene = fitted(scene, settling.rounding, settling.through, (*still, "means"), factors)
+    rounded = rounded.with_shapes_of(scene)
+    if settling.cheap and bench.parameters.drop:
+        scene = in_form_of_files(scene)
+        given = looking.views[: len(looking.views) - looking.added]
+        found = curvatures(bench.opened, scene, given, bench.background)
+        rounded = with_cheap_levels(rounded, scene, found, settling.cheap * bench.parameters.drop / _BITS)
+    return dataclasses.replace(state.recoloured(scene.sh), geometry=rounded), tuple(errors)
 
 
-def _with_chosen(state: State, bench: Workbench, looking: Looking, drop: float) -> Scene:
+def _with_chosen(state: State, bench: Workbench, looking: Looking) -> Scene:
     """The scene with the AC coefficients that are worth their bytes, solved for without a look at held-out views."""
     _, held_out = share_out(len(looking.views) - looking.added, looking.added)
     views = [view for number, view in enumerate(state.views) if number not in held_out]  # given ones come first in both
-    options = RefitOptions(steps=_CHOICE_STEPS, drop=drop, memory=bench.memory)
+    options = RefitOptions(steps=_CHOICE_STEPS, drop=bench.parameters.drop, memory=bench.memory)
     targets = RenderedTargets(looking.rasterizer, views)
     refitted = refit_colours(bench.opened, state.scene, views, targets, options, background=bench.background)
     return dataclasses.replace(state.scene, sh=refitted.sh)
