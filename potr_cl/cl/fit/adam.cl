@@ -22,14 +22,10 @@ kernel void adam(
     global float *squares,
     global float *averages,
     global float *sh,
-    global const float *scales,
     uint splats,
     uint stride,
     uint first_sh,
     global const float4 *steps,
-    float usual_size,
-    float own_means,
-    float own_turns,
     float part,
     float decay_mean,
     float decay_square,
@@ -52,14 +48,7 @@ kernel void adam(
     squares[i] = square;
     if (mean == 0.0f || !(square > 0.0f))
         return; /* and the average is what the parameter is */
-    float rate = part * step.x;
-    if (get_global_id(1) < 3 || (get_global_id(1) >= 6 && get_global_id(1) < 10)) {
-        const float a = scales[splat], b = scales[stride + splat], c = scales[2 * (size_t)stride + splat];
-        const float longest = fmax(a, fmax(b, c)), middle = fmax(fmin(a, b), fmin(fmax(a, b), c));
-        rate *= get_global_id(1) < 3 ? pow(fmin(fmax(middle / usual_size, 0.01f), 100.0f), own_means)
-                                     : pow(fmax(middle / longest, 0.01f), own_turns);
-    }
-    const float value = former - rate * (mean * debias_mean) / sqrt(square * debias_square);
+    const float value = former - part * step.x * (mean * debias_mean) / sqrt(square * debias_square);
     const bool taken = fabs(value) < 1e30f;
     const float kept = taken ? fmin(fmax(value, step.y), step.z) : former;
     if (taken) {

@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,7 +19,6 @@ from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, Parameters
 #: How fast the moments forget (Kingma and Ba, 2015), and the averages: after about so many steps.
 _DECAY_MEAN, _DECAY_SQUARE = 0.9, 0.999
 _AVERAGED = 50
-_OWN_MEANS, _OWN_TURNS = 0.0, 0.0
 
 
 @dataclass(frozen=True)
@@ -93,7 +91,6 @@ class Adam(Parameters):
     ) -> None:
         super().__init__(device, scene, buffers, columns, factors)
         self._taken = 0
-        self._usual_size = usual_size(scene)
         self._moving = columns.count if rates.ac else columns.ac.start
         try:
             nbytes = self.values.size
@@ -134,14 +131,10 @@ class Adam(Parameters):
             squares=self._moments[1],
             averages=self._averages,
             sh=buffers.sh,
-            scales=buffers.scales,
             splats=buffers.splats,
             stride=buffers.stride,
             first_sh=columns.dc.start,
             steps=self._steps,
-            usual_size=self._usual_size,
-            own_means=_OWN_MEANS,
-            own_turns=_OWN_TURNS,
             part=part,
             decay_mean=_DECAY_MEAN,
             decay_square=_DECAY_SQUARE,
@@ -163,12 +156,6 @@ class Adam(Parameters):
         finally:
             self.values = moving
             self.give()
-
-
-def usual_size(scene: Scene) -> float:
-    """The median of the splats' middle standard deviations, world units."""
-    middle = np.sort(scene.log_scales.astype(np.float64), axis=1)[:, 1]
-    return math.exp(min(float(np.median(middle)), 80.0))
 
 
 def _steps(columns: Columns, rates: Rates, limits: Limits) -> FloatArray:

@@ -18,12 +18,14 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
+
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.fitting.adam import Adam, Limits, Rates, usual_size
+from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.judges import Judges
@@ -214,7 +216,7 @@ def fit_scene(
         if options.memory is None and options.steps * options.batch >= len(fit_to):
             pictures.prepare([*held_out, *(number for number in fit_to if number not in held_out)])
         rasterizer = derivatives.rasterizer
-        rates = dataclasses.replace(options.rates, means=options.rates.means * usual_size(scene))
+        rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
         with (
             Judges(device, rasterizer, cameras, pictures, held_out) as judges,
             Adam(
@@ -328,6 +330,12 @@ class _Fit:
 def _decibels(error: float) -> float:
     """The PSNR of a mean squared error of colours from 0 to 1."""
     return -10 * math.log10(max(error, 1e-20))
+
+
+def _usual_size(scene: Scene) -> float:
+    """The median of the splats' middle standard deviations, world units."""
+    middle = np.sort(scene.log_scales.astype(np.float64), axis=1)[:, 1]
+    return math.exp(min(float(np.median(middle)), 80.0))
 
 
 def _limits(scene: Scene) -> Limits:
