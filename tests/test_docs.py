@@ -21,8 +21,11 @@ from potr_cl.cli import command_parser
 ROOT = Path(__file__).parents[1]
 #: Pages for people; data's descriptions too.
 PAGES = sorted([*ROOT.glob("*.md"), *(ROOT / "docs").rglob("*.md"), *(ROOT / "tests").rglob("*.md")])
-#: Pages that speak of the code as it is now; others tell of what was.
-PRESENT = [ROOT / name for name in ("README.md", "CONTRIBUTING.md", "docs/architecture.md", "docs/method.md")]
+#: Pages that speak of the code as it is now, but for those that are made from it; others tell of what was.
+PRESENT = [
+    *(ROOT / name for name in ("README.md", "CONTRIBUTING.md")),
+    *sorted(path for path in (ROOT / "docs").glob("*.md") if path.stem not in ("api", "cli")),
+]
 #: Folders of the package, which pages name without it.
 FOLDERS = sorted(path.name for path in (ROOT / "potr_cl").iterdir() if path.is_dir() and path.name != "__pycache__")
 #: Sections of docs/architecture.md, and the tests that must pass besides those that they bring.
@@ -103,7 +106,7 @@ def resolves(name: str) -> bool:
 def commands(page: Path) -> Iterator[list[str]]:
     """The calls of the command line in a page's indented blocks, without comments."""
     for line in re.findall(r"^ {4}(.+)$", page.read_text("utf-8"), re.MULTILINE):
-        for call in re.findall(r"python -m potr_cl ([^&|]+)", line):
+        for call in re.findall(r"(?:python -m potr_cl|^\$? *potr-cl) ([^&|]+)", line):
             yield shlex.split(call, comments=True)
 
 
@@ -118,7 +121,8 @@ def test_commands_are_understood(page: Path) -> None:
 @pytest.mark.parametrize("page", PRESENT, ids=ids(PRESENT))
 def test_flags_exist(page: Path) -> None:
     known = set(re.findall(r"`(--[\w-]+)", (ROOT / "docs" / "cli.md").read_text("utf-8")))
-    elsewhere = {"--haze", "--check", "--split"}  # of a recipe, and of tools
+    # Of a recipe, of tools, of Docker and of Dask.
+    elsewhere = {"--haze", "--check", "--split", "--replay", "--user", "--memory-limit"}
     for quoted in re.findall(r"`([^`\n]+)`", without_code(page.read_text("utf-8"))):
         if not quoted.startswith(("python -m pytest", "ruff", "pip", "git")):
             for flag in re.findall(r"(?<![\w-])--[a-z][\w-]+", quoted):

@@ -44,7 +44,8 @@ from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
 from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.pruning.unseen import Unseen
-from potr_cl.stages.refitting.refit import RefitOptions, Refitted, active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets
 from potr_cl.stages.stage import Progress, Stage, State
 

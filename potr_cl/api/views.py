@@ -51,7 +51,11 @@ class Viewpoints:
 
     @property
     def direction(self) -> tuple[float, ...] | None:
-        """(3,) what is up; None for a guess."""
+        """(3,) what is up; None for a guess.
+
+        Raises:
+            UsageError: the text is no direction.
+        """
         if self.up is None or self.up == "auto":
             return None
         if not isinstance(self.up, str):

@@ -32,7 +32,7 @@ from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.stages.compact import Compact
 from potr_cl.stages.prune import Prune
-from potr_cl.stages.refitting.refit import RefitOptions
+from potr_cl.stages.refitting.refit_options import RefitOptions
 
 
 def _prune(args: argparse.Namespace) -> None:

@@ -51,7 +51,7 @@ def codebook(values: FloatArray, weights: _F64 | None, entries: int) -> FloatArr
 
 
 def nearest(values: FloatArray, book: FloatArray) -> NDArray[np.intp]:
-    """The number of the entry of an ascending ``book`` that is nearest to each of the values; of their shape."""
+    """The number of the entry of ``book``, (entries,) ascending, that is nearest to each value; of their shape."""
     middles = (book[1:].astype(np.float64) + book[:-1]) / 2
     return np.searchsorted(middles, values, side="left")
 

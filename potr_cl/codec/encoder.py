@@ -47,6 +47,7 @@ class Coded:
 
     @property
     def nbytes(self) -> int:
+        """Of the whole file."""
         return sum(map(len, self.pieces))
 
 

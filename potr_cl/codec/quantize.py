@@ -184,13 +184,24 @@ def level_type(largest: float) -> type[np.signedinteger]:
 
 
 def quantize_scales(log_scales: F64, sf_scale: float) -> Integers:
-    """Natural logarithms of standard deviations to levels, in steps of 1 / SF of the standard deviations themselves."""
+    """Natural logarithms of standard deviations to levels, in steps of 1 / SF of the standard deviations themselves.
+
+    Args:
+        log_scales: float64, of any shape.
+        sf_scale: steps a world unit.
+
+    Returns:
+        Integers >= 0 of the same shape.
+
+    Raises:
+        DataError: one is too large for a file.
+    """
     with np.errstate(over="ignore"):
         return _to_levels(np.exp(log_scales), sf_scale, "standard deviation")
 
 
 def dequantize_scales(levels: NDArray[np.integer], sf_scale: float) -> F32:
-    """Levels to natural logarithms of standard deviations."""
+    """Levels >= 0, of any shape, to natural logarithms of standard deviations, float32 of the same shape."""
     return _looked_up(_log_scales, levels, sf_scale)
 
 
@@ -220,12 +231,12 @@ def _table(compute: Callable[[NDArray[np.integer], float], F32], size: int, fact
 
 
 def quantize_opacities(logits: F64, sf_opacity: float) -> Integers:
-    """Logits to levels, in steps of 1 / SF of the opacity."""
+    """Logits, float64 of any shape, to levels >= 0 of the same shape, in steps of 1 / SF of the opacity."""
     return _to_levels(1 / (1 + np.exp(-np.clip(logits, -500, 500))), sf_opacity, "opacity")
 
 
 def dequantize_opacities(levels: NDArray[np.integer], sf_opacity: float) -> F32:
-    """Levels to logits of (level + 0.25) / SF, kept a float32 rounding away from an opacity of 1."""
+    """Levels >= 0, of any shape, to float32 logits of (level + 0.25) / SF, kept a rounding below an opacity of 1."""
     return _looked_up(_logits, levels, sf_opacity)
 
 
@@ -236,12 +247,12 @@ def _logits(levels: NDArray[np.integer], sf_opacity: float) -> F32:
 
 
 def quantize_logits(logits: F64, sf_opacity: float) -> Integers:
-    """Logits to levels, in steps of 1 / SF of the logit from the least one up."""
+    """Logits, float64 of any shape, to levels >= 0 of the same shape, in steps of 1 / SF from the least logit up."""
     return _to_levels(np.clip(logits, LEAST_LOGIT, _LARGEST_LOGIT) - LEAST_LOGIT, sf_opacity, "opacity")
 
 
 def dequantize_logits(levels: NDArray[np.integer], sf_opacity: float) -> F32:
-    """Levels of :func:`quantize_logits` to logits."""
+    """Levels of :func:`quantize_logits`, of any shape, to float32 logits of the same shape."""
     logits: F32 = levels.astype(np.float32) / np.float32(sf_opacity) + np.float32(LEAST_LOGIT)
     return logits
 
@@ -346,12 +357,29 @@ def rotation_factors(scales: Sequence[NDArray[np.integer]], sf_rotation: float) 
 
 
 def quantize_rotations(imaginary: F64, factor: float | F32) -> Integers:
-    """One imaginary part of unit quaternions to levels, in steps of 1 / factor, which may be one a splat."""
+    """One imaginary part of unit quaternions to levels, in steps of 1 / factor.
+
+    Args:
+        imaginary: (N,) float64, -1 to 1.
+        factor: steps a unit, one for all splats or (N,).
+
+    Returns:
+        (N,) signed integers.
+
+    Raises:
+        DataError: one is too large for a file.
+    """
     return _to_levels(imaginary, factor, "quaternion component")
 
 
 def dequantize_rotations(levels: Sequence[NDArray[np.integer]], factor: float | F32, out: F32) -> None:
-    """Levels of x, y, z to unit quaternions w, x, y, z in ``out`` (N, 4); w ≥ 0 is computed from the rest."""
+    """Three times (N,) levels, of x, y, z, to unit quaternions w, x, y, z in ``out``; w ≥ 0 is computed from the rest.
+
+    Args:
+        levels: of x, y and z, (N,) each.
+        factor: steps a unit, one for all splats or (N,).
+        out: (N, 4) float32, to be filled.
+    """
     rest = np.ones(len(out), np.float32)
     factor = np.asarray(factor, np.float32)
     with np.errstate(over="ignore"):  # of squares, in a hostile file: the real part is 0 then

@@ -335,6 +335,11 @@ def no_words_left(what: str) -> DataError:
 def check_end(all_words: bool, states: NDArray[np.unsignedinteger], what: str) -> None:
     """Check that all words were taken and every lane is back where its encoder began.
 
+    Args:
+        all_words: whether they were.
+        states: (lanes,) of the decoder.
+        what: was decoded, for the message.
+
     Raises:
         DataError: they are not.
     """

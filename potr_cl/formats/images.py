@@ -159,7 +159,7 @@ def read_ground_truth(path: Path, background: Colour = (0.0, 0.0, 0.0)) -> Float
 
 
 def to_8_bits(image: NDArray[Any]) -> NDArray[np.uint8]:
-    """Colours clamped to [0, 1] and rounded to 0 … 255."""
+    """Colours of any shape, clamped to [0, 1] and rounded to 0 … 255, uint8 of the same shape."""
     pixels: NDArray[np.uint8] = np.rint(np.clip(image, 0, 1) * 255).astype(np.uint8)
     return pixels
 

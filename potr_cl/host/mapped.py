@@ -27,8 +27,8 @@ _NO_PROMISE = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)
 
 #: Bytes of the largest array that is not mapped where memory is bounded.
 _LARGEST: ContextVar[float] = ContextVar("largest", default=math.inf)
-#: It is this part of the memory.
-_PART = 1 / 16
+#: It is this part of the memory: of arrays just below it there may be twenty at a time, as of the re-fit's vectors.
+_PART = 1 / 64
 #: Rows that are copied at a time.
 _ROWS = 1 << 18
 

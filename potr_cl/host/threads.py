@@ -44,6 +44,8 @@ def in_background(work: Callable[..., T], *args: Any) -> Future[T]:
 class Ahead(Generic[S, T]):
     """Results in their order, while threads are at work on the next ones; few are there at a time.
 
+    A piece of work begins when the user has done with the result that lies as many before it as there are threads.
+
     ::
 
         with Ahead(work, arguments) as results:  # they have begun
@@ -74,9 +76,8 @@ class Ahead(Generic[S, T]):
     def _results(self) -> Iterator[tuple[S, T]]:
         while self._begun:
             argument, future = self._begun.popleft()
-            result = future.result()
+            yield argument, future.result()
             self._begin()
-            yield argument, result
 
     def __exit__(self, *_: object) -> None:
         self._pool.shutdown(cancel_futures=True)

@@ -12,8 +12,8 @@ from potr_cl.model.order import ascending
 
 #: Of each coordinate, in a code of 64 bits.
 BITS = 21
-#: Centres whose codes are made at a time.
-_ROWS = 1 << 14
+#: Centres whose codes are made at a time: so many that threads seldom wait for the interpreter.
+_ROWS = 1 << 16
 #: Bits that a table spreads at a time.
 _TABLED = 11
 
@@ -49,7 +49,8 @@ def morton_codes(means: NDArray[np.float32], run: Run = map) -> NDArray[np.uint6
             room = _Room(min(_ROWS, len(means)))
         own = means[start : start + _ROWS]
         count = slice(len(own))
-        within, cells, some = room.within[:, count], room.cells[:, count], room.some[:, count]
+        within, cells = room.within[:, count], room.cells[:, count]
+        some = within.view(np.int64)  # when the places are not needed any more
         bits, more = room.bits[:, count], room.more[:, count]
         np.subtract(own.T, corner[:, None], out=within)
         np.multiply(within, (1 << BITS) / side, out=within)
@@ -76,17 +77,17 @@ class _Room:
         rows: centres at a time.
 
     Attributes:
-        within: (3, rows) places in the cube. cells, some: (3, rows) the same as numbers. bits, more: (3, rows).
+        within: (3, rows) places in the cube. cells: (3, rows) the same as numbers. bits, more: (3, rows).
     """
 
     def __init__(self, rows: int) -> None:
         self.within = np.empty((3, rows))
-        self.cells, self.some = np.empty((2, 3, rows), np.int64)
+        self.cells = np.empty((3, rows), np.int64)
         self.bits, self.more = np.empty((2, 3, rows), np.uint64)
 
 
 def spread(x: NDArray[np.uint64]) -> NDArray[np.uint64]:
-    """Move bit i to bit 3 i, for 21 bits."""
+    """Move bit i to bit 3 i, for 21 bits, in uint64 of any shape."""
     for shift, mask in (
         (32, 0x1F00000000FFFF),
         (16, 0x1F0000FF0000FF),

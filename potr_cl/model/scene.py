@@ -17,8 +17,8 @@ from potr_cl.host.threads import thread_pool
 
 FloatArray = NDArray[np.float32]
 
-#: Splats looked at at a time where values are checked.
-_BLOCK = 1 << 14
+#: Splats looked at at a time where values are checked, and where threads do it, which wait for the interpreter.
+_BLOCK, _THREAD_BLOCK = 1 << 14, 1 << 17
 #: So many splats are copied by threads, an eighth of them at a time.
 _LARGE = 1 << 19
 
@@ -222,6 +222,43 @@ class Scene:
             sh=sh,
         )
 
+    def joined(self, other: Scene, order: NDArray[np.int64]) -> Scene:
+        """The splats of this scene and of another one of the same SH degree, each once.
+
+        Args:
+            other: the other one.
+            order: their numbers, those of the other one's splats counted on from this one's.
+        """
+        given = [
+            (self.means, other.means),
+            (self.log_scales, other.log_scales),
+            (self.quaternions, other.quaternions),
+            (self.opacity_logits, other.opacity_logits),
+            (self.sh, other.sh),
+        ]
+        made = [np.empty((len(order), *own.shape[1:]), np.float32) for own, _ in given[:-1]]
+        made.append(mapped.array((len(order), *self.sh.shape[1:]), np.float32, "SH coefficients"))
+
+        def take(first: int) -> None:
+            numbers = order[first : first + _LARGE // 8]
+            mine = numbers < len(self)
+            for (own, its), result in zip(given, made, strict=True):
+                some = result[first : first + len(numbers)]
+                some[mine], some[~mine] = own[numbers[mine]], its[numbers[~mine] - len(self)]
+
+        # Threads share what is new of the memory, which takes longer than the copies.
+        with thread_pool() as pool:
+            list(pool.map(take, range(0, len(order), _LARGE // 8)))
+        means, log_scales, quaternions, opacity_logits, sh = made
+        return dataclasses.replace(
+            self,
+            means=means,
+            log_scales=log_scales,
+            quaternions=quaternions,
+            opacity_logits=opacity_logits,
+            sh=sh,
+        )
+
     def put(self, first: int, part: Scene) -> None:
         """Replace the splats from number ``first`` on by those of another scene of the same SH degree, in place."""
         own = slice(first, first + len(part))
@@ -254,13 +291,14 @@ class Scene:
             return scene, dataclasses.replace(report, infinite_opacities=infinite_opacities)
         finite = np.ones(len(self), bool)
 
-        def look(start: int) -> None:
+        def look(start: int, stop: int) -> None:
             """Block by block the temporaries stay in the cache, and one without fault is done at the first look."""
-            rows = slice(start, start + _BLOCK)
-            for array in (self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh):
-                ok = np.isfinite(array[rows])
-                if not ok.all():
-                    finite[rows] &= ok.reshape(len(ok), -1).all(axis=1)
+            for first in range(start, stop, _BLOCK):
+                rows = slice(first, min(first + _BLOCK, stop))
+                for array in (self.means, self.log_scales, self.quaternions, self.opacity_logits, self.sh):
+                    ok = np.isfinite(array[rows])
+                    if not ok.all():
+                        finite[rows] &= ok.reshape(len(ok), -1).all(axis=1)
 
         _over_blocks(look, len(self))
         dropped = len(self) - int(np.count_nonzero(finite))
@@ -269,10 +307,10 @@ class Scene:
             raise DataError("the scene holds no splat with finite values: nothing to do")
         zero = np.empty(len(scene), bool)
 
-        def measure(start: int) -> None:
+        def measure(start: int, stop: int) -> None:
             """A length whose square underflows cannot be normalised either."""
-            some = scene.quaternions[start : start + _BLOCK]
-            zero[start : start + _BLOCK] = np.einsum("ij,ij->i", some, some, dtype=np.float64) < 1e-30
+            some = scene.quaternions[start:stop]
+            zero[start:stop] = np.einsum("ij,ij->i", some, some, dtype=np.float64) < 1e-30
 
         _over_blocks(measure, len(scene))
         zeros = int(np.count_nonzero(zero))
@@ -283,15 +321,14 @@ class Scene:
         return scene, CleanReport(dropped, zeros, 0)
 
 
-def _over_blocks(work: Callable[[int], None], splats: int) -> None:
-    """Call something with the number of the first splat of each block; by threads, if there are many."""
-    starts = range(0, splats, _BLOCK)
+def _over_blocks(work: Callable[[int, int], None], splats: int) -> None:
+    """Call something with where each block of splats begins and ends; by threads, if there are many."""
     if splats < _LARGE:
-        for start in starts:
-            work(start)
+        work(0, splats)
         return
+    starts = range(0, splats, _THREAD_BLOCK)
     with thread_pool() as pool:
-        list(pool.map(work, starts))
+        list(pool.map(work, starts, (min(start + _THREAD_BLOCK, splats) for start in starts)))
 
 
 def joined(parts: Sequence[Scene]) -> Scene:

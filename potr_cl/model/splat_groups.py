@@ -28,6 +28,8 @@ F64 = NDArray[np.float64]
 LARGEST = 1024
 #: Groups whose boxes are found at a time.
 _GROUPS = 256
+#: Splats whose sizes are looked at at a time, and views.
+_ROWS, _VIEWS = 1 << 18, 4
 #: Splats that are so many times as large as the median of some have groups of their own: they can be seen from
 #: everywhere.
 _LARGE, _SAMPLED = 8.0, 100_000
@@ -76,15 +78,9 @@ class SplatGroups:
             run: shares the work out.
         """
         group = group or LARGEST
-        logarithms = largest_scales(scene.log_scales)
-        some = logarithms[:: max(len(logarithms) // _SAMPLED, 1)]
-        large = logarithms > np.median(some) + math.log(_LARGE)
-        codes = morton_codes(scene.means, run)
-        codes |= large.astype(np.uint64) << np.uint64(3 * BITS)  # behind all others
-        numbers = ascending(codes, run)
-        del codes
+        numbers, logarithms, large = _in_order(scene, run)
         order, group_of = np.empty((2, len(numbers)), np.uint32)
-        n, small = len(order), len(order) - int(np.count_nonzero(large))
+        n, small = len(order), len(order) - large
         starts = np.concatenate([np.arange(0, small, group), np.arange(small, n, group), [n]])
         low, high = np.empty((2, len(starts) - 1, 3))
         largest = np.empty(len(starts) - 1)
@@ -146,12 +142,13 @@ class SplatGroups:
         found = np.zeros((len(cameras), len(self.starts) - 1), bool)
         features, origin = self._features()
 
-        def look(view: int) -> None:
+        def look(first: int) -> None:
+            rows = np.concatenate([_bounds(camera, near, origin) for camera in cameras[first : first + _VIEWS]])
             # Without BLAS, whose threads would wait for each other.
-            bounds = np.einsum("bf,fg->bg", _bounds(cameras[view], near, origin), features)
-            np.all(bounds >= 0, axis=0, out=found[view])
+            sums = np.einsum("bf,fg->bg", rows, features)
+            np.all(sums.reshape(-1, 5, len(self.sizes)) >= 0, axis=1, out=found[first : first + _VIEWS])
 
-        for _ in run(look, range(len(cameras))):
+        for _ in run(look, range(0, len(cameras), _VIEWS)):
             pass
         return found
 
@@ -174,6 +171,24 @@ class SplatGroups:
             1,
         )
         return features, origin
+
+
+def _in_order(scene: Scene, run: Run) -> tuple[Indices, NDArray[np.float32], int]:
+    """The splats' numbers along a Morton curve, large ones last; their largest scales; and how many are large."""
+    few = largest_scales(scene.log_scales[:: max(len(scene) // _SAMPLED, 1)])
+    limit = np.median(few) + math.log(_LARGE)
+    codes = morton_codes(scene.means, run)
+    logarithms = np.empty(len(scene), np.float32)
+
+    def flag(first: int) -> int:
+        rows = slice(first, first + _ROWS)
+        logarithms[rows] = largest_scales(scene.log_scales[rows])
+        large = logarithms[rows] > limit
+        codes[rows] |= large.astype(np.uint64) << np.uint64(3 * BITS)
+        return int(np.count_nonzero(large))
+
+    large = sum(run(flag, range(0, len(scene), _ROWS)))
+    return ascending(codes, run), logarithms, large
 
 
 def _bounds(camera: Camera, near: float, origin: F64) -> F64:

@@ -93,6 +93,7 @@ class Device:
                 raise FileNotFoundError(f"there is no file '{path}' to read a kernel from")
         self._macros = dict(macros or {})
         self._programs: dict[Wanted, cl.Program] = {}
+        self._frees_wait = quirks.WAITING_FREES.concerns(self.info.platform, self.info.version)
         self._foresight: Foresight | None = None
         self._of_this_thread = threading.local()
         with self.errors("cannot be opened"):
@@ -256,6 +257,9 @@ class Device:
                 if buffer in buffers:
                     buffers.remove(buffer)
             self.allocated -= buffer.size
+        if self._frees_wait:
+            with suppress(cl.Error):  # a queue that has failed: whoever looks at its results is told
+                self.queue.finish()
         buffer.release()
 
     def upload(self, array: np.ndarray[Any, Any], what: str, pending: list[cl.Event] | None = None) -> cl.Buffer:

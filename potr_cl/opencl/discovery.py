@@ -280,5 +280,5 @@ def fitting_devices(spec: str | None = None) -> list[DeviceInfo]:
         matches = [d for d in devices if wanted in d.name.lower() or wanted in d.platform.lower()]
     if not matches:
         listed = ", ".join(f"{d.index}: {d.name}" for d in sorted(devices, key=lambda d: d.index))
-        raise DeviceError(f"no OpenCL device fits '{spec}'; there are {listed}")
+        raise DeviceError(f"no OpenCL device fits '{spec}': give an index or a part of a name of {listed}")
     return matches

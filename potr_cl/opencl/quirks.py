@@ -130,6 +130,15 @@ SHORT_FILLS = Quirk(
     test=lambda platform, version: "nvidia" in platform,
 )
 
+#: The queue is waited for first: other threads of Python run meanwhile.
+WAITING_FREES = Quirk(
+    vendor="NVIDIA",
+    versions="driver 580",
+    reason="to give memory back that is in use waits for the device, and all threads of Python wait with it",
+    still_needed="free a buffer that a long kernel uses, and see whether another thread runs meanwhile",
+    test=lambda platform, version: "nvidia" in platform,
+)
+
 #: cl/compact/ridge.cl asks how many views a splat has, not its number alone, before a work-item ends early, and reads
 #: an element of a private array before it chooses. Both are right everywhere.
 CAREFUL_VECTORISER = Quirk(

@@ -38,7 +38,7 @@ from potr_cl.stages.pruning.schedule import Pruned
 from potr_cl.stages.pruning.unseen import Unseen
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.refitting.photographs import PhotographChoice
-from potr_cl.stages.refitting.refit import Refitted
+from potr_cl.stages.refitting.refit_options import Refitted
 from potr_cl.stages.stage import Interlude, Progress, Stage, State, Workbench
 from potr_cl.stages.views_between import Added
 from potr_cl.workers.pool import Pool, Traffic
@@ -135,7 +135,7 @@ class SharedOut:
 
     def __str__(self) -> str:
         megabytes = f"{self.sent / 1e6:,.0f} MB sent, {self.received / 1e6:,.0f} MB received"
-        return f"views shared out to {len(self.workers)} workers: {megabytes}"
+        return f"views shared out to {len(self.workers)} worker{'s' if len(self.workers) != 1 else ''}: {megabytes}"
 
 
 @dataclass(frozen=True)

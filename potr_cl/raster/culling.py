@@ -12,13 +12,11 @@ from potr_cl.host.threads import Run
 from potr_cl.model.camera import Camera
 from potr_cl.model.morton import morton_order
 from potr_cl.model.scene import Scene
-from potr_cl.model.splat_groups import F64, Indices, SplatGroups
+from potr_cl.model.splat_groups import Indices, SplatGroups
 
 #: A part's views see so many times as many splats together as three quarters of the views each at most, or this part of
 #: the scene. The others, which see more alone, are one part.
 _SPREAD, _QUANTILE, _LEAST_PART = 1.25, 0.75, 1 / 16
-#: So many groups tell well enough which views see the same.
-_COARSE = 4096
 
 
 @dataclass(frozen=True)
@@ -82,32 +80,27 @@ class Sights:
         Args:
             speeds: of the workers, above 0; their parts of the work are in proportion.
         """
-        totals, seen, counts = self.totals + 1.0, *self._coarse()
-        wanted = np.cumsum(speeds) / np.sum(speeds) * float(totals.sum())
+        counts, totals = self.groups.counts, self.totals
+        wanted = np.cumsum(speeds) / np.sum(speeds) * float((totals + 1).sum())
         left = np.ones(len(totals), bool)
         dealt: list[list[int]] = []
-        done = 0.0
+        done = 0
         for place, end in enumerate(wanted):
             own: list[int] = []
             together = np.zeros(len(counts), bool)
+            more = totals.copy()  # what each view sees that is not there yet
             while left.any() and (done < end or place == len(wanted) - 1):
-                others = np.flatnonzero(left)
-                # Of those that see little more than what is there already, beside what they see at all.
-                more = (seen[others] & ~together) @ counts if own else totals[others] ** 2
-                best = int(others[np.argmin(more / totals[others])])
+                # The narrowest first; then those that add little, beside what they see at all.
+                rank = more / (totals + 1) if own else totals
+                best = int(np.argmin(np.where(left, rank, np.inf)))
+                new = np.flatnonzero(self.seen[best] & ~together)
+                more -= self.seen[:, new] @ counts[new]
+                together[new] = True
                 own.append(best)
                 left[best] = False
-                together |= seen[best]
-                done += totals[best]
+                done += int(totals[best]) + 1
             dealt.append(sorted(own))
         return dealt
-
-    def _coarse(self) -> tuple[NDArray[np.bool_], F64]:
-        """What views see by larger groups, of neighbours, and how many splats these have."""
-        first = np.arange(0, len(self.groups.counts), -(-len(self.groups.counts) // _COARSE))
-        return np.logical_or.reduceat(self.seen, first, axis=1), np.add.reduceat(
-            self.groups.counts.astype(float), first
-        )
 
     def of_views(self, numbers: Sequence[int]) -> tuple[Indices, Sights]:
         """What some views may draw, as a scene of its own.

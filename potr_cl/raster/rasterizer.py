@@ -18,7 +18,8 @@ Semantics: the original 3DGS rasterizer (Kerbl et al. 2023); where renderers dif
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 
 import numpy as np
 import pyopencl as cl
@@ -124,6 +125,8 @@ class Rasterizer(Owner):
             )
         self._preparing = preparing or PreparingMemory(device)
         self._shares = preparing is not None
+        #: Whether the memory that sets are prepared in is kept for now, and whether it is that of several views.
+        self._keeps_preparing = self._prepared_several = False
         self._image, self._transmittance = self._preparing.image, self._preparing.transmittance
         self._frame: ViewSet | None = None
 
@@ -261,6 +264,17 @@ class Rasterizer(Owner):
         """
         return self.prepare_set([camera]).views[0]
 
+    @contextmanager
+    def preparing_many(self) -> Iterator[None]:
+        """Inside the block, memory that sets are prepared in is kept for the next one: drivers take long to give it."""
+        self._keeps_preparing = True
+        try:
+            yield
+        finally:
+            self._keeps_preparing = False
+            if self._prepared_several:
+                self._rest_preparing()
+
     def prepare_set(self, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
         """:meth:`prepare` several views, and wait for the device only once. CPU kernels take one view at a time.
 
@@ -289,12 +303,20 @@ class Rasterizer(Owner):
             self._enqueue_lists(views, bounds, counts, for_frame=False)
         except BaseException:
             self._preparing.counts.close()  # not zero
+            if len(cameras) > 1:
+                self._rest_preparing()
             views.close()
             raise
-        finally:
-            if len(cameras) > 1 and not self._shares:  # far more than a single view will need
-                self._preparing.rest()
+        if len(cameras) > 1:  # far more than a single view will need
+            self._prepared_several = True
+            if not self._keeps_preparing:
+                self._rest_preparing()
         return views
+
+    def _rest_preparing(self) -> None:
+        self._prepared_several = False
+        if not self._shares:
+            self._preparing.rest()
 
     def prepare_again(self, views: ViewSet, cameras: Sequence[Camera]) -> bool:
         """Point prepared views at other cameras, in the memory that they have; more is taken only where it must be.

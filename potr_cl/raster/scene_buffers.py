@@ -11,6 +11,7 @@ from numpy.typing import NDArray
 from potr_cl.errors import DeviceError
 from potr_cl.host.threads import Ahead
 from potr_cl.model.scene import LOW_PASS, SH_COEFFICIENTS, FloatArray, Scene
+from potr_cl.opencl import sending
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.activation import activated_scales, log2_opacities, unit_quaternions
@@ -140,6 +141,19 @@ class SceneBuffers(Owner):
         turn = device.shared_kernel("raster/columns.cl", "columns")
         if start + len(rows) > self.splats:
             raise ValueError(f"{len(rows)} rows from splat {start} on do not fit {self.splats} splats")
+        if (
+            pending is None
+            and rows.nbytes >= sending.LEAST
+            and not (device.info.kind == "cpu" or device.info.integrated)
+        ):
+            height = max(sending.PIECE // (4 * width), 1)
+            firsts = range(0, len(rows), height)
+            with sending.Sending(device, what) as sender:
+                pieces = sender.pieces([rows[first : first + height] for first in firsts])
+                for first, sent in zip(firsts, pieces, strict=True):
+                    turn.bind(rows=sent, first=start + first, width=width, stride=self.stride, result=parameter)
+                    turn.launch((min(height, len(rows) - first),))
+            return
         for first in range(0, len(rows), _UPLOADED):
             some = np.ascontiguousarray(rows[first : first + _UPLOADED], np.float32)
             with Memory(device) as memory:

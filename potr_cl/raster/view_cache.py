@@ -29,6 +29,7 @@ class ViewCache(Owner):
     Args:
         rasterizer: that prepares them.
         budget: bytes that they may take.
+        others: bytes of the budget for which others have more use than views have for geometry of their own.
 
     Attributes:
         room: bytes of the budget that are left.
@@ -36,11 +37,11 @@ class ViewCache(Owner):
             have their own.
     """
 
-    def __init__(self, rasterizer: Rasterizer, budget: float) -> None:
+    def __init__(self, rasterizer: Rasterizer, budget: float, others: float = 0) -> None:
         self._rasterizer = rasterizer
         self._memory = Memory(rasterizer.device)
         self._whole: list[ViewSet] = []  # those that keep their geometry
-        self.room = budget
+        self.room, self._others = budget, others
         self.shared: tuple[cl.Buffer, cl.Buffer] | None = None
 
     def most_views(self, most: int, nbytes: int) -> int:
@@ -71,7 +72,7 @@ class ViewCache(Owner):
         if needed + shared > self.room + sum(map(self._geometry, self._whole)):
             return False
         self.room -= needed + self._geometry(views)
-        while self.room < 0:
+        while self.room < 0 or (self.room < self._others and to_spare):
             other = to_spare.pop()
             self.room += self._geometry(other)
             other.free_geometry()

@@ -157,7 +157,7 @@ class Prune(Stage):
             sights = sights_worth_it(state.scene, state.views, options, groups, pool.map) if likely else None
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
-        told = state.having_learnt("unseen", Unseen(splats, len(state.scene), area, kept))
+        told = state.having_learnt("unseen", Unseen(splats, len(state.scene), kept, area))
         if state.scene is state.source:
             told = replace(told, sights=sights)
         if self.keep is None and self.count is None:

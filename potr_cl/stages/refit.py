@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import os
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
@@ -18,17 +19,12 @@ from potr_cl.outputs.output import Rounded
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
+from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import placed
-from potr_cl.stages.refitting.refit import (
-    ColourRefit,
-    HelpFrom,
-    RefitOptions,
-    Refitted,
-    active_coefficients,
-    refit_colours,
-)
+from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.shared_map import colour_shares
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RememberedTargets, RenderedTargets, Targets
 from potr_cl.stages.refitting.visible_targets import VisibleTargets
@@ -36,6 +32,8 @@ from potr_cl.stages.stage import Flag, Interlude, Stage, State, Workbench, optio
 
 #: A scene that takes more than this part of the memory that is given makes room for the re-fit.
 _LARGE = 1 / 16
+#: Threads that make of rounded geometry what a decoder sees; with 32 it takes half as long again.
+_DECODING = 12
 
 
 def _steps(text: str) -> int | None:
@@ -127,7 +125,7 @@ class Refit(Stage):
         return [Interlude(after, RefitOnTheWay(steps=self.at_steps)) for after in times]
 
     def run(self, state: State, bench: Workbench) -> State:
-        """Re-fit the colours, and leave a :class:`potr_cl.stages.refitting.refit.Refitted` in ``learnt``.
+        """Re-fit the colours, and leave a :class:`potr_cl.stages.refitting.refit_options.Refitted` in ``learnt``.
 
         With photographs, also a :class:`potr_cl.stages.refitting.photographs.PhotographChoice` as "photographs".
         """
@@ -170,7 +168,7 @@ class Refit(Stage):
             stack.callback(bench.progress, "refit", 1.0)
             ahead = stack.enter_context(_pictures_ahead(state, bench))
             rounded = _rounded(state, bench)
-            with thread_pool(bench.threads) as pool:
+            with thread_pool(bench.threads or min(os.cpu_count() or 1, _DECODING)) as pool:
                 decoded = rounded.decoded(state.scene.sh, pool.map)
             pictures = stack.enter_context(_pictures_of_goal(state, bench, ahead))
             help_from = None

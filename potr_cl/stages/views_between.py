@@ -103,8 +103,8 @@ class Between(Stage):
     def run(self, state: State, bench: Workbench) -> State:
         """Add them; ``learnt`` gets an :class:`Added`, if any are asked for.
 
-        And as "shown" by which part of the given views a splat is shown on the average, unless they are virtual: those
-        are placed so that many show it.
+        And as "shown" which part of the given views shows a splat on the average, unless they are virtual: those are
+        placed so that many show it.
         """
         given = len(state.views)
         if given < 2 or state.added:
@@ -118,8 +118,8 @@ class Between(Stage):
         with thread_pool(min(bench.threads or _THREADS, _THREADS)) as pool:
             known = GivenViews(state.source, state.views, pool.map)
             parts = known.views_of_parts()
-            if self.weigh and not virtual and len(parts):
-                state = state.having_learnt(SHOWN, float(parts.mean()) / given)
+            if self.weigh and not virtual and (shown := known.part_of_views()) is not None:
+                state = state.having_learnt(SHOWN, shown)
             each, shown_by = self.views, None
             if each == "auto" and virtual:
                 each = needed_of_virtual(slow)

@@ -75,9 +75,12 @@ class ClusterPool(Pool):
 
     def workers(self) -> list[Worker]:
         alive = self._alive()
-        left: list[Worker] = [worker for worker in self._workers if worker.name in alive]
+        left: list[Worker] = [worker for worker in self._workers if worker.name in alive and not worker.lost]
         if not left:
-            raise WorkerLost("all workers of the cluster are gone: start some, and encode again")
+            raise WorkerLost(
+                "no worker of the cluster answers any more: start some, with --memory-limit 0 if Dask stopped them for "
+                "the memory that they took, and encode again"
+            )
         return left
 
     @property
@@ -104,8 +107,13 @@ class ClusterPool(Pool):
 
     def _alive(self) -> set[str]:
         """Addresses of the workers that the scheduler knows."""
-        with _as_worker_lost("the scheduler"):
+        try:
             return set(self.client.nthreads())
+        except Exception as error:
+            raise WorkerLost(
+                f"the cluster's scheduler does not answer any more ({_first_line(error)}): start it and its workers, "
+                "and encode again"
+            ) from None
 
     def wait_for(self, answer: Any, address: str, most: float = math.inf) -> Any:
         """What a worker answers.
@@ -206,6 +214,10 @@ class _ClusterWorker(Worker):
             self._seat = self._pool.wait_for(self._future, self.name, _HELLO)
             version, name, family = self.ask("hello")
         except DeviceError as error:
+            if "deserialization of the task graph" in str(error):  # which the scheduler does
+                raise UsageError(
+                    "the scheduler of the cluster does not know potr_cl: install it there as it is here"
+                ) from None
             raise UsageError(
                 f"worker {self.name} of the cluster cannot do the work ({error}): install potr_cl there as it is here, "
                 "and an OpenCL driver"
@@ -369,7 +381,9 @@ def _client_of(cluster: str | Client) -> tuple[Client, bool]:
         )
     if not cluster.strip():
         raise UsageError("--cluster is empty: give the address of a Dask scheduler, such as tcp://10.0.0.1:8786")
-    logging.getLogger("distributed").setLevel(logging.CRITICAL)  # what it has to say is said here, in one line
+    # What it has to say is said here, in one line. Some of its modules' loggers have levels of their own.
+    for name in ["distributed", *(name for name in logging.root.manager.loggerDict if name.startswith("distributed."))]:
+        logging.getLogger(name).setLevel(logging.CRITICAL)
     try:
         return Client(cluster, timeout=_CONNECT, set_as_default=False, direct_to_workers=True), True
     except Exception as error:

@@ -18,6 +18,7 @@ from types import TracebackType
 from typing import Any
 
 from potr_cl.errors import DeviceError, PotrError
+from potr_cl.host.threads import in_background
 from potr_cl.opencl.memory import Owner
 from potr_cl.workers.pool import Held, Part, Pool, Worker, WorkerLost
 
@@ -60,6 +61,7 @@ class Parts(Owner):
         self._by: list[Worker | None] = [None] * len(self._given)
         self._making: list[Future[Held]] = []
         self._pending: Pending | None = None
+        self._closing: list[Future[None]] = []
         try:
             workers = self._able()
             for place, each in enumerate(self._given):
@@ -128,6 +130,16 @@ class Parts(Owner):
     ) -> None:
         self._end(abandoned=kind is not None and not issubclass(kind, Exception))
 
+    def begin_to_close(self) -> None:
+        """Have threads of this process forget the parts while the master gives back its own; :meth:`close` waits.
+
+        Drivers take long to give much memory back.
+        """
+        if self._pool.in_process and not self._making:
+            self._pending = None
+            held, self._held = self._held, [None] * len(self._given)
+            self._closing = [in_background(each.close) for each in held if each is not None]
+
     def close(self) -> None:
         """Have the workers forget the parts."""
         self._end(abandoned=False)
@@ -148,12 +160,20 @@ class Parts(Owner):
             if each is not None:
                 with suppress(PotrError):
                     each.abandon() if abandoned else each.close()
+        for closing in self._closing:
+            with suppress(PotrError):
+                closing.result()
+        self._closing = []
 
     # ------------------------------------------------------------------------------------------------ their parts
 
     def _begin(self, place: int, command: str, args: Sequence[Any]) -> Future[Any]:
-        held = self._held[place]
+        held, by = self._held[place], self._by[place]
         assert held is not None, "a part is closed"
+        if by is not None and by.lost:  # another work has waited for it
+            gone: Future[Any] = Future()
+            gone.set_exception(WorkerLost("it has been given up before"))
+            return gone
         args = [each.args[place] if isinstance(each, Each) else each for each in args]
         self._pool.traffic.sent += nbytes(args)
         return held.begin(command, args)
@@ -210,10 +230,8 @@ class Parts(Owner):
             worker = self._by[place]
             assert worker is not None
             self._unfit.add(worker.name)
-            try:
-                left = self._able()
-            except WorkerLost:
-                left = []
+            worker.lost = worker.lost or isinstance(last, WorkerLost)
+            left = self._able()
             if not left:
                 raise last
             loads = [sum(by is each for by in self._by) for each in left]

@@ -59,9 +59,11 @@ class Worker(ABC):
     Attributes:
         name: for messages.
         rate: views that it did in a second in the last work that it had a part of, each command counting; None before.
+        lost: whether it has been given up: it may stand still, and to wait for it again would take as long again.
     """
 
     name: str
+    lost: bool = False
     rate: float | None = None
 
     @abstractmethod

@@ -47,11 +47,11 @@ def test_only_large_arrays_and_only_where_memory_is_bounded():
         return in_a_file(mapped.array((nbytes,), np.uint8, "bytes"))
 
     assert not place(10_000_000)
-    with mapped.bounded(16_000_000):
+    with mapped.bounded(64_000_000):
         assert place(1_000_001)
         with mapped.bounded(None):
             assert place(1_000_001)
-        with mapped.bounded(320_000_000):
+        with mapped.bounded(1_280_000_000):
             assert not place(1_000_001)
     assert not place(10_000_000)
 

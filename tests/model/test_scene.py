@@ -114,3 +114,14 @@ def test_many_splats_are_taken_by_threads_as_few_are(monkeypatch):
     assert len(scene.subset(np.arange(-700, 0))) == 700  # as NumPy counts
     with pytest.raises(IndexError):
         scene.subset(np.arange(301, 1001))
+
+
+def test_scenes_are_joined_in_an_order(monkeypatch):
+    """Piece by piece: of each splat all values, from the scene that has it."""
+    monkeypatch.setattr(scene_module, "_LARGE", 80)
+    some, others = random_scene(40, 2, seed=1), random_scene(17, 2, seed=2)
+    order = np.random.default_rng(3).permutation(57)
+    joined = some.joined(others, order)
+    for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
+        both = np.concatenate([getattr(some, name), getattr(others, name)])
+        assert np.array_equal(getattr(joined, name), both[order])

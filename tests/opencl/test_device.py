@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import dataclasses
 import logging
 import os
 import subprocess
@@ -88,7 +89,7 @@ def test_specification(machine: list[DeviceInfo], spec: str, index: int, monkeyp
 
 @pytest.mark.parametrize("spec", ["8", "-1", "voodoo"])
 def test_specification_that_fits_nothing(machine: list[DeviceInfo], spec: str) -> None:
-    with pytest.raises(DeviceError, match=r"there are 0: Oclgrind Simulator, 1: llvmpipe"):
+    with pytest.raises(DeviceError, match=r"part of a name of 0: Oclgrind Simulator, 1: llvmpipe"):
         choose_device(spec)
 
 
@@ -548,3 +549,19 @@ def test_a_launch_that_finds_no_memory(device: Device, monkeypatch: pytest.Monke
     monkeypatch.setattr(cl, "enqueue_nd_range_kernel", refuse)
     with pytest.raises(DeviceMemoryError):
         kernel.launch((64,))
+
+
+def test_memory_in_use_is_given_back_when_the_device_is_done() -> None:
+    """Where a driver would wait itself, and hold up all threads, it is waited for before."""
+    info = choose_device()
+    there = Device(dataclasses.replace(info, platform="NVIDIA CUDA"), family=info.family)
+    add = there.kernel("prune/add_totals.cl", "add_totals")
+    count = 1 << 20
+    totals, more = (there.upload(np.zeros(count, np.int64), "a test") for _ in range(2))
+    for _ in range(50):
+        add.bind(totals=totals, more=more, count=count).launch((count,), (64,))
+    last = cl.enqueue_marker(there.queue)
+    there.free(totals)
+    assert last.command_execution_status == cl.command_execution_status.COMPLETE
+    there.free(more)
+    assert there.allocated == 0

@@ -28,6 +28,7 @@ CONCERNED = {
     "CALLED_BUILTINS": {"PoCL 3", "PoCL 4"},
     "NO_PREFETCH": {"NVIDIA", "Oclgrind"},
     "SHORT_FILLS": {"NVIDIA"},
+    "WAITING_FREES": {"NVIDIA"},
     "CAREFUL_VECTORISER": {"Intel"},
 }
 

@@ -256,7 +256,8 @@ def test_without_views_files_are_made_too(plush_excerpt, tmp_path):
 
 def test_training_views_are_what_worth_is_about(plush_excerpt, plush_excerpt_cameras, device):
     """An error in a coefficient that is worth much is worth that in pictures: the sum over one channel's error."""
-    from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions
+    from potr_cl.stages.refitting.colour_refit import ColourRefit
+    from potr_cl.stages.refitting.refit_options import RefitOptions
     from potr_cl.stages.refitting.targets import RenderedTargets
 
     views = train_views(plush_excerpt_cameras)
@@ -278,7 +279,8 @@ def test_training_views_are_what_worth_is_about(plush_excerpt, plush_excerpt_cam
 
 def test_coefficients_make_up_for_each_other(plush_excerpt, plush_excerpt_cameras, device):
     """Rounded in turn, the coefficients of a splat lose less than each for itself, and the file is no larger."""
-    from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions
+    from potr_cl.stages.refitting.colour_refit import ColourRefit
+    from potr_cl.stages.refitting.refit_options import RefitOptions
     from potr_cl.stages.refitting.targets import RenderedTargets
 
     views, output = train_views(plush_excerpt_cameras), output_of(Path("a.compressed.ply"))

@@ -20,7 +20,7 @@ from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS, ViewWeights
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.refitting.refit import RefitOptions
+from potr_cl.stages.refitting.refit_options import RefitOptions
 from tests.cases.scenes import antialiased
 from tests.devices import KERNELS, open_device
 

@@ -11,6 +11,7 @@ import pytest
 from potr_cl.codec.decoder import decode
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model.camera import Camera, train_views
+from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.encode import Encoded, encode
@@ -49,27 +50,65 @@ def encoded(device, scene, cameras, preset="best", **between) -> Encoded:
     return encode(scene, cameras, options, device=device)
 
 
+@pytest.fixture(scope="module")
+def twelve(plush_excerpt, plush_excerpt_cameras):
+    """Copies of the excerpt, and the views of all of them."""
+    return row(plush_excerpt, train_views(plush_excerpt_cameras), 12)
+
+
+@pytest.fixture(scope="module")
+def weighed(device, twelve):
+    """What they are encoded to."""
+    return encoded(device, *twelve)
+
+
 def match(device, scene, cameras, file: Encoded) -> float:
     """Mean PSNR of some views."""
     with Rasterizer(device, scene) as source, Rasterizer(device, decode(file.data)) as decoded:
         return float(np.mean([psnr(source.render(c)[0], decoded.render(c)[0]) for c in cameras[::5]]))
 
 
-def test_copies_keep_about_as_many_splats_as_one(device, plush_excerpt, plush_excerpt_cameras):
-    given, copies = train_views(plush_excerpt_cameras), 12
-    alone = len(encoded(device, plush_excerpt, given).order)
-    scene, cameras = row(plush_excerpt, given, copies)
-    before, weighed = (encoded(device, scene, cameras, weigh=weigh) for weigh in (False, True))
-    lost_before, lost = (alone - len(each.order) / copies for each in (before, weighed))
+def test_the_part_of_the_views_that_shows_a_splat(plush_excerpt, plush_excerpt_cameras):
+    given = train_views(plush_excerpt_cameras)
+    part = GivenViews(plush_excerpt, given).part_of_views()
+    assert part is not None
+    assert 0.6 < part <= 1
+    assert GivenViews(plush_excerpt, given[:1] * 5).part_of_views() == pytest.approx(1)
+    for copies in (2, 12):
+        found = GivenViews(*row(plush_excerpt, given, copies)).part_of_views()
+        assert found == pytest.approx(part / copies, rel=0.05)
+
+
+def test_a_view_from_afar_counts_little(plush_excerpt, plush_excerpt_cameras):
+    near = train_views(plush_excerpt_cameras)[0]
+    middle = plush_excerpt.means.mean(axis=0)
+    away = middle + 20 * (near.centre - middle)
+    far = dataclasses.replace(near, name="far", translation=-near.rotation @ away)
+    assert GivenViews(plush_excerpt, [near, far]).part_of_views() == pytest.approx(0.5, abs=0.02)
+    # Unless its picture is as narrow.
+    same = dataclasses.replace(far, fx=20 * near.fx, fy=20 * near.fy)
+    assert GivenViews(plush_excerpt, [near, same]).part_of_views() > 0.9
+
+
+def test_views_that_show_nothing_tell_nothing(plush_excerpt, plush_excerpt_cameras):
+    view = train_views(plush_excerpt_cameras)[0]
+    away = dataclasses.replace(view, translation=view.translation - np.array([0, 0, 1e4]))
+    assert GivenViews(plush_excerpt, [away, away]).part_of_views() is None
+
+
+def test_copies_keep_about_as_many_splats_as_one(device, plush_excerpt, plush_excerpt_cameras, twelve, weighed):
+    alone = len(encoded(device, plush_excerpt, train_views(plush_excerpt_cameras)).order)
+    scene, cameras = twelve
+    before = encoded(device, scene, cameras, weigh=False)
+    lost_before, lost = (alone - len(each.order) / 12 for each in (before, weighed))
     assert lost_before > 0.1 * alone, (alone, lost_before, lost)
     assert lost < 0.5 * lost_before, (alone, lost_before, lost)
     assert match(device, scene, cameras, weighed) > match(device, scene, cameras, before) + 0.3
 
 
-def test_the_thresholds_follow_the_part_of_the_views_that_show_a_splat(device, plush_excerpt, plush_excerpt_cameras):
-    scene, cameras = row(plush_excerpt, train_views(plush_excerpt_cameras), 12)
+def test_the_thresholds_follow_the_part_of_the_views_that_show_a_splat(weighed):
     asked = HyperParameters.from_quality(0.5, "best")
-    taken = encoded(device, scene, cameras).parameters
+    taken = weighed.parameters
     part = taken.delta_mse_max / asked.delta_mse_max
     assert 1 / 12 <= part < 1 / 3
     assert taken.drop == pytest.approx(part * asked.drop)
@@ -77,12 +116,12 @@ def test_the_thresholds_follow_the_part_of_the_views_that_show_a_splat(device, p
 
 
 def test_scenes_that_are_seen_whole_and_the_papers_preset_stay_as_they_are(
-    device, plush_excerpt, plush_excerpt_cameras
+    device, plush_excerpt, plush_excerpt_cameras, twelve
 ):
     given = train_views(plush_excerpt_cameras)
     files = {encoded(device, plush_excerpt, given, weigh=weigh).data for weigh in (True, False)}
     assert len(files) == 1
-    scene, cameras = row(plush_excerpt, given, 12)
+    scene, cameras = twelve
     options = EncodeOptions.for_preset("paper", cameras_anyway=True, prune={"iterations": 2})
     paper = encode(scene, cameras, options, device=device)
     assert paper.parameters == HyperParameters.from_quality(0.5, "paper")

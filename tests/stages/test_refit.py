@@ -16,8 +16,10 @@ from potr_cl.reference.scenes import ring_of_cameras, tilted_camera, visible_sce
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
+from potr_cl.stages.refitting.colour_refit import ColourRefit
 from potr_cl.stages.refitting.launcher import launcher_for
-from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.vector_space import Layout
 from tests.devices import KERNELS, open_device
 

@@ -14,7 +14,9 @@ from potr_cl.reference.refit_cases import Case
 from potr_cl.reference.rounding import rounded_in_turn
 from potr_cl.reference.scenes import ring_of_cameras, tilted_camera, visible_scene
 from potr_cl.stages.refitting.blocks import SplatBlocks
-from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, refit_colours
+from potr_cl.stages.refitting.colour_refit import ColourRefit
+from potr_cl.stages.refitting.refit import refit_colours
+from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.rounding import TURNS, Round, Rounding
 from tests.devices import KERNELS, open_device
 

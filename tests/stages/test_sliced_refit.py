@@ -2,10 +2,13 @@
 
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 import pytest
 
 from potr_cl.errors import UsageError
+from potr_cl.opencl.device import Device
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
@@ -13,7 +16,9 @@ from potr_cl.reference.refit_cases import Case
 from potr_cl.reference.scenes import ring_of_cameras, visible_scene
 from potr_cl.stages import refit as refit_stage
 from potr_cl.stages.refitting import placement
-from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, refit_colours
+from potr_cl.stages.refitting.colour_refit import ColourRefit
+from potr_cl.stages.refitting.refit import refit_colours
+from potr_cl.stages.refitting.refit_options import RefitOptions
 from tests.devices import KERNELS, open_device
 
 #: Slices of 256 splats, the fewest that there can be: three of the scene, and three pieces of its vectors.
@@ -104,9 +109,12 @@ def test_any_number_of_splats(device, count):
 
 
 @pytest.mark.one_runtime
-def test_little_memory_is_enough(device, monkeypatch):
+@pytest.mark.parametrize("own", [False, True], ids=["the host's memory", "memory of its own"])
+def test_little_memory_is_enough(device, own, monkeypatch):
     """Vectors that are too large for the memory that is given do not come to the device: most of them are not there."""
     monkeypatch.setattr(placement, "_ANYWAY", 0)
+    kind = {"kind": "gpu", "integrated": False} if own else {"kind": "cpu"}
+    device = Device(dataclasses.replace(device.info, **kind), family=device.family)
     count = 20_000
     one_piece = 3400 * count
     peaks = []

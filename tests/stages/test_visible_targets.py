@@ -68,7 +68,8 @@ def test_the_same_pictures(device):
 def test_a_refit_takes_them_and_the_bytes_stay(device, monkeypatch, memory):
     scene, cameras = street(6, 400)
     options = EncodeOptions.for_preset("best", memory=memory, cameras_anyway=True).changed(prune={"iterations": 4})
-    wanted = encode(scene, cameras, options, device=device)
+    # With little memory other views fit than those that all splats leave room for, and so other splats go.
+    wanted = encode(scene, cameras, options, device=device) if memory is None else None
     made = []
 
     class Noting(VisibleTargets):
@@ -80,5 +81,4 @@ def test_a_refit_takes_them_and_the_bytes_stay(device, monkeypatch, memory):
     monkeypatch.setattr(refit, "VisibleTargets", Noting)
     got = encode(scene, cameras, options, device=device)
     assert len(made) == 1
-    if memory is None:  # otherwise other views fit
-        assert got.data == wanted.data
+    assert wanted is None or got.data == wanted.data

@@ -179,15 +179,74 @@ def test_a_worker_is_killed(stage, scene, cameras, device, expected, caplog):
 def test_all_workers_are_killed(scene, cameras, device):
     with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device) as pool:
         processes = [process_of(worker) for worker in cluster.workers.values()]
-        with pytest.raises(DeviceError, match=r"gone|does not answer") as error:
+        with pytest.raises(DeviceError, match="no worker of the cluster answers any more: start some") as error:
             encode(scene, cameras, OPTIONS, killing(processes, "prune", 2), device, pool=pool)
     assert "\n" not in str(error.value)
 
 
+@contextlib.contextmanager
+def processes_of_a_cluster(workers):
+    """A scheduler and workers as users start them; the address, and the processes."""
+    with contextlib.ExitStack() as stack:
+
+        def started(*words):
+            running = subprocess.Popen(
+                [sys.executable, "-m", *words, "--no-dashboard"], cwd=ROOT, stderr=subprocess.PIPE, text=True
+            )
+            stack.callback(running.communicate)
+            stack.callback(running.kill)
+            return running
+
+        scheduler = started("distributed.cli.dask_scheduler", "--host", "127.0.0.1", "--port", "0")
+        address = next(line for line in scheduler.stderr if "Scheduler at:" in line).split()[-1]
+        more = [
+            started("distributed.cli.dask_worker", address, "--nthreads", "1", "--memory-limit", "0", "--no-nanny")
+            for _ in range(workers)
+        ]
+        for each in more:
+            next(line for line in each.stderr if "Registered to:" in line)
+        yield address, [scheduler, *more]
+
+
 @pytest.mark.slow
-def test_a_worker_stands_still(scene, cameras, device, expected):
+@pytest.mark.skipif(sys.platform == "win32", reason="sends a signal")
+@pytest.mark.parametrize("lost", ["scheduler", "workers"])
+def test_what_is_printed_when_the_cluster_is_gone(lost, tmp_path, data):
+    """One line that says what, and how to mend it; none of Dask's own."""
+    output = tmp_path / "out.potr"
+    with processes_of_a_cluster(2) as (address, (scheduler, *workers)):
+        command = [
+            sys.executable, "-m", "potr_cl", "encode", data / "plush_excerpt.ply", "-o", output, "--cameras",
+            data / "plush_excerpt_cameras.json", "--cluster", address, "--iterations", "5000",
+            "--keep", "0.001", "--no-quality", "--views-between", "0",
+        ]  # fmt: skip
+        running = subprocess.Popen(command, cwd=ROOT, stderr=subprocess.PIPE, text=True)
+        try:
+            before = "".join(iter(lambda: running.stderr.readline(), "prune …\n"))
+            time.sleep(1)
+            for each in [scheduler] if lost == "scheduler" else workers:
+                each.kill()
+            _, said = running.communicate(timeout=120)
+        finally:
+            running.kill()
+    assert running.returncode == 1
+    assert "Traceback" not in before + said
+    *progress, last = said.strip().splitlines()
+    assert not [line for line in progress if not line.startswith("prune")]
+    if lost == "scheduler":
+        assert last.startswith("potr-cl: the cluster's scheduler does not answer any more")
+    else:
+        assert last.startswith("potr-cl: no worker of the cluster answers any more: start some")
+    assert "encode again" in last
+    assert not list(tmp_path.iterdir())
+
+
+@pytest.mark.slow
+def test_a_worker_stands_still(scene, cameras, device, expected, caplog):
+    """It is waited for once, not in each stage again."""
     with local_cluster(2) as cluster, ClusterPool(cluster.scheduler_address, device, patience=2.0) as pool:
-        process = process_of(next(iter(cluster.workers.values())))
+        worker = next(iter(cluster.workers.values()))
+        process, address = process_of(worker), worker.worker_address
         stopped = []
 
         def progress(what, done):
@@ -201,6 +260,7 @@ def test_a_worker_stands_still(scene, cameras, device, expected):
             os.kill(process, signal.SIGCONT)
         assert stopped
     assert found.data == expected
+    assert caplog.text.count(f"worker {address} gave up (it does not answer)") == 1
 
 
 def seats(dask_worker):

@@ -10,7 +10,7 @@ import pytest
 
 from potr_cl.errors import DeviceMemoryError, UsageError
 from potr_cl.workers.dealing import shares
-from potr_cl.workers.parts import Parts
+from potr_cl.workers.parts import Each, Parts
 from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, WorkerLost
 
 
@@ -127,6 +127,28 @@ def test_a_silent_worker_is_given_up():
     assert course(FakePool(FakeWorker("a", 4, silent=True), FakeWorker("b"), patience=0.3)) == EXPECTED
 
 
+@pytest.mark.parametrize("lost_at", [None, 1, 2, 3, 4])
+def test_parts_can_be_told_different_things(lost_at):
+    """And those that are made again are told again what was theirs."""
+    pool = FakePool(FakeWorker("a", lost_at), FakeWorker("b"))
+    with Parts(pool, Sum, [(0, 1), (0, 2), (0, 3)]) as parts:
+        assert parts.tell("add", Each([1, 10, 100])) == [1, 20, 300]
+        assert parts.tell("add", 5) == [6, 30, 315]
+        assert parts.tell("add", Each([7, 0, 2])) == [13, 30, 321]
+
+
+def test_a_worker_that_is_silent_in_one_work_is_not_waited_for_in_another():
+    a, b = FakeWorker("a", 3, silent=True), FakeWorker("b")
+    pool = FakePool(a, b, patience=0.5)
+    with Parts(pool, Sum, [(0, 1), (0, 1)]) as first, Parts(pool, Sum, [(0, 1), (0, 1)]) as second:
+        assert first.tell("add", 1) == second.tell("add", 1) == [1, 1]
+        assert first.tell("add", 1) == [2, 2]
+        began = time.monotonic()
+        assert second.tell("add", 1) == [2, 2]
+        assert time.monotonic() - began < 0.4
+        assert a.commands == 3
+
+
 def test_a_refusal_is_no_loss():
     with Parts(FakePool(FakeWorker("a"), FakeWorker("b")), Sum, [(0, 1), (0, 1)]) as parts:
         with pytest.raises(UsageError, match="no"):
@@ -160,3 +182,22 @@ def test_a_log_that_begins_anew_is_not_replayed_whole():
         parts.begin("look", anew=True).results()
         assert parts.tell("look") == [0]  # made again, and told only the two last commands
     assert second.commands == 2
+
+
+@pytest.mark.parametrize("in_process", [True, False])
+def test_threads_forget_their_parts_meanwhile(in_process, monkeypatch):
+    """The master goes on, and waits at the end; workers elsewhere are told at the end alone."""
+    order = []
+
+    def close(self):
+        time.sleep(0.05)
+        order.append("forgotten")
+
+    monkeypatch.setattr(Sum, "close", close)
+    pool = FakePool(FakeWorker("a"), FakeWorker("b"))
+    pool.in_process = in_process
+    with Parts(pool, Sum, [(10, 1), (10, 2)]) as parts:
+        assert parts.tell("add", 1) == [11, 12]
+        parts.begin_to_close()
+        order.append("went on")
+    assert order == ["went on", "forgotten", "forgotten"]

@@ -47,7 +47,9 @@ from potr_cl.quality.metrics import psnr
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.sweep_options import SweepOptions
-from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, active_coefficients
+from potr_cl.stages.refitting.colour_refit import ColourRefit
+from potr_cl.stages.refitting.refit import active_coefficients
+from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RenderedTargets, Targets
 from tools.results import circumstances, write_json
 from tools.study.rate_distortion import size_at

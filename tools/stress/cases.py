@@ -27,7 +27,7 @@ from potr_cl.reference.scenes import (
     tilted_camera,
 )
 from potr_cl.stages.compaction.ridge import CompactionOptions
-from potr_cl.stages.refitting.refit import RefitOptions
+from potr_cl.stages.refitting.refit_options import RefitOptions
 
 F64 = NDArray[np.float64]
 

@@ -48,7 +48,7 @@ from potr_cl.reference.scenes import (
 )
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
-from potr_cl.stages.refitting.refit import RefitOptions
+from potr_cl.stages.refitting.refit_options import RefitOptions
 
 #: As in the tests: pixels that come no nearer, relatively, to 1/255 and 1e-4 cannot flip.
 CLEAR = 1e-4

@@ -62,6 +62,7 @@ from potr_cl.stages.compaction.ridge import Compactor
 from potr_cl.stages.compaction.view_weights import ViewWeights
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
+from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_files
 from potr_cl.stages.fitting.tangents import PictureTangents
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
@@ -70,9 +71,11 @@ from potr_cl.stages.pruning.survivors import Survivors
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView
 from potr_cl.stages.pruning.visible_parts import PartedRemoval
+from potr_cl.stages.refitting import coefficients, sliced_coefficients
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.packing import Packing
-from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
+from potr_cl.stages.refitting.refit import refit_colours
+from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.refitting.vector_space import Layout
 
@@ -80,6 +83,8 @@ from potr_cl.stages.refitting.vector_space import Layout
 KINDS = (("gpu", 1), ("cpu", 4), ("cpu", 8), ("cpu", 16))
 #: As in the tests: pixels that come no nearer, relatively, to 1/255 and 1e-4 cannot flip; and what those may be off by.
 _CLEAR, _TOLERANCE = 1e-4, 2e-5
+#: Work-items of a dot product: few of those that devices have, most of which would have nothing to do.
+_DOT_ITEMS = 1024
 
 Step = Callable[[Device], None]
 
@@ -216,12 +221,12 @@ def packing(device: Device) -> None:
     """What travels between devices that share a re-fit."""
     scene = random_splats(300, 2, seed=5)
     layout = Layout(300, 320, scene.sh.shape[1], 1)
-    with Memory(device) as memory, Coefficients(device, layout) as coefficients, Packing(coefficients) as packs:
-        coefficients.activate(np.random.default_rng(1).random(scene.sh.shape) < 0.5)
+    with Memory(device) as memory, Coefficients(device, layout) as vectors, Packing(vectors) as packs:
+        vectors.activate(np.random.default_rng(1).random(scene.sh.shape) < 0.5)
         packs.take_flags()
         packs.give_flags(packs.flags())
-        x = coefficients.vector()
-        coefficients.write(x, scene.sh)
+        x = vectors.vector()
+        vectors.write(x, scene.sh)
         packs.set_floats(x, packs.floats(x))
         sums = memory.upload(np.ones((layout.columns, layout.stride), np.int64), "sums")
         packs.add_sums(sums, packs.sums(sums))
@@ -256,14 +261,15 @@ def _derivatives(device: Device, scene: Scene, views: list[Camera]) -> None:
 
 
 def fit(device: Device) -> None:
-    """Some steps, judged by views that are held out; antialiased, too."""
+    """Some steps, judged by views that are held out; of an antialiased scene, and rounded on the way."""
     source, views = random_splats(60, 3, seed=2), _views(5)
-    for antialiased in (False, True):
-        original = dataclasses.replace(source, antialiased=antialiased)
+    for antialiased, factors in ((False, UNROUNDED), (True, Factors(200, 500, 20))):
+        original = in_form_of_files(dataclasses.replace(source, antialiased=antialiased))
         scene = dataclasses.replace(original, means=original.means + np.float32(0.01))
         with Rasterizer(device, original) as rasterizer:
             targets = RenderedTargets(rasterizer, views)
-            fit_scene(device, scene, views, targets, FitOptions(steps=3, rounds=1))
+            options = FitOptions(steps=3, rounds=1)
+            fit_scene(device, scene, views, targets, options, factors=factors, sparse=antialiased)
 
 
 def compaction(device: Device) -> None:
@@ -333,11 +339,27 @@ def simulate(family: str, width: int, names: list[str], told: Path) -> None:
     """Inside Oclgrind: run steps, and keep in a file which kernels were run.
 
     Nothing is freed: Oclgrind mistakes a new buffer in an old one's place for memory that no one has written. Nor does
-    it know that a filled buffer has been written.
+    it know that a filled buffer has been written, or a part of one that does not lie at its beginning: all of such a
+    buffer is written again.
     """
+    enqueue_copy = cl.enqueue_copy
+
+    def copy(queue: cl.CommandQueue, to: Any, source: Any, **more: Any) -> Any:
+        begin, from_there = more.get("dst_offset", 0), more.get("src_offset", 0)
+        if not isinstance(to, cl.Buffer) or "region" in more or not (begin or from_there):
+            return enqueue_copy(queue, to, source, **more)
+        if isinstance(source, cl.Buffer):
+            given = np.empty(more.get("byte_count", source.size - from_there), np.uint8)
+            enqueue_copy(queue, given, source, src_offset=from_there, is_blocking=True)
+        else:
+            given = np.ascontiguousarray(source).reshape(-1).view(np.uint8)
+        whole = np.empty(to.size, np.uint8)
+        enqueue_copy(queue, whole, to, is_blocking=True)
+        whole[begin : begin + len(given)] = given
+        return enqueue_copy(queue, to, whole, is_blocking=True)
 
     def fill(queue: cl.CommandQueue, buffer: cl.Buffer, pattern: Any, offset: int, size: int) -> None:
-        cl.enqueue_copy(queue, buffer, np.full(size // pattern.itemsize, pattern), dst_offset=offset)
+        enqueue_copy(queue, buffer, np.full(size // pattern.itemsize, pattern), dst_offset=offset)
 
     run: set[str] = set()
     sources: dict[int, str] = {}
@@ -358,9 +380,12 @@ def simulate(family: str, width: int, names: list[str], told: Path) -> None:
 
     with ExitStack() as patches:
         patches.enter_context(patch.object(cl, "enqueue_fill_buffer", fill))
+        patches.enter_context(patch.object(cl, "enqueue_copy", copy))
         patches.enter_context(patch.object(Device, "kernel", made))
         patches.enter_context(patch.object(Device, "launch", launched))
         patches.enter_context(patch.object(Device, "free", lambda _, buffer: freed.append(buffer)))
+        for module in (coefficients, sliced_coefficients):
+            patches.enter_context(patch.object(module, "DOT_ITEMS", _DOT_ITEMS))
         print("STEP probes", file=sys.stderr, flush=True)
         device = Device(simulated, family=family, build_options=["-DNO_PREFETCH"])  # type: ignore[arg-type]
         device.self_check()
@@ -412,6 +437,8 @@ def simulated(family: str, width: int, steps: list[str], api: bool = False) -> F
             if said:
                 findings.append(f"{step}: {said}")
             step, said = line.removeprefix("STEP "), ""
+        elif said and "Kernel:" in line and " in " not in said:
+            said += f" in {line.split('Kernel:')[1].strip()}"
         elif line.strip() and not said and not _HARMLESS.search(line):
             said = line.strip()
     if done.returncode:

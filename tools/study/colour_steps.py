@@ -35,7 +35,9 @@ from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.code import Code
 from potr_cl.stages.refit import Refit
-from potr_cl.stages.refitting.refit import ColourRefit, RefitOptions, refit_colours
+from potr_cl.stages.refitting.colour_refit import ColourRefit
+from potr_cl.stages.refitting.refit import refit_colours
+from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import State
 from tools.results import circumstances, write_json

@@ -1,7 +1,10 @@
 /* The removal kernel for GPUs with the paper's second half: see removal_prefix_sums_cpu.cl, whose names and order of
    operations these are. The first half is that of prune/removal_gpu.cl, in whose place this file is read.
 
-   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2, INT64_ATOMICS, and TIGHTEN for what is shared. */
+   Macros: ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2, INT64_ATOMICS, and TIGHTEN for what is shared; PICKED must
+   be 0. */
+
+#define SCENE_NUMBER(splat) ((size_t)(splat))
 
 /* As in prune/removal_gpu.cl. */
 #define SUMS 2
@@ -34,6 +37,7 @@ void removal(
     float bound,
     global float *target,
     global float2 *sums,
+    global const uint *numbers,
     volatile global uint *totals)
 {
     local State state;

@@ -4,7 +4,15 @@
    Macros:
        ALPHA_CAP, TRANSMITTANCE_THRESHOLD, NATIVE_EXP2  see subtile_lists.clh;
        INT64_ATOMICS                                    see totals.clh;
-       TIGHTEN                                          1: mark the intersections that touch no pixel. */
+       TIGHTEN                                          1: mark the intersections that touch no pixel;
+       PICKED                                           1: splats have other numbers in totals and states, which
+                                                        `numbers` has. */
+
+#if PICKED
+#define SCENE_NUMBER(splat) ((size_t)numbers[splat])
+#else
+#define SCENE_NUMBER(splat) ((size_t)(splat))
+#endif
 
 /* A splat's effect and importance, of eight splats at a time; with the padding, sub-tiles lie in different banks. */
 #define SUMS 2
@@ -40,6 +48,7 @@ void removal(
     float bound,
     global float *target,
     global float2 *sums,
+    global const uint *numbers,
     volatile global uint *totals)
 {
     local State state;
@@ -75,7 +84,8 @@ void removal(
         &state, &batch, unfinished, origin, picture, shapes, colours, intersections, subtiles, length, lid, &first);
     /* What lies behind the last pixel's end has no effect any more. */
     for (uint e = swept + lid; e < length; e += ITEMS) {
-        replace_sums(totals + TOTAL_WORDS * (size_t)intersections[e], sums[e], (float2)(0.0f), view_scale, view_bound);
+        replace_sums(
+            totals + TOTAL_WORDS * SCENE_NUMBER(intersections[e]), sums[e], (float2)(0.0f), view_scale, view_bound);
         sums[e] = (float2)(0.0f);
     }
 
@@ -196,7 +206,8 @@ void removal(
         barrier(CLK_LOCAL_MEM_FENCE);
         for (int i = lid; i < size; i += ITEMS) {
             const float2 before = sums[first + i], after = sums_of(&walk, i);
-            replace_sums(totals + TOTAL_WORDS * (size_t)batch.splats[i], before, after, view_scale, view_bound);
+            replace_sums(
+                totals + TOTAL_WORDS * SCENE_NUMBER(batch.splats[i]), before, after, view_scale, view_bound);
 #if TIGHTEN
             sums[first + i] = reached[i] ? after : NEVER;
 #else

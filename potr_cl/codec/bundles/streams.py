@@ -106,11 +106,11 @@ def band(index: int) -> tuple[int, int]:
 
 
 def step_terms(classes: NDArray[np.int8]) -> NDArray[np.int64]:
-    """The term that splats' classes of the steps of DC are, which are -32 to 31."""
+    """The terms, (N,) int64, that splats' classes of the steps of DC stand for: (N,) int8, -32 to 31."""
     return STEP_SIZE * (classes.astype(np.int64) + CLASSES)
 
 
 def differences(scales: Sequence[NDArray[np.signedinteger]]) -> list[NDArray[np.signedinteger]]:
-    """How far apart the sizes of a splat's scales are: of axes 0 and 1, 1 and 2, 0 and 2."""
+    """How far apart the sizes of a splat's scales, (N,) an axis, are: of axes 0 and 1, 1 and 2, 0 and 2, (N,) each."""
     a, b, c = scales
     return [np.abs(a - b), np.abs(b - c), np.abs(a - c)]

@@ -40,7 +40,7 @@ SIZES = {signed: _size_table(signed) for signed in (False, True)}
 
 
 def tokens_of(mapped: NDArray[Any]) -> U8:
-    """Tokens of integers, mapped to unsigned, below 2^38."""
+    """Tokens, uint8 of the same shape, of integers of any shape, mapped to unsigned, below 2^38."""
     tokens = mapped.astype(np.uint8)
     large = np.flatnonzero(mapped >= DIRECT)
     if len(large):

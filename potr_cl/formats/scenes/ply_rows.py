@@ -17,8 +17,8 @@ from potr_cl.errors import DataError
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.scene import FloatArray
 
-#: Rows that stay in the cache of a core while their values are put where they belong.
-_BLOCK_BYTES = 1 << 20
+#: Rows that are read at a time: few enough for a cache, and so many that threads seldom wait for the interpreter.
+_BLOCK_BYTES = 1 << 22
 #: More threads than this wait for memory.
 _MOST_THREADS = 16
 

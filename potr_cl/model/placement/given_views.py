@@ -52,6 +52,7 @@ class GivenViews:
         # Whoever photographs indoors, stands close to things.
         self._crowded = max(CROWDED, max(map(max, blocked)))
         self._places = (camera_centres(cameras) - self._frame.centre) / self._frame.unit
+        self._fields = np.array([c.width * c.height / (c.fx * c.fy) for c in cameras])
 
     @cached_property
     def _memory(self) -> tuple[ColourMemory, float]:
@@ -65,6 +66,20 @@ class GivenViews:
         """(K,) how many given views show each of some splats, evenly taken; those that none shows are left out."""
         counts: NDArray[np.int64] = np.count_nonzero(self._shown, axis=0)
         return counts[counts > 0]
+
+    def part_of_views(self) -> float | None:
+        """Which part of the given views shows a splat, on the average over those that any shows; None: none is shown.
+
+        A view counts by the part of its picture that the splat takes up: whoever sees all of a city from afar sees
+        little of each house. With weights w of V views, the part is (Σ w)² / (V Σ w²), 1 if all show the splat alike
+        and 1 / V if one alone does (Kish 1965, effective sample size).
+        """
+        distances = np.linalg.norm(self._matter.targets - self._places[:, None], axis=2)
+        sizes = self._shown / (self._fields[:, None] * np.maximum(distances, 1e-6) ** 2)
+        sizes = sizes[:, self._shown.any(axis=0)]
+        if not sizes.size:
+            return None
+        return float((sizes.sum(axis=0) ** 2 / (len(sizes) * (sizes**2).sum(axis=0))).mean())
 
     def recall(self) -> None:
         """Find out what colours remember, which :meth:`allow` asks, before several threads do."""

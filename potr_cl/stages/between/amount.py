@@ -16,6 +16,9 @@ _MOST, _MOST_ON_CPU = 5.0, 2.0
 #: An added view takes as much time as a training view. So that an encode takes at most 1.6 times as long, added views
 #: are a part of the training views, and some more where an encode does much besides looking at views, as on GPUs.
 _SHARE = 0.45
+#: Where fewer views than this show parts of the scene, what lies between is matched many decibels worse than they are.
+#: There a GPU may take up to 2.2 times as long.
+_FEW, _SHARE_OF_FEW = 10, 1.0
 _BESIDES, _BESIDES_ON_CPU = 45, 4
 
 #: Views to add for each virtual one: they are as many as a scene needs, but chosen to show what others do not, so that
@@ -31,7 +34,8 @@ def needed(shown_by: float, views: int, slow: bool) -> float:
         views: the number of training views.
         slow: whether a CPU has to look at them.
     """
-    each = min(_ENOUGH / max(shown_by, 1.0) - 1, most_needed(views, slow))
+    few = shown_by < _FEW and not slow
+    each = min(_ENOUGH / max(shown_by, 1.0) - 1, most_needed(views, slow, few))
     return each if each >= _LEAST else 0.0
 
 
@@ -54,7 +58,7 @@ def needed_of_virtual(slow: bool) -> float:
     return _OF_VIRTUAL_ON_CPU if slow else _OF_VIRTUAL
 
 
-def most_needed(views: int, slow: bool) -> float:
-    """How many are added for each of so many training views at most."""
+def most_needed(views: int, slow: bool, few: bool = False) -> float:
+    """How many are added for each of so many training views at most; ``few``: whether few of them show some part."""
     most, besides = (_MOST_ON_CPU, _BESIDES_ON_CPU) if slow else (_MOST, _BESIDES)
-    return min(most, _SHARE + besides / views)
+    return min(most, (_SHARE_OF_FEW if few else _SHARE) + besides / views)

@@ -13,11 +13,12 @@ from dataclasses import replace
 from potr_cl.codec.quantize import HyperParameters
 from potr_cl.stages.stage import State
 
-#: The name under which a state knows which part of the views show a splat, on the average.
+#: The name under which a state knows which part of the views shows a splat
+#: (:meth:`potr_cl.model.placement.given_views.GivenViews.part_of_views`).
 SHOWN = "shown"
-#: By which part of the views a splat is shown, on the average, in a scene that is seen whole: an object hides half of
-#: itself.
-_WHOLE = 0.35
+#: Which part of the views shows a splat, on the average, in a scene that is seen whole: an object hides half of itself,
+#: and a captured one is seen from near and from afar.
+_WHOLE = 0.25
 
 
 def priced(parameters: HyperParameters, state: State) -> HyperParameters:
@@ -25,7 +26,7 @@ def priced(parameters: HyperParameters, state: State) -> HyperParameters:
 
     Args:
         parameters: of a scene that is seen whole.
-        state: knows which part of the views show a splat, if anyone has found out.
+        state: knows which part of the views shows a splat, if anyone has found out.
     """
     shown: float = state.learnt.get(SHOWN, 1.0)
     part = min(shown / _WHOLE, 1.0)

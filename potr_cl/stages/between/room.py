@@ -19,15 +19,13 @@ from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.pruning.prepared_views import PreparedViews
 from potr_cl.stages.pruning.sweep_options import default_memory
-from potr_cl.stages.pruning.visible_parts import SCENES, WORTH_IT, fits_whole, groups_of_large, seen_part
+from potr_cl.stages.pruning.visible_parts import LIKELY, SCENES, fits_whole, groups_of_large, seen_part
 from potr_cl.stages.stage import State, Workbench
 
 #: More bytes than a view takes, for each splat and each pixel: where there are so many, nothing has to be measured.
 _SPLAT, _PIXEL = 500, 200
 #: Views whose memory is measured.
 _SAMPLE = 3
-#: Views that tell how much of the scene a view sees.
-_LOOKED = 32
 #: Bytes that are enough for them.
 _PLENTY = 1e18
 #: By how much the others may take more; and how much more, where views of a part share its splats.
@@ -52,11 +50,12 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
     if budget > _SPLAT * len(state.source) * (len(state.views) + len(added)) + _PIXEL * pixels:
         return len(added)
     sampled = _evenly(state.views, _SAMPLE), _evenly(added, _SAMPLE)
-    if seen_part(state.source, _evenly(state.views, _LOOKED)) <= WORTH_IT:
+    if seen_part(state.source, state.views) <= LIKELY:
         if _by_view(state, bench):
             return len(added)
         own, more = (_nbytes_of_parts(state, bench, views) for views in sampled)
-        left, margin = budget - min(SCENES * budget, state.source.nbytes), _MARGIN_OF_PARTS
+        # Views in hand take room too, and parts are larger than what a view sees of them.
+        left, margin = budget - min(SCENES * budget, state.source.nbytes) - 2 * max(own, more), _MARGIN_OF_PARTS
     else:
         own, more = (_nbytes(bench, bench.drawable(state.source), views) for views in sampled)
         left, margin = budget, _MARGIN

@@ -32,7 +32,8 @@ from potr_cl.stages.fitting.fit import FitOptions, SupportsBool, fit_scene
 from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_files
 from potr_cl.stages.fitting.pictures import TargetPictures
 from potr_cl.stages.fitting.views import share_out
-from potr_cl.stages.refitting.refit import RefitOptions, refit_colours
+from potr_cl.stages.refitting.refit import refit_colours
+from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.stage import State, Workbench
 

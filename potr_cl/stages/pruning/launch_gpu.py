@@ -54,7 +54,10 @@ class GpuLauncher:
         views, fixed_point = prepared.views, self._fixed_point
         shapes, colours = geometry
         red, green, blue = self._background
-        removal = self._device.kernel(_SOURCE, "removal", **self._macros).bind(
+        picked = buffers.numbers is not None
+        numbers = buffers.numbers if picked else views.table  # which is not looked at
+        macros = self._macros | {"PICKED": int(picked)}
+        removal = self._device.kernel(_SOURCE, "removal", **macros).bind(
             start=0,
             tiles=buffers.tiles,
             views=views.table,
@@ -75,10 +78,12 @@ class GpuLauncher:
             bound=fixed_point.bound,
             target=prepared.target,
             sums=prepared.sums,
+            numbers=numbers,
             totals=buffers.totals,
         )
-        staleness = self._device.kernel(_SOURCE, "staleness", **self._macros).bind(
+        staleness = self._device.kernel(_SOURCE, "staleness", **macros).bind(
             alive=buffers.alive,
+            numbers=numbers,
             views=views.table,
             view_count=len(views.views),
             offsets=views.offsets,

@@ -101,6 +101,10 @@ class PreparedViews(Owner):
 
     def _prepare_all(self, most: int, progress: Callable[[int, int], None] | None) -> None:
         """Prepare every view, and keep as many as the budget allows."""
+        with self.rasterizer.preparing_many():
+            self._prepare_in_turn(most, progress)
+
+    def _prepare_in_turn(self, most: int, progress: Callable[[int, int], None] | None) -> None:
         number, count = 0, len(self._cameras)
         most = self._cache.most_views(most, 12 * max(c.width * c.height for c in self._cameras))
         while number < count:

@@ -6,13 +6,14 @@ import dataclasses
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.host import mapped
-from potr_cl.host.threads import Run
+from potr_cl.host.threads import Run, in_background
 from potr_cl.model.camera import Camera
+from potr_cl.model.scene import Scene
 from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.model.unseen import opacity_weighted_areas, unseen_splats
 from potr_cl.raster.surely_seen import Seen
@@ -30,14 +31,23 @@ class Unseen:
     Attributes:
         splats: how many they are.
         of: how many splats the scene has.
-        area: their part of the scene's opacity-weighted area, 0 to 1.
         kept: whether they were kept, without what of their colours depends on the direction.
+        find_area: returns their part of the scene's opacity-weighted area, once that is known.
     """
 
     splats: int
     of: int
-    area: float
     kept: bool
+    find_area: Callable[[], float] = dataclasses.field(repr=False, compare=False)
+
+    @property
+    def area(self) -> float:
+        """Their part of the scene's opacity-weighted area, 0 to 1."""
+        return self.find_area()
+
+    def told(self) -> dict[str, Any]:
+        """For programs."""
+        return {"splats": self.splats, "of": self.of, "area": self.area, "kept": self.kept}
 
     def __str__(self) -> str:
         what = "kept, coarsely coded" if self.kept else "dropped"
@@ -69,10 +79,11 @@ def find_unseen(
     groups: SplatGroups | None = None,
     run: Run = map,
     surely_seen: Callable[[Sequence[Camera]], NDArray[np.uint8]] | None = None,
-) -> tuple[NDArray[np.bool_], float]:
-    """Which splats of a state no given training view sees, and their part of the opacity-weighted area.
+) -> tuple[NDArray[np.bool_], Callable[[], float]]:
+    """Which splats of a state no given training view sees, and what returns their part of the opacity-weighted area.
 
-    Added views do not count: the one that happens to see a splat, perhaps from afar, cannot say what it is worth.
+    Nothing but a report needs that part, so it is found in a thread of its own. Added views do not count: the one that
+    happens to see a splat, perhaps from afar, cannot say what it is worth.
 
     Args:
         state: whose scene and views.
@@ -91,9 +102,13 @@ def find_unseen(
         if len(rest):
             unseen[rest] = unseen_splats(scene.subset(rest), views, None, run)
     if not unseen.any():  # as usual
-        return unseen, 0.0
-    areas = opacity_weighted_areas(scene, run)
-    return unseen, float(areas[unseen].sum() / max(float(areas.sum()), 1e-300))
+        return unseen, float
+    return unseen, in_background(_part_of_area, scene, unseen).result
+
+
+def _part_of_area(scene: Scene, splats: NDArray[np.bool_]) -> float:
+    areas = opacity_weighted_areas(scene, map)
+    return float(areas[splats].sum() / max(float(areas.sum()), 1e-300))
 
 
 def set_aside(state: State, unseen: NDArray[np.bool_]) -> Split:
@@ -113,15 +128,7 @@ def put_back(split: Split, pruned: State) -> State:
     scene = dataclasses.replace(scene, sh=sh)
     numbers = np.concatenate([pruned.survivors, split.whole.survivors[split.unseen_splats]])
     order = np.argsort(numbers, kind="stable")  # the quickest way for two runs
-    left = pruned.scene
-    together = dataclasses.replace(
-        left,
-        means=np.concatenate([left.means, scene.means]),
-        log_scales=np.concatenate([left.log_scales, scene.log_scales]),
-        quaternions=np.concatenate([left.quaternions, scene.quaternions]),
-        opacity_logits=np.concatenate([left.opacity_logits, scene.opacity_logits]),
-        sh=np.concatenate([left.sh, scene.sh]),
-    ).subset(order)
+    together = pruned.scene.joined(scene, order)
     return dataclasses.replace(pruned, scene=together, survivors=numbers[order], geometry=None, cut=None)
 
 
@@ -129,12 +136,12 @@ def without_directions(state: State, unseen: NDArray[np.int64]) -> State:
     """The state after some splats have lost what of their colours depends on the direction, as :func:`put_back` does.
 
     Args:
-        state: whose scene is.
+        state: whose scene it is; nobody else may have its colours, which change in place: a copy would take as much
+            memory as a large scene has left.
         unseen: their numbers in the source, ascending; those that are not left do not matter.
     """
     own = np.isin(state.survivors, unseen, assume_unique=True)
-    copied = mapped.rows(state.scene.sh, None, "SH coefficients")
-    sh = state.scene.sh.copy() if copied is None else copied
+    sh = state.scene.sh
     sh[own, 1:] = 0
     return state.recoloured(sh)
 

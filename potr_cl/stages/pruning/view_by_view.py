@@ -1,8 +1,9 @@
 """Removal effects of large scenes on a GPU, each view with the splats that it may draw: :class:`ViewByView`.
 
 Of a large scene no view sees much. The whole scene lies on the device once; a view has its own numbers of splats, and
-its projection, lists and totals are of these and no others. Totals are added up by the scene's numbers. They are
-integers in units that follow from all views, so they are the same bits as of all views with all splats.
+its projection and lists are of these and no others. What it measures is added to the scene's totals by the splats'
+numbers there. Totals are integers in units that follow from all views, so they are the same bits as of all views with
+all splats.
 
 Views that the memory has no room for are prepared again whenever they are measured, some neighbours at a time and only
 with the splats that are left; their target pictures stay, if there is room for them. They are measured when on the
@@ -25,7 +26,6 @@ from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory, Owner, Reused, Scratch
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.macros import totals_limits
@@ -48,9 +48,9 @@ _GROUP = 64
 _LOST_CHUNK = 4096
 #: Views that are swept at the same time: the longest list of one keeps a work-group busy when the others are done.
 _QUEUES = 8
-#: Bytes that a view is expected to take: of a splat (shape, colour, totals, state, number, and two and a half tile
-#: intersections), and of a pixel (the target).
-_SPLAT, _PIXEL = 104, 12
+#: Bytes that a view is expected to take: of a splat (shape, colour, number, and two and a half tile intersections), and
+#: of a pixel (the target).
+_SPLAT, _PIXEL = 87, 12
 #: Views that are made again take so many bytes while they are: of each one's splats, and of those of all together.
 _OWN, _TOGETHER = 70, 56
 #: Of the memory, what these may take; how many they are at most; and how many times as many splats as one of them (on
@@ -80,11 +80,6 @@ class _View:
     camera: Camera
     splats: int
     numbers: cl.Buffer
-
-    @property
-    def items(self) -> tuple[int]:
-        """Work-items for a kernel that does a splat each."""
-        return (-(-self.splats // _GROUP) * _GROUP,)
 
 
 @dataclass
@@ -128,28 +123,14 @@ class _KeptView(Owner):
         prepared: its lists and sums; this object's from now on.
         memory: that owns what else it takes; this object's from now on.
         rasterizer: that prepared it.
-        marks: (splats,) the states of its splats. totals: (splats, 2) int64.
+        kernels: with all arguments bound.
     """
 
     def __init__(
-        self,
-        view: _View,
-        prepared: PreparedSet,
-        memory: Memory,
-        rasterizer: Rasterizer,
-        marks: cl.Buffer,
-        totals: cl.Buffer,
+        self, view: _View, prepared: PreparedSet, memory: Memory, rasterizer: Rasterizer, kernels: SetKernels
     ) -> None:
         self.view, self.prepared, self.rasterizer = view, prepared, rasterizer
-        self.marks, self.totals = marks, totals
-        self._memory = memory
-        self._kernels: SetKernels
-        self._add: Kernel
-        self._mark: Kernel
-
-    def bind(self, kernels: SetKernels, add: Kernel, mark: Kernel) -> None:
-        """Give it its kernels, all arguments bound."""
-        self._kernels, self._add, self._mark = kernels, add, mark
+        self._memory, self._kernels = memory, kernels
 
     def sweep(self, count: int, queue: cl.CommandQueue) -> None:
         """Enqueue the sweep of the first tiles of its list."""
@@ -159,13 +140,8 @@ class _KeptView(Owner):
         """From now on, sweeps compare with the target picture."""
         self._kernels.target_is_known()
 
-    def add(self) -> None:
-        """Enqueue that its totals are added to the scene's."""
-        self._add.launch(self.view.items, (_GROUP,))
-
     def note_removal(self, tolerance: float, queue: cl.CommandQueue) -> None:
         """Enqueue that it notes which splats have gone, and lists the tiles that are staler than the tolerance."""
-        self._mark.launch(self.view.items, (_GROUP,), queue)
         self._kernels.note_removal(queue, list_above=tolerance)
 
     def close(self) -> None:
@@ -223,6 +199,8 @@ class ViewByView(Owner):
         #: Whether every splat is left, and has the colours of the targets.
         self._pristine = True
         self._targets_known = self._unkept_known = False
+        #: Whether the totals have what views that are not kept have added last.
+        self._unkept_added = False
         #: Iterations since the views that are not kept were measured.
         self._unmeasured = 0
         self._seen = sights.seen
@@ -242,9 +220,10 @@ class ViewByView(Owner):
             owned.callback(self._passing.give_back)
             self._preparing = owned.enter_context(PreparingMemory(device))
             self.totals = memory.allocate(16 * whole.stride, "the removal effects")
-            self._first: cl.Buffer | None = None
+            device.fill(self.totals, np.int64(0))
             if first_totals is not None:
-                self._first = memory.upload(first_totals, "the removal effects to begin with")
+                with device.errors("cannot hold the removal effects to begin with"):
+                    cl.enqueue_copy(device.queue, self.totals, first_totals, is_blocking=True)
             self._survivors = owned.enter_context(
                 Survivors(device, self.splats, whole.stride, lambda: self._queues.wait())
             )
@@ -303,6 +282,7 @@ class ViewByView(Owner):
         self._pending.clear()
         if others:
             self._totals_of_unkept = memory.allocate(16 * self._whole.stride, "the effects in views that are not kept")
+            self._words_lost = memory.allocate(8, "the importance that has gone")
             self._unkept = self._dealt_out(others, sights, targets, passing)
             room = left + int(targets[others].sum())
             for batch in self._unkept:
@@ -344,16 +324,11 @@ class ViewByView(Owner):
             prepared = PreparedSet(rasterizer, range(number, number + 1), views, pending=self._pending)
             stack.enter_context(prepared)
             rasterizer.rest()
-            marks = memory.allocate(rasterizer.stride, "a view's splats that are left")
-            totals = memory.allocate(16 * rasterizer.stride, "a view's removal effects")
             taken = device.allocated - before
             if taken > room:
                 return 0
-            device.fill(marks, np.uint8(SplatState.ALIVE))
-            device.fill(totals, np.uint32(0))
             prepared.first_tile = first_tile
-            kept = _KeptView(view, prepared, memory, rasterizer, marks, totals)
-            buffers = SweepBuffers(marks, self._tiles, self._stale, self._counts, totals)
+            buffers = SweepBuffers(self.marks, self._tiles, self._stale, self._counts, self.totals, view.numbers)
             kernels = launcher_for(rasterizer, self._options, self._fixed_point).bind(
                 prepared,
                 (prepared.views.shapes, prepared.views.colours),
@@ -361,8 +336,7 @@ class ViewByView(Owner):
                 first_time=True,
                 place=len(self._kept),
             )
-            kept.bind(kernels, self._add(self.totals, totals, view.numbers, splats), self._mark(view, marks))
-            self._kept.append(kept)
+            self._kept.append(_KeptView(view, prepared, memory, rasterizer, kernels))
             stack.pop_all()
             return taken
         return 0
@@ -374,16 +348,6 @@ class ViewByView(Owner):
             picked.sh = self._sh
         return Rasterizer(self.device, picked, background=self._background, preparing=self._preparing)
 
-    def _add(self, totals: cl.Buffer, part: cl.Buffer, numbers: cl.Buffer, splats: int) -> Kernel:
-        return self._kernel("add_part").bind(totals=totals, part=part, numbers=numbers, count=splats)
-
-    def _mark(self, view: _View, marks: cl.Buffer) -> Kernel:
-        kernel = self._kernel("mark_part")
-        return kernel.bind(states=self.marks, part=marks, numbers=view.numbers, count=view.splats)
-
-    def _kernel(self, name: str) -> Kernel:
-        return self.device.kernel(_SOURCE, name, **totals_limits(self.device))
-
     # ------------------------------------------------------------------------------ for a controller on the device
 
     @property
@@ -394,21 +358,20 @@ class ViewByView(Owner):
     def measure_on_device(self) -> None:
         """Bring the totals up to date."""
         self._sweep_listed()
-        if self._first is None:
-            self.device.fill(self.totals, np.int64(0))
-        else:
-            with self.device.errors("failed while computing"):
-                cl.enqueue_copy(self.device.queue, self.totals, self._first, byte_count=16 * self.splats)
-        for kept in self._kept:
-            kept.add()
         if self._unkept:
             self._unmeasured += 1
             if self._unkept_are_stale():
+                if self._unkept_added:
+                    self._with_unkept("subtract_totals")
                 self._measure_unkept()
-                self._unkept_known, self._unmeasured = True, 0
-            add = self.device.shared_kernel("prune/add_totals.cl", "add_totals")
-            add.bind(totals=self.totals, more=self._totals_of_unkept, count=2 * self.splats)
-            add.launch((-(-2 * self.splats // _GROUP) * _GROUP,), (_GROUP,))
+                self._with_unkept("add_totals")
+                self._unkept_known = self._unkept_added = True
+                self._unmeasured = 0
+
+    def _with_unkept(self, name: str) -> None:
+        kernel = self.device.shared_kernel("prune/add_totals.cl", name)
+        kernel.bind(totals=self.totals, more=self._totals_of_unkept, count=2 * self.splats)
+        kernel.launch((-(-2 * self.splats // _GROUP) * _GROUP,), (_GROUP,))
 
     def remove_marked(self) -> None:
         """Take the splats out that are marked JUST_REMOVED."""
@@ -459,13 +422,12 @@ class ViewByView(Owner):
         """Whether they have lost more than the tolerance since they were measured: a part of their area, on average."""
         if not self._unkept_known or self._options.tolerance <= 0 or self._unmeasured >= _LONGEST:
             return True
-        with Memory(self.device) as memory:
-            words = memory.upload(np.zeros(1, np.int64), "the importance that has gone")
-            lost = self._kernel("lost").bind(
-                states=self.marks, totals=self._totals_of_unkept, splats=self.splats, importance=words
-            )
-            lost.launch((-(-self.splats // _LOST_CHUNK) * _GROUP,), (_GROUP,))
-            importance = int(self.device.download(words, (1,), np.int64)[0])
+        words = self._words_lost
+        self.device.fill(words, np.int64(0))
+        lost = self.device.shared_kernel(_SOURCE, "lost", **totals_limits(self.device))
+        lost.bind(states=self.marks, totals=self._totals_of_unkept, splats=self.splats, importance=words)
+        lost.launch((-(-self.splats // _LOST_CHUNK) * _GROUP,), (_GROUP,))
+        importance = int(self.device.download(words, (1,), np.int64)[0])
         part = sum(len(batch.numbers) for batch in self._unkept) / len(self._cameras)
         return importance * self.units[1] / part > _PATIENCE * self._options.tolerance
 
@@ -477,7 +439,7 @@ class ViewByView(Owner):
 
     @contextmanager
     def _swept(self, batch: _Batch, totals: cl.Buffer | None) -> Iterator[_Ready | None]:
-        """Some views prepared and swept, their totals added to others; None if none of their splats is left."""
+        """Some views prepared and swept, and added to totals (N, 2); None if none of their splats is left."""
         target, stored = batch.targets, batch.known
         if target is None:
             scratch, stored = self._scratch[-1], False
@@ -489,29 +451,29 @@ class ViewByView(Owner):
                 views.kernels.store_target()
                 self._finish()
             stored = True
-        with self._ready(batch, target) as views:
+        with self._ready(batch, target, totals) as views:
             if views is not None:
                 if stored:
                     views.kernels.target_is_known()
                 views.kernels.sweep(0, views.prepared.views.tiles)
-                if totals is not None:
-                    items = (-(-views.splats // _GROUP) * _GROUP,)
-                    self._add(totals, self._scratch[0].buffer, views.numbers, views.splats).launch(items, (_GROUP,))
                 self._finish()
             batch.known = True
             yield views
 
     @contextmanager
-    def _ready(self, batch: _Batch, target: cl.Buffer, whole: bool = False) -> Iterator[_Ready | None]:
-        """Some views prepared, all their sums and totals 0; None if there is no splat to prepare them with.
+    def _ready(
+        self, batch: _Batch, target: cl.Buffer, totals: cl.Buffer | None = None, whole: bool = False
+    ) -> Iterator[_Ready | None]:
+        """Some views prepared, all their sums 0; None if there is no splat to prepare them with.
 
         Args:
             batch: the views.
             target: their pictures.
+            totals: (N, 2) int64 that they are added to; None: nobody wants them.
             whole: with all splats, and with the colours of the target.
         """
         device, cameras = self.device, [self._cameras[number] for number in batch.numbers]
-        own_totals, tiles, stale, _ = self._scratch
+        unwanted, tiles, stale, _ = self._scratch
         with ExitStack() as stack:
             stack.callback(self._passing.close)
             states = None if whole else self.marks
@@ -523,14 +485,16 @@ class ViewByView(Owner):
             views = rasterizer.prepare_set(cameras, self._passing)
             prepared = PreparedSet(rasterizer, range(len(cameras)), views, self._passing, target)
             stack.enter_context(prepared)
-            own_totals.reserve(16 * rasterizer.stride)
-            device.fill(own_totals.buffer, np.uint32(0), 16 * rasterizer.stride)
             stale.reserve(4 * views.tiles)
             if tiles.reserve(4 * views.tiles):  # all of them: nobody writes to it
                 everything = np.arange(views.tiles, dtype=np.uint32)
                 with device.errors("failed while computing"):
                     cl.enqueue_copy(device.queue, tiles.buffer, everything, is_blocking=True)
-            buffers = SweepBuffers(self.marks, tiles.buffer, stale.buffer, self._counts, own_totals.buffer)
+            if totals is None:
+                unwanted.reserve(16 * rasterizer.stride)
+            # The states are not looked at: what has gone is not among the splats.
+            wanted = (unwanted.buffer, None) if totals is None else (totals, numbers)
+            buffers = SweepBuffers(self.marks, tiles.buffer, stale.buffer, self._counts, *wanted)
             launcher = launcher_for(rasterizer, self._options, self._fixed_point)
             kernels = launcher.bind(prepared, (views.shapes, views.colours), buffers, first_time=True)
             yield _Ready(prepared, numbers, splats, kernels)

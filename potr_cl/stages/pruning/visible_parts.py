@@ -44,6 +44,9 @@ WORTH_IT = 0.5
 _SAMPLED, _VIEWS, LIKELY = 64, 48, WORTH_IT
 #: The parts' scenes stay on the device if they take no more than this part of the memory.
 SCENES = 1 / 2
+#: Bytes that a view takes for each splat of its part while it is measured, or prepared to be kept: room for one is set
+#: aside, and no more than this part of the memory.
+_IN_HAND, _MOST_IN_HAND = 120, 1 / 4
 #: The whole scene is on the device too where that has so many times as much memory.
 _WHOLE = 3
 #: The total that spares a splat: a ΔMSE of about 1, by the bounds of :class:`FixedPoint`; and what limits it is beyond.
@@ -189,6 +192,7 @@ class PartedRemoval(Owner):
         #: Whether the parts' scenes are on the device only where they are needed.
         self._rest = sum(sizes) > SCENES * left
         left = max(left - (max(sizes) if self._rest else sum(sizes)), 0)
+        left -= min(_IN_HAND * max(len(part.splats) for part in parts), int(_MOST_IN_HAND * left))
         done = 0
 
         def report(some: int, _: int) -> None:

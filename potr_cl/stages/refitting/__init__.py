@@ -1,6 +1,7 @@
 """What the stage "refit" computes with. Begin with refit.py.
 
-- refit.py solves for the colours of a scene. The other files are its parts:
+- refit.py solves for the colours of a scene, as refit_options.py says. The other files are its parts:
+- colour_refit.py puts the problem of one scene and its views together, for any number of solutions;
 - colour_map.py is the linear map from colours to pictures, which launcher.py runs on a device;
 - solver.py minimises the error, by conjugate_gradients.py on the vectors of coefficients.py, with blocks.py as
   preconditioner;

@@ -35,7 +35,7 @@ from potr_cl.stages.refitting.gathering import Gathered, Gathering
 from potr_cl.stages.refitting.launcher import Launcher
 from potr_cl.stages.refitting.prepared_views import PreparedViews
 from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
-from potr_cl.stages.refitting.targets import TargetCache, Targets
+from potr_cl.stages.refitting.targets import TargetCache, Targets, nbytes
 from potr_cl.stages.refitting.vector_space import Vector, VectorSpace
 from potr_cl.stages.refitting.view_errors import ViewErrors
 
@@ -138,7 +138,9 @@ class ColourMap(Owner):
             columns[:, : layout.splats] = means.T
             self._means = self._memory.upload(columns, "the centres")
             own = (_CHANGE + _TOTALS) * layout.stride
-            self._views = PreparedViews(rasterizer, cameras, self._launcher.most_views, own, memory, breaks)
+            # To render a picture takes many times as long as to project a view, and it takes less room.
+            pictures = sum(nbytes(camera) for camera in cameras)
+            self._views = PreparedViews(rasterizer, cameras, self._launcher.most_views, own, memory, breaks, pictures)
             self._owned.append(self._views)
             launches = self._views.launches
             most = max((len(numbers) for numbers in launches), default=0)

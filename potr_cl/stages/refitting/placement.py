@@ -81,9 +81,11 @@ def placed(device: Device, splats: int, sh_count: int, memory: int | None, slice
     # A place for a vector that views are looked at with, the sums, and some vectors.
     of_host = device.info.kind == "cpu" or device.info.integrated
     room = int(((_OF_HOST if of_host else _OF_VECTORS) * total / max(splats, 1) - _SWEEP) / vector) - 3
+    besides = splats * (3 * vector + _SWEEP) + some * of_slice + 8 * triangle * min(blocks, splats)
+    # Of few splats a slice, which has so many at least, takes more than its share.
+    room = min(room, int((total - besides) / max(splats * vector, 1)))
     resident = min(max(room, _FEWEST), _MOST) if slices is None else _FEWEST
-    besides = splats * ((3 + resident) * vector + _SWEEP) + some * of_slice + 8 * triangle * min(blocks, splats)
-    return Place(some, blocks, max(int(total - besides), 0), resident)
+    return Place(some, blocks, max(int(total - besides - splats * resident * vector), 0), resident)
 
 
 def left_for_views(splats: int, sh_count: int, memory: int | None) -> int | None:

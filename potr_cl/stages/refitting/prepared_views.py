@@ -27,6 +27,7 @@ class PreparedViews(Owner):
         breaks: numbers of views at which a launch begins, whatever came before.
         memory: bytes that the kept views, and what else is taken from :attr:`budget`, may take; None: a quarter of what
             is free.
+        others: bytes that will be taken from the budget besides: views' projections leave room for them.
 
     Attributes:
         launches: the numbers of the views of each launch.
@@ -44,19 +45,21 @@ class PreparedViews(Owner):
         nbytes: int,
         memory: int | None,
         breaks: Sequence[int] = (),
+        others: int = 0,
     ) -> None:
         self._rasterizer = rasterizer
         self._cameras = list(cameras)
         self._breaks = sorted({*breaks, len(cameras)})
         device = rasterizer.device
         free = device.info.memory - device.allocated
-        self.budget = ViewCache(rasterizer, free * _SHARE if memory is None else memory)
+        self.budget = ViewCache(rasterizer, free * _SHARE if memory is None else memory, others)
         self.launches: list[range] = []
         self._kept: dict[range, ViewSet] = {}
         #: Memory for views that are not kept, by their number.
         self._spare: dict[int, ViewSet] = {}
         try:
-            self._prepare_all(self.budget.most_views(most_views, nbytes))
+            with rasterizer.preparing_many():
+                self._prepare_all(self.budget.most_views(most_views, nbytes))
         except BaseException:
             self.close()
             raise

@@ -116,6 +116,11 @@ def colour_shares(pool: Pool, views: int) -> Shares:
     return shares(pool, views, parts_of(views), _OWN_SPEED)
 
 
+def colourless(scene: Scene) -> Scene:
+    """The same splats in black: a re-fit's rasterizer is never asked for colours."""
+    return replace(scene, sh=np.zeros((len(scene), 1, 3), np.float32))
+
+
 @contextmanager
 def colour_parts(
     pool: Pool,

@@ -1,0 +1,301 @@
+"""The linear least-squares problem of a re-fit and its solutions, for one scene and its views: :class:`ColourRefit`.
+
+It puts together the vectors of coefficients (placement.py), the map from them to pictures (colour_map.py), perhaps with
+workers that do some of the views (shared_map.py), and the solver (solver.py).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Sequence
+from contextlib import ExitStack
+from dataclasses import dataclass, replace
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.errors import UsageError
+from potr_cl.model.camera import Camera
+from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.memory import Owner
+from potr_cl.outputs.colour_grid import ColourGrid
+from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.rules import INRIA, RasterRules
+from potr_cl.raster.view_shares import ViewShares
+from potr_cl.stages.refitting.coefficients import Coefficients
+from potr_cl.stages.refitting.colour_map import ColourMap
+from potr_cl.stages.refitting.launcher import launcher_for
+from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
+from potr_cl.stages.refitting.placement import blocks_of, left_for_views, placed, rounding_of, vectors_of
+from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
+from potr_cl.stages.refitting.rounding import ROUNDS
+from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares, colourless
+from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
+from potr_cl.stages.refitting.targets import Targets
+from potr_cl.stages.refitting.vector_space import Layout, Ridge, Vector
+from potr_cl.workers.dealing import Shares
+from potr_cl.workers.pool import Pool
+
+#: What a coefficient that becomes 0 as it is rounded is worth, as a part of what one is worth that is given up before.
+#: What the others of the splat are counted on to make up for is more than they can.
+_WORTH = 0.4
+
+
+@dataclass(frozen=True)
+class HelpFrom:
+    """Workers that do some of the views of a re-fit.
+
+    Attributes:
+        pool: the workers.
+        source: the scene whose pictures are the targets, perhaps kept on devices, or with pictures of it there; or who
+            does which views, and has what these see of it.
+    """
+
+    pool: Pool
+    source: Scene | KeptScene | PicturesAhead | ViewShares
+
+    def shares(self, views: int) -> Shares:
+        """Who does which of so many views.
+
+        Raises:
+            WorkerLost: no worker is left.
+        """
+        if isinstance(self.source, ViewShares):
+            return Shares([], [share.numbers for share in self.source.shares])
+        return colour_shares(self.pool, views)
+
+
+class ColourRefit(Owner):
+    """The map and the solver of one scene, for any number of solutions.
+
+    Args:
+        device: to compute on.
+        scene: whose geometry, opacities and SH degree are used.
+        cameras: the views that count, all the same whatever their size.
+        rules, background: of the rasterizer.
+        memory: bytes of device memory that prepared views and targets may take, together with the vectors where these
+            take much; None: views take a quarter of what is free.
+        help_from: workers that do some of the views.
+        slices: as of :class:`RefitOptions`.
+
+    Attributes:
+        coefficients, colour_map: the vectors and the map, for callers that want products rather than solutions.
+
+    Raises:
+        UsageError: no camera.
+        DeviceError: the scene or a view does not fit the device.
+    """
+
+    def __init__(
+        self,
+        device: Device,
+        scene: Scene,
+        cameras: Sequence[Camera],
+        rules: RasterRules = INRIA,
+        background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+        memory: int | None = None,
+        help_from: HelpFrom | None = None,
+        slices: int | None = None,
+    ) -> None:
+        if not cameras:
+            raise UsageError("a re-fit needs at least one view")
+        with ExitStack() as owned:
+            own, others = None, None
+            if help_from is not None:
+                share = help_from.shares(len(cameras))
+                if share.others:
+                    own = share.own
+                    others = owned.enter_context(
+                        colour_parts(
+                            help_from.pool, share, scene, rules, background, help_from.source, cameras, memory
+                        )
+                    )  # fmt: skip
+            rasterizer = owned.enter_context(Rasterizer(device, colourless(scene), rules))
+            launcher = launcher_for(device, rules)
+            layout = Layout(len(scene), rasterizer.stride, scene.sh.shape[1], launcher.lanes)
+            # The vectors come first: prepared views can do with less memory, and only take longer then.
+            place = placed(device, layout.splats, layout.sh_count, memory, slices) if others is None else None
+            if place is not None:
+                memory = place.views
+            elif others is None:
+                memory = left_for_views(layout.splats, layout.sh_count, memory)
+            self.coefficients = owned.enter_context(vectors_of(device, layout, place))
+            blocks = blocks_of(self.coefficients, place)
+            owned.callback(blocks.close)
+            self._solver = ColourSolver(self.coefficients, blocks)
+            helpers = None
+            if help_from is not None and others is not None:
+                assert isinstance(self.coefficients, Coefficients)
+                in_process = help_from.pool.in_process
+                helpers = owned.enter_context(SharedViews(self.coefficients, others, in_process))
+            self.colour_map = owned.enter_context(
+                ColourMap(
+                    launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory, own, helpers
+                )
+            )
+            if others is not None:
+                owned.callback(others.begin_to_close)
+            self._unrounded: Vector | None = None
+            self._owned = owned.pop_all()
+
+    def solve(
+        self,
+        sh: FloatArray,
+        targets: Targets,
+        options: RefitOptions,
+        active: NDArray[np.bool_] | None = None,
+        hold: bool = False,
+        progress: Callable[[int, int], None] | None = None,
+    ) -> Refitted:
+        """Re-fit the active coefficients, after choosing among them if the options say so.
+
+        Args:
+            sh: (N, M, 3) R, G, B, the start.
+            targets: the picture that each view should show.
+            options: of the solver; their memory is of no account here.
+            active: (N, M, 3) in Y, Co, Cg: the coefficients that may change; all by default.
+            hold: whether the other coefficients keep their values; if not, they become 0.
+            progress: called with the steps done and their greatest number.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        solved = self.solve_on_device(sh, targets, options, active, hold, progress)
+        return Refitted(self.colours(), solved.errors, solved.steps)
+
+    def solve_on_device(
+        self,
+        sh: FloatArray,
+        targets: Targets,
+        options: RefitOptions,
+        active: NDArray[np.bool_] | None = None,
+        hold: bool = False,
+        progress: Callable[[int, int], None] | None = None,
+        check: bool = True,
+        after_start: Callable[[], None] = lambda: None,
+    ) -> Solved:
+        """The same, with the solution left where :meth:`colours`, :meth:`round_to` and :meth:`solve_constant` find it.
+
+        Args:
+            sh, targets, options, active, hold, progress: as :meth:`solve` takes them.
+            check: measure the error of the solution, and keep the start if that was better; if not, that error is not a
+                number.
+            after_start: called when :meth:`worth` and its likes are known.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        coefficients, solver = self.coefficients, self._solver
+        coefficients.write_sh(solver.x, sh)
+        coefficients.make_room()
+        coefficients.activate(active)
+        if active is not None and not hold:
+            coefficients.keep_active(solver.x)
+        descent = Descent(options.steps, options.gain, Ridge(options.lam, options.chroma_factor, options.prior))
+        selection, total = None, options.steps
+        if options.drop:
+            ridge = replace(descent.ridge, lam=options.selection_lam)
+            selection = Selection(Descent(options.selection_steps, options.gain, ridge, part=0), options.drop)
+            total += options.selection_steps
+
+        def after_step(steps: int) -> None:
+            if progress is not None:
+                progress(steps, total)
+
+        return solver.solve(
+            self.colour_map, targets, descent, selection, after_step, check=check, after_start=after_start
+        )
+
+    def solve_constant(self, targets: Targets, options: RefitOptions, sh: FloatArray | None = None) -> Solved:
+        """Re-fit the constant coefficients alone, after a solution for nearly the same colours.
+
+        Args:
+            targets, options: as :meth:`solve` takes them; none are given up.
+            sh: (N, M, 3) R, G, B, the start; None: the solution before, perhaps rounded. AC coefficients stay.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        coefficients, solver = self.coefficients, self._solver
+        if sh is not None:
+            coefficients.write_sh(solver.x, sh)
+        coefficients.activate_constant()
+        descent = Descent(options.steps, options.gain, Ridge(options.lam, options.chroma_factor, options.prior))
+        return solver.solve(self.colour_map, targets, descent, constant=True)
+
+    def colours(self) -> FloatArray:
+        """(N, M, 3) float32 R, G, B, the solution."""
+        return self.coefficients.read_sh(self._solver.x)
+
+    def round_to(self, grid: ColourGrid, targets: Targets, options: RefitOptions) -> Solved:
+        """Make of the solution what a file can hold, but for the last constant coefficients.
+
+        :meth:`error` still knows what it was.
+
+        Args:
+            grid: what the file can hold.
+            targets, options: that the solution was found with.
+
+        Returns:
+            The errors after the first round of rounding, and in the end.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        solver, steps, errors = self._solver, 0, []
+        if self._unrounded is None:
+            self._unrounded = self.coefficients.vector()
+        self.coefficients.copy(self._unrounded, solver.x)
+        ridge = Ridge(options.lam, options.chroma_factor, options.prior)
+        worth = _WORTH * options.drop * self.colour_map.total_weight
+        with rounding_of(self.coefficients, solver.blocks, grid) as round_some:
+            *first, last = ROUNDS
+            for each in first:
+                round_some(solver.x, each, worth)
+                gone_on = solver.go_on(self.colour_map, targets, Descent(each.steps, 0.0, ridge, part=0))
+                steps += gone_on.steps
+                errors.append(gone_on.start)
+            round_some(solver.x, last, worth)
+            solved = solver.solve(self.colour_map, targets, Descent(last.steps, 0.0, ridge, part=1), constant=True)
+        return Solved((errors[0], solved.errors[1]), steps + solved.steps, solved.start)
+
+    def error(self, targets: Targets, sh: FloatArray | None = None) -> float:
+        """Mean squared error of the pictures. The solution is lost.
+
+        Args:
+            targets: the pictures.
+            sh: (N, M, 3) R, G, B, the colours; None: the solution as it was before :meth:`round_to`.
+
+        Raises:
+            DeviceError: the device failed.
+        """
+        if sh is not None:
+            self.coefficients.write_sh(self._solver.x, sh)
+        else:
+            assert self._unrounded is not None
+            self.coefficients.copy(self._solver.x, self._unrounded)
+        return self._solver.error(self.colour_map, targets)
+
+    def worth_of_constants(self) -> FloatArray:
+        """(N,) float32: :meth:`worth` of the constant coefficients."""
+        return self._solver.blocks.constants() / np.float32(self.colour_map.total_weight)
+
+    def worth(self) -> FloatArray:
+        """(N, M) float32: by how much the mean squared error grows for an error of 1 in a coefficient of one channel.
+
+        As the last solution has found it at its start; errors of different coefficients are taken as independent.
+        """
+        return self._solver.blocks.diagonals() / np.float32(self.colour_map.total_weight)
+
+    def blocks(self) -> FloatArray:
+        """(M (M + 1) / 2, N) float32: the same for errors of a splat's coefficients together, upper triangles."""
+        return self._solver.blocks.packed() / np.float32(self.colour_map.total_weight)
+
+    def active(self) -> NDArray[np.bool_]:
+        """(N, M, 3) in Y, Co, Cg: the coefficients that the last solution left active."""
+        return self.coefficients.is_active()
+
+    def close(self) -> None:
+        """Give all device memory back."""
+        self._owned.close()

@@ -1,0 +1,34 @@
+"""What is kept of views where memory is short: lists first, then what others ask for, then projections."""
+
+from __future__ import annotations
+
+import pytest
+
+from potr_cl.raster.rasterizer import Rasterizer
+from potr_cl.raster.view_cache import ViewCache
+from tests.devices import FAMILIES, open_device
+
+
+@pytest.fixture(scope="module", params=FAMILIES)
+def device(request):
+    device = open_device(request.param)
+    yield device
+    assert device.allocated == 0
+
+
+@pytest.mark.parametrize(
+    ("geometries", "others", "whole"),
+    [(8.5, 0, 7), (4.5, 0, 3), (4.5, 2, 1), (4.5, 20, 0), (1, 20, 0)],
+    ids=["all", "no others", "some room for others", "much for others", "lists alone"],
+)
+def test_lists_come_first_and_projections_last(device, plush_excerpt, plush_excerpt_cameras, geometries, others, whole):
+    with Rasterizer(device, plush_excerpt) as rasterizer:
+        sets = [rasterizer.prepare_set([camera]) for camera in plush_excerpt_cameras[:7]]
+        one, lists = 48 * rasterizer.stride, sum(views.nbytes_cached for views in sets)
+        with ViewCache(rasterizer, lists + geometries * one, others * one) as cache:
+            assert all([cache.keep(views) for views in sets])
+            assert sum(views.shapes is not None for views in sets) == whole
+            shared = int(cache.shared is not None)
+            assert cache.room == pytest.approx((geometries - whole - shared) * one)
+            for views in sets:
+                views.close()
