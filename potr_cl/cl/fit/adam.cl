@@ -8,9 +8,6 @@
 
    Macros: none. */
 
-/* What is nearer to 0 than this is 0 but for the rounding of R, G and B. */
-#define ZERO 1e-6f
-
 /* steps: for each column the length of a step, which is multiplied by `part`, and the least and the greatest value that
    it may reach.
    averages: of each parameter over the last steps: the newest value counts `newest` in it.
@@ -57,32 +54,6 @@ kernel void adam(
             sh[i - first_sh * (size_t)stride] = kept;
     }
     averages[i] = average + newest * (kept - average);
-}
-
-/* The gradient of AC coefficients without what would make something of a Y, Co or Cg that is 0: called before a step,
-   one coefficient of one splat a work-item, get_global_id(1) is its number less 1.
-
-   Each of R, G and B has a step of its own, so what is left is along Y alone if that may move, along Co or Cg alone if
-   not; all of it if nothing is 0. */
-kernel void keep_zeros(
-    global const float *parameters, global float *gradient, uint splats, uint stride, uint first_ac)
-{
-    const size_t splat = get_global_id(0);
-    if (splat >= splats)
-        return;
-    const size_t r = (first_ac + 3 * get_global_id(1)) * (size_t)stride + splat, g = r + stride, b = g + stride;
-    const float luma = (parameters[r] + parameters[b]) * 0.25f + parameters[g] * 0.5f;
-    const float orange = (parameters[r] - parameters[b]) * 0.5f;
-    const float green = parameters[g] * 0.5f - (parameters[r] + parameters[b]) * 0.25f;
-    const bool has_y = fabs(luma) > ZERO, has_co = fabs(orange) > ZERO, has_cg = fabs(green) > ZERO;
-    if (has_y && has_co && has_cg)
-        return;
-    const float3 all = (float3)(gradient[r], gradient[g], gradient[b]);
-    const float3 way = has_y ? (float3)(1.0f) : has_co ? (float3)(1.0f, 0.0f, -1.0f) : (float3)(-1.0f, 1.0f, -1.0f);
-    const float part = has_y || has_co || has_cg ? dot(all, way) / dot(way, way) : 0.0f;
-    gradient[r] = part * way.x;
-    gradient[g] = part * way.y;
-    gradient[b] = part * way.z;
 }
 
 /* Parameters as the projection takes them (raster/project.cl), one splat a work-item: the scales' exponentials, unit

@@ -72,7 +72,6 @@ class Adam(Parameters):
         limits: of the parameters.
         factors: what the rasterizer's scene is rounded with; the gradient is taken for that of the parameters, as if
             nothing were (the straight-through estimator of Bengio et al., 2013).
-        sparse: AC coefficients whose Y, Co or Cg is 0 keep it so.
 
     Raises:
         DeviceError: it does not fit the device, or the kernels cannot be built.
@@ -87,10 +86,10 @@ class Adam(Parameters):
         rates: Rates,
         limits: Limits,
         factors: Factors = UNROUNDED,
-        sparse: bool = False,
     ) -> None:
         super().__init__(device, scene, buffers, columns, factors)
         self._taken = 0
+        # AC coefficients that stand still are left out: four fifths of all columns. Their average is what they are.
         self._moving = columns.count if rates.ac else columns.ac.start
         try:
             nbytes = self.values.size
@@ -100,7 +99,6 @@ class Adam(Parameters):
             self._averages = self._memory.upload(self._start, "the averages")
             self._steps = self._memory.upload(_steps(columns, rates, limits), "the steps")
             self._step = device.shared_kernel("fit/adam.cl", "adam")
-            self._keep_zeros = device.shared_kernel("fit/adam.cl", "keep_zeros") if sparse else None
         except BaseException:
             self.close()
             raise
@@ -114,16 +112,6 @@ class Adam(Parameters):
         """
         self._taken += 1
         buffers, columns = self.buffers, self.columns
-        coefficients = (columns.count - columns.ac.start) // 3
-        if self._keep_zeros is not None and coefficients:
-            self._keep_zeros.bind(
-                parameters=self.values,
-                gradient=gradient,
-                splats=buffers.splats,
-                stride=buffers.stride,
-                first_ac=columns.ac.start,
-            )
-            self._keep_zeros.launch((buffers.stride, coefficients), (SPLAT_GROUP, 1))
         self._step.bind(
             parameters=self.values,
             gradient=gradient,

@@ -177,7 +177,6 @@ def fit_scene(
     held_out: Sequence[int] | None = None,
     fit_to: Sequence[int] | None = None,
     factors: Factors = UNROUNDED,
-    sparse: bool = False,
 ) -> Fitted:
     """Fit all parameters of a scene to pictures of some views.
 
@@ -196,7 +195,6 @@ def fit_scene(
         fit_to: numbers of the views to look at, where the judges are given; None: all others.
         factors: what a file will round shapes and opacities with. All is looked at as it is rounded, but what comes of
             it is not. The scene as :class:`potr_cl.stages.fitting.parameters.Parameters` takes it then.
-        sparse: AC coefficients whose Y, Co or Cg is 0 keep it so.
 
     Raises:
         UsageError: there are fewer than two given views, so that none can be held out.
@@ -219,9 +217,7 @@ def fit_scene(
         rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
         with (
             Judges(device, rasterizer, cameras, pictures, held_out) as judges,
-            Adam(
-                device, scene, rasterizer.parameters, derivatives.columns, rates, _limits(scene), factors, sparse
-            ) as adam,
+            Adam(device, scene, rasterizer.parameters, derivatives.columns, rates, _limits(scene), factors) as adam,
         ):
             if factors != UNROUNDED:
                 adam.give()
