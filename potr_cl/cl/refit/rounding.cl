@@ -51,36 +51,44 @@ kernel void round_ac(
         return;
     const vfloat step = VLOAD(index, steps);
     vfloat trace = (vfloat)(0.0f);
+    UNROLL
     for (int i = 0; i < SH_COUNT; ++i)
         trace += VLOAD(index, blocks + AT(i, i) * stride);
     for (int c = 0; c < 3; ++c) {
         const float length = c == 1 ? 2.0f : 3.0f;
         const vfloat more = trace * (DAMPING * length / SH_COUNT) + FLOOR;
         vfloat free[SH_COUNT];
+        UNROLL
         for (int j = 0; j < SH_COUNT; ++j)
             free[j] = active_lanes(active, stride, index, 3 * j + c);
         /* U with U^T U = block, row by row; rows of what is not free are empty. `pivots` are squares of U's diagonal,
            and what stands beside the diagonal is divided by it. */
         vfloat factor[TRIANGLE], pivots[SH_COUNT];
+        UNROLL
         for (int j = 0; j < SH_COUNT; ++j) {
             const vfloat diagonal = MAD((vfloat)(length), VLOAD(index, blocks + AT(j, j) * stride), more);
             vfloat pivot = diagonal;
+            UNROLL
             for (int i = 0; i < j; ++i)
                 pivot = MAD(-pivots[i] * factor[AT(i, j)], factor[AT(i, j)], pivot);
             pivots[j] = fmax(pivot, more) * free[j];
             const vfloat inverse = pivots[j] > 0.0f ? 1.0f / pivots[j] : (vfloat)(0.0f);
+            UNROLL
             for (int k = j + 1; k < SH_COUNT; ++k) {
                 vfloat sum = length * VLOAD(index, blocks + AT(j, k) * stride);
+                UNROLL
                 for (int i = 0; i < j; ++i)
                     sum = MAD(-pivots[i] * factor[AT(i, j)], factor[AT(i, k)], sum);
                 factor[AT(j, k)] = sum * inverse * free[k];
             }
         }
         vfloat error[SH_COUNT];
+        UNROLL
         for (int j = SH_COUNT - 1; j >= 0; --j) {
             const size_t column = 3 * j + c;
             const vfloat was = VLOAD(index, coefficients + column * stride);
             vfloat wanted = was;
+            UNROLL
             for (int k = j + 1; k < SH_COUNT; ++k)
                 wanted = MAD(factor[AT(j, k)], error[k], wanted);
             vfloat held = wanted;

@@ -18,8 +18,8 @@ from potr_cl.stages.refitting.vector_space import RARELY, Layout, Ridge, VectorS
 _SOURCE = "refit/coefficients.cl"
 #: Work-items that share a dot product.
 DOT_ITEMS = 16384
-#: Work-items of a work-group.
-_GROUP = 64
+#: Work-items of a work-group, and where they do nothing but load and store, of which there are many.
+_GROUP, _MANY = 64, 256
 #: Splats whose coefficients are uploaded at a time.
 _TURNED = 1 << 18
 
@@ -78,7 +78,9 @@ class Coefficients(VectorSpace):
 
     def combine_some(self, a: float, y: cl.Buffer, b: float, x: cl.Buffer, count: int) -> None:
         """The same of the first ``count`` values of two buffers, a multiple of 64."""
-        self._combine.bind(a=np.float32(a), y=y, b=np.float32(b), x=x).launch((count,), (_GROUP,))
+        self._combine.bind(a=np.float32(a), y=y, b=np.float32(b), x=x).launch(
+            (count,), (_GROUP if count % _MANY else _MANY,)
+        )  # fmt: skip
 
     def dot(self, x: cl.Buffer, y: cl.Buffer) -> float:
         """x · y; waits for the device. Not finite where single precision overflows."""
