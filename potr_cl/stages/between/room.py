@@ -14,12 +14,13 @@ import numpy as np
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.raster.culling import Sights
+from potr_cl.raster.kept_scene import fits_whole
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.pruning.prepared_views import PreparedViews
 from potr_cl.stages.pruning.sweep_options import default_memory
-from potr_cl.stages.pruning.visible_parts import LIKELY, SCENES, fits_whole, groups_of_large, seen_part
+from potr_cl.stages.pruning.visible_parts import LIKELY, SCENES, groups_of_large, seen_part
 from potr_cl.stages.stage import State, Workbench
 
 #: More bytes than a view takes, for each splat and each pixel: where there are so many, nothing has to be measured.
