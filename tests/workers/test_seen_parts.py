@@ -59,7 +59,8 @@ def array_fields(scene):
     "options",
     [
         OPTIONS,
-        OPTIONS.changed(memory=0, prune={"tolerance": 0.0}),  # nothing is kept of any view
+        # Nothing is kept of any view; tests/workers/test_host.py has that without slow ones.
+        pytest.param(OPTIONS.changed(memory=0, prune={"tolerance": 0.0}), marks=pytest.mark.slow),
         OPTIONS.changed(prune={"keep": None}),  # a GPU decides itself, and what nobody sees stays
     ],
     ids=["by number", "little memory", "by threshold"],

@@ -30,7 +30,7 @@ from potr_cl.raster.picked_splats import PickedSplats
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
-from potr_cl.raster.surely_seen import surely_seen
+from potr_cl.raster.surely_seen import Seen, surely_seen
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
 from potr_cl.stages.pruning.removal import RemovalSweep
@@ -105,9 +105,11 @@ def _by_view(device: Device, scene: Scene, view: Camera) -> float:
 
 
 def _wrongly_seen(device: Device, scene: Scene, view: Camera) -> float:
-    """Splats that are said to be seen, and are not by float64."""
+    """Splats that are said to be seen, or not to be, and float64 says the other."""
+    unseen = unseen_splats(scene, [view])
     with uploaded(device, scene) as there:
-        return float(np.count_nonzero(surely_seen(there, [view]) & unseen_splats(scene, [view])))
+        found = surely_seen(there, [view])
+    return float(np.count_nonzero(np.where(unseen, found == Seen.YES, found == Seen.NO)))
 
 
 def _to_device(device: Device, scene: Scene) -> float | None:
@@ -164,21 +166,17 @@ def _settled(device: Device, scene: Scene, view: Camera) -> float:
     """1 for a value that is not finite after coefficients are chosen and geometry is rounded, with fits in between."""
     views = _looked_at(view)
     bench = Workbench(_PARAMETERS, device=device)
-    through = Settling(choosing=0.5, rounding=0.5, gentle=1.0, through=1.0, cheap=1.0, sparse=True)
-    one_by_one = dataclasses.replace(through, sparse=False, through=0.0)
+    settling = Settling(choosing=0.5, rounding=0.5, gentle=1.0, through=1.0)
     with Rasterizer(device, scene) as rasterizer:
         looking = Looking(views, 0, RenderedTargets(rasterizer, views), rasterizer)
-        for settling in (one_by_one, through):
-            try:
-                state, _ = settle(State.of(scene, views), bench, looking, settling, _STEPS)
-            except DataError:  # no file holds such a scene, and the encode says so
-                continue
-            finite = is_finite(state.scene)
-            if state.geometry is not None:
-                finite &= is_finite(state.geometry.decoded(state.scene.sh))
-            if not finite:
-                return 1.0
-    return 0.0
+        try:
+            state, _ = settle(State.of(scene, views), bench, looking, settling, _STEPS)
+        except DataError:  # no file holds such a scene, and the encode says so
+            return 0.0
+    finite = is_finite(state.scene)
+    if state.geometry is not None:
+        finite &= is_finite(state.geometry.decoded(state.scene.sh))
+    return 0.0 if finite else 1.0
 
 
 def is_finite(scene: Scene) -> bool:
