@@ -166,11 +166,11 @@ def _settled(device: Device, scene: Scene, view: Camera) -> float:
     """1 for a value that is not finite after coefficients are chosen and geometry is rounded, with fits in between."""
     views = _looked_at(view)
     bench = Workbench(_PARAMETERS, device=device)
-    through = Settling(choosing=0.5, rounding=0.5, gentle=1.0, through=1.0, cheap=1.0, sparse=True)
-    one_by_one = dataclasses.replace(through, sparse=False, through=0.0)
+    nearest = Settling(choosing=0.5, rounding=0.5, gentle=1.0, through=1.0)
+    cheap = dataclasses.replace(nearest, cheap=1.0, sparse=True)
     with Rasterizer(device, scene) as rasterizer:
         looking = Looking(views, 0, RenderedTargets(rasterizer, views), rasterizer)
-        for settling in (one_by_one, through):
+        for settling in (nearest, cheap):
             try:
                 state, _ = settle(State.of(scene, views), bench, looking, settling, _STEPS)
             except DataError:  # no file holds such a scene, and the encode says so
