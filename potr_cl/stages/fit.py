@@ -44,7 +44,7 @@ FURTHER, _AT_THRESHOLD, _MOST_FURTHER = 3.5, 10**-9.3, 20.0
 #: By how much of its way to 1 the q is higher whose steps give about the PSNR that q has without a fit.
 FINER = 0.18
 #: Steps that "auto" stands for.
-STEPS: dict[Family, int] = {"cpu": 800, "gpu": 1000}
+STEPS: dict[Family, int] = {"cpu": 800, "gpu": 1300}
 #: Views between for each given one that a fit looks at: they keep it from fitting the given ones too closely.
 BETWEEN: dict[Family, float] = {"cpu": 1.0, "gpu": 3.0}
 #: Steps of a fit to photographs that "auto" stands for: their number's square, divided by this, because few photographs
@@ -122,8 +122,8 @@ class Fit(Stage):
         photograph_steps: in which what came of it is fitted to photographs, where the re-fit has some; 0: it is not.
             "auto": as many as pay on the device.
         photograph_rate: by what the rates are multiplied for photographs.
-        choosing, rounding, gentle, through, cheap, sparse: how far what is left is fitted once more after the choice of
-            coefficients and the rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`).
+        choosing, rounding, gentle, through: how far what is left is fitted once more after the choice of coefficients
+            and the rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`).
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -161,8 +161,6 @@ class Fit(Stage):
     rounding: float = option(0.15)
     gentle: float = option(0.1)
     through: float = option(0.3)
-    cheap: float = option(0.5)
-    sparse: int = option(0)
     seed: int = option(FitOptions.seed)
 
     def __post_init__(self) -> None:
@@ -180,7 +178,6 @@ class Fit(Stage):
             ("rounding", 0, 10),
             ("gentle", 1e-6, 1),
             ("through", 1e-6, 1),
-            ("cheap", 0, 1e6),
         ):
             if not least <= getattr(self, name) <= most:
                 raise UsageError(f"the fit's {name} is {getattr(self, name):g}, it must be from {least:g} to {most}")
@@ -309,9 +306,7 @@ class Fit(Stage):
     def _settled(self, state: State, bench: Workbench, looking: Looking, asked: SupportsBool) -> State:
         """Choose coefficients and round geometry, with what is left fitted once more in between."""
         options = self._options(bench.opened.family, bench.memory)
-        settling = Settling(
-            self.choosing, self.rounding, self.gentle, self.through, cheap=self.cheap, sparse=bool(self.sparse)
-        )
+        settling = Settling(self.choosing, self.rounding, self.gentle, self.through)
         done, total = options.steps, options.steps + self.further_steps_on(bench.opened.family)
 
         def progress(steps: int) -> None:

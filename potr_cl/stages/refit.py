@@ -23,7 +23,7 @@ from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import placed
-from potr_cl.stages.refitting.refit import active_coefficients, refit_colours
+from potr_cl.stages.refitting.refit import active_coefficients, chosen_coefficients, refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.shared_map import colour_shares
 from potr_cl.stages.refitting.targets import GroundTruthTargets, RememberedTargets, RenderedTargets, Targets
@@ -133,6 +133,8 @@ class Refit(Stage):
         parameters = bench.parameters
         compacted = "compact" in state.learnt
         active = active_coefficients(state.scene.sh, parameters.sf_sh) if compacted else None
+        if state.learnt.get("chosen") == parameters:
+            active = chosen_coefficients(state.scene.sh)
         options = RefitOptions(steps=self.steps, drop=parameters.drop, memory=bench.memory)
         on_grid = bench.output.on_grid(bench.request(state))
         # What has been fitted to photographs already is what the colours should show again once all else is rounded.

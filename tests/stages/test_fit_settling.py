@@ -17,6 +17,7 @@ from potr_cl.stages.fitting.fit import FitOptions, fit_scene
 from potr_cl.stages.fitting.parameters import Factors, in_form_of_files
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
 from potr_cl.stages.fitting.views import share_out
+from potr_cl.stages.refit import Refit
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.stage import State, Workbench
 from tests.devices import FAMILIES, open_device
@@ -96,6 +97,20 @@ def test_coefficients_are_chosen_and_the_rest_moves(device, plush_excerpt, views
     zeros = [np.mean(scene.sh[:, 1:] == 0) for scene in (plush_excerpt, then.scene)]
     assert zeros[1] > zeros[0] + 0.3
     assert not np.array_equal(then.scene.means, plush_excerpt.means)
+
+
+def test_the_refit_takes_no_coefficient_back(device, plush_excerpt, views):
+    """Unless it is asked for other steps, which other coefficients may suit."""
+    _, then, _, bench = settled(device, plush_excerpt, views, Settling(0.5, 0.5, 0.1))
+    given_up = (then.scene.sh[:, 1:] == 0).all(axis=2)
+    assert np.mean(given_up) > 0.3
+    other = dataclasses.replace(bench, parameters=HyperParameters.from_quality(0.6, "best"))
+    back = []
+    for each in (bench, other):
+        sh = Refit().run(then, each).scene.sh
+        back.append(np.mean((np.abs(sh[:, 1:]) > 1e-6).any(axis=2)[given_up]))
+    assert back[0] == 0
+    assert back[1] > 0.01
 
 
 def test_nothing_of_it_where_nothing_is_asked_for(device, plush_excerpt, views):

@@ -270,7 +270,7 @@ def fit(device: Device) -> None:
         with Rasterizer(device, original) as rasterizer:
             targets = RenderedTargets(rasterizer, views)
             options = FitOptions(steps=3, rounds=1)
-            fit_scene(device, scene, views, targets, options, factors=factors, sparse=antialiased)
+            fit_scene(device, scene, views, targets, options, factors=factors)
 
 
 def compaction(device: Device) -> None:

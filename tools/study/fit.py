@@ -129,7 +129,6 @@ _PARTS: dict[str, dict[str, Any]] = {
     "everything": {},
     "coefficients chosen by the re-fit alone": {"choosing": 0.0},
     "shapes rounded at once": {"rounding": 0.0},
-    "all levels the nearest": {"cheap": 0.0},
     "positions stay": {"rates": _without("means")},
     "scales stay": {"rates": _without("log_scales")},
     "rotations stay": {"rates": _without("quaternions")},

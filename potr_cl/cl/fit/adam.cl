@@ -8,9 +8,6 @@
 
    Macros: none. */
 
-/* What is nearer to 0 than this is 0 but for the rounding of R, G and B. */
-#define ZERO 1e-6f
-
 /* steps: for each column the length of a step, which is multiplied by `part`, and the least and the greatest value that
    it may reach.
    averages: of each parameter over the last steps: the newest value counts `newest` in it.
@@ -22,14 +19,10 @@ kernel void adam(
     global float *squares,
     global float *averages,
     global float *sh,
-    global const float *scales,
     uint splats,
     uint stride,
     uint first_sh,
     global const float4 *steps,
-    float usual_size,
-    float own_means,
-    float own_turns,
     float part,
     float decay_mean,
     float decay_square,
@@ -52,14 +45,7 @@ kernel void adam(
     squares[i] = square;
     if (mean == 0.0f || !(square > 0.0f))
         return; /* and the average is what the parameter is */
-    float rate = part * step.x;
-    if (get_global_id(1) < 3 || (get_global_id(1) >= 6 && get_global_id(1) < 10)) {
-        const float a = scales[splat], b = scales[stride + splat], c = scales[2 * (size_t)stride + splat];
-        const float longest = fmax(a, fmax(b, c)), middle = fmax(fmin(a, b), fmin(fmax(a, b), c));
-        rate *= get_global_id(1) < 3 ? pow(fmin(fmax(middle / usual_size, 0.01f), 100.0f), own_means)
-                                     : pow(fmax(middle / longest, 0.01f), own_turns);
-    }
-    const float value = former - rate * (mean * debias_mean) / sqrt(square * debias_square);
+    const float value = former - part * step.x * (mean * debias_mean) / sqrt(square * debias_square);
     const bool taken = fabs(value) < 1e30f;
     const float kept = taken ? fmin(fmax(value, step.y), step.z) : former;
     if (taken) {
@@ -68,32 +54,6 @@ kernel void adam(
             sh[i - first_sh * (size_t)stride] = kept;
     }
     averages[i] = average + newest * (kept - average);
-}
-
-/* The gradient of AC coefficients without what would make something of a Y, Co or Cg that is 0: called before a step,
-   one coefficient of one splat a work-item, get_global_id(1) is its number less 1.
-
-   Each of R, G and B has a step of its own, so what is left is along Y alone if that may move, along Co or Cg alone if
-   not; all of it if nothing is 0. */
-kernel void keep_zeros(
-    global const float *parameters, global float *gradient, uint splats, uint stride, uint first_ac)
-{
-    const size_t splat = get_global_id(0);
-    if (splat >= splats)
-        return;
-    const size_t r = (first_ac + 3 * get_global_id(1)) * (size_t)stride + splat, g = r + stride, b = g + stride;
-    const float luma = (parameters[r] + parameters[b]) * 0.25f + parameters[g] * 0.5f;
-    const float orange = (parameters[r] - parameters[b]) * 0.5f;
-    const float green = parameters[g] * 0.5f - (parameters[r] + parameters[b]) * 0.25f;
-    const bool has_y = fabs(luma) > ZERO, has_co = fabs(orange) > ZERO, has_cg = fabs(green) > ZERO;
-    if (has_y && has_co && has_cg)
-        return;
-    const float3 all = (float3)(gradient[r], gradient[g], gradient[b]);
-    const float3 way = has_y ? (float3)(1.0f) : has_co ? (float3)(1.0f, 0.0f, -1.0f) : (float3)(-1.0f, 1.0f, -1.0f);
-    const float part = has_y || has_co || has_cg ? dot(all, way) / dot(way, way) : 0.0f;
-    gradient[r] = part * way.x;
-    gradient[g] = part * way.y;
-    gradient[b] = part * way.z;
 }
 
 /* Parameters as the projection takes them (raster/project.cl), one splat a work-item: the scales' exponentials, unit

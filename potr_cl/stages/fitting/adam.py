@@ -2,7 +2,6 @@
 
 from __future__ import annotations
 
-import math
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -20,7 +19,6 @@ from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, Parameters
 #: How fast the moments forget (Kingma and Ba, 2015), and the averages: after about so many steps.
 _DECAY_MEAN, _DECAY_SQUARE = 0.9, 0.999
 _AVERAGED = 50
-_OWN_MEANS, _OWN_TURNS = 0.0, 0.0
 
 
 @dataclass(frozen=True)
@@ -74,7 +72,6 @@ class Adam(Parameters):
         limits: of the parameters.
         factors: what the rasterizer's scene is rounded with; the gradient is taken for that of the parameters, as if
             nothing were (the straight-through estimator of Bengio et al., 2013).
-        sparse: AC coefficients whose Y, Co or Cg is 0 keep it so.
 
     Raises:
         DeviceError: it does not fit the device, or the kernels cannot be built.
@@ -89,11 +86,10 @@ class Adam(Parameters):
         rates: Rates,
         limits: Limits,
         factors: Factors = UNROUNDED,
-        sparse: bool = False,
     ) -> None:
         super().__init__(device, scene, buffers, columns, factors)
         self._taken = 0
-        self._usual_size = usual_size(scene)
+        # AC coefficients that stand still are left out: four fifths of all columns. Their average is what they are.
         self._moving = columns.count if rates.ac else columns.ac.start
         try:
             nbytes = self.values.size
@@ -103,7 +99,6 @@ class Adam(Parameters):
             self._averages = self._memory.upload(self._start, "the averages")
             self._steps = self._memory.upload(_steps(columns, rates, limits), "the steps")
             self._step = device.shared_kernel("fit/adam.cl", "adam")
-            self._keep_zeros = device.shared_kernel("fit/adam.cl", "keep_zeros") if sparse else None
         except BaseException:
             self.close()
             raise
@@ -117,16 +112,6 @@ class Adam(Parameters):
         """
         self._taken += 1
         buffers, columns = self.buffers, self.columns
-        coefficients = (columns.count - columns.ac.start) // 3
-        if self._keep_zeros is not None and coefficients:
-            self._keep_zeros.bind(
-                parameters=self.values,
-                gradient=gradient,
-                splats=buffers.splats,
-                stride=buffers.stride,
-                first_ac=columns.ac.start,
-            )
-            self._keep_zeros.launch((buffers.stride, coefficients), (SPLAT_GROUP, 1))
         self._step.bind(
             parameters=self.values,
             gradient=gradient,
@@ -134,14 +119,10 @@ class Adam(Parameters):
             squares=self._moments[1],
             averages=self._averages,
             sh=buffers.sh,
-            scales=buffers.scales,
             splats=buffers.splats,
             stride=buffers.stride,
             first_sh=columns.dc.start,
             steps=self._steps,
-            usual_size=self._usual_size,
-            own_means=_OWN_MEANS,
-            own_turns=_OWN_TURNS,
             part=part,
             decay_mean=_DECAY_MEAN,
             decay_square=_DECAY_SQUARE,
@@ -163,12 +144,6 @@ class Adam(Parameters):
         finally:
             self.values = moving
             self.give()
-
-
-def usual_size(scene: Scene) -> float:
-    """The median of the splats' middle standard deviations, world units."""
-    middle = np.sort(scene.log_scales.astype(np.float64), axis=1)[:, 1]
-    return math.exp(min(float(np.median(middle)), 80.0))
 
 
 def _steps(columns: Columns, rates: Rates, limits: Limits) -> FloatArray:

@@ -18,12 +18,14 @@ from contextlib import AbstractContextManager, nullcontext
 from dataclasses import dataclass
 from typing import Any, Protocol
 
+import numpy as np
+
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.raster.rasterizer import Rasterizer
-from potr_cl.stages.fitting.adam import Adam, Limits, Rates, usual_size
+from potr_cl.stages.fitting.adam import Adam, Limits, Rates
 from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.judges import Judges
@@ -175,7 +177,6 @@ def fit_scene(
     held_out: Sequence[int] | None = None,
     fit_to: Sequence[int] | None = None,
     factors: Factors = UNROUNDED,
-    sparse: bool = False,
 ) -> Fitted:
     """Fit all parameters of a scene to pictures of some views.
 
@@ -194,7 +195,6 @@ def fit_scene(
         fit_to: numbers of the views to look at, where the judges are given; None: all others.
         factors: what a file will round shapes and opacities with. All is looked at as it is rounded, but what comes of
             it is not. The scene as :class:`potr_cl.stages.fitting.parameters.Parameters` takes it then.
-        sparse: AC coefficients whose Y, Co or Cg is 0 keep it so.
 
     Raises:
         UsageError: there are fewer than two given views, so that none can be held out.
@@ -214,12 +214,10 @@ def fit_scene(
         if options.memory is None and options.steps * options.batch >= len(fit_to):
             pictures.prepare([*held_out, *(number for number in fit_to if number not in held_out)])
         rasterizer = derivatives.rasterizer
-        rates = dataclasses.replace(options.rates, means=options.rates.means * usual_size(scene))
+        rates = dataclasses.replace(options.rates, means=options.rates.means * _usual_size(scene))
         with (
             Judges(device, rasterizer, cameras, pictures, held_out) as judges,
-            Adam(
-                device, scene, rasterizer.parameters, derivatives.columns, rates, _limits(scene), factors, sparse
-            ) as adam,
+            Adam(device, scene, rasterizer.parameters, derivatives.columns, rates, _limits(scene), factors) as adam,
         ):
             if factors != UNROUNDED:
                 adam.give()
@@ -328,6 +326,12 @@ class _Fit:
 def _decibels(error: float) -> float:
     """The PSNR of a mean squared error of colours from 0 to 1."""
     return -10 * math.log10(max(error, 1e-20))
+
+
+def _usual_size(scene: Scene) -> float:
+    """The median of the splats' middle standard deviations, world units."""
+    middle = np.sort(scene.log_scales.astype(np.float64), axis=1)[:, 1]
+    return math.exp(min(float(np.median(middle)), 80.0))
 
 
 def _limits(scene: Scene) -> Limits:

@@ -7,10 +7,9 @@ do. Here it comes one kind after the other, and what may still move makes up for
 2. All but them goes on moving, but what the pictures show is scales, rotations and opacities as the file rounds them:
    what lies behind a level moves until another level suits the other splats' better.
 3. Centres are rounded; the others move on in this way.
-4. Opacities and scales take the levels that are worth their bits.
 
-The re-fit then solves for the colours, on just this geometry. Held-out views watch over every fit: one that does not
-help them is not taken.
+The re-fit then solves for the colours, on just this geometry; it may give up more coefficients, but takes none back.
+Held-out views watch over every fit: one that does not help them is not taken.
 """
 
 from __future__ import annotations
@@ -26,8 +25,6 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
-from potr_cl.stages.fitting.cheap_levels import with_cheap_levels
-from potr_cl.stages.fitting.curvature import curvatures
 from potr_cl.stages.fitting.fit import FitOptions, SupportsBool, fit_scene
 from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_files
 from potr_cl.stages.fitting.pictures import TargetPictures
@@ -39,8 +36,6 @@ from potr_cl.stages.stage import State, Workbench
 
 #: Steps of the solution that coefficients are chosen by; the last solution, of the re-fit, takes more.
 _CHOICE_STEPS = 4
-#: Bits that a coefficient takes in a file, about.
-_BITS = 7
 
 
 @dataclass(frozen=True)
@@ -52,9 +47,6 @@ class Settling:
             rounded, as parts of those of the fit. 0: that is left to the re-fit and the coder.
         gentle, through: part of the fit's first rates that the fit after the choice begins with, and those that look at
             what is rounded.
-        cheap: price of a bit of opacities and scales, as a multiple of what one of a coefficient is worth; 0: they take
-            the nearest levels.
-        sparse: whether AC coefficients that are not 0 move too.
         last: part of the first rates of each fit that is left at its end.
     """
 
@@ -62,8 +54,6 @@ class Settling:
     rounding: float
     gentle: float
     through: float = 0.3
-    cheap: float = 0.0
-    sparse: bool = False
     last: float = 0.1
 
 
@@ -105,8 +95,9 @@ def settle(
 
     Returns:
         The state: its ``scene`` is not rounded yet, so that other steps can be tried with it. Its ``geometry`` is, for
-        the steps of now, if the output is a .potr file in one block: only that can keep some kinds rounded while others
-        move. And the mean squared error of the held-out views after each fit.
+        the steps of now, if the output is a .potr file in one block of version 2 or later: what others hold is not
+        known here. In ``learnt``, "chosen" are the parameters that coefficients were chosen with. And the mean squared
+        error of the held-out views after each fit.
 
     Raises:
         DeviceError: it does not fit the device.
@@ -121,16 +112,16 @@ def settle(
         )
         found = fit_scene(
             bench.opened, scene, looking.views, looking.targets, more, looking.added, bench.background,
-            tell=bench.tell, asked=asked, factors=factors, sparse=settling.sparse,
+            tell=bench.tell, asked=asked, factors=factors,
         )  # fmt: skip
         errors.append(found.error)
         progress(steps)
         return found.scene
 
-    still = () if settling.sparse else ("ac",)
+    still = ("ac",)
     if settling.choosing and bench.parameters.drop and "compact" not in state.learnt:
         scene = fitted(_with_chosen(state, bench, looking), settling.choosing, settling.gentle, still)
-        state = dataclasses.replace(state, scene=scene, geometry=None)
+        state = dataclasses.replace(state, scene=scene, geometry=None).having_learnt("chosen", bench.parameters)
     rounded = bench.output.geometry(state.scene, bench.request(state)) if settling.rounding else None
     if not isinstance(rounded, Geometry) or not VERSIONS[rounded.parameters.version].quantises_splats_as(Version2):
         return state, tuple(errors)
@@ -141,13 +132,8 @@ def settle(
         rounded = rounded.with_centres_of(scene.means, state.views, pool.map)
     scene = dataclasses.replace(scene, means=rounded.decoded(scene.sh).means)
     scene = fitted(scene, settling.rounding, settling.through, (*still, "means"), factors)
-    rounded = rounded.with_shapes_of(scene)
-    if settling.cheap and bench.parameters.drop:
-        scene = in_form_of_files(scene)
-        given = looking.views[: len(looking.views) - looking.added]
-        found = curvatures(bench.opened, scene, given, bench.background)
-        rounded = with_cheap_levels(rounded, scene, found, settling.cheap * bench.parameters.drop / _BITS)
-    return dataclasses.replace(state.recoloured(scene.sh), geometry=rounded), tuple(errors)
+    then = dataclasses.replace(state.recoloured(scene.sh), geometry=rounded.with_shapes_of(scene))
+    return then, tuple(errors)
 
 
 def _with_chosen(state: State, bench: Workbench, looking: Looking) -> Scene:

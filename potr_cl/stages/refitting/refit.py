@@ -19,7 +19,7 @@ from typing import Protocol
 import numpy as np
 from numpy.typing import NDArray
 
-from potr_cl.codec.quantize import nonzero_levels
+from potr_cl.codec.quantize import nonzero_levels, to_ycocg
 from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
@@ -32,6 +32,8 @@ from potr_cl.stages.refitting.targets import Targets
 
 #: Steps in which the constant coefficients are solved for once more, after the others have been rounded.
 _CONSTANT_STEPS = 3
+#: What is nearer to 0 than this was 0 before it was made R, G and B.
+_ZERO = 1e-6
 
 
 def refit_colours(
@@ -171,6 +173,20 @@ class _AsTheFileDoes:
 
     def error(self) -> float:
         return self.refit.error(self.targets, self._found)
+
+
+def chosen_coefficients(sh: FloatArray) -> NDArray[np.bool_]:
+    """(N, M, 3) the coefficients in Y, Co, Cg that are not 0 but for roundings of R, G and B; DC always.
+
+    Args:
+        sh: (N, M, 3) R, G, B.
+    """
+    found = np.empty(sh.shape, bool)
+    for m in range(sh.shape[1]):
+        for channel, values in enumerate(to_ycocg(sh[:, m].astype(np.float64))):
+            found[:, m, channel] = np.abs(values) > _ZERO
+    found[:, 0] = True
+    return found
 
 
 def active_coefficients(sh: FloatArray, sf_sh: float) -> NDArray[np.bool_]:
