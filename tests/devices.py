@@ -32,7 +32,7 @@ def _pocl() -> DeviceInfo | None:
 _POCL = _pocl()
 
 #: Parameters of fixtures, for :func:`open_device`: both families on the device that is taken by default, and again on
-#: PoCL, which every installation on Linux brings. What cannot compile is skipped in tests/test_device.py, visibly.
+#: PoCL, which every installation on Linux brings. tests/opencl/test_discovery.py skips what cannot compile, visibly.
 KERNELS: list[Any] = ["cpu", "gpu"]
 #: Parameters for tests of what the host does, which does not depend on the runtime.
 FAMILIES: list[Any] = ["cpu", "gpu"]

@@ -7,7 +7,9 @@ makes that several times as fast as a download and an upload of everything.
 
 from __future__ import annotations
 
+import threading
 from typing import Any
+from weakref import WeakKeyDictionary
 
 import numpy as np
 import pyopencl as cl
@@ -16,7 +18,10 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner, Staging
 
 #: Bytes of a slice, and slices that the host has room for.
-_SLICE, _SLOTS = 1 << 22, 4
+_SLICE, _SLOTS = 1 << 23, 3
+#: Room of relays that are closed: to take memory that a driver knows takes long. By the device that they were for.
+_spare: WeakKeyDictionary[Device, list[Any]] = WeakKeyDictionary()
+_sparing = threading.Lock()
 
 
 class Lent:
@@ -57,8 +62,7 @@ class Relay(Owner):
         self._queue = _queue_beside(device)
         self._queues: dict[Device, Any] = {}
         # Taken now: a device that computes would be waited for. Any driver copies fast to and from memory of another.
-        self._staging = Staging(device)
-        self._slots = self._staging.array((_SLOTS, _SLICE), np.uint8)
+        self._slots = _room(device)
 
     def fetch(
         self,
@@ -135,10 +139,23 @@ class Relay(Owner):
             self._queue.finish()
 
     def close(self) -> None:
-        """Give the host's memory back; the relay is of no use afterwards."""
-        self._staging.close()
-        self._slots = np.empty((0, 0), np.uint8)
+        """Leave the host's memory to the device's next relay; this one is of no use afterwards."""
+        slots, self._slots = self._slots, np.empty((0, 0), np.uint8)
+        if slots.size:
+            with _sparing:
+                _spare.setdefault(self._device, []).append(slots)
         self._queues = {}
+
+
+def _room(device: Device) -> Any:
+    """(slots, bytes) uint8 of the host, that a closed relay of the device has left, or new."""
+    with _sparing:
+        spare = _spare.get(device, [])
+        while spare:
+            slots = spare.pop()
+            if slots.shape == (_SLOTS, _SLICE):
+                return slots
+    return Staging(device).array((_SLOTS, _SLICE), np.uint8)
 
 
 def done_so_far(device: Device) -> cl.Event:

@@ -7,7 +7,7 @@ from potr_cl.stages.pruning.visible_parts import LEAST_SPLATS
 
 #: Bytes of the host's memory for each splat: what is not mapped of the scene (44), and what pruning knows of the splats
 #: while it chooses among them, as measured with 2.5 and 10 million. And what the interpreter and compilers take.
-_SPLAT, _PROCESS = 184, 1 << 28
+_SPLAT, _PROCESS = 220, 1 << 28
 #: Views get this part of the memory in any case.
 _LEAST = 1 / 4
 

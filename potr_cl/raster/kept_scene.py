@@ -5,7 +5,7 @@ from __future__ import annotations
 import threading
 from collections.abc import Iterator
 from concurrent.futures import Future
-from contextlib import contextmanager, suppress
+from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,8 @@ from potr_cl.raster.view_shares import Excerpt
 
 #: A scene that takes more than this part of the device's memory is not kept: others may need the room.
 _PART = 10
+#: The whole scene is on the device too where that has so many times as much memory.
+_WHOLE = 3
 
 
 class KeptScene(Owner):
@@ -122,3 +124,23 @@ def lying_on(device: Device, scene: Scene | KeptScene | PartOfKept | Excerpt) ->
         yield scene.gathered()
     else:
         yield scene
+
+
+def fits_whole(device: Device, scene: Drawable) -> bool:
+    """Whether a whole scene is to lie on a device: on a GPU with memory of its own that it fits, or it does already."""
+    if isinstance(scene, SceneBuffers):
+        return True
+    if device.info.kind == "cpu" or device.info.integrated:
+        return False
+    return _WHOLE * scene.nbytes <= device.info.memory - device.allocated
+
+
+@contextmanager
+def whole_on_device(device: Device, scene: Drawable) -> Iterator[Drawable]:
+    """The same scene where parts are filled from it quickest: on a GPU with memory of its own, if it fits."""
+    found: Drawable = scene
+    with ExitStack() as stack:
+        if not isinstance(scene, SceneBuffers) and fits_whole(device, scene):
+            with suppress(DeviceMemoryError):
+                found = stack.enter_context(uploaded(device, scene))
+        yield found

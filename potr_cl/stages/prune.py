@@ -155,6 +155,9 @@ class Prune(Stage):
             hidden, area = find_unseen(state, groups, pool.map, quick)
             options = self._sweep_options(bench.memory)
             sights = sights_worth_it(state.scene, state.views, options, groups, pool.map) if likely else None
+            groups = None
+            if sights is not None and (bench.pool is None or bench.pool.in_process):
+                sights = sights.lasting()
         splats = int(np.count_nonzero(hidden))
         kept = self.unseen == "keep" and self.keep is None and self.count is None
         told = state.having_learnt("unseen", Unseen(splats, len(state.scene), kept, area))

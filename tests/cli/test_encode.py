@@ -73,23 +73,25 @@ def test_encode_tells_what_it_did(tmp_path, scene_path, capsys):
 
 
 def test_encode_to_a_size(tmp_path, excerpt, capsys):
-    potr = tmp_path / "a.potr"
-    report = json.loads(run(capsys, *excerpt, "-o", potr, "--max-size", "20 kB", "--json"))
+    potr, fast = tmp_path / "a.potr", [*excerpt, "--preset", "fast"]
+    report = json.loads(run(capsys, *fast, "-o", potr, "--max-size", "20 kB", "--json"))
     assert 19_600 <= potr.stat().st_size == report["bytes"] <= 20_000
     assert report["search"]["target"] == "at most 20,000 bytes"
     assert report["search"]["max_bytes"] == 20_000
     assert report["search"]["tries"][-1]["value"] == report["bytes"]
     assert report["search"]["reached"] == f"{report['bytes']:,} bytes"
-    assert "asked for  at most 20,480 bytes; reached" in run(capsys, *excerpt, "-o", potr, "--max-size", "20KiB")
+    assert "asked for  at most 20,480 bytes; reached" in run(capsys, *fast, "-o", potr, "--max-size", "20KiB")
 
 
 def test_encode_to_a_psnr(tmp_path, excerpt, capsys):
-    report = json.loads(run(capsys, *excerpt, "-o", tmp_path / "a.potr", "--min-psnr", "43", "--json"))
+    report = json.loads(
+        run(capsys, *excerpt, "--preset", "fast", "-o", tmp_path / "a.potr", "--min-psnr", "43", "--json")
+    )
     assert 43 <= report["quality"]["psnr"] <= 43.1
 
 
 def test_encode_to_the_impossible(tmp_path, excerpt, capsys):
-    potr = tmp_path / "a.potr"
+    potr, excerpt = tmp_path / "a.potr", [*excerpt, "--preset", "fast"]
     fails(
         capsys, [*excerpt, "-o", potr, "--max-size", "1k"], 1, "at most 1,000 bytes cannot be reached: quality 0 gives"
     )
@@ -304,6 +306,7 @@ def test_few_cameras_are_told_where_held_out_views_suffer(tmp_path, data, capsys
         path = tmp_path / f"{name}.json"
         path.write_text(json.dumps(cameras))
         arguments = ["encode", scene, "--cameras", path, "--iterations", "4", "-q", "0.3", "-o", tmp_path / "a.potr"]
+        arguments += ["--preset", "fast"]
         told.append("the held-out views are matched" in run(capsys, *arguments))
         quality = json.loads(run(capsys, *arguments, "--json"))["quality"]
         assert quality["training"]["views"] == (1 if name == "few" else 4)

@@ -116,10 +116,13 @@ def test_many_splats_are_taken_by_threads_as_few_are(monkeypatch):
         scene.subset(np.arange(301, 1001))
 
 
-def test_scenes_are_joined_in_an_order(monkeypatch):
-    """Piece by piece: of each splat all values, from the scene that has it."""
+@pytest.mark.parametrize("planar", [False, True])
+def test_scenes_are_joined_in_an_order(monkeypatch, planar):
+    """Piece by piece: of each splat all values, from the scene that has it, however they lie in memory."""
     monkeypatch.setattr(scene_module, "_LARGE", 80)
     some, others = random_scene(40, 2, seed=1), random_scene(17, 2, seed=2)
+    if planar:
+        some = dataclasses.replace(some, sh=np.ascontiguousarray(some.sh.transpose(1, 2, 0)).transpose(2, 0, 1))
     order = np.random.default_rng(3).permutation(57)
     joined = some.joined(others, order)
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):

@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import gc
+import weakref
+
 import numpy as np
 import pytest
 
@@ -77,3 +80,20 @@ def test_another_buffer_can_take_its_place(devices):
         target = here.allocate(80, "a test")
         relayed.fetch(target, lent)
         assert borrower.download(target, (10,), np.int64).tolist() == [1] * 10
+
+
+def test_devices_are_forgotten_with_what_their_relays_left(devices):
+    """The memory of closed relays is kept for the next ones of the device, and no longer than that."""
+    borrower = open_device("gpu")
+    lender = devices[0]
+    with Memory(lender) as there:
+        lent = Lent(lender, there.upload(np.arange(1000), "a test"), 8000)
+        for _ in range(3):
+            with Memory(borrower) as here, Relay(borrower) as relayed:
+                target = here.allocate(8000, "a test")
+                relayed.fetch(target, lent)
+                assert np.array_equal(borrower.download(target, (1000,), np.int64), np.arange(1000))
+    gone = weakref.ref(borrower)
+    del borrower, here, relayed, target
+    gc.collect()
+    assert gone() is None

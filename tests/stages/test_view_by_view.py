@@ -119,13 +119,13 @@ def test_views_that_are_not_kept_wait_until_they_have_lost_enough(device):
     sights = Sights.of(scene, cameras, INRIA.near)
     with (
         uploaded(device, scene) as whole,
-        ViewByView(device, whole, cameras, sights, SweepOptions(0.02, memory=0)) as waiting,
+        ViewByView(device, whole, cameras, sights, SweepOptions(0.06, memory=0)) as waiting,
         ViewByView(device, whole, cameras, sights, SweepOptions(0.0, memory=0)) as eager,
     ):
         (_, importances), first = eager.measure(), waiting.measure()
         order = np.argsort(importances)
         covered = np.cumsum(importances[order])
-        little, much = order[covered < 0.03], order[covered < 0.08]
+        little, much = order[covered < 0.02], order[covered < 0.06]
         assert 0 < len(little) < len(much)
         for removal in (eager, waiting):
             removal.remove(little)

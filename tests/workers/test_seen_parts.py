@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import dataclasses
+import importlib
 import pickle
 from itertools import chain
 
@@ -58,7 +59,8 @@ def array_fields(scene):
     "options",
     [
         OPTIONS,
-        OPTIONS.changed(memory=0, prune={"tolerance": 0.0}),  # nothing is kept of any view
+        # Nothing is kept of any view; tests/workers/test_host.py has that without slow ones.
+        pytest.param(OPTIONS.changed(memory=0, prune={"tolerance": 0.0}), marks=pytest.mark.slow),
         OPTIONS.changed(prune={"keep": None}),  # a GPU decides itself, and what nobody sees stays
     ],
     ids=["by number", "little memory", "by threshold"],
@@ -91,6 +93,34 @@ def test_the_same_bytes(family, options, monkeypatch):
         constant = 2 * 56 * len(scene)
         assert pool.scenes < sum(made[:3]) * scene.nbytes / len(scene) + constant
     assert [device.allocated for device in devices] == [0] * 4
+
+
+@pytest.mark.parametrize("keep", [0.4, None])
+def test_workers_with_gpus_look_at_each_view_with_what_it_may_draw(keep, monkeypatch):
+    """As a GPU with memory of its own does: a CPU that runs its kernels has none."""
+    family = next(each for each in FAMILIES if "gpu" in str(each))
+    family = getattr(family, "values", [family])[0]
+    scene, cameras = street(5, 500, across=True)
+    scene = with_a_house_that_nobody_sees(scene)
+    options = OPTIONS.changed(prune={"keep": keep})
+    expected = encode(scene, cameras, options, device=open_device(family)).data
+    monkeypatch.setattr("potr_cl.raster.kept_scene.fits_whole", lambda device, scene: True)
+    made = []
+    for module, name in (("pruning", "ViewByView"), ("refitting", "VisibleTargets")):
+        where = f"potr_cl.stages.{module}.part.{name}"
+        kind = importlib.import_module(where.rpartition(".")[0]).__dict__[name]
+
+        def noted(*args, kind=kind, **named):
+            made.append(kind.__name__)
+            return kind(*args, **named)
+
+        monkeypatch.setattr(where, noted)
+    devices = [open_device(family) for _ in range(3)]
+    with ElsewherePool(devices) as pool:
+        assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected
+    assert made.count("ViewByView") == 2
+    assert made.count("VisibleTargets") == 4
+    assert [device.allocated for device in devices] == [0] * 3
 
 
 def test_neighbours_go_to_the_same():

@@ -42,8 +42,15 @@ from tools.bench.memory import reset_peak, resident
 from tools.make.city import City, building_of, write_cameras, write_city
 from tools.results import Column, Results
 
-#: What is fitted, and the numbers that it is fitted with.
-FIGURES = ("seconds", "pruning", "refit", "host", "device", "left")
+#: What is fitted, with what the table calls it, and the numbers that it is fitted with.
+FIGURES = {
+    "seconds": "time",
+    "pruning": "pruning",
+    "refit": "re-fit",
+    "host": "host peak",
+    "device": "device peak",
+    "left": "splats left",
+}
 NUMBERS = ("splats", "views", "workers")
 
 
@@ -220,9 +227,9 @@ def main() -> None:
         *(Column(name, "", ".2f") for name in NUMBERS),
         Column("largest deviation", "%", ".0f"),
     )
-    for figure in FIGURES:
+    for figure, called in FIGURES.items():
         powers, deviation = exponents(measured, figure)
-        fitted.add(figure, *(powers.get(name) for name in NUMBERS), 100 * deviation)
+        fitted.add(called, *(powers.get(name) for name in NUMBERS), 100 * deviation)
 
 
 if __name__ == "__main__":

@@ -32,7 +32,7 @@ WHAT = {
     "fit: J x": "x · Jᵀ J x over ‖J x‖², less 1",
     "fit: steps": "what steps of the fit add to the held-out error, relative; or a parameter that is not finite",
     "fit: settling": "a value that is not finite after coefficients were chosen, geometry rounded and the rest fitted",
-    "surely seen": "splats that a device says are seen, and float64 does not",
+    "surely seen": "splats of which a device and float64 say that views see them and that none does",
     "same bits: picked splats": "pixels of splats drawn out of a larger scene, and of a scene of their own",
     "same bits: view by view": "removal effects measured view by view, and with all splats for all views",
     "same bits: to a device": "values of a file decoded into a device's memory, and on the host",

@@ -30,7 +30,7 @@ from potr_cl.raster.picked_splats import PickedSplats
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
-from potr_cl.raster.surely_seen import surely_seen
+from potr_cl.raster.surely_seen import Seen, surely_seen
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
 from potr_cl.stages.fitting.settling import Looking, Settling, settle
 from potr_cl.stages.pruning.removal import RemovalSweep
@@ -105,9 +105,11 @@ def _by_view(device: Device, scene: Scene, view: Camera) -> float:
 
 
 def _wrongly_seen(device: Device, scene: Scene, view: Camera) -> float:
-    """Splats that are said to be seen, and are not by float64."""
+    """Splats that are said to be seen, or not to be, and float64 says the other."""
+    unseen = unseen_splats(scene, [view])
     with uploaded(device, scene) as there:
-        return float(np.count_nonzero(surely_seen(there, [view]) & unseen_splats(scene, [view])))
+        found = surely_seen(there, [view])
+    return float(np.count_nonzero(np.where(unseen, found == Seen.YES, found == Seen.NO)))
 
 
 def _to_device(device: Device, scene: Scene) -> float | None:

@@ -12,6 +12,7 @@ from __future__ import annotations
 
 import argparse
 import dataclasses
+import itertools
 import json
 import os
 import re
@@ -298,8 +299,8 @@ def decoding(device: Device) -> None:
 def clusters(device: Device) -> None:
     """k-means of a palette."""
     generator = np.random.default_rng(1)
-    points = generator.normal(size=(700, 3, 3)).astype(np.float32)
-    cluster(device, points, generator.uniform(0.1, 2, (700, 3)).astype(np.float32), 550)
+    points = generator.normal(size=(150, 3, 3)).astype(np.float32)
+    cluster(device, points, generator.uniform(0.1, 2, (150, 3)).astype(np.float32), 40)
 
 
 def similarity(device: Device) -> None:
@@ -405,7 +406,7 @@ class Found:
     """What a run of one family and vector width told.
 
     Attributes:
-        findings: a line each: the step, and what Oclgrind or the step itself said first.
+        findings: a line each: the step, what Oclgrind said, and the kernel; or how the run failed.
         kernels: "file: name" of those that were run.
         seconds: that it took.
     """
@@ -431,24 +432,24 @@ def simulated(family: str, width: int, steps: list[str], api: bool = False) -> F
             env=os.environ | {"PYOPENCL_NO_CACHE": "1"}, capture_output=True, text=True, check=False,
         )  # fmt: skip
         kernels = set(json.loads(told.read_text())) if told.exists() else set()
-    findings, step, said = [], "before the first step", ""
-    for line in [*done.stderr.splitlines(), "STEP the end"]:
+    findings: dict[str, None] = {}  # in their order, each once
+    step = "before the first step"
+    for line, after in itertools.pairwise([*done.stderr.splitlines(), ""]):
         if line.startswith("STEP "):
-            if said:
-                findings.append(f"{step}: {said}")
-            step, said = line.removeprefix("STEP "), ""
-        elif said and "Kernel:" in line and " in " not in said:
-            said += f" in {line.split('Kernel:')[1].strip()}"
-        elif line.strip() and not said and not _HARMLESS.search(line):
-            said = line.strip()
+            step = line.removeprefix("STEP ")
+        elif after.startswith("\tKernel: "):
+            kernel = after.removeprefix("\tKernel: ")
+            if (kernel, line.strip()) not in _HARMLESS:
+                findings[f"{step}: {line.strip()} in {kernel}"] = None
     if done.returncode:
         last = [f"exit code {done.returncode}", *done.stderr.strip().splitlines()][-1]
-        findings.append(f"the run failed: {last}")
-    return Found(findings, kernels, time.perf_counter() - began)
+        findings[f"{step}: the run failed: {last}"] = None
+    return Found(list(findings), kernels, time.perf_counter() - began)
 
 
-#: What pyopencl and Python say besides.
-_HARMLESS = re.compile(r"CompilerWarning|prg\.build|_create_built_program|warn\(|^\s+|UserWarning")
+#: What it says, and kernels of which that is no fault: splat_tangents finds changes of splats, too, that are not drawn;
+#: their colours are unset, and nobody looks at what it has found of them.
+_HARMLESS = {("splat_tangents", "Controlflow depends on uninitialized value")}
 
 
 def all_kernels() -> set[str]:

@@ -144,7 +144,7 @@ class GaussNewton(Parameters):
             self._vectors.vector() for _ in range(5)
         )
         elements = _TRIANGLE + count - _BLOCK
-        self._blocks, self._factors = (self._memory.allocate(4 * elements * stride, "the blocks") for _ in range(2))
+        self._blocks, self._triangles = (self._memory.allocate(4 * elements * stride, "the blocks") for _ in range(2))
         cl.enqueue_fill_buffer(device.queue, self._blocks, np.float32(0), 0, self._blocks.size)
         names = ("add_products", "factorise", "solve", "add_diagonal", "move", "signs")
         self._kernels = {name: device.shared_kernel(_KERNELS, name) for name in names}
@@ -171,7 +171,7 @@ class GaussNewton(Parameters):
         part = 1 / (self._samples * self._weight())
         self._over_splats(
             "factorise", blocks=self._blocks, columns=self.columns.count, part=part, damping=self._damping,
-            floors=self._floors, diagonal=self._diagonal, factors=self._factors,
+            floors=self._floors, diagonal=self._diagonal, factors=self._triangles,
         )  # fmt: skip
         vectors.zero(self._solution)
         vectors.copy(self._slope, self._residual)
@@ -205,7 +205,7 @@ class GaussNewton(Parameters):
 
     def precondition(self, residual: cl.Buffer, result: cl.Buffer) -> None:
         """See :class:`potr_cl.stages.refitting.conjugate_gradients.System`."""
-        self._over_splats("solve", factors=self._factors, columns=self.columns.count, x=residual, result=result)
+        self._over_splats("solve", factors=self._triangles, columns=self.columns.count, x=residual, result=result)
 
     def product(self, direction: cl.Buffer, result: cl.Buffer) -> None:
         """result = (Jᵀ W J + D) direction."""

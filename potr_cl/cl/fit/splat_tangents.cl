@@ -131,7 +131,8 @@ kernel void splat_tangents(
     numbers[7] = factor * uv;
     numbers[8] = factor * vv;
 
-    /* The colour. Channels that are cut are 0, and stay so. */
+    /* The colour. Channels that are cut are 0, and stay so. Those of splats that are not drawn are unset: nobody looks at
+       what is found of these. */
     const vfloat nearness = 1.0f / sqrt(p.away[0] * p.away[0] + p.away[1] * p.away[1] + p.away[2] * p.away[2]);
     const vfloat x = p.away[0] * nearness, y = p.away[1] * nearness, z = p.away[2] * nearness;
     const vfloat farther = move[0] * x + move[1] * y + move[2] * z;

@@ -2,7 +2,7 @@
 
 A view that does not fit is made again for each measurement. So added views that take the room of others cost many times
 what they should, and only as many are added as there is room for. Where views are made again in batches, each with what
-it may draw (:mod:`potr_cl.stages.pruning.view_by_view`), they cost little more than others: all may be added.
+it may draw (:mod:`potr_cl.stages.pruning.view_by_view`), they cost less: half as many as were given are added anyway.
 """
 
 from __future__ import annotations
@@ -14,18 +14,23 @@ import numpy as np
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.raster.culling import Sights
+from potr_cl.raster.kept_scene import fits_whole
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.stages.pruning.prepared_views import PreparedViews
 from potr_cl.stages.pruning.sweep_options import default_memory
-from potr_cl.stages.pruning.visible_parts import LIKELY, SCENES, fits_whole, groups_of_large, seen_part
+from potr_cl.stages.pruning.visible_parts import LIKELY, SCENES, groups_of_large, seen_part
 from potr_cl.stages.stage import State, Workbench
 
 #: More bytes than a view takes, for each splat and each pixel: where there are so many, nothing has to be measured.
 _SPLAT, _PIXEL = 500, 200
 #: Views whose memory is measured.
 _SAMPLE = 3
+#: Bytes of a view that is looked at by itself, for each splat that it may draw and each pixel.
+_DRAWN, _TARGET = 104, 12
+#: So many are added there for each given one, whether they fit or not.
+_ANYWAY = 1 / 2
 #: Bytes that are enough for them.
 _PLENTY = 1e18
 #: By how much the others may take more; and how much more, where views of a part share its splats.
@@ -52,7 +57,9 @@ def room_for(added: Sequence[Camera], state: State, bench: Workbench) -> int:
     sampled = _evenly(state.views, _SAMPLE), _evenly(added, _SAMPLE)
     if seen_part(state.source, state.views) <= LIKELY:
         if _by_view(state, bench):
-            return len(added)
+            own, more = (_nbytes_by_view(state, views) for views in (state.views, added))
+            room = int(max((budget - own * len(state.views)) // more, _ANYWAY * len(state.views)))
+            return min(room, len(added))
         own, more = (_nbytes_of_parts(state, bench, views) for views in sampled)
         # Views in hand take room too, and parts are larger than what a view sees of them.
         left, margin = budget - min(SCENES * budget, state.source.nbytes) - 2 * max(own, more), _MARGIN_OF_PARTS
@@ -67,6 +74,12 @@ def _by_view(state: State, bench: Workbench) -> bool:
     """Whether views that do not fit are made again in batches."""
     shared = bench.pool is None or bench.pool.in_process
     return shared and bench.opened.family == "gpu" and fits_whole(bench.opened, bench.drawable(state.source))
+
+
+def _nbytes_by_view(state: State, views: Sequence[Camera]) -> float:
+    """Bytes that is kept of a view where each is looked at by itself: about the mean."""
+    pixels = sum(view.width * view.height for view in views) / len(views)
+    return _DRAWN * seen_part(state.source, views) * len(state.source) + _TARGET * pixels
 
 
 def _evenly(views: Sequence[Camera], count: int) -> list[Camera]:

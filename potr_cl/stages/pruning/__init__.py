@@ -4,4 +4,6 @@
   its parts.
 - schedule.py decides from these effects which splats go, in NumPy. on_device.py decides the same on a GPU, so that the
   effects need not be fetched.
+- view_by_view.py and visible_parts.py measure large scenes, of which no view sees much. measured.py chooses between all
+  these.
 """

@@ -10,7 +10,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.raster.culling import Sights
-from potr_cl.raster.kept_scene import lying_on
+from potr_cl.raster.kept_scene import lying_on, whole_on_device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.pruning.part import RemovalPart
@@ -18,7 +18,7 @@ from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.shared_removal import SharedRemoval
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView, can_go_by_view
-from potr_cl.stages.pruning.visible_parts import PartedRemoval, first_totals, whole_on_device
+from potr_cl.stages.pruning.visible_parts import PartedRemoval, first_totals
 from potr_cl.stages.stage import State, Workbench
 from potr_cl.workers.dealing import Shares, shares
 from potr_cl.workers.parts import Parts

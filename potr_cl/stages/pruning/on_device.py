@@ -10,6 +10,7 @@ from collections.abc import Callable
 
 import numpy as np
 import pyopencl as cl
+from numpy.typing import NDArray
 
 from potr_cl.host.threads import in_background
 from potr_cl.model.order import ascending
@@ -138,39 +139,41 @@ class _Controller(Owner):
         iteration = removed["iteration"].astype(np.int32)
         iteration[alive] = -1
         if not alive.any():  # an empty scene is no scene
-            last = _as_they_went(np.arange(n), removed)[-1]
+            final = np.flatnonzero(iteration == iteration.max())
+            last = final[ascending(removed["key"][final])][-1]
             alive[last], iteration[last] = True, -1
         left = np.flatnonzero(alive)
-
-        def course() -> Course:
-            gone = _as_they_went(np.flatnonzero(~alive), removed)
-            kept = left[ascending(smoothed[left])]
-            return Course(np.concatenate([gone, kept]), self._history(removed[gone], iteration[gone]))
-
         # Others go on with what is left meanwhile.
-        return Pruned(len(left), iteration, done, in_background(course).result)
+        course = in_background(self._course, done, iteration, removed, left, smoothed)
+        return Pruned(len(left), iteration, done, course.result)
 
-    def _history(self, removed: np.ndarray, iteration: np.ndarray) -> tuple[Iteration, ...]:
-        """What is known of each iteration in which splats went, in order."""
-        starts = np.flatnonzero(np.diff(iteration, prepend=-1))
-        if not len(starts):
-            return ()
-        effects = removed["effect"].astype(np.float64)
-        sums = [np.add.reduceat(values.astype(np.float64), starts) for values in (removed["importance"], effects)]
-        left = self._splats - np.append(starts[1:], len(removed))
-        columns = (left, *sums, np.maximum.reduceat(effects, starts))
-        return tuple(
-            Iteration(int(count), float(weight), float(effect), float(largest))
-            for count, weight, effect, largest in zip(*columns, strict=True)
-        )
+    def _course(
+        self,
+        done: int,
+        iteration: NDArray[np.int32],
+        removed: np.ndarray,
+        left: Indices,
+        smoothed: NDArray[np.float32],
+    ) -> Course:
+        """In which order splats went, and those that are left would go; what is known of each iteration.
+
+        One iteration after the other: what all of a large scene's splats need at once is as large as the scene.
+        """
+        order = np.empty(len(iteration), np.int64)
+        history = []
+        gone = 0
+        for number in range(done):
+            own = np.flatnonzero(iteration == number)
+            if not len(own):
+                continue
+            own = own[ascending(removed["key"][own])]
+            order[gone : gone + len(own)] = own
+            gone += len(own)
+            importance, effect = (removed[name][own].astype(np.float64) for name in ("importance", "effect"))
+            weight, harm = (float(np.add.reduceat(values, [0])[0]) for values in (importance, effect))
+            history.append(Iteration(self._splats - gone, weight, harm, float(effect.max())))
+        order[gone:] = left[ascending(smoothed[left])]
+        return Course(order, tuple(history))
 
     def close(self) -> None:
         self._memory.close()
-
-
-def _as_they_went(gone: Indices, removed: np.ndarray) -> Indices:
-    """Removed splats in the order of their removal."""
-    order: Indices = gone[
-        ascending(removed["iteration"][gone].astype(np.uint64) << np.uint64(32) | removed["key"][gone])
-    ]
-    return order

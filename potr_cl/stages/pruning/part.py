@@ -15,14 +15,15 @@ from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Scratch, Staging
 from potr_cl.opencl.relay import Lent
 from potr_cl.raster.culling import Sights
-from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on
+from potr_cl.raster.kept_scene import KeptScene, PartOfKept, lying_on, whole_on_device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_shares import Excerpt
+from potr_cl.stages.pruning.alive_packing import AlivePacking
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.survivors import Bits
 from potr_cl.stages.pruning.sweep_options import SweepOptions
 from potr_cl.stages.pruning.view_by_view import ViewByView, can_go_by_view
-from potr_cl.stages.pruning.visible_parts import PartedRemoval, whole_on_device
+from potr_cl.stages.pruning.visible_parts import PartedRemoval
 from potr_cl.workers.pool import Part
 
 Indices = NDArray[np.int64]
@@ -72,6 +73,12 @@ class RemovalPart(Part):
                 rasterizer = owned.enter_context(Rasterizer(device, drawable, background=background))
                 self._sweep = RemovalSweep(rasterizer, cameras, options, numbers=numbers)
             owned.callback(self._sweep.close)
+            steering = self._sweep.steering
+            self._alive = (
+                None
+                if steering is None
+                else owned.enter_context(AlivePacking(device, self._sweep.splats, steering.marks))
+            )
             self._staging = owned.enter_context(Staging(device))
             self._totals = owned.enter_context(Scratch(device, "the removal effects"))
             self._owned = owned.pop_all()
@@ -114,7 +121,10 @@ class RemovalPart(Part):
         return changed.astype(np.uint32), changes
 
     def lend_totals(self) -> Lent:
-        """The totals of :meth:`measure`, for others of this process to read from the device until the next command."""
+        """The totals of :meth:`measure`, for others of this process to read from the device until the next command.
+
+        Those of all splats, or of those that are left, as :class:`AlivePacking` has them.
+        """
         steering, nbytes = self._sweep.steering, 16 * self._sweep.splats
         if steering is None:  # some views do not fit this device
             self._totals.reserve(nbytes)
@@ -122,7 +132,8 @@ class RemovalPart(Part):
             cl.enqueue_copy(self._device.queue, self._totals.buffer, totals, is_blocking=True)
             return Lent(self._device, self._totals.buffer, nbytes)
         steering.measure_on_device()
-        return Lent(self._device, steering.totals, nbytes)
+        assert self._alive is not None
+        return self._alive.lend(steering.totals)
 
     def remove(self, splats: Indices) -> None:
         """Take splats out for good."""
@@ -137,6 +148,8 @@ class RemovalPart(Part):
         else:
             steering.mark(splats)
             steering.remove_marked()
+            assert self._alive is not None
+            self._alive.note()
 
     def replace_sh(self, sh: FloatArray) -> None:
         """Go on with other colours."""

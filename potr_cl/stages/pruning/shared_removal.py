@@ -21,6 +21,7 @@ from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
 from potr_cl.opencl.relay import Lent, Relay
+from potr_cl.stages.pruning.alive_packing import AlivePacking
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
 from potr_cl.stages.pruning.steering import Steered, Steering
@@ -184,6 +185,7 @@ class _SharedSteering(Owner):
             else:
                 self.marks = own.marks
             self._add = device.kernel("prune/add_totals.cl", "add_totals")
+            self._alive = None if self._relay is None else AlivePacking(device, self.splats, self.marks)
 
     @property
     def alive(self) -> NDArray[np.bool_]:
@@ -208,12 +210,18 @@ class _SharedSteering(Owner):
     def _fetch(self, found: Sequence[Lent]) -> None:
         """Have as totals the sum of what others lend."""
         assert self._relay is not None
-        first, *others = found
-        self._relay.fetch(self.totals, first)
-        for more in others:
+        assert self._alive is not None
+        for number, more in enumerate(found):
+            packed = self._alive.are_packed(more)
+            if number == 0 and not packed:
+                self._relay.fetch(self.totals, more)
+                continue
             self._more.reserve(more.nbytes)
             self._relay.fetch(self._more.buffer, more)
-            self._add_to_totals(self._more.buffer)
+            if packed:
+                self._alive.unpack(self._more.buffer, self.totals, add=number > 0)
+            else:
+                self._add_to_totals(self._more.buffer)
 
     def _add_to_totals(self, more: cl.Buffer) -> None:
         self._add.bind(totals=self.totals, more=more, count=2 * self.splats)
@@ -229,11 +237,15 @@ class _SharedSteering(Owner):
             assert self._marks is not None
             self._marks.marked_by_device()
             self._marks.settle()
+        if self._alive is not None:
+            self._alive.note()
 
     def close(self) -> None:
         if self._marks is not None:
             self._marks.close()
         if self._relay is not None:
             self._relay.close()
+        if self._alive is not None:
+            self._alive.close()
         self._more.close()
         self._memory.close()

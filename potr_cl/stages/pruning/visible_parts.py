@@ -10,14 +10,13 @@ from __future__ import annotations
 
 import heapq
 from collections.abc import Callable, Iterator, Sequence
-from contextlib import ExitStack, contextmanager, suppress
+from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass, replace
 
 import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
-from potr_cl.errors import DeviceMemoryError
 from potr_cl.host.threads import Run
 from potr_cl.model import splat_groups
 from potr_cl.model.camera import Camera
@@ -28,7 +27,7 @@ from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.culling import Sights, ViewPart, work
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA
-from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, uploaded
+from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers
 from potr_cl.stages.pruning.fixed_point import FixedPoint, zero_totals
 from potr_cl.stages.pruning.removal import F64, Indices, RemovalSweep
 from potr_cl.stages.pruning.steering import Steering
@@ -47,8 +46,6 @@ SCENES = 1 / 2
 #: Bytes that a view takes for each splat of its part while it is measured, or prepared to be kept: room for one is set
 #: aside, and no more than this part of the memory.
 _IN_HAND, _MOST_IN_HAND = 120, 1 / 4
-#: The whole scene is on the device too where that has so many times as much memory.
-_WHOLE = 3
 #: The total that spares a splat: a ΔMSE of about 1, by the bounds of :class:`FixedPoint`; and what limits it is beyond.
 _SPARED, LARGEST_LIMIT = 1 << 58, 0.1
 
@@ -105,26 +102,6 @@ def first_totals(splats: int, spared: NDArray[np.bool_] | None) -> NDArray[np.in
     if spared is not None:
         totals[spared, 0] = _SPARED
     return totals
-
-
-def fits_whole(device: Device, scene: Drawable) -> bool:
-    """Whether a whole scene is to lie on a device: on a GPU with memory of its own that it fits, or it does already."""
-    if isinstance(scene, SceneBuffers):
-        return True
-    if device.info.kind == "cpu" or device.info.integrated:
-        return False
-    return _WHOLE * scene.nbytes <= device.info.memory - device.allocated
-
-
-@contextmanager
-def whole_on_device(device: Device, scene: Drawable) -> Iterator[Drawable]:
-    """The same scene where parts are filled from it quickest: on a GPU with memory of its own, if it fits."""
-    found: Drawable = scene
-    with ExitStack() as stack:
-        if not isinstance(scene, SceneBuffers) and fits_whole(device, scene):
-            with suppress(DeviceMemoryError):
-                found = stack.enter_context(uploaded(device, scene))
-        yield found
 
 
 @dataclass(frozen=True)

@@ -78,7 +78,8 @@ class ColourMap(Owner):
         means: (N, 3) float32, the splats' centres.
         cameras: the views that count, all the same whatever their size.
         background: R, G, B behind the splats.
-        memory: bytes of device memory that prepared views and targets may take; None: a quarter of what is free.
+        memory: bytes of device memory that prepared views and targets may take; None: two fifths of
+            what is free, or a quarter where that is the host's memory.
         numbers: of the views that are done here, ascending; None: all.
         helpers: do the others.
 

@@ -75,7 +75,8 @@ class ColourRefit(Owner):
         cameras: the views that count, all the same whatever their size.
         rules, background: of the rasterizer.
         memory: bytes of device memory that prepared views and targets may take, together with the vectors where these
-            take much; None: views take a quarter of what is free.
+            take much; None: views take two fifths of what is free, or a quarter where that is the host's
+            memory.
         help_from: workers that do some of the views.
         slices: as of :class:`RefitOptions`.
 

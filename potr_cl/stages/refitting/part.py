@@ -15,9 +15,11 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Staging
 from potr_cl.opencl.relay import Lent
-from potr_cl.raster.kept_scene import KeptScene, lying_on
+from potr_cl.raster.culling import Sights
+from potr_cl.raster.kept_scene import KeptScene, lying_on, whole_on_device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
+from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.raster.view_shares import Excerpt
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
@@ -26,6 +28,7 @@ from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.refitting.vector_space import Layout
+from potr_cl.stages.refitting.visible_targets import VisibleTargets
 from potr_cl.workers.pool import Part
 
 
@@ -62,6 +65,7 @@ class ColourPart(Part):
             these views see of it.
         cameras: all views.
         numbers: of the views of this part, ascending.
+        sights: what all views may draw of the source, where no view sees much of it.
 
     Raises:
         DeviceError: the scenes or a view do not fit the device.
@@ -78,13 +82,21 @@ class ColourPart(Part):
         source: Scene | KeptScene | PicturesAhead | Excerpt,
         cameras: Sequence[Camera],
         numbers: Sequence[int],
+        sights: Sights | None = None,
     ) -> None:
         self._device = device
         with ExitStack() as owned:
             rasterizer = owned.enter_context(Rasterizer(device, scene, rules))
             ahead, kept = (source, source.source) if isinstance(source, PicturesAhead) else (None, source)
             pictured = owned.enter_context(lying_on(device, kept))
-            of_source = owned.enter_context(Rasterizer(device, pictured, background=background))
+            if sights is not None:
+                pictured = owned.enter_context(whole_on_device(device, pictured))
+            of_source: Targets
+            if sights is not None and isinstance(pictured, SceneBuffers) and device.family == "gpu":
+                of_source = owned.enter_context(VisibleTargets(pictured, cameras, sights, background))
+            else:
+                rendering = owned.enter_context(Rasterizer(device, pictured, background=background))
+                of_source = RenderedTargets(rendering, cameras)
             launcher = launcher_for(device, rules)
             layout = Layout(len(scene), rasterizer.stride, sh_count, launcher.lanes)
             self._coefficients = owned.enter_context(Coefficients(device, layout))
@@ -93,7 +105,7 @@ class ColourPart(Part):
             self._map = owned.enter_context(
                 ColourMap(launcher, rasterizer, self._coefficients, scene.means, cameras, background, memory, numbers)
             )
-            self._targets: Targets = RenderedTargets(of_source, cameras)
+            self._targets: Targets = of_source
             if ahead is not None:
                 self._targets = ahead.before(device, self._targets)
             self._map.prepare(self._targets)

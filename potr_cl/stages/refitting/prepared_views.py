@@ -12,8 +12,9 @@ from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_cache import ViewCache
 from potr_cl.raster.view_set import ViewSet
 
-#: Part of the device's memory not yet taken that is the budget unless the caller sets one.
-_SHARE = 0.25
+#: Part of the device's memory not yet taken that is the budget unless the caller sets one: of a memory of its own, and
+#: of one that is the host's too.
+_SHARE, _SHARE_OF_HOST = 0.4, 0.25
 
 
 class PreparedViews(Owner):
@@ -25,8 +26,8 @@ class PreparedViews(Owner):
         most_views: how many views a launch can do.
         nbytes: bytes that a view takes in a sweep's own buffers.
         breaks: numbers of views at which a launch begins, whatever came before.
-        memory: bytes that the kept views, and what else is taken from :attr:`budget`, may take; None: a quarter of what
-            is free.
+        memory: bytes that the kept views, and what else is taken from :attr:`budget`, may take; None: two fifths of
+            what is free, or a quarter where that is the host's memory.
         others: bytes that will be taken from the budget besides: views' projections leave room for them.
 
     Attributes:
@@ -52,7 +53,9 @@ class PreparedViews(Owner):
         self._breaks = sorted({*breaks, len(cameras)})
         device = rasterizer.device
         free = device.info.memory - device.allocated
-        self.budget = ViewCache(rasterizer, free * _SHARE if memory is None else memory, others)
+        of_host = device.info.kind == "cpu" or device.info.integrated
+        share = _SHARE_OF_HOST if of_host else _SHARE
+        self.budget = ViewCache(rasterizer, free * share if memory is None else memory, others)
         self.launches: list[range] = []
         self._kept: dict[range, ViewSet] = {}
         #: Memory for views that are not kept, by their number.

@@ -21,7 +21,8 @@ class RefitOptions:
         lam: lambda on the AC coefficients of Y, in pixels of an image of :data:`REFERENCE_PIXELS`.
         chroma_factor: lambda of Co and Cg over that of Y.
         prior: the same for every coefficient's distance to its start, so that what no view shows stays as it was.
-        memory: bytes of device memory that prepared views and targets may take; None: a quarter of what is free.
+        memory: bytes of device memory that prepared views and targets may take; None: two fifths
+            of what is free, or a quarter where that is the host's memory.
         slices: splats of a slice, with the vectors on the host (:mod:`potr_cl.stages.refitting.placement`); None: only
             where they do not fit.
 

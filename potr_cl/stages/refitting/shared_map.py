@@ -13,6 +13,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.memory import Owner, Staging
 from potr_cl.opencl.relay import Lent
+from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.view_shares import ViewShares
@@ -23,7 +24,7 @@ from potr_cl.stages.refitting.part import ColourPart, Gradient
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.workers.dealing import Shares, shares
 from potr_cl.workers.parts import Parts, Pending
-from potr_cl.workers.pool import Pool
+from potr_cl.workers.pool import Pool, Shared
 
 #: Bytes of the splats' own blocks that are added at a time.
 _AT_ONCE = 1 << 26
@@ -147,13 +148,14 @@ def colour_parts(
     constant = replace(scene, sh=np.ascontiguousarray(scene.sh[:, :1]))
     with ExitStack() as stack:
         shape = stack.enter_context(pool.shared(constant))
+        pictured: list[tuple[Shared, Sights | None]]
         if isinstance(source, ViewShares):
-            pictured = [stack.enter_context(pool.shared(each.excerpt)) for each in source.shares]
+            pictured = [(stack.enter_context(pool.shared(each.excerpt)), each.sights) for each in source.shares]
         else:
-            pictured = [stack.enter_context(pool.shared(source))] * len(share.others)
+            pictured = [(stack.enter_context(pool.shared(source)), None)] * len(share.others)
         given = [
-            (shape, scene.sh.shape[1], rules, background, own, cameras, numbers)
-            for own, numbers in zip(pictured, share.others, strict=True)
+            (shape, scene.sh.shape[1], rules, background, own, cameras, numbers, sights)
+            for (own, sights), numbers in zip(pictured, share.others, strict=True)
         ]
         with Parts(pool, ColourPart, given, memory, [len(each) for each in share.others]) as parts:
             yield parts

@@ -1,0 +1,335 @@
+"""Which devices there are, on this machine and on invented ones, which is taken, and drivers that are broken."""
+
+from __future__ import annotations
+
+import logging
+import os
+import subprocess
+import sys
+from pathlib import Path
+
+import pyopencl as cl
+import pytest
+
+from potr_cl.errors import DeviceError
+from potr_cl.opencl import discovery, loader
+from potr_cl.opencl.device import Device
+from potr_cl.opencl.discovery import DeviceInfo, choose_device, compiler_fault, list_devices
+from potr_cl.opencl.source import kernel_source
+from potr_cl.report.devices import device_report, format_devices
+
+
+def invented(
+    index: int, name: str, kind: str, platform: str = "Some", version: str = "1", integrated: bool = False
+) -> DeviceInfo:
+    return DeviceInfo(
+        index, name, platform, version, kind, integrated, 1 << 30, 1 << 28, 1 << 15, 8, 8, 256, "gpu", None  # type: ignore[arg-type]
+    )  # fmt: skip
+
+
+@pytest.fixture
+def faults(monkeypatch: pytest.MonkeyPatch) -> dict[str, str]:
+    """What is wrong with the compilers of devices, by name: those of this test's choice, whatever the machine has."""
+    faults: dict[str, str] = {}
+    monkeypatch.setattr(discovery, "compiler_fault", lambda info: faults.get(info.name))
+    monkeypatch.setattr("potr_cl.opencl.device.compiler_fault", lambda info: faults.get(info.name))
+    monkeypatch.setattr("potr_cl.report.devices.compiler_fault", lambda info: faults.get(info.name))
+    monkeypatch.setattr(discovery, "_passed_over", set())
+    return faults
+
+
+@pytest.fixture
+def machine(monkeypatch: pytest.MonkeyPatch, faults: dict[str, str]) -> list[DeviceInfo]:
+    """A machine with one of everything, worst first."""
+    pocl = "Portable Computing Language"
+    devices = [
+        invented(0, "Oclgrind Simulator", "cpu", "Oclgrind"),
+        invented(1, "llvmpipe", "cpu", "rusticl"),
+        invented(2, "pthread-old", "cpu", pocl, "OpenCL 3.0 PoCL 3.0-rc2  Linux"),
+        invented(3, "pthread-new", "cpu", pocl, "OpenCL 3.0 PoCL 3.1+debian  Linux"),
+        invented(4, "AMD EPYC", "cpu", "Intel(R) OpenCL"),
+        invented(5, "Iris", "gpu", "Intel(R) OpenCL Graphics", integrated=True),
+        invented(6, "RTX", "gpu", "NVIDIA CUDA"),
+        invented(7, "RTX", "gpu", "NVIDIA CUDA"),
+    ]
+    for module in ("opencl.discovery", "report.devices"):
+        monkeypatch.setattr(f"potr_cl.{module}.list_devices", lambda: list(devices))
+    monkeypatch.delenv("POTR_CL_DEVICE", raising=False)
+    return devices
+
+
+def test_preference(machine: list[DeviceInfo]) -> None:
+    """Discrete GPU, integrated GPU, then CPU runtimes by speed; the first of equals."""
+    order = []
+    while machine:
+        order.append(choose_device().index)
+        machine.remove(choose_device())
+    assert order == [6, 7, 5, 4, 3, 2, 1, 0]
+
+
+@pytest.mark.parametrize(
+    ("spec", "index"),
+    [("7", 7), ("cpu", 4), ("gpu", 6), ("CPU", 4), ("iris", 5), ("pthread-old", 2), ("portable", 3), ("nvidia", 6)],
+)
+def test_specification(machine: list[DeviceInfo], spec: str, index: int, monkeypatch: pytest.MonkeyPatch) -> None:
+    assert choose_device(spec).index == index
+    monkeypatch.setenv("POTR_CL_DEVICE", spec)
+    assert choose_device().index == index
+    assert choose_device("1").index == 1  # what is asked for goes before the environment
+
+
+@pytest.mark.parametrize("spec", ["8", "-1", "voodoo"])
+def test_specification_that_fits_nothing(machine: list[DeviceInfo], spec: str) -> None:
+    with pytest.raises(DeviceError, match=r"part of a name of 0: Oclgrind Simulator, 1: llvmpipe"):
+        choose_device(spec)
+
+
+@pytest.mark.parametrize(
+    ("architecture", "advice"), [("x86_64", "`pip install intel"), ("AMD64", "`pip install intel"), ("aarch64", "PoCL")]
+)
+def test_no_device_at_all(monkeypatch: pytest.MonkeyPatch, architecture: str, advice: str) -> None:
+    monkeypatch.setattr(discovery, "list_devices", list)
+    monkeypatch.setattr(discovery, "machine", lambda: architecture)
+    monkeypatch.setattr("sys.platform", "linux")
+    with pytest.raises(DeviceError, match=f"or a CPU runtime by .*{advice}"):
+        choose_device()
+
+
+REFUSED = "error: unknown target CPU 'generic'"
+
+
+@pytest.mark.parametrize("spec", [None, "cpu", "pthread"])
+def test_what_cannot_compile_is_passed_over(
+    machine: list[DeviceInfo], faults: dict[str, str], caplog: pytest.LogCaptureFixture, spec: str | None
+) -> None:
+    """The next best that fits is taken; one line a process says so."""
+    del machine[4:]
+    faults["pthread-new"] = REFUSED
+    with caplog.at_level(logging.WARNING, "potr_cl"):
+        assert [choose_device(spec).name for _ in range(3)] == ["pthread-old"] * 3
+        assert len(caplog.records) == 1
+        said = caplog.records[0].getMessage()
+        assert said.startswith(
+            f"device 'pthread-new' (Portable Computing Language) cannot compile even an empty program ({REFUSED})"
+        )
+        assert said.endswith("going on with 'pthread-old' (Portable Computing Language)")
+        assert "\n" not in said
+        faults["pthread-old"] = REFUSED
+        if spec != "pthread":
+            assert choose_device(spec).name == "llvmpipe"
+            said = caplog.records[1].getMessage()
+            assert "'pthread-new'" in said
+            assert "'pthread-old'" in said
+            assert "'llvmpipe'" in said
+            faults["llvmpipe"] = faults["Oclgrind Simulator"] = REFUSED
+        with pytest.raises(DeviceError, match=r"'pthread-new'.*'pthread-old'.*cannot compile"):
+            choose_device(spec)
+
+
+def test_nothing_is_said_of_what_is_not_wanted(
+    machine: list[DeviceInfo], faults: dict[str, str], caplog: pytest.LogCaptureFixture
+) -> None:
+    """A device that cannot compile does not matter where a better one is taken, or another is asked for."""
+    faults["pthread-new"] = REFUSED
+    with caplog.at_level(logging.WARNING, "potr_cl"):
+        assert choose_device().index == 6
+        assert choose_device("cpu").index == 4
+        assert choose_device("pthread-old").index == 2
+    assert not caplog.records
+
+
+@pytest.mark.parametrize("spec", ["3", "pthread-new"])
+def test_what_cannot_compile_is_refused_where_asked_for(
+    machine: list[DeviceInfo], faults: dict[str, str], caplog: pytest.LogCaptureFixture, spec: str
+) -> None:
+    faults["pthread-new"] = REFUSED
+    with caplog.at_level(logging.WARNING, "potr_cl"), pytest.raises(DeviceError) as error:
+        choose_device(spec)
+    said = str(error.value)
+    assert said.startswith("device 'pthread-new' (Portable Computing Language) cannot compile even an empty program")
+    assert REFUSED in said
+    assert "newer PoCL" in said
+    assert "\n" not in said
+    assert not caplog.records
+    with pytest.raises(DeviceError) as again:
+        Device(machine[3])
+    assert str(again.value) == said
+
+
+def test_listing_asks_no_compiler(monkeypatch: pytest.MonkeyPatch) -> None:
+    def asked(handle: cl.Device) -> None:
+        raise AssertionError("a compiler was asked")
+
+    monkeypatch.setattr(discovery.compiler, "fault", asked)
+    monkeypatch.setattr(discovery, "_devices", None)
+    assert list_devices()
+
+
+def test_only_cpus_of_pocl_are_asked(machine: list[DeviceInfo], monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(discovery.compiler, "fault", lambda handle: REFUSED)
+    pocl_gpu = invented(8, "Some GPU", "gpu", "Portable Computing Language")
+    assert [info.name for info in [*machine, pocl_gpu] if compiler_fault(info)] == ["pthread-old", "pthread-new"]
+
+
+def test_the_report_shows_what_cannot_compile(machine: list[DeviceInfo], faults: dict[str, str]) -> None:
+    del machine[4:]
+    faults["pthread-new"] = REFUSED
+    report = device_report(check=False)
+    assert [entry["fault"] for entry in report] == [None, None, None, REFUSED]
+    assert [entry["chosen"] for entry in report] == [False, False, True, False]
+    assert format_devices(report).splitlines()[-1].strip() == f"cannot compile anything: {REFUSED}"
+    faults.update({info.name: REFUSED for info in machine})
+    assert not any(entry["chosen"] for entry in device_report(check=False))  # nothing to take is no reason to fail
+
+
+@pytest.mark.skipif(sys.platform == "win32", reason="a module's own libraries cannot be looked through there")
+def test_other_threads_go_on_while_a_device_is_opened() -> None:
+    """pyopencl's calls keep the interpreter's lock: the loader's own functions are found, and take what it takes."""
+    assert None not in [loader.loader_function(name) for name in ("clGetPlatformIDs", "clCreateContext")]
+    info = choose_device()
+    assert loader.new_context(info.handle).devices == [info.handle]
+
+
+def test_without_the_loaders_functions_pyopencl_does_it(monkeypatch: pytest.MonkeyPatch) -> None:
+    known = list_devices()
+    monkeypatch.setattr(loader, "loader_function", lambda name: None)
+    monkeypatch.setattr(discovery, "_devices", None)
+    assert list_devices() == known
+    assert Device().vector_width >= 1
+
+
+def test_a_loader_without_platforms(monkeypatch: pytest.MonkeyPatch) -> None:
+    """It leaves the count as it was and returns an error; nothing is asked of it any more."""
+    monkeypatch.setattr(loader, "loader_function", lambda name: lambda *arguments: -1001)
+    loader.load_drivers()
+
+
+def test_compilers_of_this_machine() -> None:
+    """A device that is said to compile does, one that is said not to refuses what the others take."""
+    for info in list_devices():
+        fault = compiler_fault(info)
+        if fault is None:
+            Device(info).program("opencl/probe.cl", LANES=1)
+        else:
+            with pytest.raises(cl.RuntimeError):
+                cl.Program(cl.Context([info.handle]), kernel_source("opencl/probe.cl")).build(["-DLANES=1"])
+
+
+@pytest.mark.parametrize(
+    ("message", "said"),
+    [
+        (
+            "clBuildProgram failed: BUILD_PROGRAM_FAILURE - clBuildProgram failed: BUILD_PROGRAM_FAILURE\n\n"
+            "Build on <pyopencl.Device 'A' on 'B' at 0x1>:\n\n\n"
+            "a.cl:1:2: warning: tedious\n  a.cl:3:4: error: use of undeclared identifier 'x'\n1 error generated.\n\n"
+            "(options: -DX -I /errors/error)\n(source saved as /tmp/a.cl)",
+            "a.cl:3:4: error: use of undeclared identifier 'x'",
+        ),
+        ("clBuildProgram failed: X\n\nBuild on <A>:\n\nToo hard.\nSorry.\n\n(options: )", "Too hard."),
+        (
+            "clBuildProgram failed: X - clBuildProgram failed: X\n\nBuild on <A>:\n\n\n\n(options: -DX)",
+            "clBuildProgram failed: X",
+        ),
+        ("clWaitForEvents failed: OUT_OF_RESOURCES", "clWaitForEvents failed: OUT_OF_RESOURCES"),
+        ("", "RuntimeError"),
+    ],
+)
+def test_the_line_that_tells_most(message: str, said: str) -> None:
+    assert discovery.compiler.complaint(cl.RuntimeError(message)) == said
+
+
+def test_this_machine() -> None:
+    devices = list_devices()
+    assert devices
+    assert [d.index for d in devices] == list(range(len(devices)))
+    for info in devices:
+        assert info.memory > 0
+        assert 0 < info.largest_buffer <= info.memory
+        assert info.vector_width in (1, 4, 8, 16)
+
+
+@pytest.mark.parametrize("index", range(len(list_devices())))
+def test_each_device_of_this_machine(index: int) -> None:
+    info = list_devices()[index]
+    if (fault := compiler_fault(info)) is not None:
+        pytest.skip(f"{info}, {info.version} cannot compile: {fault}")
+    Device(info).self_check()
+
+
+def list_names(vendors: Path, **environment: str) -> list[str]:
+    """The devices that a fresh process finds with this folder of ICDs."""
+    run = subprocess.run(
+        [sys.executable, "-c", "from potr_cl.opencl.discovery import *\nfor d in list_devices(): print(d.platform)"],
+        env=os.environ | {"OCL_ICD_VENDORS": str(vendors)} | environment,
+        cwd=Path(__file__).parents[2],
+        capture_output=True,
+        text=True,
+        check=True,
+    )
+    return run.stdout.splitlines()
+
+
+def test_broken_drivers_are_survived(tmp_path: Path) -> None:
+    """ICDs whose library is missing, is no library, or is no OpenCL driver; and one that is empty."""
+    (tmp_path / "missing.icd").write_text("/nowhere/libOpenCL-nothing.so\n")
+    (tmp_path / "empty.icd").write_text("")
+    (tmp_path / "text.icd").write_text(f"{tmp_path / 'text.so'}\n")
+    (tmp_path / "text.so").write_text("no library")
+    (tmp_path / "other.icd").write_text("libm.so.6\n")
+    empty = tmp_path / "empty"
+    empty.mkdir()
+    assert list_names(tmp_path) == list_names(empty)
+
+
+def test_registering_a_runtime_keeps_the_others(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    library = tmp_path / "lib" / "libintelocl.so"
+    library.parent.mkdir()
+    library.touch()
+    vendors = tmp_path / "vendors"
+    vendors.mkdir()
+    (vendors / "other.icd").write_text("libother.so\n")
+
+    class Installed:
+        name = "libintelocl.so"
+
+        def locate(self) -> Path:
+            return library
+
+    monkeypatch.setattr(loader.importlib.metadata, "files", lambda package: [Installed()])
+    monkeypatch.setattr(loader, "place_for_temporary_files", lambda: str(tmp_path))
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))
+    loader.register_runtimes()
+    made = Path(os.environ["OCL_ICD_VENDORS"])
+    assert made.parent == tmp_path
+    assert {p.name: p.read_text() for p in made.iterdir()} == {
+        "other.icd": "libother.so\n",
+        "potr_cl_intel_cpu.icd": f"{library}\n",
+    }
+    loader.register_runtimes()  # what is there already is left alone
+    assert os.environ["OCL_ICD_VENDORS"] == str(made)
+
+    library.unlink()
+    monkeypatch.setenv("OCL_ICD_VENDORS", str(vendors))
+    loader.register_runtimes()
+    assert os.environ["OCL_ICD_VENDORS"] == str(vendors)
+
+
+@pytest.mark.parametrize("known", ["", "other.dll"])
+def test_registering_a_runtime_on_windows(tmp_path: Path, monkeypatch: pytest.MonkeyPatch, known: str) -> None:
+    library = tmp_path / "intelocl64.dll"
+
+    class Installed:
+        name = library.name
+
+        def locate(self) -> Path:
+            return library
+
+    monkeypatch.setattr(loader.importlib.metadata, "files", lambda package: [Installed()])
+    monkeypatch.setenv("OCL_ICD_FILENAMES", known)
+    monkeypatch.delattr(os, "getuid")  # which Windows has not
+    loader.register_runtimes()
+    assert os.environ["OCL_ICD_FILENAMES"] == known  # it is not there
+    library.touch()
+    for _ in range(2):  # the second time it is known
+        loader.register_runtimes()
+        assert os.environ["OCL_ICD_FILENAMES"].split(os.pathsep) == [*filter(None, [known]), str(library)]
