@@ -124,7 +124,7 @@ def test_flags_exist(page: Path) -> None:
     # Of a recipe, of tools, of Docker and of Dask.
     elsewhere = {"--haze", "--check", "--split", "--replay", "--user", "--memory-limit"}
     for quoted in re.findall(r"`([^`\n]+)`", without_code(page.read_text("utf-8"))):
-        if not quoted.startswith(("python -m pytest", "ruff", "pip", "git")):
+        if not quoted.startswith(("python -m pytest", "python -m tools", "ruff", "pip", "git")):
             for flag in re.findall(r"(?<![\w-])--[a-z][\w-]+", quoted):
                 assert flag in known | elsewhere, f"no command has {flag}"
 
