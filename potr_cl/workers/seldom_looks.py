@@ -105,6 +105,11 @@ class _OfScheduler(SchedulerPlugin):  # type: ignore[misc]
         look_as_before(scheduler)
         with suppress(ValueError):
             scheduler.remove_plugin(self._name)
-        for leave in (scheduler.unregister_worker_plugin, scheduler.unregister_nanny_plugin):
-            with suppress(Exception):
-                await leave(None, self._name)
+        # It logs with a traceback that a plugin has gone already, as after look_as_before_for.
+        for plugins, leave in (
+            (scheduler.worker_plugins, scheduler.unregister_worker_plugin),
+            (scheduler.nanny_plugins, scheduler.unregister_nanny_plugin),
+        ):
+            if self._name in plugins:
+                with suppress(Exception):
+                    await leave(None, self._name)

@@ -340,24 +340,18 @@ def simulate(family: str, width: int, names: list[str], told: Path) -> None:
     """Inside Oclgrind: run steps, and keep in a file which kernels were run.
 
     Nothing is freed: Oclgrind mistakes a new buffer in an old one's place for memory that no one has written. Nor does
-    it know that a filled buffer has been written, or a part of one that does not lie at its beginning: all of such a
-    buffer is written again.
+    it know that a filled buffer has been written, or a part of one that does not lie at its beginning, or a rectangle:
+    all of such a buffer is written again.
     """
     enqueue_copy = cl.enqueue_copy
 
     def copy(queue: cl.CommandQueue, to: Any, source: Any, **more: Any) -> Any:
-        begin, from_there = more.get("dst_offset", 0), more.get("src_offset", 0)
-        if not isinstance(to, cl.Buffer) or "region" in more or not (begin or from_there):
-            return enqueue_copy(queue, to, source, **more)
-        if isinstance(source, cl.Buffer):
-            given = np.empty(more.get("byte_count", source.size - from_there), np.uint8)
-            enqueue_copy(queue, given, source, src_offset=from_there, is_blocking=True)
-        else:
-            given = np.ascontiguousarray(source).reshape(-1).view(np.uint8)
-        whole = np.empty(to.size, np.uint8)
-        enqueue_copy(queue, whole, to, is_blocking=True)
-        whole[begin : begin + len(given)] = given
-        return enqueue_copy(queue, to, whole, is_blocking=True)
+        done = enqueue_copy(queue, to, source, **more)
+        if isinstance(to, cl.Buffer) and ("region" in more or more.get("dst_offset") or more.get("src_offset")):
+            whole = np.empty(to.size, np.uint8)
+            enqueue_copy(queue, whole, to, is_blocking=True)
+            return enqueue_copy(queue, to, whole, is_blocking=True)
+        return done
 
     def fill(queue: cl.CommandQueue, buffer: cl.Buffer, pattern: Any, offset: int, size: int) -> None:
         enqueue_copy(queue, buffer, np.full(size // pattern.itemsize, pattern), dst_offset=offset)
