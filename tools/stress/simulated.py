@@ -65,6 +65,7 @@ from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.fit import FitOptions, fit_scene
 from potr_cl.stages.fitting.parameters import UNROUNDED, Factors, in_form_of_files
 from potr_cl.stages.fitting.tangents import PictureTangents
+from potr_cl.stages.pruning.alive_packing import AlivePacking
 from potr_cl.stages.pruning.on_device import prune_scene
 from potr_cl.stages.pruning.removal import RemovalSweep
 from potr_cl.stages.pruning.schedule import PruningOptions
@@ -235,10 +236,16 @@ def packing(device: Device) -> None:
 
 
 def marks(device: Device) -> None:
-    """The bits of splats that go, and back."""
-    with Survivors(device, 61, 64, device.queue.finish) as survivors:
+    """The bits of splats that go, and back; the totals of those that are left, packed, and back."""
+    with Survivors(device, 61, 64, device.queue.finish) as survivors, Memory(device) as memory:
         survivors.remove(np.arange(0, 61, 3))
         survivors.mark(survivors.just_marked())
+        totals = memory.upload(np.ones((64, 2), np.int64), "totals")
+        with AlivePacking(device, 61, survivors.buffer) as packing:
+            packing.note()
+            lent = packing.lend(totals)
+            assert packing.are_packed(lent)
+            packing.unpack(lent.buffer, totals, add=True)
 
 
 def derivatives(device: Device) -> None:
