@@ -166,21 +166,17 @@ def _settled(device: Device, scene: Scene, view: Camera) -> float:
     """1 for a value that is not finite after coefficients are chosen and geometry is rounded, with fits in between."""
     views = _looked_at(view)
     bench = Workbench(_PARAMETERS, device=device)
-    nearest = Settling(choosing=0.5, rounding=0.5, gentle=1.0, through=1.0)
-    cheap = dataclasses.replace(nearest, cheap=1.0, sparse=True)
+    settling = Settling(choosing=0.5, rounding=0.5, gentle=1.0, through=1.0)
     with Rasterizer(device, scene) as rasterizer:
         looking = Looking(views, 0, RenderedTargets(rasterizer, views), rasterizer)
-        for settling in (nearest, cheap):
-            try:
-                state, _ = settle(State.of(scene, views), bench, looking, settling, _STEPS)
-            except DataError:  # no file holds such a scene, and the encode says so
-                continue
-            finite = is_finite(state.scene)
-            if state.geometry is not None:
-                finite &= is_finite(state.geometry.decoded(state.scene.sh))
-            if not finite:
-                return 1.0
-    return 0.0
+        try:
+            state, _ = settle(State.of(scene, views), bench, looking, settling, _STEPS)
+        except DataError:  # no file holds such a scene, and the encode says so
+            return 0.0
+    finite = is_finite(state.scene)
+    if state.geometry is not None:
+        finite &= is_finite(state.geometry.decoded(state.scene.sh))
+    return 0.0 if finite else 1.0
 
 
 def is_finite(scene: Scene) -> bool:
