@@ -42,7 +42,7 @@ class Prune(Stage):
 
     Attributes:
         keep, count: part or number of the splats to keep, exactly, instead of ``delta_mse_max``.
-        delta_mse_max: replaces q's ΔMSE_MAX.
+        delta_mse_max: replaces q's ΔMSE_MAX: that of a scene that each view shows whole.
         iterations, decay, mapping_a: of the schedule (:class:`potr_cl.stages.pruning.schedule.PruningOptions`).
         unseen: "keep" or "drop": what becomes of splats that no training view's picture reaches
             (:mod:`potr_cl.model.unseen`). With ``keep`` or ``count`` they go first in any case.
@@ -65,7 +65,14 @@ class Prune(Stage):
     )
     delta_mse_max: float | None = option(
         None,
-        Flag("--delta-mse-max", "remove a splat if the mean squared error grows by less", "X", float, group="how many"),
+        Flag(
+            "--delta-mse-max",
+            "remove a splat if the mean squared error grows by less (by less still where each view shows a part of the "
+            "scene)",
+            "X",
+            float,
+            group="how many",
+        ),
         parameter=True,
     )
     iterations: int = option(48, Flag("--iterations", "rounds in which effects are measured anew", "N", int))
