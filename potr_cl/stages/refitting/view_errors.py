@@ -51,9 +51,10 @@ class ViewErrors(Owner):
     def keep(self, launch: range) -> None:
         """Enqueue that what the last sweep, of this launch, has found is kept until :meth:`found`."""
         first, end = self._ends[launch.start], self._ends[launch.stop]
-        cl.enqueue_copy(
-            self._device.queue, self._all, self.latest, byte_count=4 * (end - first), dst_offset=4 * first
-        )  # fmt: skip
+        with self._device.errors("failed while computing"):
+            cl.enqueue_copy(
+                self._device.queue, self._all, self.latest, byte_count=4 * (end - first), dst_offset=4 * first
+            )
 
     def found(self) -> dict[int, float]:
         """The squared error by W of each view, by its number among all; waits for the device."""
