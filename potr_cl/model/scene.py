@@ -210,16 +210,15 @@ class Scene:
             for each, result in zip(given, taken, strict=True):
                 each.take(numbers[some], axis=0, out=result[some], mode="clip")  # without a copy in between
 
+        return self._of_runs(take, taken)
+
+    def _of_runs(self, take: Callable[[int], None], arrays: Sequence[FloatArray]) -> Scene:
+        """A scene like this one of other arrays, which threads fill by runs: ``take`` gets where each begins."""
         with thread_pool() as pool:
-            list(pool.map(take, range(0, len(numbers), _LARGE // 8)))
-        means, log_scales, quaternions, opacity_logits, sh = taken
+            list(pool.map(take, range(0, len(arrays[0]), _LARGE // 8)))
+        means, log_scales, quaternions, opacity_logits, sh = arrays
         return dataclasses.replace(
-            self,
-            means=means,
-            log_scales=log_scales,
-            quaternions=quaternions,
-            opacity_logits=opacity_logits,
-            sh=sh,
+            self, means=means, log_scales=log_scales, quaternions=quaternions, opacity_logits=opacity_logits, sh=sh
         )
 
     def joined(self, other: Scene, order: NDArray[np.int64]) -> Scene:
@@ -252,18 +251,7 @@ class Scene:
                     some[mine] = own[numbers[mine]]
                 some[others] = its[numbers[others] - len(self)]
 
-        # Threads share what is new of the memory, which takes longer than the copies.
-        with thread_pool() as pool:
-            list(pool.map(take, range(0, len(order), _LARGE // 8)))
-        means, log_scales, quaternions, opacity_logits, sh = made
-        return dataclasses.replace(
-            self,
-            means=means,
-            log_scales=log_scales,
-            quaternions=quaternions,
-            opacity_logits=opacity_logits,
-            sh=sh,
-        )
+        return self._of_runs(take, made)  # the memory that is new takes longer than the copies
 
     def put(self, first: int, part: Scene) -> None:
         """Replace the splats from number ``first`` on by those of another scene of the same SH degree, in place."""

@@ -37,7 +37,6 @@ from potr_cl.codec.decoder import open_file
 from potr_cl.codec.encoder import code_scene
 from potr_cl.codec.native.library import VARIABLE
 from potr_cl.codec.quantize import HyperParameters
-from potr_cl.errors import DeviceError
 from potr_cl.model import splat_groups
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.scene import Scene
@@ -48,9 +47,6 @@ from potr_cl.opencl.discovery import list_devices
 from potr_cl.opencl.kernel import Kernel
 from potr_cl.opencl.memory import Memory
 from potr_cl.outputs.colour_grid import ColourGrid
-from potr_cl.quality.metrics import ssim
-from potr_cl.quality.metrics_device import Similarity
-from potr_cl.quality.pictures import Picture
 from potr_cl.raster.culling import Sights, parts_of_views
 from potr_cl.raster.picked_splats import Picker
 from potr_cl.raster.rasterizer import Rasterizer
@@ -80,6 +76,7 @@ from potr_cl.stages.refitting.refit import refit_colours
 from potr_cl.stages.refitting.refit_options import RefitOptions
 from potr_cl.stages.refitting.targets import RenderedTargets
 from potr_cl.stages.refitting.vector_space import Layout
+from tools.stress.platforms import check_similarity
 
 #: Kernel families and vector widths.
 KINDS = (("gpu", 1), ("cpu", 4), ("cpu", 8), ("cpu", 16))
@@ -316,13 +313,7 @@ def similarity(device: Device) -> None:
     Raises:
         DeviceError: it is more than 1e-6 away.
     """
-    rng = np.random.default_rng(0)
-    for level, noise in ((0.5, 0.2), (0.98, 1e-3)):
-        a, b = (np.float32(level) + noise * rng.standard_normal((37, 50, 3), np.float32) for _ in range(2))
-        pair = Picture(device.upload(a, "a picture"), 0, 50, 37), Picture(device.upload(b, "a picture"), 0, 50, 37)
-        ((_, found),) = Similarity(device)([pair])
-        if abs(found - ssim(a, b)) > 1e-6:
-            raise DeviceError(f"SSIM is {found}, not {ssim(a, b)}")
+    check_similarity(device)
 
 
 def filling(device: Device) -> None:
