@@ -26,3 +26,14 @@ def test_the_same_octree(monkeypatch, tolerance):
     assert (tree.origin, tree.side, tree.depth) == (wanted.origin, wanted.side, wanted.depth)
     for name in ("occupancy", "several", "multiplicities", "tail_lengths", "tails"):
         assert np.array_equal(getattr(tree, name), getattr(wanted, name)), name
+
+
+@pytest.mark.parametrize("absolute", [True, False])
+def test_the_order_is_there_before_the_streams(absolute):
+    means = np.random.default_rng(8).normal(size=(5000, 3)).astype(np.float32)
+    wanted, wanted_order = octree.build(means, 1e-3, absolute)
+    its_order, finish = octree.begin(means, 1e-3, absolute)
+    assert np.array_equal(wanted_order, its_order)
+    tree = finish()
+    for name in ("occupancy", "several", "multiplicities", "tail_lengths", "tails"):
+        assert np.array_equal(getattr(tree, name), getattr(wanted, name)), name
