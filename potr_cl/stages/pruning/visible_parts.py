@@ -57,7 +57,8 @@ def seen_part(scene: Scene, cameras: Sequence[Camera]) -> float:
     """Which part of a scene a view may draw on the average, told from few of both; 1 for a small scene."""
     if len(scene) < LEAST_SPLATS or not cameras:
         return 1.0
-    few = scene.subset(np.arange(0, len(scene), _SAMPLED))
+    black = replace(scene, sh=np.broadcast_to(np.float32(0), (len(scene), 1, 3)))  # colours are not looked at
+    few = black.subset(np.arange(0, len(scene), _SAMPLED))
     groups = SplatGroups.of(few, max(splat_groups.LARGEST // _SAMPLED, 1))
     some = [cameras[number] for number in range(0, len(cameras), -(-len(cameras) // _VIEWS))]
     return float((groups.visible_by(some, INRIA.near) @ groups.counts).mean() / len(few))
