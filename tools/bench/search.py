@@ -24,7 +24,8 @@ from potr_cl.codec.decoder import decode
 from potr_cl.codec.quantize import PRESETS
 from potr_cl.errors import UnreachableError
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, encode
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Target
