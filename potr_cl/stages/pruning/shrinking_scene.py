@@ -10,7 +10,8 @@ from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.picked_splats import PickedSplats
-from potr_cl.raster.rasterizer import PreparingMemory, Rasterizer
+from potr_cl.raster.preparing_memory import PreparingMemory
+from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.pruning.fixed_point import FixedPoint
 from potr_cl.stages.pruning.launcher import SweepLauncher, launcher_for
