@@ -212,14 +212,14 @@ def test_pictures_of_several_views_in_one_buffer(
 ) -> None:
     """Those of one after the other, also where the device holds no more than two views at a time."""
     rasterizer = Rasterizer(device, random_splats(500, 1, seed=5))
-    prepare_set = Rasterizer.prepare_set
+    prepare_set = Preparation.prepare_set
 
-    def at_most(self: Rasterizer, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
+    def at_most(self: Preparation, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
         if most is not None and len(cameras) > most:
             raise DeviceMemoryError("too many views")
         return prepare_set(self, cameras, memory)
 
-    monkeypatch.setattr(Rasterizer, "prepare_set", at_most)
+    monkeypatch.setattr(Preparation, "prepare_set", at_most)
     cameras = [tilted_camera(1, 64, 64), tilted_camera(2, 50, 33), *(tilted_camera(seed, 17, 15) for seed in range(3))]
     wanted = [rasterizer.render(view)[0].reshape(-1, 3) for view in cameras]
     pixels = sum(map(len, wanted))
