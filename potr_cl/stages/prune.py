@@ -231,10 +231,10 @@ class Prune(Stage):
 
 def _dealt(state: State, pool: Pool, sights: Sights) -> ViewShares:
     """The views for a pool's workers, and which of the source's splats each gets, for this stage and others."""
-    speeds = speeds_of(pool.workers())
-    if state.is_cut:
-        return ViewShares.of(state.views, sights, speeds, state.source, state.survivors)
-    return ViewShares.of(state.views, sights, speeds, state.scene, np.arange(len(state.scene)))
+    workers = pool.workers()
+    source, splats = (state.source, state.survivors) if state.is_cut else (state.scene, np.arange(len(state.scene)))
+    names = [worker.name for worker in workers]
+    return ViewShares.of(state.views, sights, speeds_of(workers), source, splats, names)
 
 
 class _Course:

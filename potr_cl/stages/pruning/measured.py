@@ -74,7 +74,7 @@ def measurement(
             return
         given: list[tuple[Any, ...]] = []
         if dealt is not None:
-            share = Shares([], [each.numbers for each in dealt.shares])
+            share = Shares([], [each.numbers for each in dealt.shares], dealt.names)
             for part in dealt.shares:
                 excerpt = stack.enter_context(pool.shared(part.excerpt))
                 given.append((excerpt, views, options, bench.background, part.numbers, part.sights))
@@ -83,7 +83,7 @@ def measurement(
             sights = sights if pool.in_process else None
             given = [(scene, views, options, bench.background, numbers, sights) for numbers in share.others]
         others = stack.enter_context(
-            Parts(pool, RemovalPart, given, options.memory, [len(each) for each in share.others])
+            Parts(pool, RemovalPart, given, options.memory, [len(each) for each in share.others], share.names)
         )
         own: RemovalSweep | ViewByView | None = None
         stride = len(state.scene)

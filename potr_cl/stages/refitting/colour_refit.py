@@ -62,7 +62,7 @@ class HelpFrom:
             WorkerLost: no worker is left.
         """
         if isinstance(self.source, ViewShares):
-            return Shares([], [share.numbers for share in self.source.shares])
+            return Shares([], [share.numbers for share in self.source.shares], self.source.names)
         return colour_shares(self.pool, views)
 
 
