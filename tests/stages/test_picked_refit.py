@@ -84,9 +84,9 @@ def test_which_splats_are_reached(device, monkeypatch):
             drawn.append(np.unique(listed))
             assert np.all(np.diff(numbers.astype(np.int64)) > 0)
             assert np.isin(numbers, drawn[-1]).all()
-            with Rasterizer(device, scene.subset(numbers.astype(np.int64))) as alone:
-                with alone.prepare_set([camera]) as views:
-                    got, _ = alone.composite(views.views[0])
+            subset = scene.subset(numbers.astype(np.int64))
+            with Rasterizer(device, subset) as alone, alone.prepare_set([camera]) as views:
+                got, _ = alone.composite(views.views[0])
             assert np.array_equal(got, wanted)
         assert sum(map(len, found)) < 0.9 * sum(map(len, drawn)) < 0.5 * len(scene) * len(cameras)
 

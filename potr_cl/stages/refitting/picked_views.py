@@ -14,7 +14,8 @@ from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.memory import Memory, Owner, Reused
 from potr_cl.raster.picked_splats import NO_SPLAT, PickedSplats
-from potr_cl.raster.rasterizer import PreparingMemory, Rasterizer
+from potr_cl.raster.preparing_memory import PreparingMemory
+from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
 from potr_cl.raster.view_cache import GEOMETRY, LEAST_SETS, ViewCache
 from potr_cl.raster.view_set import ViewSet
