@@ -64,7 +64,8 @@ class PickedViews(Owner):
         #: What the last views that are not kept have picked.
         self._passed: tuple[range, cl.Buffer] | None = None
         try:
-            most_splats = self.budget.room // (LEAST_SETS * (GEOMETRY + nbytes))
+            # The largest view has its room in any case.
+            most_splats = max(self.budget.room // (LEAST_SETS * (GEOMETRY + nbytes)), *map(_padded, self._reached), 0)
             to_do = self._dealt(most_views, most_splats, breaks)
             self.budget.largest = max((self.stride(numbers) * len(numbers) for numbers in to_do), default=0)
             while to_do:
