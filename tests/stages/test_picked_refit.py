@@ -74,8 +74,10 @@ def test_which_splats_are_reached(device, monkeypatch):
     monkeypatch.setattr(reached, "WORTH_IT", 1.0)
     scene, cameras = crowded()
     with Rasterizer(device, scene) as rasterizer:
-        found = reached_splats(rasterizer, cameras)
-        assert found is not None
+        reach = reached_splats(rasterizer, cameras, range(len(cameras)))
+        assert reach is not None
+        found = [reach.of[number] for number in range(len(cameras))]
+        assert (reach.total, reach.most) == (sum(map(len, found)), max(map(len, found)))
         drawn = []
         for camera, numbers in zip(cameras, found, strict=True):
             with rasterizer.prepare_set([camera]) as views:
@@ -94,14 +96,14 @@ def test_which_splats_are_reached(device, monkeypatch):
 def test_not_where_views_reach_much(device, monkeypatch):
     scene, cameras = crowded()
     with Rasterizer(device, scene) as rasterizer:
-        assert reached_splats(rasterizer, cameras) is None
+        assert reached_splats(rasterizer, cameras, range(5)) is None
         monkeypatch.setattr(reached, "LEAST_SPLATS", len(scene))
         monkeypatch.setattr(reached, "WORTH_IT", 1.0)
-        assert reached_splats(rasterizer, cameras) is not None
+        assert reached_splats(rasterizer, cameras, range(5)) is not None
         monkeypatch.setattr(reached, "WORTH_IT", 0.01)
-        assert reached_splats(rasterizer, cameras) is None
+        assert reached_splats(rasterizer, cameras, range(5)) is None
         monkeypatch.setattr(reached, "LEAST_SPLATS", len(scene) + 1)
-        assert reached_splats(rasterizer, cameras) is None
+        assert reached_splats(rasterizer, cameras, range(5)) is None
 
 
 #: Bytes that all lists fit and some geometry, that some views fit, and none.
