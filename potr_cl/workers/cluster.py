@@ -386,8 +386,7 @@ def _client_of(cluster: str | Client) -> tuple[Client, bool]:
         # Of another program's answer it takes the first bytes for a size.
         said = "something else does" if isinstance(error, MemoryError) else _first_line(error)
         raise UsageError(
-            f"no Dask scheduler answers at '{cluster}' ({said}): give its address, such as "
-            "tcp://10.0.0.1:8786"
+            f"no Dask scheduler answers at '{cluster}' ({said}): give its address, such as tcp://10.0.0.1:8786"
         ) from None
 
 
