@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
@@ -30,7 +31,7 @@ from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene, PartOfKept
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.raster.view_shares import ViewShares
-from potr_cl.workers.pool import Pool
+from potr_cl.workers.pool import Pool, Shared
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -162,9 +163,22 @@ class Workbench:
             return state.scene
         return kept if state.scene is state.source else PartOfKept(kept, state.survivors, state.scene)
 
-    def shared(self, state: State) -> Scene | KeptScene | PartOfKept:
-        """The same for the pool's workers: threads of this process have it from what is kept on their devices."""
-        return self.placed(state) if self.pool is not None and self.pool.in_process else state.scene
+    @contextmanager
+    def shared(self, pool: Pool, state: State) -> Iterator[Shared]:
+        """The same for a pool's workers, as long as the context lasts.
+
+        Threads of this process have it from what is kept on their devices. Others are sent the source, which later
+        stages need too, and numbers.
+        """
+        if pool.in_process:
+            with pool.shared(self.placed(state)) as placed:
+                yield placed
+        elif state.is_cut and state.scene is not state.source:
+            with pool.shared(state.source) as source:
+                yield Shared(source.handle, state.survivors.astype(np.uint32))
+        else:
+            with pool.shared(state.scene) as scene:
+                yield scene
 
     def shared_source(self, state: State) -> Scene | KeptScene | ViewShares:
         """A state's source for the pool's workers; where they have what their views see already, that."""

@@ -301,7 +301,10 @@ class _ClusterWorker(Worker):
     def make(self, kind: type[Part], memory: int | None, given: Sequence[Any]) -> Future[Held]:
         def made() -> Held:
             with self._sending:
-                things = [Known(self._sent(each.handle)) if isinstance(each, Shared) else each for each in given]
+                things = [
+                    Shared(Known(self._sent(each.handle)), each.part) if isinstance(each, Shared) else each
+                    for each in given
+                ]
                 self._next += 1
                 number = self._next
             self.ask("make", number, kind, memory, things)

@@ -9,7 +9,7 @@ from typing import Any
 
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.discovery import DeviceInfo, fitting_devices
-from potr_cl.workers.pool import Part
+from potr_cl.workers.pool import Part, Shared
 
 
 class Seat:
@@ -38,7 +38,7 @@ class Seat:
     def make(self, number: int, kind: type[Part], memory: int | None, given: Sequence[Any]) -> None:
         """Make a part."""
         device = _device(self._place)
-        things = [self._known[each.number] if isinstance(each, Known) else each for each in given]
+        things = [each.of(self._known[each.handle.number]) if isinstance(each, Shared) else each for each in given]
         # A failure may leave buffers behind that nobody owns any more.
         with device.all_or_nothing(), device.errors("failed while encoding"):
             self._parts[number] = kind(device, memory, *things)

@@ -79,7 +79,7 @@ def measurement(
                 excerpt = stack.enter_context(pool.shared(part.excerpt))
                 given.append((excerpt, views, options, bench.background, part.numbers, part.sights))
         else:
-            scene = stack.enter_context(pool.shared(bench.shared(state)))
+            scene = stack.enter_context(bench.shared(pool, state))
             sights = sights if pool.in_process else None
             given = [(scene, views, options, bench.background, numbers, sights) for numbers in share.others]
         others = stack.enter_context(
