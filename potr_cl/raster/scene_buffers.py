@@ -115,7 +115,7 @@ class SceneBuffers(Owner):
     @property
     def picks(self) -> dict[str, Any]:
         """The projection's arguments that say which they are, by their names."""
-        return {"whole_stride": self.stride, "numbers": self.means, "picked": self.splats}
+        return {"whole_stride": self.stride, "numbers": self.means, "picked": self.splats, "apart": 0}
 
     def write_rows(
         self,

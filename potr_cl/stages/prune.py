@@ -260,12 +260,11 @@ class Prune(Stage):
 
 def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, sights: Sights) -> ViewShares:
     """The views for a pool's workers, and which of the source's splats each gets, for this stage and others."""
-    speeds = speeds_of(pool.workers())
-    if state.is_cut:
-        source, numbers = state.source, state.survivors
-    else:
-        source, numbers = state.scene, np.arange(len(state.scene))
-    return ViewShares.of(state.views, sights, speeds, source, numbers if seen is None else numbers[seen])
+    workers = pool.workers()
+    source, numbers = (state.source, state.survivors) if state.is_cut else (state.scene, np.arange(len(state.scene)))
+    names = [worker.name for worker in workers]
+    splats = numbers if seen is None else numbers[seen]
+    return ViewShares.of(state.views, sights, speeds_of(workers), source, splats, names)
 
 
 class _Course:

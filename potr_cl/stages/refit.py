@@ -241,7 +241,8 @@ def _pictures_of_goal(state: State, bench: Workbench, ahead: PicturesAhead | Non
             yield targets
             return
         remembered = RememberedTargets(device, targets, views)
-    yield remembered
+    with remembered:
+        yield remembered
 
 
 @contextmanager

@@ -30,6 +30,7 @@ from potr_cl.stages.refitting.coming_scene import AnyScene, ComingScene, arrived
 from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import blocks_of, left_for_views, placed, rounding_of, vectors_of
+from potr_cl.stages.refitting.reached import reached_splats
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.rounding import ROUNDS, Steps
 from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
@@ -64,7 +65,7 @@ class HelpFrom:
             WorkerLost: no worker is left.
         """
         if isinstance(self.source, ViewShares):
-            return Shares([], [share.numbers for share in self.source.shares])
+            return Shares([], [share.numbers for share in self.source.shares], self.source.names)
         return colour_shares(self.pool, views)
 
 
@@ -120,12 +121,16 @@ class ColourRefit(Owner):
             layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], launcher.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             place = placed(device, layout.splats, layout.sh_count, memory, slices) if others is None else None
-            if place is not None:
-                memory = place.views
-            elif others is None:
+            if place is None and others is None:
                 memory = left_for_views(layout.splats, layout.sh_count, memory)
-            if place is not None:  # the host has no room for vectors beside what rounds the geometry
-                scene = arrived(scene)
+            reach = None
+            if place is not None:
+                scene = arrived(scene)  # the host has no room for vectors beside what rounds the geometry
+                rasterizer = owned.enter_context(Rasterizer(device, colourless(scene), rules))
+                reach = reached_splats(rasterizer, cameras, range(len(cameras)))
+                if reach is not None:
+                    place = placed(device, layout.splats, layout.sh_count, memory, slices, reach) or place
+                memory = place.views
             self.coefficients = owned.enter_context(vectors_of(device, layout, place))
             blocks = blocks_of(self.coefficients, place)
             owned.callback(blocks.close)
@@ -140,12 +145,14 @@ class ColourRefit(Owner):
                 in_process = help_from.pool.in_process
                 helpers = owned.enter_context(SharedViews(self.coefficients, others, in_process))
             here = arrived(scene)
-            rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
+            if place is None:
+                rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
             self.colour_map = owned.enter_context(
                 ColourMap(
-                    launcher, rasterizer, self.coefficients, here.means, cameras, background, memory, own, helpers
+                    launcher, rasterizer, self.coefficients, here.means, cameras, background, memory, own, helpers,
+                    reach,
                 )
-            )
+            )  # fmt: skip
             if others is not None:
                 owned.callback(others.begin_to_close)
             self._unrounded: Vector | None = None

@@ -156,5 +156,6 @@ def colour_parts(
             (shape, sh_count, rules, background, own, cameras, numbers, sights)
             for (own, sights), numbers in zip(pictured, share.others, strict=True)
         ]
-        with Parts(pool, ColourPart, given, memory, [len(each) for each in share.others]) as parts:
+        views = [len(each) for each in share.others]
+        with Parts(pool, ColourPart, given, memory, views, share.names) as parts:
             yield parts
