@@ -17,7 +17,7 @@ from potr_cl.host.threads import in_background
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
-from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, gathered, uploaded
+from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, copied, gathered, uploaded
 from potr_cl.raster.view_shares import Excerpt
 
 #: A scene that takes more than this part of the device's memory is not kept: others may need the room.
@@ -38,17 +38,19 @@ class KeptScene(Owner):
 
     def __init__(self, device: Device, scene: Scene, memory: int | None = None) -> None:
         self._device, self._scene, self._memory = device, scene, memory
-        self._buffers = self._uploaded(device)
+        self._buffers: SceneBuffers | None = None
+        self._buffers = self._placed(device)
         self._elsewhere: dict[Device, Future[SceneBuffers | None]] = {}
         self._lock = threading.Lock()
 
-    def _uploaded(self, device: Device) -> SceneBuffers | None:
+    def _placed(self, device: Device) -> SceneBuffers | None:
         most = device.info.memory
         if self._memory is not None and (device.info.kind == "cpu" or device.info.integrated):
             most = min(most, self._memory)
         if _PART * self._scene.nbytes <= most:
             with suppress(DeviceMemoryError):
-                return uploaded(device, self._scene)
+                # To make a scene ready on the host takes many times as long as to copy it from device to device.
+                return uploaded(device, self._scene) if self._buffers is None else copied(device, self._buffers)
         return None
 
     def is_of(self, scene: Scene) -> bool:
@@ -66,11 +68,11 @@ class KeptScene(Owner):
         return scene
 
     def bring_to(self, device: Device) -> Future[SceneBuffers | None]:
-        """Begin to upload it to another device as well, to be kept there too, and do not wait for it."""
+        """Begin to bring it to another device as well, to be kept there too, and do not wait for it."""
         with self._lock:
             if device not in self._elsewhere:
                 # In a thread of its own: what this thread takes may belong to something that fails.
-                self._elsewhere[device] = in_background(self._uploaded, device)
+                self._elsewhere[device] = in_background(self._placed, device)
             return self._elsewhere[device]
 
     def on(self, device: Device) -> Drawable:
