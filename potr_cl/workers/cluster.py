@@ -204,8 +204,8 @@ class ClusterPool(Pool):
                 gone.append(error)
         if not workers:
             raise UsageError(f"{gone[0]}, and no other worker is there")
-        for error in gone:
-            _log.warning("%s; it does no views", error)
+        for lost in gone:
+            _log.warning("%s; it does no views", lost)
         self._take_in(workers)
 
     def _meet_others(self) -> None:
