@@ -156,29 +156,36 @@ class Workbench:
         """What to give to a rasterizer for a scene: it may lie on the device already."""
         return scene if self.kept is None else self.kept.drawable(self.opened, scene)
 
-    def placed(self, state: State) -> Scene | KeptScene | PartOfKept:
-        """A state's scene, or where devices have it, for :func:`potr_cl.raster.kept_scene.lying_on`."""
+    def placed(self, state: State, some: NDArray[np.int64] | None = None) -> Scene | KeptScene | PartOfKept:
+        """A state's scene, or where devices have it, for :func:`potr_cl.raster.kept_scene.lying_on`.
+
+        Args:
+            state: whose scene.
+            some: (n,) numbers there of the splats that are wanted, ascending; None: all.
+        """
         kept = self.kept
         if kept is None or not state.is_cut or kept.drawable(self.opened, state.source) is state.source:
-            return state.scene
-        return kept if state.scene is state.source else PartOfKept(kept, state.survivors, state.scene)
+            return state.scene if some is None else state.scene.subset(some)
+        if state.scene is state.source:
+            return kept if some is None else PartOfKept(kept, some)
+        return PartOfKept(kept, state.survivors if some is None else state.survivors[some])
 
     @contextmanager
-    def shared(self, pool: Pool, state: State) -> Iterator[Shared]:
+    def shared(self, pool: Pool, state: State, some: NDArray[np.int64] | None = None) -> Iterator[Shared]:
         """The same for a pool's workers, as long as the context lasts.
 
         Threads of this process have it from what is kept on their devices. Others are sent the source, which later
         stages need too, and numbers.
         """
         if pool.in_process:
-            with pool.shared(self.placed(state)) as placed:
+            with pool.shared(self.placed(state, some)) as placed:
                 yield placed
-        elif state.is_cut and state.scene is not state.source:
-            with pool.shared(state.source) as source:
-                yield Shared(source.handle, state.survivors.astype(np.uint32))
-        else:
-            with pool.shared(state.scene) as scene:
-                yield scene
+            return
+        numbers = some
+        if state.is_cut and state.scene is not state.source:
+            numbers = state.survivors if some is None else state.survivors[some]
+        with pool.shared(state.source if state.is_cut else state.scene) as whole:
+            yield whole if numbers is None else Shared(whole.handle, numbers.astype(np.uint32))
 
     def shared_source(self, state: State) -> Scene | KeptScene | ViewShares:
         """A state's source for the pool's workers; where they have what their views see already, that."""

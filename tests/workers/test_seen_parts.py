@@ -58,7 +58,8 @@ def array_fields(scene):
 @pytest.mark.parametrize(
     "options",
     [
-        OPTIONS,
+        # The host decides, as it does on a CPU whatever the options.
+        pytest.param(OPTIONS, marks=pytest.mark.slow),
         # Nothing is kept of any view; tests/workers/test_host.py has that without slow ones.
         pytest.param(OPTIONS.changed(memory=0, prune={"tolerance": 0.0}), marks=pytest.mark.slow),
         OPTIONS.changed(prune={"keep": None}),  # a GPU decides itself, and what nobody sees stays

@@ -20,10 +20,11 @@ from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene, lying_on, whole_on_device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
-from potr_cl.raster.scene_buffers import SceneBuffers
+from potr_cl.raster.scene_buffers import SceneBuffers, stride_of
 from potr_cl.raster.view_shares import Excerpt
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap, parts_of
+from potr_cl.stages.refitting.coming_scene import AnyScene, arrived, colourless
 from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
@@ -60,7 +61,7 @@ class ColourPart(Part):
     Args:
         device: to compute on.
         memory: bytes of its memory that prepared views and targets may take; None: the default.
-        scene: whose geometry and opacities are used; its colours need no more than their constant coefficients.
+        scene: whose geometry and opacities are used, perhaps still to come; its colours are not looked at.
         sh_count: M, coefficients of a channel.
         rules, background: of the rasterizer.
         source: the scene whose pictures are the targets, perhaps kept on devices, with pictures of it there, or what
@@ -77,7 +78,7 @@ class ColourPart(Part):
         self,
         device: Device,
         memory: int | None,
-        scene: Scene,
+        scene: AnyScene,
         sh_count: int,
         rules: RasterRules,
         background: tuple[float, float, float],
@@ -88,7 +89,11 @@ class ColourPart(Part):
     ) -> None:
         self._device = device
         with ExitStack() as owned:
-            rasterizer = owned.enter_context(Rasterizer(device, scene, rules))
+            launcher = launcher_for(device, rules)
+            layout = Layout(len(scene), stride_of(len(scene)), sh_count, launcher.lanes)
+            self._coefficients = owned.enter_context(Coefficients(device, layout))
+            self._packing = owned.enter_context(Packing(self._coefficients))
+            self._x, self._direction = self._coefficients.vector(), self._coefficients.vector()
             ahead, kept = (source, source.source) if isinstance(source, PicturesAhead) else (None, source)
             pictured = owned.enter_context(lying_on(device, kept))
             if sights is not None:
@@ -99,13 +104,10 @@ class ColourPart(Part):
             else:
                 rendering = owned.enter_context(Rasterizer(device, pictured, background=background))
                 of_source = RenderedTargets(rendering, cameras)
-            launcher = launcher_for(device, rules)
-            layout = Layout(len(scene), rasterizer.stride, sh_count, launcher.lanes)
-            self._coefficients = owned.enter_context(Coefficients(device, layout))
-            self._packing = owned.enter_context(Packing(self._coefficients))
-            self._x, self._direction = self._coefficients.vector(), self._coefficients.vector()
+            here = arrived(scene)
+            rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
             self._map = owned.enter_context(
-                ColourMap(launcher, rasterizer, self._coefficients, scene.means, cameras, background, memory, numbers)
+                ColourMap(launcher, rasterizer, self._coefficients, here.means, cameras, background, memory, numbers)
             )
             self._targets: Targets = of_source
             if ahead is not None:
