@@ -21,6 +21,7 @@ from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.adam import Rates
 from potr_cl.stages.fitting.at_photographs import FittedToPhotographs
+from potr_cl.stages.fitting.files import TwoFiles
 from potr_cl.stages.fitting.fit import (
     FitOptions,
     FitProgress,
@@ -76,20 +77,23 @@ class LeftOut:
         why: as people are told it.
         ended_early: whether someone has asked it to end.
         photographs: what a fit to photographs did; None if there were none.
+        files: that were made to see whether it pays; None if it was left out before.
     """
 
     why: str
     ended_early: bool = False
     photographs: FittedToPhotographs | None = None
+    files: TwoFiles | None = None
 
     @property
     def facts(self) -> dict[str, Any]:
         """All by name."""
         photographs = None if self.photographs is None else self.photographs.facts
-        return {"left_out": self.why, "ended_early": self.ended_early, "photographs": photographs}
+        files = None if self.files is None else self.files.facts
+        return {"left_out": self.why, "ended_early": self.ended_early, "photographs": photographs, "files": files}
 
     def __str__(self) -> str:
-        more = "" if self.photographs is None else f"; {self.photographs}"
+        more = "".join(f"; {each}" for each in (self.files, self.photographs) if each is not None)
         return f"the fit was left out: {self.why}{more}"
 
 
@@ -124,6 +128,7 @@ class Fit(Stage):
         photograph_rate: by what the rates are multiplied for photographs.
         choosing, rounding, gentle, through: how far what is left is fitted once more after the choice of coefficients
             and the rounding of geometry (:class:`potr_cl.stages.fitting.settling.Settling`).
+        compared: whether two files say if it pays, where its gain is small (potr_cl/pipeline/fit_trial.py).
         batch, rounds, patience, rates, last, seed: see :class:`potr_cl.stages.fitting.fit.FitOptions`.
 
     Raises:
@@ -161,6 +166,7 @@ class Fit(Stage):
     rounding: float = option(0.15)
     gentle: float = option(0.1)
     through: float = option(0.3)
+    compared: bool = option(True)
     seed: int = option(FitOptions.seed)
 
     def __post_init__(self) -> None:
@@ -273,7 +279,7 @@ class Fit(Stage):
         price: float | None = state.learnt.get("price")
         worth = 0.0 if price is None else _WORTH * price
         without = held_out_error(bench.opened, state.scene, state.views, targets, state.added, bench.background)
-        least = without + worth * len(state.scene)
+        least = plain = without + worth * len(state.scene)
         further = 1.0
         if price is not None:
             least *= _LESS
@@ -295,7 +301,8 @@ class Fit(Stage):
             cost = fitted.error + worth * len(fitted.scene)
             spared = len(state.scene) - len(fitted.scene)
             if cost < least and (spared or fitted.error < _LESS_ALONE * without):
-                best, least, taken = last, cost, dataclasses.replace(fitted, spared=spared, without=without)
+                best, least = last, cost
+                taken = dataclasses.replace(fitted, spared=spared, without=without, cost=cost / plain)
             if asked:
                 break
         if taken is None:
