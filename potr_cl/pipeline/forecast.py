@@ -1,8 +1,8 @@
 """What an encode will take, before it begins (:func:`forecast`): seconds and bytes, roughly.
 
 Nearly all of the time goes into projecting, sorting and compositing splats, view by view. So a few views are rendered,
-and their mean time, as a unit, is multiplied by what each stage was measured to take in such units. This sees the
-device, the scene and the size of the pictures, and whatever else the machine is doing.
+and the mean of their times, as a unit, is multiplied by what each stage was measured to take in such units. This sees
+the device, the scene and the size of the pictures, and what the machine is doing besides, unless that lasts a moment.
 ``python -m tools.bench.forecast`` measures the units, and how far off a forecast is (docs/benchmarks/forecast.md).
 """
 
@@ -170,8 +170,7 @@ def _view(drawable: Drawable, cameras: Sequence[Camera], options: EncodeOptions,
             return time.perf_counter() - began
 
         rendered(chosen[0])  # the first time buffers are made
-        began = time.perf_counter()
-        while len(seconds) < _MOST_OFTEN and (not seconds or time.perf_counter() - began < _ENOUGH):
+        while len(seconds) < _MOST_OFTEN and (not seconds or np.size(seconds) * np.median(seconds) < _ENOUGH):
             seconds.append([rendered(camera) for camera in chosen])
         for camera in chosen:
             before = device.allocated
