@@ -11,6 +11,7 @@ from __future__ import annotations
 import dataclasses
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, ClassVar, Protocol, TypeVar
@@ -30,7 +31,7 @@ from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene, PartOfKept
 from potr_cl.raster.scene_buffers import Drawable
 from potr_cl.raster.view_shares import ViewShares
-from potr_cl.workers.pool import Pool
+from potr_cl.workers.pool import Pool, Shared
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -155,16 +156,36 @@ class Workbench:
         """What to give to a rasterizer for a scene: it may lie on the device already."""
         return scene if self.kept is None else self.kept.drawable(self.opened, scene)
 
-    def placed(self, state: State) -> Scene | KeptScene | PartOfKept:
-        """A state's scene, or where devices have it, for :func:`potr_cl.raster.kept_scene.lying_on`."""
+    def placed(self, state: State, some: NDArray[np.int64] | None = None) -> Scene | KeptScene | PartOfKept:
+        """A state's scene, or where devices have it, for :func:`potr_cl.raster.kept_scene.lying_on`.
+
+        Args:
+            state: whose scene.
+            some: (n,) numbers there of the splats that are wanted, ascending; None: all.
+        """
         kept = self.kept
         if kept is None or not state.is_cut or kept.drawable(self.opened, state.source) is state.source:
-            return state.scene
-        return kept if state.scene is state.source else PartOfKept(kept, state.survivors, state.scene)
+            return state.scene if some is None else state.scene.subset(some)
+        if state.scene is state.source:
+            return kept if some is None else PartOfKept(kept, some)
+        return PartOfKept(kept, state.survivors if some is None else state.survivors[some])
 
-    def shared(self, state: State) -> Scene | KeptScene | PartOfKept:
-        """The same for the pool's workers: threads of this process have it from what is kept on their devices."""
-        return self.placed(state) if self.pool is not None and self.pool.in_process else state.scene
+    @contextmanager
+    def shared(self, pool: Pool, state: State, some: NDArray[np.int64] | None = None) -> Iterator[Shared]:
+        """The same for a pool's workers, as long as the context lasts.
+
+        Threads of this process have it from what is kept on their devices. Others are sent the source, which later
+        stages need too, and numbers.
+        """
+        if pool.in_process:
+            with pool.shared(self.placed(state, some)) as placed:
+                yield placed
+            return
+        numbers = some
+        if state.is_cut and state.scene is not state.source:
+            numbers = state.survivors if some is None else state.survivors[some]
+        with pool.shared(state.source if state.is_cut else state.scene) as whole:
+            yield whole if numbers is None else Shared(whole.handle, numbers.astype(np.uint32))
 
     def shared_source(self, state: State) -> Scene | KeptScene | ViewShares:
         """A state's source for the pool's workers; where they have what their views see already, that."""

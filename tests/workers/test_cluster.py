@@ -305,9 +305,9 @@ def test_ctrl_c_leaves_no_worker_busy(tmp_path, data, scene, cameras, device, ex
 
 def taken():
     """On a worker: bytes of its devices that somebody has."""
-    from potr_cl.workers import cluster
+    from potr_cl.workers import seat
 
-    return sum(device.allocated for device in cluster._opened.values())
+    return sum(device.allocated for device in seat.opened.values())
 
 
 @pytest.mark.parametrize(

@@ -1,40 +1,58 @@
 /* From coefficients to the splats' colours in each view: the first half of the map from coefficients to pictures.
 
-   Macros: LANES (splats a work-item), SH_COUNT. */
+   Macros: LANES (splats a work-item), SH_COUNT; PICKED (1: each view has some splats only, in an order of its own, which
+   `numbers` names; LANES must be 1. 0: all views have all). */
 
 #include "refit/view_colours.clh"
 
 /* The splats' colours in each view of a set: of the coefficients themselves (direction == 0), cut at 0, w telling which
    channels are free (1, 2, 4: above 0); or their change along a direction, 0 where `free` says that the channel is cut,
-   and the same w.
-   Work-item i of the second dimension does views i, i + get_global_size(1), … */
+   and the same w. Views that have some splats have `free` in a byte each, `free_picks`, which colours leave there.
+   What views have lies `apart`. Work-item i of the second dimension does views i, i + get_global_size(1), … */
 kernel void view_colours(
     global const float *coefficients,
     global const float *means,
     ulong stride,
+    ulong apart,
+    global const uint *numbers,
     global const SetView *views,
     uint view_count,
     int direction,
     float unit,
     global const float4 *free,
+    global uchar *free_picks,
     global float4 *colours)
 {
     const size_t index = get_global_id(0);
     vfloat values[3 * SH_COUNT];
+#if !PICKED
+    const size_t splat = index;
     for (int i = 0; i < 3 * SH_COUNT; ++i)
-        values[i] = VLOAD(index, coefficients + i * stride);
+        values[i] = VLOAD(splat, coefficients + i * stride);
+#endif
     for (uint number = get_global_id(1); number < view_count; number += get_global_size(1)) {
+#if PICKED
+        const uint splat = numbers[number * apart + index];
+        if (splat == NO_SPLAT)
+            continue;
+        for (int i = 0; i < 3 * SH_COUNT; ++i)
+            values[i] = VLOAD(splat, coefficients + i * stride);
+#endif
         VREAL basis[SH_COUNT];
-        basis_towards(means, stride, index, &views[number].view, basis);
+        basis_towards(means, stride, splat, &views[number].view, basis);
         vfloat sums[3] = {(vfloat)(0.0f), (vfloat)(0.0f), (vfloat)(0.0f)};
         for (int m = 0; m < SH_COUNT; ++m)
             for (int c = 0; c < 3; ++c)
                 sums[c] = MAD(basis[m], values[3 * m + c], sums[c]);
         vfloat red = sums[0] + sums[1] - sums[2], green = sums[0] + sums[2], blue = sums[0] - sums[1] - sums[2];
         vfloat channels = (vfloat)(0.0f);
-        const size_t place = number * stride / LANES + index;
+        const size_t place = number * apart / LANES + index;
         if (direction) {
+#if PICKED
+            const vint kept = free_picks[place];
+#else
             const vint kept = free_channels(free, place);
+#endif
             red = (kept & 1) != 0 ? red * unit : (vfloat)(0.0f);
             green = (kept & 2) != 0 ? green * unit : (vfloat)(0.0f);
             blue = (kept & 4) != 0 ? blue * unit : (vfloat)(0.0f);
@@ -46,6 +64,9 @@ kernel void view_colours(
             channels = (red > 0.0f ? (vfloat)(1.0f) : (vfloat)(0.0f)) +
                 (green > 0.0f ? (vfloat)(2.0f) : (vfloat)(0.0f)) +
                 (blue > 0.0f ? (vfloat)(4.0f) : (vfloat)(0.0f));
+#if PICKED
+            free_picks[place] = (uchar)channels;
+#endif
             red = fmax(red, (vfloat)(0.0f));
             green = fmax(green, (vfloat)(0.0f));
             blue = fmax(blue, (vfloat)(0.0f));

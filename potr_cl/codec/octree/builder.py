@@ -2,12 +2,16 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+from dataclasses import dataclass
+
 import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.codec.native.library import native
 from potr_cl.codec.native.octree_build import OctreeBuilding
-from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, U64, OctreeStreams
+from potr_cl.codec.octree.parser import parse
+from potr_cl.codec.octree.streams import DEEPEST_LEVEL, U8, U64, OctreeStreams, check_centres
 from potr_cl.host.threads import Run
 from potr_cl.model.morton import spread
 
@@ -35,9 +39,46 @@ def build(
     Returns:
         The streams, and ``order`` (N,): the splats' indices in the order of the leaves.
     """
+    begun = begin(means, tolerance, absolute, run)
+    return begun.streams(), begun.order
+
+
+@dataclass(frozen=True)
+class Begun:
+    """An octree whose streams are still to be written.
+
+    Attributes:
+        order: (N,) the splats' indices in the order of the leaves.
+        depth: of the octree.
+        streams: returns the streams; another thread may call it.
+        decoded: takes what shares work out, and returns (N, 3) float32, the centres as
+            :func:`potr_cl.codec.octree.parse` finds them in the streams; it raises what that does.
+    """
+
+    order: NDArray[np.int64]
+    depth: int
+    streams: Callable[[], OctreeStreams]
+    decoded: Callable[[Run], NDArray[np.float32]]
+
+
+def begin(means: NDArray[np.float32], tolerance: F64 | float, absolute: bool = False, run: Run = map) -> Begun:
+    """:func:`build`, where what the streams are not needed for need not wait for them.
+
+    Args:
+        means, tolerance, absolute, run: as :func:`build` takes them.
+    """
     functions = native()
     if absolute and functions is not None:
-        return _build_natively(functions.octree_build, means, tolerance, run)
+        return _begin_natively(functions.octree_build, means, tolerance, run)
+    streams, order = _build_in_numpy(means, tolerance, absolute)
+    parts = -(-len(order) // _BLOCK)
+    return Begun(order, streams.depth, lambda: streams, lambda run: parse(streams, len(order), run, parts))
+
+
+def _build_in_numpy(
+    means: NDArray[np.float32], tolerance: F64 | float, absolute: bool
+) -> tuple[OctreeStreams, NDArray[np.int64]]:
+    """:func:`build`, as NumPy does it."""
     n = len(means)
     axes, low, side, limit, depth, grid = _gridded(means, tolerance)
     words = _morton_words(grid, depth)
@@ -90,19 +131,27 @@ def leaf_order(means: NDArray[np.float32], tolerance: F64 | float) -> NDArray[np
     return _depth_first(_morton_words(grid, depth))
 
 
-def _build_natively(
-    functions: OctreeBuilding, means: NDArray[np.float32], tolerance: F64 | float, run: Run
-) -> tuple[OctreeStreams, NDArray[np.int64]]:
-    """:func:`build` with ``absolute``."""
+def _begin_natively(functions: OctreeBuilding, means: NDArray[np.float32], tolerance: F64 | float, run: Run) -> Begun:
+    """:func:`begin` with ``absolute``."""
     low, side, limit, depth, words = _words_of(functions, means, tolerance, run)
     order, words = functions.order(words, run)
     half_diagonal = _half_diagonal(side)
     wanted = functions.wanted(limit, half_diagonal, depth) if half_diagonal else np.zeros(len(limit), np.int8)
     unclear = np.flatnonzero(wanted < 0)
     wanted[unclear] = _levels_for(side, limit[unclear], depth)
-    occupancy, several, multiplicities, lengths, tails = functions.streams(words, depth, order, wanted)
     origin = (float(low[0]), float(low[1]), float(low[2]))
-    return OctreeStreams(origin, side, depth, occupancy, several, multiplicities, lengths, tails, absolute=True), order
+
+    def streams() -> OctreeStreams:
+        found = functions.streams(words, depth, order, wanted)
+        return OctreeStreams(origin, side, depth, *found, absolute=True)
+
+    def decoded(run: Run) -> NDArray[np.float32]:
+        sides = np.ldexp(side, -np.arange(depth + 1))
+        centres = functions.decoded(words, depth, order, wanted, sides, np.array(origin), run)
+        check_centres(origin, side, centres)
+        return centres
+
+    return Begun(order, depth, streams, decoded)
 
 
 def _words_of(

@@ -22,15 +22,18 @@ from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
+from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
+from potr_cl.stages.refitting.coming_scene import AnyScene, ComingScene, arrived, colourless
 from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import blocks_of, left_for_views, placed, rounding_of, vectors_of
+from potr_cl.stages.refitting.reached import reached_splats
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
-from potr_cl.stages.refitting.rounding import ROUNDS
-from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares, colourless
+from potr_cl.stages.refitting.rounding import ROUNDS, Steps
+from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
 from potr_cl.stages.refitting.targets import Targets
 from potr_cl.stages.refitting.vector_space import Layout, Ridge, Vector
@@ -62,7 +65,7 @@ class HelpFrom:
             WorkerLost: no worker is left.
         """
         if isinstance(self.source, ViewShares):
-            return Shares([], [share.numbers for share in self.source.shares])
+            return Shares([], [share.numbers for share in self.source.shares], self.source.names)
         return colour_shares(self.pool, views)
 
 
@@ -71,7 +74,8 @@ class ColourRefit(Owner):
 
     Args:
         device: to compute on.
-        scene: whose geometry, opacities and SH degree are used.
+        scene: whose geometry, opacities and SH degree are used. If it is still to come, all is made ready meanwhile
+            that its colours are enough for.
         cameras: the views that count, all the same whatever their size.
         rules, background: of the rasterizer.
         memory: bytes of device memory that prepared views and targets may take, together with the vectors where these
@@ -86,12 +90,13 @@ class ColourRefit(Owner):
     Raises:
         UsageError: no camera.
         DeviceError: the scene or a view does not fit the device.
+        What making a scene raises that is still to come.
     """
 
     def __init__(
         self,
         device: Device,
-        scene: Scene,
+        scene: AnyScene,
         cameras: Sequence[Camera],
         rules: RasterRules = INRIA,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -112,29 +117,42 @@ class ColourRefit(Owner):
                             help_from.pool, share, scene, rules, background, help_from.source, cameras, memory
                         )
                     )  # fmt: skip
-            rasterizer = owned.enter_context(Rasterizer(device, colourless(scene), rules))
             launcher = launcher_for(device, rules)
-            layout = Layout(len(scene), rasterizer.stride, scene.sh.shape[1], launcher.lanes)
+            layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], launcher.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             place = placed(device, layout.splats, layout.sh_count, memory, slices) if others is None else None
-            if place is not None:
-                memory = place.views
-            elif others is None:
+            if place is None and others is None:
                 memory = left_for_views(layout.splats, layout.sh_count, memory)
+            reach = None
+            if place is not None:
+                scene = arrived(scene)  # the host has no room for vectors beside what rounds the geometry
+                rasterizer = owned.enter_context(Rasterizer(device, colourless(scene), rules))
+                reach = reached_splats(rasterizer, cameras, range(len(cameras)))
+                if reach is not None:
+                    place = placed(device, layout.splats, layout.sh_count, memory, slices, reach) or place
+                memory = place.views
             self.coefficients = owned.enter_context(vectors_of(device, layout, place))
             blocks = blocks_of(self.coefficients, place)
             owned.callback(blocks.close)
             self._solver = ColourSolver(self.coefficients, blocks)
+            self._written: FloatArray | None = None  # colours that the start of the next solution has already
+            if isinstance(scene, ComingScene):
+                self.coefficients.write_sh(self._solver.x, scene.sh)
+                self._written = scene.sh
             helpers = None
             if help_from is not None and others is not None:
                 assert isinstance(self.coefficients, Coefficients)
                 in_process = help_from.pool.in_process
                 helpers = owned.enter_context(SharedViews(self.coefficients, others, in_process))
+            here = arrived(scene)
+            if place is None:
+                rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
             self.colour_map = owned.enter_context(
                 ColourMap(
-                    launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory, own, helpers
+                    launcher, rasterizer, self.coefficients, here.means, cameras, background, memory, own, helpers,
+                    reach,
                 )
-            )
+            )  # fmt: skip
             if others is not None:
                 owned.callback(others.begin_to_close)
             self._unrounded: Vector | None = None
@@ -188,7 +206,9 @@ class ColourRefit(Owner):
             DeviceError: the device failed.
         """
         coefficients, solver = self.coefficients, self._solver
-        coefficients.write_sh(solver.x, sh)
+        if self._written is not sh:
+            coefficients.write_sh(solver.x, sh)
+        self._written = None  # it changes
         coefficients.make_room()
         coefficients.activate(active)
         if active is not None and not hold:
@@ -229,13 +249,17 @@ class ColourRefit(Owner):
         """(N, M, 3) float32 R, G, B, the solution."""
         return self.coefficients.read_sh(self._solver.x)
 
-    def round_to(self, grid: ColourGrid, targets: Targets, options: RefitOptions) -> Solved:
+    def steps_of(self, grid: ColourGrid) -> Steps:
+        """A grid as :meth:`round_to` takes it. Another thread may ask for it."""
+        return Steps.of(grid, self.coefficients.layout.stride)
+
+    def round_to(self, steps_of_splats: Steps, targets: Targets, options: RefitOptions) -> Solved:
         """Make of the solution what a file can hold, but for the last constant coefficients.
 
         :meth:`error` still knows what it was.
 
         Args:
-            grid: what the file can hold.
+            steps_of_splats: what the file can hold.
             targets, options: that the solution was found with.
 
         Returns:
@@ -250,7 +274,7 @@ class ColourRefit(Owner):
         self.coefficients.copy(self._unrounded, solver.x)
         ridge = Ridge(options.lam, options.chroma_factor, options.prior)
         worth = _WORTH * options.drop * self.colour_map.total_weight
-        with rounding_of(self.coefficients, solver.blocks, grid) as round_some:
+        with rounding_of(self.coefficients, solver.blocks, steps_of_splats) as round_some:
             *first, last = ROUNDS
             for each in first:
                 round_some(solver.x, each, worth)

@@ -12,7 +12,8 @@ from potr_cl.model.camera import Camera
 from potr_cl.opencl.memory import Memory, Owner, Reused
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.picked_splats import PickedSplats, Picker, Picks
-from potr_cl.raster.rasterizer import PreparingMemory, Rasterizer
+from potr_cl.raster.preparing_memory import PreparingMemory
+from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 
 
