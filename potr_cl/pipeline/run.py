@@ -71,7 +71,7 @@ class Run:
     def _fit_that_pays(self, before: State, after: State) -> State:
         """The state after a fit, or the one before it if a file says so."""
         device = self.device
-        if device is None or not self._options.stage(Fit).compared:
+        if device is None or Fit.name not in after.learnt or not self._options.stage(Fit).compared:
             return after
         names = [type(stage) for stage in self._options.stages]
         remaining = names[names.index(Fit) + 1 :]

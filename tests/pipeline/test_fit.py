@@ -65,6 +65,14 @@ def test_a_fit_pays(device, plush_excerpt, plush_excerpt_cameras):
     assert better > before + 0.5
 
 
+def test_time_is_told_only_of_a_fit_that_was_asked_for(device, plush_excerpt, plush_excerpt_cameras):
+    plain = encode(plush_excerpt, plush_excerpt_cameras, HALF.changed(fit=False), device=device)
+    assert "fit" not in plain.seconds
+    fitted = encode(plush_excerpt, plush_excerpt_cameras, HALF, device=device)
+    assert fitted.fitted.files is not None
+    assert fitted.seconds["fit"] > 0.3 * fitted.seconds["refit"], "that of the files that were made to see is the fit's"
+
+
 def test_what_makes_up_for_splats_rounds_finer(device, plush_excerpt, plush_excerpt_cameras):
     options = EncodeOptions(q=0.3).changed(
         prune={"delta_mse_max": 1e-7}, fit={"steps": 80, "further": 0.2, "cycles": 1}
