@@ -33,7 +33,6 @@ from potr_cl.plain_text import plain
 from potr_cl.quality.compare import (
     Comparison,
     SceneFile,
-    ViewFigures,
     comparison_report,
     find_ground_truth,
     format_comparison,
@@ -43,6 +42,7 @@ from potr_cl.quality.compare import (
     size_report,
 )
 from potr_cl.quality.compare import compare as compare_pictures
+from potr_cl.quality.figures import ViewFigures
 from potr_cl.quality.metrics import Lpips
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RULES, RasterRules

@@ -25,6 +25,7 @@ from potr_cl.model.camera import Camera, train_views, within_photographs
 from potr_cl.model.scene import Scene
 from potr_cl.model.virtual_cameras import is_virtual, place_cameras
 from potr_cl.opencl.device import Device
+from potr_cl.outputs.coded_scene import CodedScene
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.host_memory import for_views
 from potr_cl.pipeline.options import EncodeOptions
@@ -145,10 +146,12 @@ class Proved:
     Attributes:
         data: the whole file.
         scene: what readers see; in a device's memory, where it will be looked at there.
+        coded: the file, for other computers' devices to make the scene of.
     """
 
     data: bytes
     scene: Drawable
+    coded: CodedScene
 
 
 @contextmanager
@@ -174,7 +177,7 @@ def proved(encoded: Encoded, trust: bool = False, device: Device | None = None) 
                 f"the encoded file cannot be decoded ({error}): nothing was written. If the scene has splats that are "
                 "very far away or very large, leave them out"
             ) from error
-        yield Proved(data, scene)
+        yield Proved(data, scene, CodedScene(output, data, trust))
 
 
 def encode(
