@@ -64,10 +64,19 @@ class SharedJudging(Owner):
         self._device, self._reference, self._views, self._looks = device, reference, list(views), looks
         self._pool = pool if pool is not None and pool.first is device else None
         self._anyway = anyway
-        here: Drawable = reference.drawable(device, reference.scene) if isinstance(reference, KeptScene) else reference
-        self._groups: SplatGroups | None = reference.groups if isinstance(reference, KeptScene) else None
-        if self._groups is None:
-            self._groups = groups_worth_it(here, views, device, looks.rules.near)
+        self._groups: SplatGroups | None = None
+        here: Drawable
+        if isinstance(reference, KeptScene):
+            here = reference.drawable(device, reference.scene)
+            there = isinstance(here, SceneBuffers)
+            # What is not kept there takes too much of what the user allows.
+            self._groups = groups_worth_it(
+                device, reference.scene, views, looks.rules.near, there, not there, reference.groups
+            )
+        else:
+            here = reference
+            if isinstance(here, Scene):
+                self._groups = groups_worth_it(device, here, views, looks.rules.near)
         self._own = Judging(device, here, looks, self._groups)
         self._parts: Parts | None = None
         self._places: dict[str, int] = {}  # who has a view, by its name; the others are this device's

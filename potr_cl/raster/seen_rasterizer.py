@@ -11,12 +11,12 @@ from numpy.typing import NDArray
 
 from potr_cl.host.threads import thread_pool
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray
+from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.splat_groups import SplatGroups
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Reused
 from potr_cl.raster.culling import part_seen
-from potr_cl.raster.kept_scene import fits_whole
+from potr_cl.raster.kept_scene import fits_whole, whole_on_device
 from potr_cl.raster.picked_splats import PickedSplats, Picker, Picks
 from potr_cl.raster.rasterizer import PreparingMemory, Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
@@ -24,16 +24,19 @@ from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, gathered
 
 #: Smaller scenes are projected whole before their groups are found, and so are scenes of which a view sees more.
 _LEAST_SPLATS, _MOST_SEEN = 1 << 21, 1 / 2
-#: To find the groups takes about as long as to project the whole scene into so many views: on a GPU, and on a CPU.
-_VIEWS_GPU, _VIEWS_CPU = 48, 4
+#: To find the groups takes about as long as a GPU takes to project the whole scene into so many views.
+_VIEWS = 48
+#: On a CPU a view's splats are not gathered faster than all are projected, but they take less memory: they are where a
+#: scene takes more than this part of it.
+_PART = 1 / 10
 
 
 class SeenRasterizer(Owner):
     """Renders what :class:`~potr_cl.raster.rasterizer.Rasterizer` renders, of a scene of which no view sees much.
 
     The pictures are the same bits: what is left out is drawn nowhere. Views take turns in the same memory. On a GPU
-    that has the scene, a view's splats are drawn from where they are. Elsewhere they are gathered for each view, from
-    the device's memory or the host's, so that the device never holds a whole scene of the host.
+    that has the scene, or has room for it, a view's splats are drawn from where they are. Elsewhere they are gathered
+    for each view, so that the device never holds a whole scene of the host.
 
     Args:
         device: to render on.
@@ -58,8 +61,9 @@ class SeenRasterizer(Owner):
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
     ) -> None:
         self.device, self.rules, self.background = device, rules, background
-        self._scene, self._groups = scene, groups
+        self._groups = groups
         with ExitStack() as owned:
+            self._scene = scene = owned.enter_context(whole_on_device(device, scene))
             self._preparing = owned.enter_context(PreparingMemory(device))
             self._passing = Reused(device)
             owned.callback(self._passing.give_back)
@@ -181,21 +185,31 @@ def rasterizer_of(
 
 
 def groups_worth_it(
-    scene: Drawable, cameras: Sequence[Camera], device: Device, near: float = INRIA.near
+    device: Device,
+    scene: Scene,
+    cameras: Sequence[Camera],
+    near: float = INRIA.near,
+    there: bool = False,
+    large: bool = False,
+    known: SplatGroups | None = None,
 ) -> SplatGroups | None:
-    """The groups of a scene's splats, where so many views see so little of it that it is worth its time to find them.
+    """The groups of a scene's splats, where it pays to render each view with what it may show; else None.
 
     Args:
-        scene: clean; None are found for one that lies on a device.
-        cameras: the views that will be rendered.
-        device: on which.
+        device: that renders.
+        scene: clean.
+        cameras: the views.
         near: as in the rasterizer's rules.
+        there: whether all of the scene is on the device already.
+        large: whether it takes too much of the device's memory, or of what a user allows, to be there.
+        known: its groups, where somebody has found that views see little of it.
     """
-    if isinstance(scene, SceneBuffers) or len(scene) < _LEAST_SPLATS:
+    if device.info.kind == "cpu" or device.info.integrated:
+        if there or not (large or scene.nbytes > _PART * device.info.memory):
+            return None
+    elif known is None and len(cameras) < _VIEWS and (there or fits_whole(device, scene)):
         return None
-    if len(cameras) < (_VIEWS_GPU if fits_whole(device, scene) else _VIEWS_CPU):
-        return None
-    if part_seen(scene, cameras, near) > _MOST_SEEN:
-        return None
+    if known is not None or len(scene) < _LEAST_SPLATS or part_seen(scene, cameras, near) > _MOST_SEEN:
+        return known
     with thread_pool() as pool:
         return SplatGroups.of(scene, run=pool.map)

@@ -20,7 +20,7 @@ from potr_cl.quality.by_photographs import judge_by_photographs
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.judging import JudgingPart
-from potr_cl.raster import seen_rasterizer
+from potr_cl.raster import culling, seen_rasterizer
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer, render
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
@@ -193,8 +193,11 @@ def test_photographs_are_judged_by_together(plush_excerpt, cameras, coded, tmp_p
 
 @pytest.fixture
 def _small_groups(monkeypatch):
+    """Scenes count as large, and devices as small."""
     monkeypatch.setattr(splat_groups, "LARGEST", 32)
     monkeypatch.setattr(seen_rasterizer, "_LEAST_SPLATS", 1)
+    monkeypatch.setattr(seen_rasterizer, "_PART", 0)
+    monkeypatch.setattr(culling, "_SAMPLED", 2)
 
 
 @pytest.mark.usefixtures("_small_groups")
@@ -221,9 +224,11 @@ def test_views_of_a_large_scene_are_judged_by_what_they_see(family, monkeypatch)
     assert np.mean(sorted(projected)[:-1]) < 0.4 * len(scene)
     with HostPool(devices) as pool:
         assert judged(devices[0], scene, coded, views, pool) == expected
-        with KeptScene(devices[0], scene) as kept:
+        with KeptScene(devices[0], scene, memory=0) as kept:
             kept.groups = SplatGroups.of(scene)
+            monkeypatch.setattr(seen_rasterizer, "_LEAST_SPLATS", 1 << 30)
             assert judged(devices[0], kept, coded, views, pool) == expected
+            assert devices[0].allocated == 0
     assert [device.allocated for device in devices] == [0] * 2
 
 
