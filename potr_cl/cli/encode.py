@@ -20,7 +20,7 @@ from potr_cl.cli.batch import add_to_option, for_each_scene, jobs
 from potr_cl.cli.forecasts import tell_what_is_ahead
 from potr_cl.cli.guard import StandardOutput, read_file
 from potr_cl.cli.ladder import encode_ladder
-from potr_cl.cli.options import Commands, add_device_options, add_memory_option
+from potr_cl.cli.options import SEVERAL, Commands, add_cluster_option, add_device_options, add_memory_option
 from potr_cl.cli.outputs import WrittenEncoded, WrittenPage, place, writing
 from potr_cl.cli.parser import whole_number
 from potr_cl.cli.progress import Progress
@@ -339,12 +339,6 @@ def add_encode(commands: Commands) -> None:
     add_trust_option(p)
     add_antialiased_option(p)
     add_memory_option(p, ", and for the re-fit; the host's arrays of a scene too large for it lie in temporary files")
-    add_device_options(
-        p, "; of several the views are shared out: all (of the best one's kind), or indices with commas, 0,1"
-    )
-    p.add_argument(
-        "--cluster",
-        metavar="ADDRESS",
-        help="a Dask cluster whose workers do the views: its scheduler's address, tcp://HOST:8786",
-    )
+    add_device_options(p, SEVERAL)
+    add_cluster_option(p)
     p.set_defaults(run=_encode, checked_suffix=encoded_suffix)

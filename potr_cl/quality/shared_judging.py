@@ -47,6 +47,7 @@ class SharedJudging(Owner):
         looks: how pictures are made.
         pool: workers that views are shared out to; None: the device does all.
         anyway: whether other computers are sent the uncompressed scene, however large.
+        coded: the uncompressed scene for other computers, where there is something smaller.
 
     Raises:
         DeviceError: the kernels cannot be built.
@@ -60,10 +61,11 @@ class SharedJudging(Owner):
         looks: Looks,
         pool: Pool | None = None,
         anyway: bool = False,
+        coded: Carried | None = None,
     ) -> None:
         self._device, self._reference, self._views, self._looks = device, reference, list(views), looks
         self._pool = pool if pool is not None and pool.first is device else None
-        self._anyway = anyway
+        self._anyway, self._coded = anyway, coded
         self._groups: SplatGroups | None = None
         here: Drawable
         if isinstance(reference, KeptScene):
@@ -217,8 +219,12 @@ class SharedJudging(Owner):
         reference = self._reference
         if pool.in_process:
             return LentScene(reference) if isinstance(reference, SceneBuffers) else reference
+        if self._looks.lpips is not None or self._looks.ground_truth is not None:
+            return None  # they are read, or computed, here
+        if self._coded is not None:
+            return self._coded
         scene = reference.scene if isinstance(reference, KeptScene) else reference
-        if isinstance(scene, SceneBuffers) or self._looks.lpips is not None or self._looks.ground_truth is not None:
+        if isinstance(scene, SceneBuffers):
             return None
         there = pool.has(scene) or scene.nbytes <= _SENT_ANYWAY
         return scene if there or self._anyway else None

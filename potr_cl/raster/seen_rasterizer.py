@@ -28,7 +28,7 @@ _LEAST_SPLATS, _MOST_SEEN = 1 << 21, 1 / 2
 _VIEWS = 48
 #: On a CPU a view's splats are not gathered faster than all are projected, but they take less memory: they are where a
 #: scene takes more than this part of it.
-_PART = 1 / 10
+_PART = 1 / 20
 
 
 class SeenRasterizer(Owner):
@@ -161,6 +161,18 @@ class SeenRasterizer(Owner):
     def close(self) -> None:
         """Give all device memory back."""
         self._owned.close()
+
+
+def rasterizer_for(
+    device: Device,
+    scene: Drawable,
+    cameras: Sequence[Camera],
+    rules: RasterRules = INRIA,
+    background: tuple[float, float, float] = (0.0, 0.0, 0.0),
+) -> Rasterizer | SeenRasterizer:
+    """What renders pictures of a scene from these views quickest; arguments and errors of :func:`rasterizer_of`."""
+    groups = groups_worth_it(device, scene, cameras, rules.near) if isinstance(scene, Scene) else None
+    return rasterizer_of(device, scene, rules, background, groups)
 
 
 def rasterizer_of(
