@@ -40,7 +40,7 @@ if TYPE_CHECKING:
     from potr_cl.model.scene import Scene
     from potr_cl.model.viewpoints import look_around, turntable
     from potr_cl.model.virtual_cameras import place_cameras
-    from potr_cl.pipeline.encode import Encoded
+    from potr_cl.pipeline.encoded import Encoded
     from potr_cl.pipeline.options import EncodeOptions
     from potr_cl.pipeline.search import encode_to_target
     from potr_cl.pipeline.target import Target
@@ -101,7 +101,7 @@ _HOMES = {
     "DeviceError": "errors",
     "DeviceMemoryError": "errors",
     "EncodeOptions": "pipeline.options",
-    "Encoded": "pipeline.encode",
+    "Encoded": "pipeline.encoded",
     "FittedScene": "api.fitting",
     "PotrError": "errors",
     "PrunedScene": "api.editing",

@@ -33,12 +33,14 @@ from potr_cl.opencl.discovery import several_are_named
 from potr_cl.outputs.output import Output
 from potr_cl.outputs.registry import OUTPUTS, output_of, output_of_suffix
 from potr_cl.pipeline.amounts import as_bytes, size_in_bytes
-from potr_cl.pipeline.encode import Encoded, Proved, SharedOut, Stopwatch, proved
 from potr_cl.pipeline.encode import encode as run_stages
+from potr_cl.pipeline.encoded import Encoded, SharedOut
 from potr_cl.pipeline.keywords import stage_changes
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT
+from potr_cl.pipeline.proof import Proved, proved
 from potr_cl.pipeline.search import encode_to_target
+from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.pipeline.target import Found, Target
 from potr_cl.quality.by_photographs import judge_by_photographs
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator

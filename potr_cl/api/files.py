@@ -28,7 +28,7 @@ from potr_cl.model.box import Box
 from potr_cl.model.scene import Scene
 
 if TYPE_CHECKING:
-    from potr_cl.pipeline.encode import Encoded
+    from potr_cl.pipeline.encoded import Encoded
     from potr_cl.raster.scene_buffers import SceneBuffers
 
 

@@ -28,8 +28,8 @@ from potr_cl.model.views_between import views_between as place_between
 from potr_cl.model.virtual_cameras import is_virtual
 from potr_cl.opencl.device import Device
 from potr_cl.pipeline.amounts import as_bytes
-from potr_cl.pipeline.encode import check_frame
 from potr_cl.pipeline.fallback import on_device
+from potr_cl.pipeline.frame import check_frame
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.fitting.fit import FitOptions, Fitted, fit_scene

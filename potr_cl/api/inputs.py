@@ -23,7 +23,7 @@ if TYPE_CHECKING:
     from potr_cl.opencl.device import Device
     from potr_cl.opencl.discovery import DeviceInfo
     from potr_cl.outputs.coded_scene import CodedScene
-    from potr_cl.pipeline.encode import Encoded
+    from potr_cl.pipeline.encoded import Encoded
     from potr_cl.raster.rules import RasterRules
     from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
 

@@ -26,9 +26,10 @@ from potr_cl.host.mapped import bounded
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Stopwatch, proved
 from potr_cl.pipeline.encode import encode as run_stages
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.proof import proved
+from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.report.summary import decibels
 from potr_cl.stages.stage import Progress

@@ -46,10 +46,14 @@ from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output
 from potr_cl.outputs.registry import OUTPUTS, encoded_suffix, output_of, output_of_suffix, suffixes_encoded
-from potr_cl.pipeline.encode import Encoded, Proved, SharedOut, Stopwatch, encode, frame_checked_beside, proved
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.encoded import Encoded, SharedOut
+from potr_cl.pipeline.frame import frame_checked_beside
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.presets import DEFAULT, PRESETS, PURPOSE
+from potr_cl.pipeline.proof import Proved, proved
 from potr_cl.pipeline.search import encode_to_target
+from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.pipeline.target import Target
 from potr_cl.quality.evaluator import EvaluationViews
 from potr_cl.quality.ground_truth import GroundTruth

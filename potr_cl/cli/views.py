@@ -64,8 +64,9 @@ def read_cameras(args: argparse.Namespace) -> list[Camera]:
 def warn_of_frame(path: Path, scene: Scene, views: Sequence[Camera]) -> None:
     """Say so if the views of a file do not seem to be in a scene's frame; for commands that throw nothing away."""
     judged = judge_cameras(scene, views)
-    if judged.suspicious:
-        note(f"warning: {path}: {judged.finding}")
+    said = judged.finding if judged.suspicious else judged.doubt
+    if said is not None:
+        note(f"warning: {path}: {said}", "warning")
 
 
 def virtual_cameras(args: argparse.Namespace, scene: Scene, progress: Progress) -> list[Camera]:

@@ -16,6 +16,7 @@ import zstandard
 from numpy.typing import NDArray
 
 from potr_cl.codec.sections import Coder, Property, Section, context_groups, is_bytes, is_per_splat, stream_count
+from potr_cl.codec.sound_header import CRC, require_sound_header
 from potr_cl.codec.steps.rule import MOST_BESIDE_GROUPS
 from potr_cl.codec.versions import VERSIONS, FormatVersion
 from potr_cl.errors import DataError, UsageError
@@ -31,7 +32,6 @@ VERSION_OF_BLOCKS = 4
 _FIXED = struct.Struct("<8sHHIQQBBHI8d8s8s")
 _FACTOR = struct.Struct("<d")
 _ENTRY = struct.Struct("<BBBBIQQ")
-_CRC = struct.Struct("<I")
 #: Of a section in the table.
 ENTRY_BYTES = _ENTRY.size
 
@@ -208,7 +208,7 @@ def raw_bytes(header: Header, data: bytes | memoryview, prop: Property, index: i
 
 def assemble(header: Header, coded: list[tuple[Section, bytes]]) -> list[bytes]:
     """The pieces of a file, in order: header with the table of the coded sections, then each section's bytes."""
-    header_bytes = _FIXED.size + _ENTRY.size * len(coded) + _CRC.size
+    header_bytes = _FIXED.size + _ENTRY.size * len(coded) + CRC.size
     file_bytes = header_bytes + sum(len(stored) for _, stored in coded)
     fixed = _FIXED.pack(
         MAGIC,
@@ -231,7 +231,7 @@ def assemble(header: Header, coded: list[tuple[Section, bytes]]) -> list[bytes]:
         bytes(8),
     )
     table = b"".join(_pack_entry(section) for section, _ in coded)
-    return [fixed + table + _CRC.pack(zlib.crc32(fixed + table)), *(stored for _, stored in coded)]
+    return [fixed + table + CRC.pack(zlib.crc32(fixed + table)), *(stored for _, stored in coded)]
 
 
 def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) -> Header:
@@ -268,16 +268,8 @@ def read_header(data: bytes | memoryview, file_bytes: int, trust: bool = False) 
     fields = _FIXED.unpack_from(data)
     _, _, flags, header_bytes, said_bytes, splats, degree, depth, count, reserved = fields[:10]
     numbers = fields[10:18]
-    wanted = _FIXED.size + _ENTRY.size * count + _CRC.size
-    if header_bytes != wanted:
-        raise DataError("the header is damaged (its size does not fit its number of sections): get the file again")
-    if len(data) < header_bytes:
-        raise DataError(f"truncated: the header has {header_bytes} bytes, the file {file_bytes}")
-    if zlib.crc32(data[: header_bytes - _CRC.size]) != _CRC.unpack_from(data, header_bytes - _CRC.size)[0]:
-        raise DataError("the header is damaged (its checksum does not match): get the file again")
-    if said_bytes != file_bytes:
-        how = "truncated" if file_bytes < said_bytes else "followed by something else"
-        raise DataError(f"{how}: the file has {file_bytes} bytes, its header says {said_bytes}")
+    counted = _FIXED.size + _ENTRY.size * count + CRC.size
+    require_sound_header(data, header_bytes, counted, "sections", said_bytes, file_bytes)
     rules = VERSIONS.get(version)
     if rules is not None and rules.separate_ac_factor:
         (sf_ac,) = _FACTOR.unpack(fields[18])

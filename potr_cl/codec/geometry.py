@@ -6,7 +6,7 @@ end is the same geometry.
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 
 import numpy as np
@@ -15,11 +15,11 @@ from numpy.typing import NDArray
 from potr_cl.codec import octree, quantize
 from potr_cl.codec.native.library import native
 from potr_cl.codec.outliers import check_positions, may_be_coarse
-from potr_cl.codec.splat_levels import BLOCK, splat_levels
+from potr_cl.codec.splat_levels import BLOCK, SplatLevels, splat_levels
 from potr_cl.codec.steps.fitting import fit_steps
 from potr_cl.codec.steps.rule import ColourSteps
 from potr_cl.codec.versions import VERSIONS
-from potr_cl.host.threads import Run
+from potr_cl.host.threads import Run, in_background
 from potr_cl.model.camera import Camera, camera_centres
 from potr_cl.model.scene import Scene
 
@@ -65,12 +65,16 @@ class Geometry:
         """Fill all but the colours of some splats of a scene; ``order`` (N,) are their numbers there."""
         parameters, n = self.parameters, len(order)
         version = VERSIONS[parameters.version]
-        centres = octree.parse(self.tree, n, run, -(-n // BLOCK))
+
+        def parsed() -> NDArray[np.float32]:
+            return octree.parse(self.tree, n, run, -(-n // BLOCK))
+
+        # A part of it is one thread's work, and the others have enough to do meanwhile.
+        centres = parsed if run is map else in_background(parsed).result
 
         def fill(start: int) -> None:
             part = slice(start, min(start + BLOCK, n))
             rows, scales = order[part], [axis[part] for axis in self.scales]
-            scene.means[rows] = centres[part]
             log_scales = [version.dequantize_scales(levels, parameters.sf_scale) for levels in scales]
             scene.log_scales[rows] = np.stack(log_scales, axis=1)
             turned = np.empty((len(rows), 4), np.float32)
@@ -80,6 +84,12 @@ class Geometry:
             scene.opacity_logits[rows] = version.dequantize_opacities(self.opacities[part], parameters.sf_opacity)
 
         list(run(fill, range(0, n, BLOCK)))
+        found = centres()
+
+        def place(start: int) -> None:
+            scene.means[order[start : start + BLOCK]] = found[start : start + BLOCK]
+
+        list(run(place, range(0, n, BLOCK)))
 
     def colour_classes(self) -> tuple[NDArray[np.int8], NDArray[np.int8]]:
         """(N,) classes of the steps of DC and of AC, in the order of the file: :class:`ColourSteps`; 0 without any."""
@@ -197,27 +207,43 @@ def quantise_in_world_units(
     """
     absolute = VERSIONS[parameters.version].absolute_leaf_levels
 
-    def built(numbers: NDArray[np.int64] | None, run: Run = map) -> tuple[octree.OctreeStreams, NDArray[np.int64]]:
+    def begun(
+        numbers: NDArray[np.int64] | None, run: Run = map
+    ) -> tuple[NDArray[np.int64], Callable[[], octree.OctreeStreams]]:
         own = slice(None) if numbers is None else numbers
         tolerance = np.maximum(world.gamma, world.beta * nearest[own])
-        tree, order = octree.build(scene.means[own], tolerance, absolute, run)
-        if may_be_coarse(tree):
-            check_positions(scene.means[own], scene.log_scales[own], tolerance, tree, order)
-        return tree, order
+        order, finish = octree.begin(scene.means[own], tolerance, absolute, run)
 
-    parts = [None] if rows is None else rows
-    found = []
-    # Threads share out the parts here, and each part's splats there; or those of the only part in both places.
-    trees = [built(None, run)] if rows is None else run(built, parts)
-    for own, (tree, order) in zip(parts, trees, strict=True):
-        levels = splat_levels(scene, order if own is None else own[order], world, run)
-        found.append(
-            Geometry(
-                parameters, world, tree, order, levels.scales, levels.rotations, levels.opacities,
-                scene.antialiased, scene.low_pass,
-            )
+        def tree() -> octree.OctreeStreams:
+            streams = finish()
+            if may_be_coarse(streams):
+                check_positions(scene.means[own], scene.log_scales[own], tolerance, streams, order)
+            return streams
+
+        return order, tree
+
+    def made(streams: octree.OctreeStreams, order: NDArray[np.int64], levels: SplatLevels) -> Geometry:
+        return Geometry(
+            parameters, world, streams, order, levels.scales, levels.rotations, levels.opacities,
+            scene.antialiased, scene.low_pass,
         )  # fmt: skip
-    return found
+
+    if rows is None:
+        order, tree = begun(None, run)
+        # One thread writes the tree while the others find the levels.
+        tree = tree if run is map else in_background(tree).result
+        levels = splat_levels(scene, order, world, run)
+        return [made(tree(), order, levels)]
+
+    def built(numbers: NDArray[np.int64]) -> tuple[NDArray[np.int64], octree.OctreeStreams]:
+        order, tree = begun(numbers)
+        return order, tree()
+
+    # Threads share out the parts here, and each part's splats there.
+    return [
+        made(streams, order, splat_levels(scene, own[order], world, run))
+        for own, (order, streams) in zip(rows, run(built, rows), strict=True)
+    ]
 
 
 def distances_to_views(means: NDArray[np.float32], views: Sequence[Camera], run: Run) -> NDArray[np.float64]:

@@ -84,7 +84,7 @@ def load_cameras(path: str | os.PathLike[str]) -> list[Camera]:
 
     Args:
         path: of a file in one of ``registry.CAMERA_FORMATS``, or of a folder that holds such files. A COLMAP model may
-            also be in the folder's ``sparse/0`` or ``sparse``.
+            also be in the folder's ``sparse/0``, ``sparse`` or ``0``.
 
     Returns:
         The views with their split into training and test views; at least one.

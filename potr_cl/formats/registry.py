@@ -6,9 +6,12 @@ Reading, writing, error messages, the help of the command line and docs/formats.
 
 from __future__ import annotations
 
+import itertools
 import os
+import re
 import zlib
 from collections.abc import Iterable, Sequence
+from contextlib import suppress
 from pathlib import Path
 
 from potr_cl.errors import DataError, UsageError
@@ -32,6 +35,10 @@ SCENE_FORMATS: tuple[SceneFormat, ...] = (
 
 #: Bytes that a scene begins with and that may be needed to tell its format.
 START_BYTES = 1024
+#: Where programs that train put their scenes, from the folder that they were given or from one within; and how many
+#: files are looked at.
+_PLACES_OF_TRAININGS = ("point_cloud/iteration_*/*", "iteration_*/*", "ply/*", "*")
+_MOST_FILES = 1000
 _GZIP = b"\x1f\x8b"
 
 #: In the order in which a folder is searched for them. cameras.json stands before transforms.json, for it lists just
@@ -76,8 +83,25 @@ def format_of(path: Path) -> SceneFormat:
             return entry
     names = listed([name for entry in SCENE_FORMATS for name in entry.names])
     if os.path.isdir(path):
-        raise UsageError(f"the folder '{path}' holds no scene that can be read as a folder: it has no {names}")
+        inside = _scene_in(path)
+        found = f"; give the file in it: '{inside}'" if inside is not None else ""
+        raise UsageError(f"the folder '{path}' holds no scene that can be read as a folder: it has no {names}{found}")
     raise UsageError(f"'{path}': unknown kind of scene, expected a {suffixes_read()} file, or a folder with {names}")
+
+
+def _scene_in(folder: Path) -> Path | None:
+    """The scene that a program which trains has left in its folder: of the last iteration, where there are several."""
+    found: list[Path] = []
+    for place in _PLACES_OF_TRAININGS:
+        with suppress(OSError):
+            found += itertools.islice(folder.glob(f"{place}.ply"), _MOST_FILES)
+    return max(found, key=_iteration, default=None)
+
+
+def _iteration(file: Path) -> tuple[int, str]:
+    """By which number of a file's name and its folder's it is the last: "iteration_30000", "point_cloud_29999.ply"."""
+    digits = re.findall(r"\d+", f"{file.parent.name} {file.stem}")
+    return max((int(each[:18]) for each in digits), default=0), os.fspath(file)
 
 
 def suffix_of_content(start: bytes, name: str) -> str:

@@ -16,6 +16,7 @@ unless they see nothing at all. docs/benchmarks/frames.md has what this finds, a
 
 from __future__ import annotations
 
+import logging
 import math
 from collections.abc import Sequence
 from dataclasses import dataclass
@@ -25,16 +26,19 @@ from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import Camera
-from potr_cl.model.motions import LOOKING_BACK, Motion, likely_motions
+from potr_cl.model.motions import LOOKING_BACK, WRONG_WAY_ROUND, Motion, likely_motions
 from potr_cl.model.scene import Scene
-from potr_cl.model.sightings import Poses, Sample, Sights, look, poses, sample
+from potr_cl.model.sightings import Poses, Sample, Sights, look, poses, sample, show_nothing
+
+_log = logging.getLogger("potr_cl")
 
 #: Views that are looked at; those of them by which motions are chosen, and how many of each kind (once by how well they
 #: fit, once by how usual they are) are then looked at in all.
 _VIEWS, _FEW, _CHOSEN = 16, 4, 3
 #: A fit of this or more cannot be surpassed by much: nothing else is tried.
 _FINE = -0.9
-#: A motion must fit at least so well to be believed in.
+#: A motion must fit at least so well to be believed in. (Poses written the wrong way round must fit as well as if
+#: nothing was wrong: views that look all around from within a scene fit many a reading half as well.)
 _PLAUSIBLE = -2.1
 #: By how much a motion must fit better: with many views, if people know its size, and if it was fitted to the cameras;
 #: and what one view needs on top, which falls with this power of their number. (One view may look at a bare wall.)
@@ -46,6 +50,8 @@ _TURNED_AWAY = 0.05
 _AS_WELL = 0.35
 #: Part of a scene's splats that views must see at least, whatever the rest.
 _LEAST_SEEN = 0.005
+#: Part of a picture below which it is background and nothing else.
+_EMPTY = 1e-4
 #: Cameras that see so much of the splats look at the scene, whatever else fits better, if the colours know so many of
 #: the views, or if the scene is so small in the pictures that it may be a part of what was photographed.
 _WHOLE, _WELL_KNOWN, _SMALL_PART = 0.95, 0.9, 0.05
@@ -87,6 +93,7 @@ class Judgement:
             tried fits plausibly, or none had to be tried.
         moved: the fit if that is undone.
         needed: by how much the motion had to fit better to be believed.
+        empty: names of those of the views that show nothing of the scene.
     """
 
     views: int
@@ -94,6 +101,7 @@ class Judgement:
     motion: Motion | None = None
     moved: Fit | None = None
     needed: float = math.inf
+    empty: tuple[str, ...] = ()
 
     @property
     def gain(self) -> float:
@@ -127,14 +135,25 @@ class Judgement:
         return f"{text}; they fit if {self.motion.condition} ({then})"
 
     @property
+    def doubt(self) -> str | None:
+        """What is odd about cameras that are taken, in a sentence without a full stop; None if nothing is."""
+        if self.suspicious or not self.empty:
+            return None
+        which = f"'{self.empty[0]}'" if len(self.empty) == 1 else f"'{self.empty[0]}' and others"
+        return (
+            f"{len(self.empty)} of {self.views} views that were looked at show nothing of the scene ({which}): if "
+            "their poses are wrong, leave such views out, for they count as matched without loss"
+        )
+
+    @property
     def remedy(self) -> str:
         """What bring both together again, in a few words."""
         undone = "" if self.motion is None or self.gain < self.needed else self.motion.undone
         if undone:
             return f"bring the scene back ({undone})"
         if self.motion is not None and self.gain >= self.needed:
-            if self.motion.looks_back:
-                return "write the cameras with x right, y down, z forward"
+            if self.motion.misread is not None:
+                return self.motion.misread.remedy
             return "give the cameras of this scene, or undo what moved it"
         return "give the cameras of this scene"
 
@@ -156,24 +175,33 @@ def judge_cameras(scene: Scene, cameras: Sequence[Camera]) -> Judgement:
         raise UsageError("there is no camera to judge")
     at = sample(scene)
     world = poses(cameras)
-    some = world.some(_spread(len(cameras), _VIEWS))
-    fit = _fit(look(at, some))
+    numbers = _spread(len(cameras), _VIEWS)
+    some = world.some(numbers)
+    sights = look(at, some)
+    fit = _fit(sights)
     if fit.seen < _LEAST_SEEN and len(cameras) > len(some.centres):
         # Few of many views may be those that see it: all are asked before it is said that none does.
         more = look(at, world.some(_spread(len(cameras), 6 * _VIEWS)))
         fit = Fit(fit.total, float(more.seen.any(axis=0).mean()), fit.covered, fit.known, fit.size)
     views = len(some.centres)
-    found = None if fit.total >= _FINE else _best_motion(at, some, fit)
+    blank = _empty(scene, some, sights)
+    empty = tuple(cameras[number].name for number in numbers[blank])
+    # A few stray views among good ones are no sign that the scene was moved.
+    others = np.setdiff1d(np.arange(views), blank)
+    fine = fit.total >= _FINE or (bool(empty) and len(others) > 0 and _fit(sights.some(others)).total >= _FINE)
+    found = None if fine else _best_motion(at, some, fit)
     if found is None:
-        return Judgement(views, fit)
+        return Judgement(views, fit, empty=empty)
     motion, moved = found
     if _looked_at(fit) and (motion.fitted or motion.scale == 1):
-        return Judgement(views, fit)
-    return Judgement(views, fit, motion, moved, _needed(motion, views))
+        return Judgement(views, fit, empty=empty)
+    return Judgement(views, fit, motion, moved, _needed(motion, views), empty)
 
 
 def require_agreement(scene: Scene, cameras: Sequence[Camera]) -> None:
     """Refuse cameras that are probably not in the scene's frame.
+
+    What is odd about others is told to the logger "potr_cl".
 
     Args:
         scene: clean, at least one splat.
@@ -188,6 +216,8 @@ def require_agreement(scene: Scene, cameras: Sequence[Camera]) -> None:
             f"{judged.finding}: {judged.remedy}, leave --cameras out (virtual ones are placed), or, if they are right, "
             "--cameras-anyway"
         )
+    if judged.doubt is not None:
+        _log.warning("%s", judged.doubt)
 
 
 def _fit(sights: Sights) -> Fit:
@@ -207,6 +237,12 @@ def _fit(sights: Sights) -> Fit:
     )
 
 
+def _empty(scene: Scene, cameras: Poses, sights: Sights) -> NDArray[np.int64]:
+    """Numbers of the views that show nothing of the scene."""
+    empty = np.flatnonzero(~sights.seen.any(axis=1) & (sights.covered < _EMPTY))
+    return empty[show_nothing(scene, cameras.some(empty))] if len(empty) else empty
+
+
 def _looked_at(fit: Fit) -> bool:
     """Whether the cameras see the whole scene and nothing speaks against them: other axes or places prove nothing then.
 
@@ -219,22 +255,24 @@ def _looked_at(fit: Fit) -> bool:
 def _best_motion(at: Sample, cameras: Poses, fit: Fit) -> tuple[Motion, Fit] | None:
     """The motion after which the cameras fit best, and how well; None if it is not plausible."""
     views = len(cameras.centres)
-    motions = list(likely_motions(cameras, at))
+    motions = [*likely_motions(cameras, at), *WRONG_WAY_ROUND]
     if fit.seen < _TURNED_AWAY:
         motions.append(LOOKING_BACK)
     rough = cameras.some(_spread(views, _FEW))
     totals = np.array([_fit(look(at, motion.of(rough))).total for motion in motions])
-    best = _promising(totals, np.array([motion.fitted for motion in motions]))
-    tried = [(motions[number], _fit(look(at, motions[number].of(cameras)))) for number in best]
+    numbers = _promising(totals, np.array([motion.fitted for motion in motions]))
+    tried = [(motions[number], _fit(look(at, motions[number].of(cameras)))) for number in numbers]
     gains = [(each.total - fit.total - _needed(motion, views), motion, each) for motion, each in tried]
-    gains = [gain for gain in gains if gain[2].total >= _PLAUSIBLE]
+    gains = [gain for gain in gains if gain[2].total >= (_FINE if gain[1] in WRONG_WAY_ROUND else _PLAUSIBLE)]
     if not gains:
         return None
     # What people do to scenes explains more than what could be fitted to any cameras.
     enough = [gain for gain in gains if gain[0] >= 0]
     gains = [gain for gain in enough if not gain[1].fitted] or enough or gains
-    most = max(margin for margin, _, _ in gains)
-    return next((motion, moved) for margin, motion, moved in gains if margin >= most - _AS_WELL)
+    most = max(gains, key=lambda gain: gain[2].total)
+    as_well = [gain for gain in gains if gain[1].misread is None and gain[2].total >= most[2].total - _AS_WELL]
+    _, motion, moved = as_well[0] if as_well else most
+    return motion, moved
 
 
 def _promising(totals: NDArray[np.float64], fitted: NDArray[np.bool_]) -> NDArray[np.int64]:
@@ -249,7 +287,9 @@ def _promising(totals: NDArray[np.float64], fitted: NDArray[np.bool_]) -> NDArra
 
 
 def _needed(motion: Motion, views: int) -> float:
-    return (_FITTED if motion.fitted or motion.looks_back else _BETTER) + _ALONE * math.exp(-_FALL * math.log(views))
+    return (_FITTED if motion.fitted or motion.misread is not None else _BETTER) + _ALONE * math.exp(
+        -_FALL * math.log(views)
+    )
 
 
 def _spread(count: int, wanted: int) -> NDArray[np.int64]:

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import itertools
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -21,6 +21,23 @@ _DISTANCES = (None, 1.5, 4.0)
 _ENOUGH = 3
 
 
+@dataclass(frozen=True)
+class Misreading:
+    """Poses that were written in another way than they were read, each camera's by itself; the scene stayed in place.
+
+    Attributes:
+        name: of what went wrong, to stand behind "the scene was".
+        condition: what must be so for it all to fit, to stand behind "they fit if".
+        remedy: what to do about it.
+        mended: makes the poses that were meant of those that were read.
+    """
+
+    name: str
+    condition: str
+    remedy: str
+    mended: Callable[[Poses], Poses]
+
+
 @dataclass(frozen=True, eq=False)
 class Motion:
     """What may have happened to a scene after it was trained: x became ``scale · axes x + shift``.
@@ -30,32 +47,31 @@ class Motion:
         scale: a factor.
         shift: (3,) world units of the scene as it is now.
         fitted: whether shift and scale were fitted to the cameras, which then need not be this scene's at all.
-        looks_back: it was not the scene: each camera has the axes of OpenGL, y up and z back, where y down and z
-            forward are meant, so that it looks away from what it should show.
+        misread: it was not the scene: the cameras' poses were meant in another way.
     """
 
     axes: F64
     scale: float
     shift: F64
     fitted: bool
-    looks_back: bool = False
+    misread: Misreading | None = None
 
     def of(self, cameras: Poses) -> Poses:
         """Cameras that are moved along with the scene, all in world units."""
-        return cameras.turned_round() if self.looks_back else cameras.moved(self.axes, self.scale, self.shift)
+        return (
+            cameras.moved(self.axes, self.scale, self.shift) if self.misread is None else self.misread.mended(cameras)
+        )
 
     @property
     def condition(self) -> str:
         """What must be so for it all to fit, to stand behind "they fit if"."""
-        if self.looks_back:
-            return "each camera's y and z axes are turned round, from OpenGL's to COLMAP's"
-        return f"the scene was {self.name} after training"
+        return f"the scene was {self.name} after training" if self.misread is None else self.misread.condition
 
     @property
     def name(self) -> str:
         """What happened, to stand behind "the scene was"."""
-        if self.looks_back:
-            return "behind its cameras"
+        if self.misread is not None:
+            return self.misread.name
         said = [_turn(self.axes)] if not np.array_equal(self.axes, np.eye(3)) else []
         if self.fitted:
             return " and ".join([*said, "moved"])
@@ -66,7 +82,7 @@ class Motion:
     @property
     def undone(self) -> str:
         """What brings it back, to stand behind "bring the scene back:"; empty if that is not known."""
-        if self.fitted or self.looks_back:
+        if self.fitted or self.misread is not None:
             return ""
         said = [_turn(self.axes.T)] if not np.array_equal(self.axes, np.eye(3)) else []
         if self.scale != 1:
@@ -74,8 +90,46 @@ class Motion:
         return " and ".join(said)
 
 
-#: What is wrong where cameras were exported with the axes of another convention.
-LOOKING_BACK = Motion(np.eye(3), 1.0, np.zeros(3), fitted=False, looks_back=True)
+def _misread(misreading: Misreading) -> Motion:
+    return Motion(np.eye(3), 1.0, np.zeros(3), fitted=False, misread=misreading)
+
+
+#: What is wrong where cameras were exported with the axes of another convention: OpenGL's y up and z back.
+LOOKING_BACK = _misread(
+    Misreading(
+        "behind its cameras",
+        "each camera's y and z axes are turned round, from OpenGL's to COLMAP's",
+        "write the cameras with x right, y down, z forward",
+        Poses.turned_round,
+    )
+)
+#: What is wrong where a program has written one direction of a pose for the other.
+WRONG_WAY_ROUND = (
+    _misread(
+        Misreading(
+            "seen by inverted poses",
+            "each camera's pose is inverted, from world-to-camera to camera-to-world",
+            "write the poses camera to world: the inverse of each matrix",
+            Poses.inverted,
+        )
+    ),
+    _misread(
+        Misreading(
+            "seen by transposed rotations",
+            "each camera's rotation is transposed, from world-to-camera to camera-to-world",
+            "write the rotations camera to world: the transpose of each",
+            Poses.transposed,
+        )
+    ),
+    _misread(
+        Misreading(
+            "seen from translations",
+            "each camera's position is the translation t of its world-to-camera pose",
+            "write the cameras' centres, which are -R^T t",
+            Poses.from_translations,
+        )
+    ),
+)
 
 
 def likely_motions(world: Poses, at: Sample) -> Iterator[Motion]:

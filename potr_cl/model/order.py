@@ -13,8 +13,9 @@ from potr_cl.host.threads import Run
 #: So many numbers are put into ranges first, which threads sort; numbers of a range, on the average, and how many
 #: ranges there are at most (their numbers take a byte).
 _LARGE, _RANGE, _MOST_RANGES = 1 << 19, 1 << 16, 256
-#: Numbers that are put into ranges at a time, and how many of each range are looked at to find where it ends.
-_DEALT, _SAMPLED = 1 << 19, 64
+#: Numbers that are put into ranges at a time, at most and at least; into how many pieces, so that many threads have
+#: one; and how many numbers of each range are looked at to find where it ends.
+_DEALT, _LEAST_DEALT, _PIECES, _SAMPLED = 1 << 19, 1 << 15, 32, 64
 
 
 def ascending(score: NDArray[Any], run: Run = map) -> NDArray[np.int64]:
@@ -68,10 +69,11 @@ def over_ranges(
     few = np.sort(score[:: max(len(score) // (ranges * _SAMPLED), 1)])
     # The first score of each range but the first one: equal ones are in the same range.
     ends = few[np.arange(1, ranges) * len(few) // ranges]
-    starts = range(0, len(score), _DEALT)
+    size = min(max(-(-len(score) // _PIECES), _LEAST_DEALT), _DEALT)
+    starts = range(0, len(score), size)
 
     def deal(first: int) -> tuple[NDArray[np.int64], NDArray[np.int64]]:
-        own = np.searchsorted(ends, score[first : first + _DEALT], "right").astype(np.uint8)
+        own = np.searchsorted(ends, score[first : first + size], "right").astype(np.uint8)
         return np.argsort(own, kind="stable"), np.bincount(own, minlength=ranges)
 
     dealt = list(run(deal, starts))

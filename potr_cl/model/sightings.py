@@ -29,6 +29,10 @@ _NEAR = 0.2
 _THINNED, _TARGETS, _POINTS = 60_000, 1_500, 6_000
 #: A splat's opacity above which it counts as matter.
 _OPAQUE = 0.1
+#: Splats by which it is made sure that a view shows none, and those that are looked at together.
+_MOST, _TOGETHER = 2_000_000, 1 << 17
+#: How far beside a picture centres count, at distance 1: their splats reach into it.
+_ROOM = 0.1
 #: Nothing is farther away than this, in units of the sample.
 _FAR = 1e6
 #: Cells along a side of a picture: of the map of depths, and of the map of what is covered.
@@ -108,6 +112,22 @@ class Poses:
         """The same cameras, each with its own y and z axes turned round: it looks the other way."""
         return Poses(self.centres, np.array([[1.0], [-1.0], [-1.0]]) * self.rotations, self.windows, self.near)
 
+    def transposed(self) -> Poses:
+        """The same cameras, where each rotation was written the wrong way round, and its centre right."""
+        return Poses(self.centres, self.rotations.transpose(0, 2, 1), self.windows, self.near)
+
+    def inverted(self) -> Poses:
+        """The same cameras, where world-to-camera matrices were written for camera-to-world ones."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            centres = -np.einsum("vij,vj->vi", self.rotations, self.centres)
+        return Poses(centres, self.rotations.transpose(0, 2, 1), self.windows, self.near)
+
+    def from_translations(self) -> Poses:
+        """The same cameras, where the translations of their world-to-camera poses were written for their centres."""
+        with np.errstate(over="ignore", invalid="ignore"):
+            centres = -np.einsum("vji,vj->vi", self.rotations, self.centres)
+        return Poses(centres, self.rotations, self.windows, self.near)
+
     def within(self, of: Sample) -> Poses:
         """The same cameras in the units of a sample."""
         with np.errstate(over="ignore", invalid="ignore"):
@@ -131,6 +151,10 @@ class Sights:
     covered: F64
     sizes: F64
     remembered: F64
+
+    def some(self, views: NDArray[np.int64]) -> Sights:
+        """What some of the views see, by their numbers."""
+        return Sights(self.seen[views], self.covered[views], self.sizes[views], self.remembered[views])
 
 
 def sample(scene: Scene) -> Sample:
@@ -224,6 +248,28 @@ def look(at: Sample, world: Poses) -> Sights:
             best = float(np.quantile(np.einsum("dk,k->d", at.overall, known) / len(now), 0.95))
             remembered[view] = float(own.mean()) / max(best, 1e-12)
     return Sights(seen, covered, sizes, remembered)
+
+
+def show_nothing(scene: Scene, world: Poses) -> Mask:
+    """Which of some views have no splat's centre in their pictures, nor near the edges: (V,).
+
+    A sample may leave out all that a view of a large scene shows; here up to two million splats are looked at.
+
+    Args:
+        scene: clean, at least one splat.
+        world: of the views, in world units.
+    """
+    rows = _spread(len(scene), _MOST)
+    nothing = np.ones(len(world.centres), bool)
+    for first in range(0, len(rows), _TOGETHER):
+        means = scene.means[rows[first : first + _TOGETHER]].astype(np.float64)
+        for view in np.flatnonzero(nothing):
+            with np.errstate(over="ignore", invalid="ignore"):
+                x, y, depth = world.rotations[view] @ (means - world.centres[view]).T
+            left, right, upper, lower = world.windows[view] + _ROOM * np.array([-1.0, 1, -1, 1])
+            shown = (depth > 0) & (x >= left * depth) & (x <= right * depth) & (y >= upper * depth)
+            nothing[view] = not (shown & (y <= lower * depth)).any()
+    return nothing
 
 
 def _picture(at: Sample, camera_centre: F64, rotation: F64, window: F64, near: float) -> tuple[Mask, F64, float]:

@@ -31,10 +31,13 @@ from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.coded_scene import CodedScene
-from potr_cl.pipeline.encode import Encoded, Run, Stopwatch, as_done, cameras_or_virtual, tell_left_out, tell_losses
+from potr_cl.pipeline.encode import cameras_or_virtual, tell_left_out, tell_losses
+from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.fallback import on_device
 from potr_cl.pipeline.growth import FASTEST, SLOWEST, FinenessAxis, Typical, meet, with_colour_steps, with_steps
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.run import Run, as_done
+from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.pipeline.target import KINDS, Found, Target, Try
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.stages.code import Code

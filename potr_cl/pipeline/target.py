@@ -6,7 +6,7 @@ import math
 from dataclasses import dataclass
 
 from potr_cl.errors import UsageError
-from potr_cl.pipeline.encode import Encoded
+from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 
 #: The kinds of tries (:class:`Try`), and what is said of each; to be followed by a value.

@@ -7,6 +7,7 @@ from collections.abc import Iterator
 from concurrent.futures import Future
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
+from functools import cached_property
 
 import numpy as np
 from numpy.typing import NDArray
@@ -65,6 +66,10 @@ class KeptScene(Owner):
         """Whether it is this scene."""
         return scene is self._scene
 
+    def subset(self, splats: NDArray[np.int64]) -> Scene:
+        """Some of its splats, on the host."""
+        return self._scene.subset(splats)
+
     def drawable(self, device: Device, scene: Scene) -> Drawable:
         """What to give to a rasterizer for a scene: what is kept, if it is this scene and on this device."""
         if self._buffers is not None and self.is_of(scene) and device is self._device:
@@ -106,12 +111,15 @@ class PartOfKept:
     Attributes:
         kept: the scene.
         splats: (n,) int64, their numbers there.
-        scene: the same splats on the host.
     """
 
     kept: KeptScene
     splats: NDArray[np.int64]
-    scene: Scene
+
+    @cached_property
+    def scene(self) -> Scene:
+        """The same splats on the host, copied when somebody asks for them."""
+        return self.kept.subset(self.splats)
 
 
 @contextmanager

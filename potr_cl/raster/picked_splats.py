@@ -15,6 +15,8 @@ from potr_cl.raster.scene_buffers import SPLAT_GROUP, SceneBuffers
 _SOURCE = "raster/pick.cl"
 #: Work-items of a work-group there, and splats that it looks at.
 _GROUP, _CHUNK = 256, 4096
+#: Among splats' numbers: there is none (cl/include/splat.clh).
+NO_SPLAT = 0xFFFFFFFF
 
 
 class PickedSplats(SceneBuffers):
@@ -27,16 +29,18 @@ class PickedSplats(SceneBuffers):
         whole: the scene; it must outlive this object.
         numbers: (count,) uint32 in the device's memory, the numbers of these splats in it; the caller's.
         count: how many they are, at least one.
+        apart: so far behind the numbers for one view those for the next begin; 0: all views have the same. Then the
+            numbers may be :data:`NO_SPLAT`, for none.
     """
 
-    def __init__(self, whole: SceneBuffers, numbers: cl.Buffer, count: int) -> None:
+    def __init__(self, whole: SceneBuffers, numbers: cl.Buffer, count: int, apart: int = 0) -> None:
         self.device = whole.device
         self.splats = count
         self.stride = -(-count // SPLAT_GROUP) * SPLAT_GROUP
         self.sh_count = whole.sh_count
         self.antialiased, self.low_pass = whole.antialiased, whole.low_pass
         self._memory = Memory(whole.device)
-        self._whole, self._numbers = whole, numbers
+        self._whole, self._numbers, self._apart = whole, numbers, apart
         self.means, self.scales, self.quaternions = whole.means, whole.scales, whole.quaternions
         self.log2_opacities, self.sh = whole.log2_opacities, whole.sh
 
@@ -46,7 +50,12 @@ class PickedSplats(SceneBuffers):
 
     @property
     def picks(self) -> dict[str, Any]:
-        return {"whole_stride": self._whole.stride, "numbers": self._numbers, "picked": self.splats}
+        return {
+            "whole_stride": self._whole.stride,
+            "numbers": self._numbers,
+            "picked": self.splats,
+            "apart": self._apart,
+        }
 
 
 class Picker(Owner):

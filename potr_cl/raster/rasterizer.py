@@ -24,49 +24,24 @@ from contextlib import contextmanager
 import numpy as np
 import pyopencl as cl
 
-from potr_cl.errors import DeviceError, DeviceMemoryError
+from potr_cl.errors import DeviceError
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import LOW_PASS, FloatArray, Scene
+from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.opencl.memory import Memory, Owner, Scratch
+from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.launcher import launcher_for
-from potr_cl.raster.rules import INRIA, LEAST_COMPENSATION, RasterRules
-from potr_cl.raster.scene_buffers import SPLAT_GROUP, Drawable, SceneBuffers, uploaded
+from potr_cl.raster.pictures_in_sets import render_in_sets
+from potr_cl.raster.preparation import Preparation
+from potr_cl.raster.preparing_memory import PreparingMemory
+from potr_cl.raster.projection import Projection
+from potr_cl.raster.rules import INRIA, RasterRules
+from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, uploaded
 from potr_cl.raster.view_set import View, ViewSet
 
 #: Least room for intersections before anything is known of a view, and as a multiple of the splats.
 _FIRST_CAPACITY, _FIRST_CAPACITY_A_SPLAT = 1 << 16, 4
 #: Projected splats of the views that are rendered together. More take gigabytes, and a driver long to find them.
 _PROJECTED = 1 << 26
-
-
-class PreparingMemory(Owner):
-    """What preparing views takes besides what is left of them: rasterizers that take turns may share it.
-
-    Args:
-        device: whose memory it is.
-
-    Attributes:
-        bounds, counts, keys: the tiles that splats touch, the tiles' counters, and the lists while they are sorted.
-        image, transmittance: of pictures.
-    """
-
-    def __init__(self, device: Device) -> None:
-        self.bounds = Scratch(device, "the projected splats' bounds")
-        self.counts = Scratch(device, "the tile counts")
-        self.keys = Scratch(device, "the tile lists' sort keys")
-        self.image = Scratch(device, "the image")
-        self.transmittance = Scratch(device, "the transmittance")
-
-    def rest(self) -> None:
-        """Give all back but the pictures."""
-        for scratch in (self.bounds, self.counts, self.keys):
-            scratch.close()
-
-    def close(self) -> None:
-        self.rest()
-        for scratch in (self.image, self.transmittance):
-            scratch.close()
 
 
 class Rasterizer(Owner):
@@ -109,25 +84,11 @@ class Rasterizer(Owner):
                 self._scene, self._owns = scene, False
             else:
                 self._scene, self._owns = uploaded(device, scene), True
-            self._replaced: cl.Buffer | None = None  # other SH coefficients than the scene's
-            self._other_sh = Memory(device)
             self._launcher = launcher_for(device, rules)
-            self._filter_macros = _filter_macros(self._scene)
-            self._projection = device.shared_kernel(
-                "raster/project.cl",
-                "project",
-                LANES=self._launcher.lanes,
-                SH_COUNT=self._scene.sh_count,
-                NEAR=float(rules.near),
-                SQUARE_EXTENT=int(rules.square_extent),
-                **self._filter_macros,
-                **self._scene.pick_macros,
-            )
-        self._preparing = preparing or PreparingMemory(device)
-        self._shares = preparing is not None
-        #: Whether the memory that sets are prepared in is kept for now, and whether it is that of several views.
-        self._keeps_preparing = self._prepared_several = False
-        self._image, self._transmittance = self._preparing.image, self._preparing.transmittance
+            self._projection = Projection(device, self._scene, rules, self._launcher.lanes)
+        self._preparation = Preparation(device, self._scene.stride, self._projection, self._launcher, preparing)
+        memory = self._preparation.memory
+        self._image, self._transmittance = memory.image, memory.transmittance
         self._frame: ViewSet | None = None
 
     @property
@@ -142,7 +103,7 @@ class Rasterizer(Owner):
     @property
     def filter_macros(self) -> dict[str, float]:
         """Macros that a kernel needs which goes through the projection again; none unless the scene is antialiased."""
-        return dict(self._filter_macros)
+        return dict(self._projection.filter_macros)
 
     @property
     def stride(self) -> int:
@@ -170,22 +131,15 @@ class Rasterizer(Owner):
         """
         views = self._frame_view(camera)
         (view,) = views.views
-        try:
-            counts, bounds = self._zeroed_counts(views), self._room_for_bounds(views)
+        with self._preparation.counting():
             while True:
-                self._enqueue_project(views, bounds)
-                self._launcher.enqueue_offsets(views, bounds, counts)
-                self._enqueue_lists(views, bounds, counts, for_frame=True)
+                self._preparation.enqueue_frame(views)
                 self._enqueue_composite(views)
-                # Lists that did not fit are cut short, so the kernels were safe; their result is thrown away.
-                (count,) = views.read_counts()
-                _accept(view, count)
+                # The picture of lists that were cut short is thrown away.
+                (count,) = self._preparation.counted(views)
                 if count <= view.capacity:
                     return self._image.buffer, self._transmittance.buffer
                 views.make_room([count + count // 4])
-        except BaseException:
-            self._preparing.counts.close()  # maybe not zero
-            raise
 
     def render_into(
         self, cameras: Sequence[Camera], target: cl.Buffer, start: int = 0, memory: Memory | None = None
@@ -198,60 +152,25 @@ class Rasterizer(Owner):
             start: byte where they begin.
             memory: on a GPU, to prepare views in, as of :meth:`prepare_set`.
         """
+        device = self.device
+
+        def copied(image: cl.Buffer, pixels: int) -> None:
+            nonlocal start
+            cl.enqueue_copy(device.queue, target, image, byte_count=12 * pixels, dst_offset=start)
+            start += 12 * pixels
+
+        def composited(views: ViewSet) -> None:
+            self._enqueue_composite(views)
+            copied(self._image.buffer, views.pixels)
+
         if self._launcher.whole_sets:
-            self._render_sets_into(cameras, target, start, memory)
+            room = (device.info.memory - device.allocated) // 512
+            most = int(max(min(room, _PROJECTED) // self.stride, 1))
+            render_in_sets(self._preparation, composited, cameras, most, memory)
             return
         for camera in cameras:
-            nbytes = 12 * camera.width * camera.height
             image, _ = self.render_device(camera)
-            cl.enqueue_copy(self.device.queue, target, image, byte_count=nbytes, dst_offset=start)
-            start += nbytes
-
-    def _render_sets_into(
-        self, cameras: Sequence[Camera], target: cl.Buffer, start: int, memory: Memory | None
-    ) -> None:
-        device = self.device
-        room = (device.info.memory - device.allocated) // 512
-        most = int(max(min(room, _PROJECTED) // self.stride, 1))
-        number = 0
-        views: ViewSet | None = None
-        try:
-            while number < len(cameras):
-                # Sets of about one size: drivers take long to give memory back and to take it anew.
-                left = len(cameras) - number
-                sets = -(-left // most)
-                some = cameras[number : number - (-left // sets)]
-                try:
-                    former, views = views, None
-                    views = self._prepare_instead(former, some, memory)
-                except DeviceMemoryError:
-                    if most == 1:
-                        raise
-                    most = max(len(some) // 2, 1)
-                    continue
-                nbytes = 12 * views.pixels
-                self._enqueue_composite(views)
-                cl.enqueue_copy(device.queue, target, self._image.buffer, byte_count=nbytes, dst_offset=start)
-                number += len(some)
-                start += nbytes
-        finally:
-            if views is not None:
-                views.close()
-                if not self._shares:
-                    self._preparing.close()
-
-    def _prepare_instead(self, former: ViewSet | None, cameras: Sequence[Camera], memory: Memory | None) -> ViewSet:
-        """Prepared views, in the memory of others that nobody needs any more, if they fit in there."""
-        if former is not None:
-            fits = False
-            try:
-                fits = len(former.views) == len(cameras) and self.prepare_again(former, cameras)
-            finally:
-                if not fits:
-                    former.close()
-            if fits:
-                return former
-        return self.prepare_set(cameras, memory)
+            copied(image, camera.width * camera.height)
 
     def prepare(self, camera: Camera) -> View:
         """Find projection, tile lists and depth order of a view, which :meth:`composite` can use any number of times.
@@ -267,13 +186,8 @@ class Rasterizer(Owner):
     @contextmanager
     def preparing_many(self) -> Iterator[None]:
         """Inside the block, memory that sets are prepared in is kept for the next one: drivers take long to give it."""
-        self._keeps_preparing = True
-        try:
+        with self._preparation.of_many_sets():
             yield
-        finally:
-            self._keeps_preparing = False
-            if self._prepared_several:
-                self._rest_preparing()
 
     def prepare_set(self, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
         """:meth:`prepare` several views, and wait for the device only once. CPU kernels take one view at a time.
@@ -289,34 +203,7 @@ class Rasterizer(Owner):
             DeviceMemoryError: they do not fit the device, or not all in buffers of the size that it allows.
             DeviceError: one view alone has too many intersections, or the device failed.
         """
-        views = ViewSet(self.device, cameras, self.stride, self._launcher.subtile_bytes, memory)
-        try:
-            counts, bounds = self._zeroed_counts(views), self._room_for_bounds(views)
-            self._enqueue_project(views, bounds)
-            self._launcher.enqueue_offsets(views, bounds, counts)
-            # All of them, while there is nothing else to wait for: the lists are enqueued behind them.
-            views.found_offsets = views.read_offsets()
-            found = [int(offsets[-1]) for offsets in views.found_offsets]
-            for view, count in zip(views.views, found, strict=True):
-                _accept(view, count)
-            views.make_room(found)
-            self._enqueue_lists(views, bounds, counts, for_frame=False)
-        except BaseException:
-            self._preparing.counts.close()  # not zero
-            if len(cameras) > 1:
-                self._rest_preparing()
-            views.close()
-            raise
-        if len(cameras) > 1:  # far more than a single view will need
-            self._prepared_several = True
-            if not self._keeps_preparing:
-                self._rest_preparing()
-        return views
-
-    def _rest_preparing(self) -> None:
-        self._prepared_several = False
-        if not self._shares:
-            self._preparing.rest()
+        return self._preparation.prepare_set(cameras, memory)
 
     def prepare_again(self, views: ViewSet, cameras: Sequence[Camera]) -> bool:
         """Point prepared views at other cameras, in the memory that they have; more is taken only where it must be.
@@ -332,22 +219,7 @@ class Rasterizer(Owner):
         Raises:
             As :meth:`prepare_set`; the views are of no use then.
         """
-        if not views.aim_all(cameras):
-            return False
-        try:
-            counts, bounds = self._zeroed_counts(views), self._room_for_bounds(views)
-            self._enqueue_project(views, bounds)
-            self._launcher.enqueue_offsets(views, bounds, counts)
-            found = views.read_counts()
-            for view, count in zip(views.views, found, strict=True):
-                _accept(view, count)
-            if any(count > view.capacity for view, count in zip(views.views, found, strict=True)):
-                views.make_room([count + count // 4 for count in found])
-            self._enqueue_lists(views, bounds, counts, for_frame=False)
-        except BaseException:
-            self._preparing.counts.close()  # not zero
-            raise
-        return True
+        return self._preparation.prepare_again(views, cameras)
 
     def composite(self, view: View) -> tuple[FloatArray, FloatArray]:
         """The picture of a prepared view; returns what :meth:`render` returns."""
@@ -362,12 +234,12 @@ class Rasterizer(Owner):
         colours: cl.Buffer | None = None,
     ) -> None:
         """Enqueue only the projection of prepared views; with other SH, or into other buffers, if these are given."""
-        self._enqueue_project(views, self._room_for_bounds(views), sh, shapes, colours)
+        self._projection.enqueue(views, self._preparation.room_for_bounds(views), sh, shapes, colours)
 
     @property
     def sh(self) -> cl.Buffer:
         """The SH coefficients that splats have now, as :class:`~potr_cl.raster.scene_buffers.SceneBuffers` has them."""
-        return self._scene.sh if self._replaced is None else self._replaced
+        return self._projection.sh
 
     def replace_sh(self, sh: FloatArray) -> cl.Buffer | None:
         """Give the scene other SH coefficients, (N, M, 3) float32 of the same degree.
@@ -378,45 +250,8 @@ class Rasterizer(Owner):
             The buffer of the former coefficients, which is the caller's to free; None if they are those of a scene that
             lay on the device already, and stay there.
         """
-        former = self.sh
-        self._replaced = self._scene.other_sh(self._other_sh, sh)
-        if former is not self._scene.sh:
-            return self._other_sh.release(former)
-        return self._scene.release_sh() if self._owns else None
-
-    def _room_for_bounds(self, views: ViewSet) -> cl.Buffer:
-        self._preparing.bounds.reserve(8 * self.stride * len(views.views))
-        return self._preparing.bounds.buffer
-
-    def _zeroed_counts(self, views: ViewSet) -> cl.Buffer:
-        """Counters for all tiles. They are zero, and the kernels that use them leave them zero."""
-        if self._preparing.counts.reserve(self._launcher.counter_bytes * views.tiles):
-            self.device.fill(self._preparing.counts.buffer, np.uint32(0), self._preparing.counts.nbytes)
-        return self._preparing.counts.buffer
-
-    def _enqueue_project(
-        self,
-        views: ViewSet,
-        bounds: cl.Buffer,
-        sh: cl.Buffer | None = None,
-        shapes: cl.Buffer | None = None,
-        colours: cl.Buffer | None = None,
-    ) -> None:
-        self._projection.bind(
-            **self._scene.geometry,
-            **self._scene.picks,
-            sh=self.sh if sh is None else sh,
-            views=views.table,
-            shapes=views.shapes if shapes is None else shapes,
-            colours=views.colours if colours is None else colours,
-            bounds=bounds,
-        )
-        lanes = self._launcher.lanes
-        self._projection.launch((self.stride // lanes, len(views.views)), (SPLAT_GROUP // lanes, 1))
-
-    def _enqueue_lists(self, views: ViewSet, bounds: cl.Buffer, counts: cl.Buffer, for_frame: bool) -> None:
-        self._preparing.keys.reserve(self._launcher.key_bytes * views.capacity)
-        self._launcher.enqueue_lists(views, bounds, counts, self._preparing.keys.buffer, for_frame)
+        former = self._projection.replace_sh(sh)
+        return self._scene.release_sh() if former is None and self._owns else former
 
     def _enqueue_composite(self, views: ViewSet) -> None:
         """Enqueue the pictures, one behind the other into the rasterizer's own image."""
@@ -441,7 +276,7 @@ class Rasterizer(Owner):
             capacity = max(capacity, old.capacity)
             old.close()
             self._frame = None
-        views = ViewSet(self.device, [camera], self.stride, self._launcher.subtile_bytes)
+        views = self._preparation.new_views([camera])
         try:
             views.make_room([capacity])
         except BaseException:
@@ -455,17 +290,12 @@ class Rasterizer(Owner):
         if self._frame is not None:
             self._frame.close()
             self._frame = None
-        if not self._shares:
-            self._preparing.close()
+        self._preparation.close()
 
     def close(self) -> None:
         if self._frame is not None:
             self._frame.close()
-        for owner in (
-            *([self._scene] if self._owns else []),
-            self._other_sh,
-            *([] if self._shares else [self._preparing]),
-        ):
+        for owner in (*([self._scene] if self._owns else []), self._projection, self._preparation):
             owner.close()
 
 
@@ -487,23 +317,3 @@ def render(
     """
     with Rasterizer(device or Device(), scene.rendered(antialiased), rules, background) as rasterizer:
         return rasterizer.render(camera)
-
-
-def _filter_macros(scene: SceneBuffers) -> dict[str, float]:
-    """Macros of the projection that an antialiased scene needs; the kernel of classic ones has no trace of it."""
-    if not scene.antialiased:
-        return {}
-    macros = {"ANTIALIASED": 1, "LEAST_COMPENSATION_SQUARED": LEAST_COMPENSATION**2}
-    if scene.low_pass != LOW_PASS:
-        macros |= {"LOW_PASS": scene.low_pass, "LOW_PASS_SQUARED": scene.low_pass**2}
-    return macros
-
-
-def _accept(view: View, count: int) -> None:
-    """Note in a view how many intersections the device has found."""
-    if count == 0xFFFFFFFF:
-        raise DeviceError(
-            f"view '{view.camera.name}' needs more than 2^32 tile intersections: "
-            "too many huge splats for this image size"
-        )
-    view.intersection_count = count

@@ -59,7 +59,7 @@ class SceneBuffers(Owner):
             raise DeviceError(f"{splats} splats are more than the kernels can number")
         self.device = device
         self.splats = splats
-        self.stride = max(-(-splats // SPLAT_GROUP), 1) * SPLAT_GROUP
+        self.stride = stride_of(splats)
         self.sh_count = sh_count
         self.antialiased, self.low_pass = antialiased, low_pass
         self._memory = Memory(device)
@@ -121,7 +121,7 @@ class SceneBuffers(Owner):
     @property
     def picks(self) -> dict[str, Any]:
         """The projection's arguments that say which they are, by their names."""
-        return {"whole_stride": self.stride, "numbers": self.means, "picked": self.splats}
+        return {"whole_stride": self.stride, "numbers": self.means, "picked": self.splats, "apart": 0}
 
     def write_rows(
         self,
@@ -335,6 +335,11 @@ class SceneBuffers(Owner):
 
     def close(self) -> None:
         self._memory.close()
+
+
+def stride_of(splats: int) -> int:
+    """So many splats rounded up: how long a column of values is that has one for each."""
+    return max(-(-splats // SPLAT_GROUP), 1) * SPLAT_GROUP
 
 
 #: What can be rendered: a scene of the host, or one that is on the device already.

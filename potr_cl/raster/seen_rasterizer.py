@@ -18,7 +18,8 @@ from potr_cl.opencl.memory import Memory, Owner, Reused
 from potr_cl.raster.culling import part_seen
 from potr_cl.raster.kept_scene import fits_whole, whole_on_device
 from potr_cl.raster.picked_splats import PickedSplats, Picker, Picks
-from potr_cl.raster.rasterizer import PreparingMemory, Rasterizer
+from potr_cl.raster.preparing_memory import PreparingMemory
+from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
 from potr_cl.raster.scene_buffers import Drawable, SceneBuffers, gathered
 

@@ -18,9 +18,10 @@ from potr_cl.raster.view_set import ViewSet
 
 #: A launch's views should take at most a sixteenth of the budget: it is filled launch by launch, and what is left over
 #: at the end is not used.
-_LEAST_SETS = 16
+LEAST_SETS = 16
 #: Bytes of a projected splat of a view: shape and colour.
 _SHAPE, _COLOUR = 32, 16
+GEOMETRY = _SHAPE + _COLOUR
 
 
 class ViewCache(Owner):
@@ -33,6 +34,8 @@ class ViewCache(Owner):
 
     Attributes:
         room: bytes of the budget that are left.
+        largest: projected splats of the largest set of views that will be kept, where later ones are larger than the
+            first ones.
         shared: shapes and colours for views that have none of their own, one set of views at a time; None: all views
             have their own.
     """
@@ -42,6 +45,7 @@ class ViewCache(Owner):
         self._memory = Memory(rasterizer.device)
         self._whole: list[ViewSet] = []  # those that keep their geometry
         self.room, self._others = budget, others
+        self.largest = 0
         self.shared: tuple[cl.Buffer, cl.Buffer] | None = None
 
     def most_views(self, most: int, nbytes: int) -> int:
@@ -50,8 +54,8 @@ class ViewCache(Owner):
         Args:
             nbytes: that a view takes besides its geometry, at least.
         """
-        least = (_SHAPE + _COLOUR) * self._rasterizer.stride + nbytes
-        return int(min(max(self.room // (_LEAST_SETS * least), 1), most))
+        least = GEOMETRY * self._rasterizer.stride + nbytes
+        return int(min(max(self.room // (LEAST_SETS * least), 1), most))
 
     def keep(self, views: ViewSet, own: int = 0) -> bool:
         """Keep prepared views if the budget allows it.
@@ -67,7 +71,7 @@ class ViewCache(Owner):
             DeviceMemoryError: the device has no room for what views share.
         """
         to_spare = [*self._whole, views]
-        shared = 0 if self.shared else max(map(self._geometry, to_spare))
+        shared = 0 if self.shared else max(GEOMETRY * self.largest, *map(self._geometry, to_spare))
         needed = views.nbytes_cached + own
         if needed + shared > self.room + sum(map(self._geometry, self._whole)):
             return False
@@ -78,12 +82,12 @@ class ViewCache(Owner):
             other.free_geometry()
             if self.shared is None:
                 self.room -= shared
-                self._share(shared // (_SHAPE + _COLOUR))
+                self._share(shared // GEOMETRY)
         self._whole = to_spare
         return True
 
     def _geometry(self, views: ViewSet) -> int:
-        return (_SHAPE + _COLOUR) * self._rasterizer.stride * len(views.views)
+        return GEOMETRY * views.stride * len(views.views)
 
     def _share(self, splats: int) -> None:
         self.shared = (
@@ -92,8 +96,12 @@ class ViewCache(Owner):
         )
 
     @contextmanager
-    def geometry(self, views: ViewSet) -> Iterator[bool]:
+    def geometry(self, views: ViewSet, rasterizer: Rasterizer | None = None) -> Iterator[bool]:
         """Make sure that kept views have their geometry inside the block.
+
+        Args:
+            views: that are kept.
+            rasterizer: that has prepared them; None: the cache's own.
 
         Yields:
             Whether it had to be made again.
@@ -104,7 +112,7 @@ class ViewCache(Owner):
         assert self.shared is not None
         views.shapes, views.colours = self.shared
         try:
-            self._rasterizer.project(views)
+            (rasterizer or self._rasterizer).project(views)
             yield True
         finally:
             views.shapes = views.colours = None

@@ -68,14 +68,21 @@ class ViewShares:
     Attributes:
         views: all views.
         shares: who does which of them; each has some.
+        names: of those that do them, in the same order.
     """
 
     views: Sequence[Camera]
     shares: tuple[ViewShare, ...]
+    names: tuple[str, ...] = ()
 
     @staticmethod
     def of(
-        views: Sequence[Camera], sights: Sights, speeds: Sequence[float], source: Scene, numbers: Indices
+        views: Sequence[Camera],
+        sights: Sights,
+        speeds: Sequence[float],
+        source: Scene,
+        numbers: Indices,
+        names: Sequence[str] = (),
     ) -> ViewShares:
         """Deal views out, neighbours to the same.
 
@@ -85,10 +92,13 @@ class ViewShares:
             speeds: of those that are to do them.
             source: a scene that has that one's splats as they are.
             numbers: (N,) of these there, ascending.
+            names: of those that are to do them.
         """
-        shares = []
-        for own in sights.dealt(speeds):
+        shares: list[ViewShare] = []
+        busy: list[str] = []
+        for place, own in enumerate(sights.dealt(speeds)):
             if own:
+                busy += names[place : place + 1]
                 splats, of_these = sights.of_views(own)
                 shares.append(ViewShare(own, splats, Excerpt(source, numbers[splats]), of_these))
-        return ViewShares(views, tuple(shares))
+        return ViewShares(views, tuple(shares), tuple(busy))

@@ -7,7 +7,7 @@ from __future__ import annotations
 
 import dataclasses
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 
 import numpy as np
 from numpy.typing import NDArray
@@ -50,6 +50,18 @@ def looking_back(camera: Camera) -> Camera:
     """The camera with its y and z axes turned round, as programs write it that have y up and z back."""
     rotation = np.diag([1.0, -1.0, -1.0]) @ camera.rotation
     return dataclasses.replace(camera, rotation=rotation, translation=-rotation @ camera.centre)
+
+
+def _posed(camera: Camera, rotation: F64, centre: F64) -> Camera:
+    return dataclasses.replace(camera, rotation=rotation, translation=-rotation @ centre)
+
+
+#: What a reader makes of poses that were written in another way than the format says.
+MISREADINGS: dict[str, Callable[[Camera], Camera]] = {
+    "rotations written world to camera": lambda camera: _posed(camera, camera.rotation.T, camera.centre),
+    "poses written world to camera": lambda camera: _posed(camera, camera.rotation.T, camera.translation),
+    "translations written as positions": lambda camera: _posed(camera, camera.rotation, camera.translation),
+}
 
 
 def right(scene: Scene, cameras: Sequence[Camera], others: bool = True) -> Iterator[tuple[str, list[Camera]]]:

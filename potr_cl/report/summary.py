@@ -11,8 +11,9 @@ from typing import Any
 
 from potr_cl import __version__
 from potr_cl.model.scene import Scene
-from potr_cl.pipeline.encode import Encoded, Proved
+from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.proof import Proved
 from potr_cl.pipeline.target import Found, Target
 from potr_cl.plain_text import plain_document
 from potr_cl.quality.compare import Comparison, mean_view

@@ -9,7 +9,8 @@ import numpy as np
 from numpy.typing import NDArray
 
 from potr_cl.errors import UsageError
-from potr_cl.host.threads import thread_pool
+from potr_cl.host.threads import in_background, thread_pool
+from potr_cl.model.scene import FloatArray
 from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import lying_on
 from potr_cl.raster.scene_buffers import SceneBuffers
@@ -24,8 +25,6 @@ from potr_cl.stages.pruning.unseen import (
     Unseen,
     as_of_whole,
     find_unseen,
-    put_back,
-    set_aside,
     without_directions,
 )
 from potr_cl.stages.pruning.visible_parts import LARGEST_LIMIT, LIKELY, groups_of_large, seen_part, sights_worth_it
@@ -157,9 +156,11 @@ class Prune(Stage):
         """
         with thread_pool(bench.threads) as pool, lying_on(bench.opened, bench.placed(state)) as placed:
             quick = partial(surely_seen, placed) if isinstance(placed, SceneBuffers) else None
-            likely = seen_part(state.scene, state.views) <= LIKELY
-            groups = groups_of_large(state.scene, pool.map) if likely or not quick else None
-            hidden, area = find_unseen(state, groups, pool.map, quick)
+            part = in_background(seen_part, state.scene, state.views)  # while a device finds the unseen ones
+            unseen = find_unseen(state, None, pool.map, quick) if quick else None
+            likely = part.result() <= LIKELY
+            groups = groups_of_large(state.scene, pool.map) if likely or not unseen else None
+            hidden, area = unseen or find_unseen(state, groups, pool.map)
             options = self._sweep_options(bench.memory)
             sights = sights_worth_it(state.scene, state.views, options, groups, pool.map) if likely else None
             groups = None
@@ -183,39 +184,48 @@ class Prune(Stage):
             and not bench.interludes
             and bench.parameters.delta_mse_max < LARGEST_LIMIT
         ):
-            return without_directions(self._pruned(told, bench, sights, hidden), told.survivors[hidden])
-        split = set_aside(told, hidden)
-        if not len(split.seen_splats):
+            return self._pruned(told, bench, sights, spared=hidden)
+        seen = np.flatnonzero(~hidden)
+        if not len(seen):
             everything = np.arange(splats)
             return told.having_learnt(
                 self.name, Pruned(splats, np.full(splats, -1, np.int32), 0, lambda: Course(everything))
             )
         if sights is not None:
-            sights = sights_worth_it(split.seen.scene, state.views, options)
-        left = self._pruned(split.seen, bench, sights)
-        return put_back(split, left).having_learnt(self.name, as_of_whole(split, left.learnt[self.name]))
+            sights = sights_worth_it(state.scene.subset(seen), state.views, options)
+        return self._pruned(told, bench, sights, seen)
 
     def _pruned(
         self,
         state: State,
         bench: Workbench,
         sights: Sights | None = None,
+        seen: NDArray[np.int64] | None = None,
         spared: NDArray[np.bool_] | None = None,
     ) -> State:
+        """The state after pruning.
+
+        Args:
+            state, bench: of the stage.
+            sights: what the views see of the splats that are pruned.
+            seen: (n,) numbers of these, ascending; the others are kept, without what of their colours depends on the
+                direction. None: all may go, or the measurement spares some.
+            spared: (N,) which splats the measurement is to spare; these lose the same.
+        """
         dealt = None
         if sights is not None and bench.pool is not None and not bench.pool.in_process:
-            dealt = _dealt(state, bench.pool, sights)
+            dealt = _dealt(state, seen, bench.pool, sights)
             state = state.having_learnt("shares", dealt)
         waiting = sorted(bench.interludes, key=lambda interlude: interlude.after)
-        schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene))
+        schedule = self._schedule(bench.parameters.delta_mse_max, len(state.scene) if seen is None else len(seen))
         bench.progress("prepare views", 0.0)
-        with measurement(state, bench, self._sweep_options(bench.memory), sights, spared, dealt) as removal:
-            course = _Course(state, removal)
+        with measurement(state, bench, self._sweep_options(bench.memory), sights, spared, dealt, seen) as removal:
+            course = _Course(state, removal, seen)
 
             def after_iteration(iteration: int) -> None:
                 while waiting and iteration + 1 >= waiting[0].after:
                     course.visit(waiting.pop(0), np.flatnonzero(removal.alive), bench)
-                    removal.replace_sh(course.sh)
+                    removal.replace_sh(course.measured_sh)
 
             bench.progress("prune", 0.0)
             pruned = prune_scene(
@@ -228,15 +238,34 @@ class Prune(Stage):
             for interlude in waiting:
                 if interlude.always:
                     course.visit(interlude, pruned.survivors, bench)
-            return course.left(pruned.survivors).having_learnt(self.name, pruned)
+            # While drivers give the measurement's memory back.
+            left = in_background(self._left, course, pruned, seen, spared)
+        return left.result()
+
+    def _left(
+        self, course: _Course, pruned: Pruned, seen: NDArray[np.int64] | None, spared: NDArray[np.bool_] | None
+    ) -> State:
+        """The state after pruning; ``seen`` and ``spared`` as of :meth:`_pruned`."""
+        if seen is None:
+            left = course.left(pruned.survivors).having_learnt(self.name, pruned)
+            return left if spared is None else without_directions(left, spared[pruned.survivors])
+        unseen = np.ones(course.splats, bool)
+        unseen[seen] = False
+        kept = unseen.copy()
+        kept[seen[pruned.survivors]] = True
+        numbers = np.flatnonzero(kept)
+        # Nobody looked at the unseen ones from any direction.
+        left = without_directions(course.having(numbers), unseen[numbers])
+        return left.having_learnt(self.name, as_of_whole(seen, np.flatnonzero(unseen), pruned))
 
 
-def _dealt(state: State, pool: Pool, sights: Sights) -> ViewShares:
+def _dealt(state: State, seen: NDArray[np.int64] | None, pool: Pool, sights: Sights) -> ViewShares:
     """The views for a pool's workers, and which of the source's splats each gets, for this stage and others."""
-    speeds = speeds_of(pool.workers())
-    if state.is_cut:
-        return ViewShares.of(state.views, sights, speeds, state.source, state.survivors)
-    return ViewShares.of(state.views, sights, speeds, state.scene, np.arange(len(state.scene)))
+    workers = pool.workers()
+    source, numbers = (state.source, state.survivors) if state.is_cut else (state.scene, np.arange(len(state.scene)))
+    names = [worker.name for worker in workers]
+    splats = numbers if seen is None else numbers[seen]
+    return ViewShares.of(state.views, sights, speeds_of(workers), source, splats, names)
 
 
 class _Course:
@@ -245,27 +274,44 @@ class _Course:
     Args:
         state: the state before the first iteration.
         removal: measures effects, and knows which splats are left.
+        seen: (n,) numbers in the state's scene of the splats that the removal has; None: it has all.
 
     Attributes:
-        sh: (N, M, 3) the colours that all splats of the state's scene have by now.
+        splats: N, of the state's scene.
+        sh: (N, M, 3) the colours that these have by now.
     """
 
-    def __init__(self, state: State, removal: Removal) -> None:
-        self._state, self._removal = state, removal
-        self.sh = state.scene.sh
+    def __init__(self, state: State, removal: Removal, seen: NDArray[np.int64] | None = None) -> None:
+        self._state, self._removal, self._seen = state, removal, seen
+        self.splats, self.sh = len(state.scene), state.scene.sh
+
+    @property
+    def measured_sh(self) -> FloatArray:
+        """(n, M, 3) the colours of the removal's splats."""
+        return self.sh if self._seen is None else self.sh[self._seen]
 
     def left(self, splats: NDArray[np.int64], afresh: bool = False) -> State:
-        """The state in which only these splats are left, with the colours of the beginning or with those of now."""
+        """The state in which only these of the removal's splats are left.
+
+        With the colours of the beginning or with those of now.
+        """
+        return self.having(self._numbers(splats), afresh)
+
+    def having(self, numbers: NDArray[np.int64], afresh: bool = False) -> State:
+        """The same for splats of the state's scene."""
         scene = self._state.scene if afresh else replace(self._state.scene, sh=self.sh)
-        return replace(self._state, scene=scene).keeping(splats)
+        return replace(self._state, scene=scene).keeping(numbers)
+
+    def _numbers(self, splats: NDArray[np.int64]) -> NDArray[np.int64]:
+        return splats if self._seen is None else self._seen[splats]
 
     def visit(self, interlude: Interlude, splats: NDArray[np.int64], bench: Workbench) -> None:
-        """Have another stage work on these splats, and go on with the colours that it gives them."""
+        """Have another stage work on these of the removal's splats, and go on with the colours that it gives them."""
         given = replace(self.left(splats, interlude.afresh), importances=Measured(self._removal, splats))
         then = interlude.stage.run(given, bench)
         if then is given:
             return
         if self.sh is self._state.scene.sh:  # the array of the state before, which must not change
             self.sh = self.sh.copy()
-        self.sh[splats] = then.scene.sh
+        self.sh[self._numbers(splats)] = then.scene.sh
         self._state = replace(self._state, learnt=then.learnt)

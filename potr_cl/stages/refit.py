@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from potr_cl.errors import UsageError
-from potr_cl.host.threads import thread_pool
+from potr_cl.host.threads import in_background, thread_pool
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
@@ -20,6 +20,7 @@ from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.scene_buffers import SceneBuffers
 from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
+from potr_cl.stages.refitting.coming_scene import ComingScene
 from potr_cl.stages.refitting.photographs import PhotographChoice, hold_out
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import placed
@@ -142,7 +143,7 @@ class Refit(Stage):
         fits = 1 if folder is None else 2
 
         def fitted(views: Sequence[Camera], targets: Targets, number: int) -> tuple[Refitted, Rounded]:
-            geometry = rounded
+            geometry: Rounded | None = None
 
             def progress(done: int, steps: int) -> None:
                 bench.progress("refit", (number + done / steps) / fits)
@@ -150,12 +151,12 @@ class Refit(Stage):
             def fix_ac(sh: FloatArray, refit: ColourRefit) -> FloatArray:
                 nonlocal geometry
                 request = replace(bench.request(state), blocks=refit.blocks)
-                geometry, fixed = bench.output.fix_ac(rounded, sh, refit.worth(), request)
+                geometry, fixed = bench.output.fix_ac(rounded.result(), sh, refit.worth(), request)
                 return fixed
 
             def colour_grid(effects: FloatArray) -> ColourGrid:
                 nonlocal geometry
-                geometry, grid = bench.output.colour_grid(rounded, effects, bench.request(state))
+                geometry, grid = bench.output.colour_grid(rounded.result(), effects, bench.request(state))
                 return grid
 
             found = refit_colours(
@@ -164,14 +165,18 @@ class Refit(Stage):
                 help_from=help_from if number == 0 else None,
                 colour_grid=colour_grid if on_grid else None,
             )  # fmt: skip
-            return found, geometry
+            return found, rounded.result() if geometry is None else geometry
 
         with ExitStack() as stack:
             stack.callback(bench.progress, "refit", 1.0)
             ahead = stack.enter_context(_pictures_ahead(state, bench))
-            rounded = _rounded(state, bench)
-            with thread_pool(bench.threads or min(os.cpu_count() or 1, _DECODING)) as pool:
-                decoded = rounded.decoded(state.scene.sh, pool.map)
+            rounded = in_background(_rounded, state, bench)
+
+            def decode() -> Scene:
+                with thread_pool(bench.threads or min(os.cpu_count() or 1, _DECODING)) as pool:
+                    return rounded.result().decoded(state.scene.sh, pool.map)
+
+            decoded = ComingScene(state.scene.sh, decode)
             pictures = stack.enter_context(_pictures_of_goal(state, bench, ahead))
             help_from = None
             if bench.pool is not None:
@@ -190,7 +195,8 @@ class Refit(Stage):
                 to_photographs, its_geometry = fitted(fit_to, targets, 1)
                 psnrs = []
                 for each in (to_photographs, refitted):
-                    with Rasterizer(bench.opened, replace(decoded, sh=each.sh), background=bench.background) as judged:
+                    shown = replace(decoded.result(), sh=each.sh)
+                    with Rasterizer(bench.opened, shown, background=bench.background) as judged:
                         psnrs.append(photographs.psnr(judged, judging))
                 choice = PhotographChoice(len(judging), *psnrs)
                 if choice.kept:
@@ -235,7 +241,8 @@ def _pictures_of_goal(state: State, bench: Workbench, ahead: PicturesAhead | Non
             yield targets
             return
         remembered = RememberedTargets(device, targets, views)
-    yield remembered
+    with remembered:
+        yield remembered
 
 
 @contextmanager

@@ -155,16 +155,25 @@ class Workbench:
         """What to give to a rasterizer for a scene: it may lie on the device already."""
         return scene if self.kept is None else self.kept.drawable(self.opened, scene)
 
-    def placed(self, state: State) -> Scene | KeptScene | PartOfKept:
-        """A state's scene, or where devices have it, for :func:`potr_cl.raster.kept_scene.lying_on`."""
+    def placed(self, state: State, some: NDArray[np.int64] | None = None) -> Scene | KeptScene | PartOfKept:
+        """A state's scene, or where devices have it, for :func:`potr_cl.raster.kept_scene.lying_on`.
+
+        Args:
+            state: whose scene.
+            some: (n,) numbers there of the splats that are wanted, ascending; None: all.
+        """
         kept = self.kept
         if kept is None or not state.is_cut or kept.drawable(self.opened, state.source) is state.source:
-            return state.scene
-        return kept if state.scene is state.source else PartOfKept(kept, state.survivors, state.scene)
+            return state.scene if some is None else state.scene.subset(some)
+        if state.scene is state.source:
+            return kept if some is None else PartOfKept(kept, some)
+        return PartOfKept(kept, state.survivors if some is None else state.survivors[some])
 
-    def shared(self, state: State) -> Scene | KeptScene | PartOfKept:
+    def shared(self, state: State, some: NDArray[np.int64] | None = None) -> Scene | KeptScene | PartOfKept:
         """The same for the pool's workers: threads of this process have it from what is kept on their devices."""
-        return self.placed(state) if self.pool is not None and self.pool.in_process else state.scene
+        if self.pool is not None and self.pool.in_process:
+            return self.placed(state, some)
+        return state.scene if some is None else state.scene.subset(some)
 
     def shared_source(self, state: State) -> Scene | KeptScene | ViewShares:
         """A state's source for the pool's workers; where they have what their views see already, that."""

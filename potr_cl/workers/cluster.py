@@ -52,6 +52,7 @@ class ClusterPool(Pool):
 
     takes_part = False
     sparse = True
+    relieves = True
 
     def __init__(self, cluster: str | Client, first: Device, patience: float = 60.0) -> None:
         self.first, self.traffic, self.patience = first, Traffic(), patience
@@ -81,7 +82,7 @@ class ClusterPool(Pool):
                 "no worker of the cluster answers any more: start some, with --memory-limit 0 if Dask stopped them for "
                 "the memory that they took, and encode again"
             )
-        return left
+        return [worker for worker in left if not worker.is_behind] or left
 
     @property
     def names(self) -> tuple[str, ...]:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
+from statistics import median
 
 from potr_cl.workers.pool import Pool, Worker
 
@@ -17,10 +18,12 @@ class Shares:
 
     Attributes:
         own: numbers of the master's views. others: of each part's; none is empty.
+        names: of the workers that the parts are meant for, in the same order.
     """
 
     own: list[int]
     others: list[list[int]]
+    names: tuple[str, ...] = ()
 
 
 def shares(pool: Pool, views: int, parts: int = 1, own_speed: float = 1.0) -> Shares:
@@ -44,7 +47,8 @@ def shares(pool: Pool, views: int, parts: int = 1, own_speed: float = 1.0) -> Sh
         for share, places in zip(dealt, deal(len(numbers), speeds, part), strict=True):
             share += [numbers[place] for place in places]
     own, others = (dealt[0], dealt[1:]) if pool.takes_part else ([], dealt)
-    return Shares(sorted(own), [sorted(each) for each in others if each])
+    busy = [(worker, sorted(each)) for worker, each in zip(workers, others, strict=True) if each]
+    return Shares(sorted(own), [each for _, each in busy], tuple(worker.name for worker, _ in busy))
 
 
 def speeds_of(workers: Sequence[Worker]) -> list[float]:
@@ -52,11 +56,12 @@ def speeds_of(workers: Sequence[Worker]) -> list[float]:
 
     Small differences say more about what else a computer did just then than about its device.
     """
-    rates = [worker.rate for worker in workers]
-    known = [rate for rate in rates if rate is not None]
-    if len(known) < len(rates) or not known or max(known) < _MATTERS * min(known):
-        return [1.0] * len(rates)
-    return [rate / max(known) for rate in known]
+    known = [worker.rate for worker in workers if worker.rate is not None]
+    if not known or max(known) < _MATTERS * min(known):
+        return [1.0] * len(workers)
+    # One that has come since is counted on to be as fast as most.
+    rates = [median(known) if worker.rate is None else worker.rate for worker in workers]
+    return [rate / max(known) for rate in rates]
 
 
 def deal(views: int, speeds: Sequence[float], first: int = 0) -> list[list[int]]:
@@ -77,3 +82,15 @@ def deal(views: int, speeds: Sequence[float], first: int = 0) -> list[list[int]]
         best = min(asked, key=lambda place: (len(shares[place]) + 1) / speeds[place])
         shares[best].append(view)
     return shares
+
+
+def in_pieces(numbers: Sequence[int], pieces: int, parts: int = 1) -> list[list[int]]:
+    """The views of one worker for several others, each ascending and none empty.
+
+    Args:
+        numbers: of the views.
+        pieces: how many others there are.
+        parts: as of :func:`shares`.
+    """
+    in_turn = sorted(numbers, key=lambda number: (number % parts, number))
+    return [sorted(each) for each in (in_turn[first::pieces] for first in range(pieces)) if each]

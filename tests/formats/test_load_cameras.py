@@ -68,6 +68,8 @@ def test_folders(data: Path, tmp_path: Path) -> None:
     refused(tmp_path, "holds no cameras, expected a COLMAP model .*, a cameras.json or a transforms.json", UsageError)
     shutil.copytree(data / "plush_sparse_binary", tmp_path / "sparse")
     assert len(load_cameras(tmp_path)) == 17
+    shutil.copytree(data / "plush_sparse_binary", tmp_path / "another" / "sparse" / "0")
+    assert len(load_cameras(tmp_path / "another" / "sparse")) == 17
     write_json(tmp_path / "transforms.json", nerfstudio(["a.png", "b.png"]))
     assert len(load_cameras(tmp_path)) == 2
     write_json(tmp_path / "cameras.json", [view()])

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import builtins
 import importlib
+import os
 import pkgutil
 import re
 import shutil
@@ -18,11 +19,12 @@ import pytest
 from hypothesis import HealthCheck, Phase, given, settings
 from hypothesis import strategies as st
 
-from potr_cl import Scene, UsageError, cli, info
+from potr_cl import DataError, Scene, UsageError, cli, info
 from potr_cl.formats import cameras, load_cameras, load_scene, registry, save_scene, scene_writer, scenes
 from potr_cl.formats.declaration import CameraFormat, SceneFormat
 from potr_cl.formats.registry import CAMERA_FORMATS, SCENE_FORMATS, listed
 from potr_cl.formats.scenes.compressed_ply import is_compressed_ply
+from potr_cl.formats.scenes.scene_files import opened
 from potr_cl.host.installation import install_command
 from potr_cl.reference.scenes import random_scene
 from tests.cases.cameras import nerfstudio, view, write_json
@@ -287,3 +289,39 @@ def test_a_format_is_one_line_of_the_table(
 def test_lists_for_people() -> None:
     assert [listed(list("abc")[:n]) for n in range(4)] == ["", "a", "a or b", "a, b or c"]
     assert listed(["a", "b"], "and") == "a and b"
+
+
+@pytest.mark.parametrize("broken", [False, True])
+def test_a_file_of_any_format_that_is_written_while_it_is_read(tmp_path, broken):
+    path = tmp_path / "scene.splat"
+    path.write_bytes(bytes(64))
+    os.utime(path, ns=(0, 0))
+
+    def read() -> None:
+        with opened(path):
+            path.write_bytes(bytes(65))
+            if broken:
+                raise ValueError("it ends too early")
+
+    with pytest.raises(DataError, match="was changed while it was read"):
+        read()
+
+
+@pytest.mark.parametrize(
+    ("files", "named"),
+    [
+        (["input.ply", "point_cloud/iteration_7000/a.ply", "point_cloud/iteration_30000/a.ply"], 2),
+        (["ply/point_cloud_6999.ply", "ply/point_cloud_29999.ply", "cfgs/a.yml"], 1),
+        (["iteration_7000/point_cloud.ply", "iteration_30000/point_cloud.ply"], 1),
+        (["splat.ply"], 0),
+        (["images/a.png"], None),
+    ],
+)
+def test_the_folder_of_a_training_is_refused_with_the_name_of_its_scene(tmp_path, files, named):
+    for file in files:
+        (tmp_path / file).parent.mkdir(parents=True, exist_ok=True)
+        (tmp_path / file).touch()
+    with pytest.raises(UsageError, match="holds no scene that can be read as a folder") as caught:
+        load_scene(tmp_path)
+    inside = [file for file in files if f"give the file in it: '{tmp_path / file}'" in str(caught.value)]
+    assert inside == ([] if named is None else [files[named]])

@@ -14,7 +14,7 @@ from potr_cl.model.agreement import judge_cameras, require_agreement
 from potr_cl.model.camera import train_views
 from potr_cl.model.virtual_cameras import place_cameras
 from potr_cl.reference.captures import CAPTURES
-from potr_cl.reference.frames import MOTIONS, looking_back, moved, right, without_directions, wrong
+from potr_cl.reference.frames import MISREADINGS, MOTIONS, looking_back, moved, right, without_directions, wrong
 from potr_cl.reference.raster import sh_basis
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
 
@@ -89,6 +89,10 @@ def test_every_wrong_frame_of_a_whole_scene_is_found(name, request):
     for what in ("turned by 180 degrees about x", "scaled by 10", "scaled by 0.1"):
         assert found[what] == what
     assert found["cameras with the axes of OpenGL"] == "behind its cameras"
+    for what, misread in MISREADINGS.items():
+        judged = judge_cameras(scene, [misread(camera) for camera in views])
+        assert judged.suspicious, what
+        assert judged.motion.misread is not None, what
 
 
 def test_cameras_with_the_axes_of_opengl_are_called_so():
@@ -98,6 +102,45 @@ def test_cameras_with_the_axes_of_opengl_are_called_so():
     assert judged.suspicious
     assert "they fit if each camera's y and z axes are turned round" in judged.finding
     assert judged.remedy == "write the cameras with x right, y down, z forward"
+
+
+@pytest.mark.parametrize(
+    ("what", "condition", "remedy"),
+    [
+        ("rotations written world to camera", "rotation is transposed", "the transpose of each"),
+        ("poses written world to camera", "pose is inverted", "the inverse of each matrix"),
+        ("translations written as positions", "position is the translation t", "-R^T t"),
+    ],
+)
+def test_poses_that_were_written_the_wrong_way_round_are_called_so(what, condition, remedy):
+    scene, cameras = CAPTURES["facade"]()
+    judged = judge_cameras(scene, [MISREADINGS[what](camera) for camera in cameras])
+    assert judged.suspicious
+    assert condition in judged.finding
+    assert remedy in judged.remedy
+
+
+def test_views_that_show_nothing_are_told_and_the_others_taken(plush_excerpt, plush_excerpt_cameras, caplog):
+    views = [looking_back(camera) if number % 4 == 1 else camera for number, camera in enumerate(plush_excerpt_cameras)]
+    judged = judge_cameras(plush_excerpt, views)
+    assert not judged.suspicious
+    assert set(judged.empty) == {camera.name for camera in plush_excerpt_cameras[1::4]}
+    require_agreement(plush_excerpt, views)
+    assert [record.getMessage() for record in caplog.records] == [judged.doubt]
+    assert f"{len(judged.empty)} of {judged.views} views" in judged.doubt
+    assert judged.empty[0] in judged.doubt
+
+
+def test_a_view_of_what_the_sample_leaves_out_is_not_empty(plush_excerpt, plush_excerpt_cameras):
+    """Of a large scene a view may show some splats only, and the sample none of them."""
+    many = plush_excerpt.subset(np.zeros(100_000, int))
+    far = dataclasses.replace(many, means=many.means + np.float32(100))
+    some = np.r_[1:4:2]  # too few and at places that the sample leaves out
+    means = far.means.copy()
+    means[some] = plush_excerpt.means[some]
+    judged = judge_cameras(dataclasses.replace(far, means=means), plush_excerpt_cameras)
+    assert judged.empty == ()
+    assert len(judge_cameras(far, plush_excerpt_cameras).empty) == judged.views
 
 
 @pytest.mark.slow

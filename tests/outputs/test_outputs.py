@@ -20,7 +20,7 @@ from potr_cl.opencl.device import Device
 from potr_cl.outputs.output import Output, Request, RoundedScene
 from potr_cl.outputs.registry import OUTPUTS, output_of, output_of_suffix
 from potr_cl.outputs.spz import Spz
-from potr_cl.pipeline.encode import Encoded
+from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.compare import compare, mean_view
 from potr_cl.raster.rasterizer import Rasterizer

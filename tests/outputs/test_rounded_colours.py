@@ -10,7 +10,7 @@ from potr_cl.codec.quantize import to_ycocg
 from potr_cl.model.camera import test_views as held_out
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.potr import Potr
-from potr_cl.pipeline.encode import Encoded
+from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.compare import compare, mean_view
 from potr_cl.raster.rasterizer import Rasterizer

@@ -11,8 +11,10 @@ from potr_cl.codec.geometry import quantise_geometry
 from potr_cl.codec.quantize import ac_sparsity
 from potr_cl.errors import UsageError
 from potr_cl.model.camera import train_views
-from potr_cl.pipeline.encode import Run, Stopwatch, encode
+from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.run import Run
+from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.reference.scenes import random_scene, ring_of_cameras
 from potr_cl.stages.code import Code
@@ -99,7 +101,8 @@ def test_refits_on_the_way_need_none_at_the_end(device, plush_excerpt, views):
 
 
 def test_nothing_to_do_needs_no_device(monkeypatch):
-    monkeypatch.setattr("potr_cl.pipeline.encode.Device", None)
+    for module in ("encode", "run"):
+        monkeypatch.setattr(f"potr_cl.pipeline.{module}.Device", None)
     encode(random_scene(20, 0), ring_of_cameras(4), EncodeOptions.for_preset("paper", prune=False))
     encode(random_scene(20, 3), None, EncodeOptions.for_preset("paper", prune=False, compact=False))
 
@@ -135,7 +138,7 @@ def test_progress_comes_to_an_end(device, plush_excerpt, views):
 
 def test_a_stage_within_another_counts_for_itself(monkeypatch):
     now = iter([0.0, 1.0, 2.0, 5.0, 9.0, 10.0, 20.0, 21.0])
-    monkeypatch.setattr("potr_cl.pipeline.encode.time.perf_counter", lambda: next(now))
+    monkeypatch.setattr("potr_cl.pipeline.stopwatch.time.perf_counter", lambda: next(now))
     watch = Stopwatch()
     for stage, done in (("a", 0.0), ("a", 0.5), ("b", 0.0), ("b", 1.0), ("a", 0.7), ("a", 1.0), ("c", 1.0)):
         watch(stage, done)

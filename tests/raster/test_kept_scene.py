@@ -138,7 +138,7 @@ def test_a_part_of_what_is_kept_is_taken_on_the_device(device):
     with KeptScene(device, scene) as kept, Rasterizer(device, scene.subset(numbers)) as wanted:
         expected = wanted.render(camera)[0]
         for place in (device, other):
-            with lying_on(place, PartOfKept(kept, numbers, scene.subset(numbers))) as part:
+            with lying_on(place, PartOfKept(kept, numbers)) as part:
                 assert isinstance(part, SceneBuffers)
                 with Rasterizer(place, part) as rasterizer:
                     assert np.array_equal(rasterizer.render(camera)[0], expected)

@@ -15,6 +15,7 @@ from potr_cl.model.camera import Camera
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory
+from potr_cl.raster.preparation import Preparation
 from potr_cl.raster.rasterizer import Rasterizer, render
 from potr_cl.raster.rules import GSPLAT, INRIA, RasterRules
 from potr_cl.raster.view_set import TILE, View, ViewSet
@@ -211,14 +212,14 @@ def test_pictures_of_several_views_in_one_buffer(
 ) -> None:
     """Those of one after the other, also where the device holds no more than two views at a time."""
     rasterizer = Rasterizer(device, random_splats(500, 1, seed=5))
-    prepare_set = Rasterizer.prepare_set
+    prepare_set = Preparation.prepare_set
 
-    def at_most(self: Rasterizer, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
+    def at_most(self: Preparation, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
         if most is not None and len(cameras) > most:
             raise DeviceMemoryError("too many views")
         return prepare_set(self, cameras, memory)
 
-    monkeypatch.setattr(Rasterizer, "prepare_set", at_most)
+    monkeypatch.setattr(Preparation, "prepare_set", at_most)
     cameras = [tilted_camera(1, 64, 64), tilted_camera(2, 50, 33), *(tilted_camera(seed, 17, 15) for seed in range(3))]
     wanted = [rasterizer.render(view)[0].reshape(-1, 3) for view in cameras]
     pixels = sum(map(len, wanted))
@@ -231,9 +232,9 @@ def test_pictures_of_several_views_in_one_buffer(
 def test_sets_of_pictures_take_the_memory_of_those_before(monkeypatch: pytest.MonkeyPatch) -> None:
     """Only the first of them takes memory, where the others have as many tiles; pictures are the same."""
     device = open_device("gpu")
-    prepare_set, made = Rasterizer.prepare_set, []
+    prepare_set, made = Preparation.prepare_set, []
 
-    def at_most_two(self: Rasterizer, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
+    def at_most_two(self: Preparation, cameras: Sequence[Camera], memory: Memory | None = None) -> ViewSet:
         if len(cameras) > 2:
             raise DeviceMemoryError("too many views")
         made.append(len(cameras))
@@ -243,7 +244,7 @@ def test_sets_of_pictures_take_the_memory_of_those_before(monkeypatch: pytest.Mo
     with Rasterizer(device, random_splats(500, 1, seed=5)) as rasterizer, Memory(device) as memory:
         wanted = [rasterizer.render(view)[0] for view in cameras]
         buffer = memory.allocate(12 * 50 * 33 * 4, "pictures")
-        monkeypatch.setattr(Rasterizer, "prepare_set", at_most_two)
+        monkeypatch.setattr(Preparation, "prepare_set", at_most_two)
         rasterizer.render_into(cameras, buffer)
         assert np.array_equal(device.download(buffer, (4, 33, 50, 3), np.float32), wanted)
     assert made == [2]

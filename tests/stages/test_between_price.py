@@ -14,7 +14,8 @@ from potr_cl.model.camera import Camera, train_views
 from potr_cl.model.placement.given_views import GivenViews
 from potr_cl.model.scene import Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, encode
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Target

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import threading
 import time
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import contextmanager
@@ -9,7 +10,8 @@ from contextlib import contextmanager
 import pytest
 
 from potr_cl.errors import DeviceMemoryError, UsageError
-from potr_cl.workers.dealing import shares
+from potr_cl.workers import pace
+from potr_cl.workers.dealing import in_pieces, shares
 from potr_cl.workers.parts import Each, Parts
 from potr_cl.workers.pool import Held, Part, Pool, Shared, Traffic, Worker, WorkerLost
 
@@ -201,3 +203,147 @@ def test_threads_forget_their_parts_meanwhile(in_process, monkeypatch):
         parts.begin_to_close()
         order.append("went on")
     assert order == ["went on", "forgotten", "forgotten"]
+
+
+class Slow(Sum):
+    """Takes its time on workers that are slow; views are the numbers that it multiplies by."""
+
+    def __init__(self, device, memory, numbers, seconds):
+        self.numbers, self.seconds = numbers, seconds
+        self.total = 0
+        time.sleep(self.seconds.get("make", 0) * len(numbers) * rate_here())
+
+    @classmethod
+    def split(cls, given, pieces):
+        numbers, seconds = given
+        return [(own, seconds) for own in in_pieces(numbers, pieces)]
+
+    def add(self, number):
+        time.sleep(self.seconds["add"] * len(self.numbers) * rate_here())
+        self.total += number * sum(self.numbers)
+        return self.total
+
+
+here = threading.local()
+
+
+def rate_here():
+    """By how much the worker of this thread is slower than others now."""
+    rate = here.rate
+    return rate() if callable(rate) else rate
+
+
+class Runner(FakeWorker):
+    """A worker so many times as slow as others."""
+
+    def __init__(self, name, slower):
+        super().__init__(name)
+        self.threads.submit(setattr, here, "rate", slower)
+
+
+@pytest.fixture
+def in_a_hurry(monkeypatch):
+    """Slow workers are waited for little."""
+    monkeypatch.setattr(pace, "_AT_LEAST", 0.05)
+    monkeypatch.setattr(pace, "_AT_FIRST", 0.1)
+
+
+def relieving(*workers):
+    pool = FakePool(*workers)
+    pool.relieves = True
+    return pool
+
+
+def sums(pool, rounds, seconds, views=12):
+    """What is found in each round, summed over parts; and the seconds that each took."""
+    share = shares(pool, views).others
+    with Parts(pool, Slow, [(own, seconds) for own in share], views=[len(own) for own in share]) as parts:
+        found, took = [], []
+        for number in range(rounds):
+            began = time.monotonic()
+            found.append(sum(parts.tell("add", number)))
+            took.append(time.monotonic() - began)
+    return found, took
+
+
+@pytest.mark.parametrize("workers", [2, 3])
+def test_others_do_the_views_of_a_slow_worker(workers, in_a_hurry, caplog):
+    """After it has been waited for once, no round takes as long as its share of the views."""
+    pool = relieving(Runner("slow", 20), *(Runner(str(number), 1) for number in range(1, workers)))
+    found, took = sums(pool, 8, {"add": 0.01})
+    expected, _ = sums(FakePool(Runner("a", 1)), 8, {"add": 0})
+    assert found == expected
+    alone = 0.01 * 20 * 12 / workers
+    assert max(took[3:]) < 0.3 * alone
+    assert sum(took) < 1.5 * alone
+    assert "worker slow is slow: its views go to 1" in caplog.text
+
+
+def test_who_becomes_slow_on_the_way_and_who_is_slow_from_the_beginning(in_a_hurry):
+    rounds = iter(range(1000))
+    pool = relieving(Runner("a", 1), Runner("b", lambda: 1 if next(rounds) < 6 else 50), Runner("c", 1))
+    found, took = sums(pool, 12, {"add": 0.01})
+    assert found == sums(FakePool(Runner("a", 1)), 12, {"add": 0})[0]
+    assert max(took[8:]) < 0.3
+    pool = relieving(Runner("a", 1), Runner("b", 30), Runner("c", 1))
+    found, took = sums(pool, 3, {"make": 0.05, "add": 0.01})
+    assert found == sums(FakePool(Runner("a", 1)), 3, {"add": 0})[0]
+    assert sum(took) < 0.05 * 30 * 4 / 2
+
+
+def test_a_slow_worker_gets_little_in_the_next_work(in_a_hurry):
+    slow = Runner("slow", 8)
+    pool = relieving(slow, Runner("a", 1), Runner("b", 1))
+    sums(pool, 6, {"add": 0.01})
+    if slow.behind is not None:
+        slow.behind.result()
+    share = shares(pool, 34)
+    counts = dict(zip(share.names, map(len, share.others), strict=True))
+    assert counts["slow"] <= 4
+    assert counts["a"] + counts["b"] >= 30
+
+
+def test_workers_that_are_all_as_slow_keep_their_views(in_a_hurry, caplog):
+    found, _ = sums(relieving(Runner("a", 3), Runner("b", 2), Runner("c", 3)), 8, {"add": 0.01})
+    assert found == sums(FakePool(Runner("a", 1)), 8, {"add": 0})[0]
+    assert "slow" not in caplog.text
+
+
+def test_a_slow_worker_is_waited_for_where_others_cannot(in_a_hurry):
+    """They have no room, say; and it is asked once only."""
+
+    class Large(Slow):
+        made = 0
+
+        def __init__(self, device, memory, numbers, seconds):
+            Large.made += 1
+            if Large.made > 2:
+                raise DeviceMemoryError("too little memory")
+            super().__init__(device, memory, numbers, seconds)
+
+    pool = relieving(Runner("slow", 10), Runner("a", 1))
+    with Parts(pool, Large, [([1, 2, 3], {"add": 0.01}), ([4, 5], {"add": 0.01})]) as parts:
+        assert [sum(parts.tell("add", 1)) for _ in range(3)] == [15, 30, 45]
+    assert Large.made == 3
+
+
+def test_what_a_worker_is_still_at_is_nothing_to_add_to():
+    """One that others have overtaken gets no part until it is done."""
+    late: Future = Future()
+    worker = Runner("a", 1)
+    worker.behind = late
+    assert worker.is_behind
+    late.set_result(None)
+    assert not worker.is_behind
+
+
+def test_parts_go_to_the_workers_that_they_were_meant_for():
+    """Where the first worker gets none, it gets none."""
+    a, b, c = (FakeWorker(name) for name in "abc")
+    a.rate, b.rate, c.rate = 0.1, 1.0, 1.0
+    pool = FakePool(a, b, c)
+    share = shares(pool, 2)
+    assert share.names == ("b", "c")
+    with Parts(pool, Sum, [(0, len(own)) for own in share.others], names=share.names) as parts:
+        parts.tell("add", 1)
+    assert (a.commands, b.commands, c.commands) == (0, 1, 1)

@@ -21,7 +21,8 @@ from typing import Any
 from potr_cl.codec.decoder import PotrFile
 from potr_cl.codec.quantize import PRESETS
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, encode
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from tools.bench.whole_command import clocked, fresh_python
 from tools.results import Column, Results

@@ -24,12 +24,13 @@ from potr_cl.codec.decoder import decode
 from potr_cl.codec.quantize import PRESETS
 from potr_cl.errors import UnreachableError
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, encode
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.pipeline.search import encode_to_target
 from potr_cl.pipeline.target import Target
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
-from tools.results import Column, Results
+from tools.results import Column, Results, Table
 from tools.workloads import read, scene_parser
 
 
@@ -69,7 +70,15 @@ def _against(
     return psnr - usual, took.clock / clock, took.processors / processors
 
 
-def bench(folder: Path, device: Device, results: Results, args: argparse.Namespace) -> None:
+@dataclass(frozen=True)
+class _Tables:
+    """What all scenes' rows go to."""
+
+    plain: Table
+    targets: Table
+
+
+def bench(folder: Path, device: Device, tables: _Tables, args: argparse.Namespace) -> None:
     """One scene."""
     scene, cameras = read(folder)
     cameras = [c for split in ("train", "test") for c in [c for c in cameras if c.split == split][:: args.every]]
@@ -81,57 +90,26 @@ def bench(folder: Path, device: Device, results: Results, args: argparse.Namespa
         def measured(encoded: Encoded) -> float:
             return evaluator.psnr(decode(b"".join(encoded.pieces)))
 
-        table = results.table(
-            f"{folder.name}_plain",
-            f"{folder.name}: plain encodes, preset {args.preset}",
-            Column("quality", format="g"),
-            Column("bytes", format=","),
-            Column("PSNR", "dB", ".3f"),
-            Column("time", "s", ".1f"),
-            Column("of processors", "s", ".1f"),
-        )
         plain: list[_Plain] = []
         for q in sorted(args.qualities):
             with Timed() as took:
                 encoded = encode(scene, cameras, replace(options, q=q), device=device)
             plain.append(_Plain(math.log(encoded.nbytes), measured(encoded), took.clock, took.processors))
-            table.add(q, encoded.nbytes, plain[-1].psnr, took.clock, took.processors)
-
-        table = results.table(
-            f"{folder.name}_targets",
-            f"{folder.name}: searches for a size or a PSNR, preset {args.preset}",
-            Column("target"),
-            Column("bytes", format=","),
-            Column("PSNR", "dB", ".3f"),
-            Column("against plain", "dB", "+.3f"),
-            Column("quality", format=".4f"),
-            Column("steps"),
-            Column("time", "s", ".1f"),
-            Column("in plain encodes", format=".2f"),
-            Column("of processors, in plain encodes", format=".2f"),
-        )
+            tables.plain.add(folder.name, q, encoded.nbytes, plain[-1].psnr, took.clock, took.processors)
         targets = [Target(max_bytes=int(size)) for size in args.sizes] + [Target(min_psnr=psnr) for psnr in args.psnrs]
         for target in targets:
             try:
                 with Timed() as took:
                     found = encode_to_target(scene, cameras, target, options, device=device)
             except UnreachableError as error:
-                table.add(str(error), *[None] * 8)
+                tables.targets.add(folder.name, str(error), *[None] * 7)
                 continue
             psnr = measured(found.encoded)
             kinds = Counter(step.kind for step in found.tries)
             gain, clock, processors = _against(plain, math.log(found.encoded.nbytes), psnr, took)
-            steps = ", ".join(f"{count} {kind}" for kind, count in kinds.items())
-            table.add(
-                str(target),
-                found.encoded.nbytes,
-                psnr,
-                gain,
-                found.options.q,
-                steps,
-                took.clock,
-                clock,
-                processors,
+            steps = ", ".join(f"{count} {kind}" if count > 1 else kind for kind, count in kinds.items())
+            tables.targets.add(
+                folder.name, str(target), found.encoded.nbytes, psnr, gain, found.options.q, steps, clock, processors
             )
 
 
@@ -146,8 +124,34 @@ def main() -> None:
     args = parser.parse_args()
     device = Device(args.device)
     results = Results(device.info, args.json)
+    every = "all views" if args.every == 1 else f"one of {args.every} views"
+    tables = _Tables(
+        results.table(
+            "plain",
+            f"Plain encodes, preset {args.preset}, {every}",
+            Column("scene"),
+            Column("quality", format="g"),
+            Column("bytes", format=","),
+            Column("PSNR", "dB", ".2f"),
+            Column("time", "s", ".1f"),
+            Column("processor time", "s", ".1f"),
+        ),
+        results.table(
+            "targets",
+            f"Search to a size or a PSNR, preset {args.preset}, {every}",
+            Column("scene"),
+            Column("target"),
+            Column("bytes reached", format=","),
+            Column("PSNR reached", "dB", ".2f"),
+            Column("against plain", "dB", "+.2f"),
+            Column("quality", format=".3f"),
+            Column("steps"),
+            Column("time, in plain encodes", format=".1f"),
+            Column("processor time, in plain encodes", format=".1f"),
+        ),
+    )
     for folder in args.scenes:
-        bench(folder, device, results, args)
+        bench(folder, device, tables, args)
 
 
 if __name__ == "__main__":

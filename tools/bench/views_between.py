@@ -27,7 +27,8 @@ from potr_cl.codec.decoder import decode
 from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
-from potr_cl.pipeline.encode import Encoded, encode
+from potr_cl.pipeline.encode import encode
+from potr_cl.pipeline.encoded import Encoded
 from potr_cl.pipeline.options import EncodeOptions
 from potr_cl.quality.metrics import psnr
 from tools.results import Column, Results

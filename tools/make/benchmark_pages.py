@@ -5,7 +5,8 @@ that result (docs/benchmarks/results/encode.json) with its title, and a line wit
 ``<!-- headlines -->`` and ``<!-- end -->`` stands the list of headlines, whose figures come from the same results.
 
 --check writes nothing; it fails and says what is stale: tables that are not those of the results, plots drawn of other
-figures, results that no page shows, history outside of history.md, commands that name no module, links to nowhere.
+figures, results that no page shows, history outside of history.md, commands that name no module, links to nowhere,
+sentences of README.md with other figures than the results have.
 --tables leaves the plots alone, which need matplotlib (the extra "bench").
 --ages writes nothing either: it lists the tables by how much the package has changed since they were measured.
 """
@@ -23,6 +24,7 @@ from pathlib import Path
 from tools.make import benchmark_plots
 from tools.make.benchmark_ages import ages
 from tools.make.benchmark_results import RESULTS, ROOT, Result, ResultError, circumstances, load, table
+from tools.make.readme_figures import README, wrong_sentences
 
 PAGES = ROOT / "docs" / "benchmarks"
 HISTORY = "history.md"
@@ -77,6 +79,7 @@ def problems(results: dict[str, Result]) -> list[str]:
         if (results[name].state == "history") != (path.name == HISTORY):
             found.append(f"{path}: '{name}' is {results[name].state}; history, and only that, belongs in {HISTORY}")
     found += [problem for path, text in pages.items() for problem in (*_commands(path, text), *_links(path, text))]
+    found += wrong_sentences(results, README.read_text(encoding="utf-8"))
     return found + benchmark_plots.stale(results)
 
 

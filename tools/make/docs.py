@@ -24,6 +24,7 @@ ROOT = Path(__file__).parents[2]
 
 #: Tables that other pages hold, and the function that makes each.
 _TABLES = {
+    "figures": "tools.make.readme_figures:figures_table",
     "formats": "potr_cl.formats.registry:formats_table",
     "presets": "potr_cl.pipeline.presets:presets_table",
     "quirks": "tools.make.quirks_table:quirks_table",

@@ -29,8 +29,9 @@ from potr_cl.model.camera import Camera, test_views, train_views
 from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.colour_grid import ColourGrid
-from potr_cl.pipeline.encode import Run, Stopwatch
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.run import Run
+from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.stages.code import Code

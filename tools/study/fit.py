@@ -37,8 +37,9 @@ from potr_cl.codec.quantize import HyperParameters
 from potr_cl.model.camera import test_views, train_views
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
-from potr_cl.pipeline.encode import Run, Stopwatch
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.run import Run
+from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.stages.code import Code

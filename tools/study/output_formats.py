@@ -29,8 +29,9 @@ from potr_cl.formats import load_scene, save_scene
 from potr_cl.model.camera import train_views
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.registry import output_of_suffix
-from potr_cl.pipeline.encode import Run, Stopwatch
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.run import Run
+from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.stages.code import Code
 from potr_cl.stages.refit import Refit
 from potr_cl.stages.stage import State

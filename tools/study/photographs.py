@@ -44,8 +44,10 @@ from potr_cl.model.scene import FloatArray, Scene
 from potr_cl.model.views_between import views_between
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Memory, Owner, Scratch
-from potr_cl.pipeline.encode import Run, Stopwatch, encode
+from potr_cl.pipeline.encode import encode
 from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.run import Run
+from potr_cl.pipeline.stopwatch import Stopwatch
 from potr_cl.quality.compare import find_ground_truth
 from potr_cl.quality.metrics import psnr, ssim
 from potr_cl.raster.rasterizer import Rasterizer

@@ -15,7 +15,9 @@
        LEAST_COMPENSATION_SQUARED  the least value under that root; must be given if ANTIALIASED;
        LOW_PASS, LOW_PASS_SQUARED  square pixels added to a splat's variances on screen, and their square;
        PICKED         1: only the splats that `numbers` names are projected, `picked` of them, of a scene that is
-                      `whole_stride` long; what is found lies in their order; LANES must be 1. 0, the default: all. */
+                      `whole_stride` long; what is found lies in their order. Each view's numbers begin `apart` behind
+                      those of the view before it; NO_SPLAT among them is drawn nowhere. LANES must be 1. 0, the
+                      default: all. */
 
 #include "include/lanes.clh"
 #include "include/splat.clh"
@@ -66,6 +68,7 @@ kernel void project(
     uint whole_stride,
     global const uint *numbers,
     uint picked,
+    uint apart,
     global const SetView *views,
     global float4 *shapes,
     global float4 *colours,
@@ -78,8 +81,9 @@ kernel void project(
     const size_t place = get_global_id(0); /* of the results */
 #if PICKED
     const size_t column = whole_stride; /* a parameter's columns lie so far apart */
-    const size_t index = numbers[min(place, (size_t)picked - 1)];
-    vfloat lo = place < picked ? log2_opacities[index] : -INFINITY;
+    const uint number = numbers[(size_t)apart * get_global_id(1) + min(place, (size_t)picked - 1)];
+    const size_t index = number == NO_SPLAT ? 0 : number;
+    vfloat lo = place < picked && number != NO_SPLAT ? log2_opacities[index] : -INFINITY;
 #else
     const size_t column = stride;
     const size_t index = place;

@@ -5,7 +5,9 @@
    same whatever views are done together, in whatever order and on however many devices.
 
    Macros: LANES (splats a work-item), SH_COUNT, WEIGHTS (1: the totals hold the sums of w^2 too, for the blocks),
-   SOME_BLOCKS (1: only the blocks of some splats are added up). */
+   SOME_BLOCKS (1: only the blocks of some splats are added up), PICKED (1: each view has some splats only, in an order
+   of its own, which `numbers` names. Then views are done one after another, because two of them may have the same
+   splat; LANES must be 1. 0: all views have all). */
 
 #include "refit/refit.clh"
 #include "refit/view_colours.clh"
@@ -58,14 +60,17 @@ inline vlong to_fixed_lanes(vfloat value)
     return (CONVERT_VLONG(high) << 31) + CONVERT_VLONG(low);
 }
 
-/* The totals of a set's views, times the view's scale, onto the coefficients: result += basis x (Y, Co, Cg) of the free
-   channels' sums, view by view. With WEIGHTS also blocks += the sum of w^2 x basis x basis, for `block_stride` splats from
+/* The totals of some of a set's views, times the view's scale, onto the coefficients: result += basis x (Y, Co, Cg) of
+   the free channels' sums, view by view. What views have lies `apart`. With WEIGHTS also blocks += the sum of w^2 x basis x basis, for `block_stride` splats from
    number `first_block` on. Both are columns of integers; the scales say what is 1. Leaves the totals zero. */
 kernel void gather(
     global long *totals,
     global const float *means,
     ulong stride,
+    ulong apart,
+    global const uint *numbers,
     global const SetView *views,
+    uint first_view,
     uint view_count,
     global const float *scales,
     uint first_scale,
@@ -76,20 +81,27 @@ kernel void gather(
     global long *blocks)
 {
     const size_t index = get_global_id(0);
+#if PICKED
+    const uint splat = numbers[first_view * apart + index];
+    if (splat == NO_SPLAT)
+        return;
+#else
+    const size_t splat = index;
+#endif
     vlong results[3 * SH_COUNT];
     int any_view = 0;
-    for (uint number = 0; number < view_count; ++number) {
-        const size_t place = number * stride / LANES + index;
+    for (uint number = first_view; number < first_view + view_count; ++number) {
+        const size_t place = number * apart / LANES + index;
         vfloat sums[4];
         const int any_sum = take_totals(totals + (size_t)TOTALS * LANES * place, scales[first_scale + number], sums);
         if (!any_sum)
             continue;
         if (!any_view)
             for (int i = 0; i < 3 * SH_COUNT; ++i)
-                results[i] = VLOAD(index, result + i * stride);
+                results[i] = VLOAD(splat, result + i * stride);
         any_view = 1;
         VREAL basis[SH_COUNT];
-        basis_towards(means, stride, index, &views[number].view, basis);
+        basis_towards(means, stride, splat, &views[number].view, basis);
         const vint kept = free_channels(free, place);
         const vfloat r = (kept & 1) != 0 ? sums[0] : (vfloat)(0.0f);
         const vfloat g = (kept & 2) != 0 ? sums[1] : (vfloat)(0.0f);
@@ -114,7 +126,7 @@ kernel void gather(
     }
     if (any_view)
         for (int i = 0; i < 3 * SH_COUNT; ++i)
-            VSTORE(results[i], index, result + i * stride);
+            VSTORE(results[i], splat, result + i * stride);
 }
 
 #if LANES == 1
@@ -128,7 +140,10 @@ kernel void gather_blocks(
     global const long *totals,
     global const float *means,
     ulong stride,
+    ulong apart,
+    global const uint *numbers,
     global const SetView *views,
+    uint first_view,
     uint view_count,
     global const float *scales,
     uint first_scale,
@@ -136,24 +151,34 @@ kernel void gather_blocks(
     ulong block_stride,
     global long *blocks)
 {
-    const size_t block = get_global_id(0), index = first_block + block;
-    const int row = get_global_id(1), last = SH_COUNT - 1 - row;
-    if (block >= block_stride || index >= stride)
+#if PICKED
+    const size_t index = get_global_id(0);
+    if (index >= apart)
         return;
+    const uint splat = numbers[first_view * apart + index];
+    const size_t block = splat - first_block; /* of splats before the first one it is far beyond the last */
+    if (splat == NO_SPLAT || block >= block_stride)
+        return;
+#else
+    const size_t block = get_global_id(0), index = first_block + block, splat = index;
+    if (block >= block_stride || splat >= stride)
+        return;
+#endif
+    const int row = get_global_id(1), last = SH_COUNT - 1 - row;
     /* Element j of the row, or, before its beginning, element SH_COUNT - 1 - j of the last row; and the latter's first
        one, on the diagonal. */
     long found[SH_COUNT], diagonal = 0;
     for (int j = 0; j < SH_COUNT; ++j)
         found[j] = 0;
     int any = 0;
-    for (uint number = 0; number < view_count; ++number) {
-        const long total = totals[TOTALS * (number * stride + index) + 3];
+    for (uint number = first_view; number < first_view + view_count; ++number) {
+        const long total = totals[TOTALS * (number * apart + index) + 3];
         if (!total)
             continue;
         any = 1;
         const float weight = (float)total * scales[first_scale + number];
         float basis[SH_COUNT], own = 0.0f, its = 0.0f;
-        basis_towards(means, stride, index, &views[number].view, basis);
+        basis_towards(means, stride, splat, &views[number].view, basis);
         for (int m = 0; m < SH_COUNT; ++m) {
             own = m == row ? basis[m] : own;
             its = m == last ? basis[m] : its;

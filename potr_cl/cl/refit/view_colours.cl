@@ -1,17 +1,20 @@
 /* From coefficients to the splats' colours in each view: the first half of the map from coefficients to pictures.
 
-   Macros: LANES (splats a work-item), SH_COUNT. */
+   Macros: LANES (splats a work-item), SH_COUNT; PICKED (1: each view has some splats only, in an order of its own, which
+   `numbers` names; LANES must be 1. 0: all views have all). */
 
 #include "refit/view_colours.clh"
 
 /* The splats' colours in each view of a set: of the coefficients themselves (direction == 0), cut at 0, w telling which
    channels are free (1, 2, 4: above 0); or their change along a direction, 0 where `free` says that the channel is cut,
    and the same w.
-   Work-item i of the second dimension does views i, i + get_global_size(1), … */
+   What views have lies `apart`. Work-item i of the second dimension does views i, i + get_global_size(1), … */
 kernel void view_colours(
     global const float *coefficients,
     global const float *means,
     ulong stride,
+    ulong apart,
+    global const uint *numbers,
     global const SetView *views,
     uint view_count,
     int direction,
@@ -21,18 +24,28 @@ kernel void view_colours(
 {
     const size_t index = get_global_id(0);
     vfloat values[3 * SH_COUNT];
+#if !PICKED
+    const size_t splat = index;
     for (int i = 0; i < 3 * SH_COUNT; ++i)
-        values[i] = VLOAD(index, coefficients + i * stride);
+        values[i] = VLOAD(splat, coefficients + i * stride);
+#endif
     for (uint number = get_global_id(1); number < view_count; number += get_global_size(1)) {
+#if PICKED
+        const uint splat = numbers[number * apart + index];
+        if (splat == NO_SPLAT)
+            continue;
+        for (int i = 0; i < 3 * SH_COUNT; ++i)
+            values[i] = VLOAD(splat, coefficients + i * stride);
+#endif
         VREAL basis[SH_COUNT];
-        basis_towards(means, stride, index, &views[number].view, basis);
+        basis_towards(means, stride, splat, &views[number].view, basis);
         vfloat sums[3] = {(vfloat)(0.0f), (vfloat)(0.0f), (vfloat)(0.0f)};
         for (int m = 0; m < SH_COUNT; ++m)
             for (int c = 0; c < 3; ++c)
                 sums[c] = MAD(basis[m], values[3 * m + c], sums[c]);
         vfloat red = sums[0] + sums[1] - sums[2], green = sums[0] + sums[2], blue = sums[0] - sums[1] - sums[2];
         vfloat channels = (vfloat)(0.0f);
-        const size_t place = number * stride / LANES + index;
+        const size_t place = number * apart / LANES + index;
         if (direction) {
             const vint kept = free_channels(free, place);
             red = (kept & 1) != 0 ? red * unit : (vfloat)(0.0f);

@@ -12,6 +12,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 from potr_cl.codec.container import FLAGS, MAGIC, MAX_METADATA, MOST_A_BYTE, OF_FLAGS, VERSION_OF_BLOCKS
+from potr_cl.codec.sound_header import CRC, require_sound_header
 from potr_cl.errors import DataError
 from potr_cl.model.box import Box
 from potr_cl.model.claims import check_claim
@@ -19,7 +20,6 @@ from potr_cl.model.scene import LOW_PASS, SH_COEFFICIENTS
 
 _FIXED = struct.Struct("<8sHHIQQB3sIII")
 _ENTRY = struct.Struct("<6fQQII")
-_CRC = struct.Struct("<I")
 #: Bytes that tell how long the header is.
 FIXED_BYTES = _FIXED.size
 
@@ -88,7 +88,7 @@ def assemble(table: BlockTable, blocks: Sequence[tuple[Box, int, Sequence[bytes]
         blocks: of each its box, whose corners are single precision numbers, its splats, and its pieces.
     """
     sizes = [sum(map(len, pieces)) for _, _, pieces in blocks]
-    header_bytes = _FIXED.size + _ENTRY.size * len(blocks) + len(table.metadata) + _CRC.size
+    header_bytes = _FIXED.size + _ENTRY.size * len(blocks) + len(table.metadata) + CRC.size
     head = _FIXED.pack(
         MAGIC,
         VERSION_OF_BLOCKS,
@@ -108,7 +108,7 @@ def assemble(table: BlockTable, blocks: Sequence[tuple[Box, int, Sequence[bytes]
             crc = zlib.crc32(piece, crc)
         head += _ENTRY.pack(*box.low, *box.high, splats, nbytes, crc, 0)
     head += table.metadata
-    return [head + _CRC.pack(zlib.crc32(head)), *(piece for _, _, pieces in blocks for piece in pieces)]
+    return [head + CRC.pack(zlib.crc32(head)), *(piece for _, _, pieces in blocks for piece in pieces)]
 
 
 def read_table(data: bytes | memoryview, file_bytes: int, trust: bool = False) -> BlockTable:
@@ -124,15 +124,8 @@ def read_table(data: bytes | memoryview, file_bytes: int, trust: bool = False) -
     """
     fields = _FIXED.unpack_from(data)
     _, version, flags, header_bytes, said_bytes, splats, degree, zeros, count, metadata_bytes, reserved = fields
-    if header_bytes != _FIXED.size + _ENTRY.size * count + metadata_bytes + _CRC.size:
-        raise DataError("the header is damaged (its size does not fit its number of blocks): get the file again")
-    if len(data) < header_bytes:
-        raise DataError(f"truncated: the header has {header_bytes} bytes, the file {file_bytes}")
-    if zlib.crc32(data[: header_bytes - _CRC.size]) != _CRC.unpack_from(data, header_bytes - _CRC.size)[0]:
-        raise DataError("the header is damaged (its checksum does not match): get the file again")
-    if said_bytes != file_bytes:
-        how = "truncated" if file_bytes < said_bytes else "followed by something else"
-        raise DataError(f"{how}: the file has {file_bytes} bytes, its header says {said_bytes}")
+    counted = _FIXED.size + _ENTRY.size * count + metadata_bytes + CRC.size
+    require_sound_header(data, header_bytes, counted, "blocks", said_bytes, file_bytes)
     if flags not in OF_FLAGS or any(zeros) or reserved:
         raise DataError(f"format version {version} with flags {flags} is unknown: update potr_cl")
     if degree >= len(SH_COEFFICIENTS) or count < 1 or metadata_bytes > MAX_METADATA:

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import numpy as np
 from numpy.typing import NDArray
 
@@ -35,9 +37,32 @@ def build(
     Returns:
         The streams, and ``order`` (N,): the splats' indices in the order of the leaves.
     """
+    order, finish = begin(means, tolerance, absolute, run)
+    return finish(), order
+
+
+def begin(
+    means: NDArray[np.float32], tolerance: F64 | float, absolute: bool = False, run: Run = map
+) -> tuple[NDArray[np.int64], Callable[[], OctreeStreams]]:
+    """The first part of :func:`build`, which other work may wait for.
+
+    Args:
+        means, tolerance, absolute, run: as :func:`build` takes them.
+
+    Returns:
+        The order, and what returns the streams; another thread may call it.
+    """
     functions = native()
     if absolute and functions is not None:
-        return _build_natively(functions.octree_build, means, tolerance, run)
+        return _begin_natively(functions.octree_build, means, tolerance, run)
+    streams, order = _build_in_numpy(means, tolerance, absolute)
+    return order, lambda: streams
+
+
+def _build_in_numpy(
+    means: NDArray[np.float32], tolerance: F64 | float, absolute: bool
+) -> tuple[OctreeStreams, NDArray[np.int64]]:
+    """:func:`build`, as NumPy does it."""
     n = len(means)
     axes, low, side, limit, depth, grid = _gridded(means, tolerance)
     words = _morton_words(grid, depth)
@@ -90,19 +115,23 @@ def leaf_order(means: NDArray[np.float32], tolerance: F64 | float) -> NDArray[np
     return _depth_first(_morton_words(grid, depth))
 
 
-def _build_natively(
+def _begin_natively(
     functions: OctreeBuilding, means: NDArray[np.float32], tolerance: F64 | float, run: Run
-) -> tuple[OctreeStreams, NDArray[np.int64]]:
-    """:func:`build` with ``absolute``."""
+) -> tuple[NDArray[np.int64], Callable[[], OctreeStreams]]:
+    """:func:`begin` with ``absolute``."""
     low, side, limit, depth, words = _words_of(functions, means, tolerance, run)
-    order, words = functions.order(words, run)
-    half_diagonal = _half_diagonal(side)
-    wanted = functions.wanted(limit, half_diagonal, depth) if half_diagonal else np.zeros(len(limit), np.int8)
-    unclear = np.flatnonzero(wanted < 0)
-    wanted[unclear] = _levels_for(side, limit[unclear], depth)
-    occupancy, several, multiplicities, lengths, tails = functions.streams(words, depth, order, wanted)
-    origin = (float(low[0]), float(low[1]), float(low[2]))
-    return OctreeStreams(origin, side, depth, occupancy, several, multiplicities, lengths, tails, absolute=True), order
+    order, ordered = functions.order(words, run)
+
+    def finish() -> OctreeStreams:
+        half_diagonal = _half_diagonal(side)
+        wanted = functions.wanted(limit, half_diagonal, depth) if half_diagonal else np.zeros(len(limit), np.int8)
+        unclear = np.flatnonzero(wanted < 0)
+        wanted[unclear] = _levels_for(side, limit[unclear], depth)
+        occupancy, several, multiplicities, lengths, tails = functions.streams(ordered, depth, order, wanted)
+        origin = (float(low[0]), float(low[1]), float(low[2]))
+        return OctreeStreams(origin, side, depth, occupancy, several, multiplicities, lengths, tails, absolute=True)
+
+    return order, finish
 
 
 def _words_of(

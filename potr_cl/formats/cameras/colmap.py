@@ -148,7 +148,7 @@ FORMAT = CameraFormat(
     load=lambda path, content: load(path.parent),
     is_in=is_model,
     load_folder=load,
-    subfolders=("sparse/0", "sparse"),
+    subfolders=("sparse/0", "sparse", "0"),
 )
 
 

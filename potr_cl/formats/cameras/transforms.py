@@ -51,6 +51,8 @@ _BROWN = ("OPENCV", "PINHOLE", "SIMPLE_PINHOLE", "PERSPECTIVE", "SIMPLE_RADIAL",
 _FISHEYES = ("OPENCV_FISHEYE", "FISHEYE", "SIMPLE_RADIAL_FISHEYE", "RADIAL_FISHEYE")
 #: As nerfstudio has them: k3 and k4 are further radial terms of both kinds.
 _DISTORTION = ("k1", "k2", "k3", "k4", "p1", "p2")
+#: A key by which a file of nerfstudio's ns-process-data is known: how it has turned COLMAP's world.
+_PROCESSED = "applied_transform"
 _OPENGL_TO_OPENCV = np.diag([1.0, -1.0, -1.0])
 
 
@@ -274,13 +276,20 @@ def _placement(content: dict[str, Any], path: Path) -> tuple[NDArray[np.float64]
     """
     beside = path.with_name("dataparser_transforms.json")
     if not beside.exists():
+        if _PROCESSED in content:
+            _log.warning(
+                "'%s': the views are taken as they stand; if nerfstudio trained the scene, put the %s of the "
+                "training's output folder beside the file, since nerfstudio moves and scales views before it trains",
+                path,
+                beside.name,
+            )
         return np.eye(4), 1.0
     whole = read_json(beside)
     if not isinstance(whole, dict):
         raise DataError(f"'{beside}' is no dataparser_transforms.json: it is not an object")
     placement = _rigid(whole.get("transform"), f"'{beside}': 'transform'")
-    if "applied_transform" in content:
-        placement = placement @ np.linalg.inv(_rigid(content["applied_transform"], f"'{path}': 'applied_transform'"))
+    if _PROCESSED in content:
+        placement = placement @ np.linalg.inv(_rigid(content[_PROCESSED], f"'{path}': '{_PROCESSED}'"))
     scale = _positive(whole.get("scale"), f"'{beside}': 'scale'")
     scale /= _positive(content.get("applied_scale", 1), f"'{path}': 'applied_scale'")
     _log.warning("'%s': moved the views to the training space that '%s' describes", path, beside.name)

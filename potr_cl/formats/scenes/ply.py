@@ -20,7 +20,7 @@ from potr_cl.formats.declaration import SceneFormat
 from potr_cl.formats.scenes.filter_3d import FILTER_3D, folded
 from potr_cl.formats.scenes.ply_comments import ANTIALIASED_COMMENT, marked
 from potr_cl.formats.scenes.ply_rows import Target, read_rows
-from potr_cl.formats.scenes.scene_files import NO_EXTENT, cleaned, unfilled
+from potr_cl.formats.scenes.scene_files import NO_EXTENT, cleaned, unchanged, unfilled
 from potr_cl.host.atomic_write import replacing
 from potr_cl.model.scene import MIP_SPLATTING_LOW_PASS, SH_COEFFICIENTS, Scene
 
@@ -72,7 +72,7 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
 
     Raises:
         UsageError: there is no such file, or it cannot be opened.
-        DataError: it is no PLY file, is truncated, or holds no splats.
+        DataError: it is no PLY file, is truncated, holds no splats, or was changed meanwhile.
     """
     try:
         # Unbuffered: the blocks are as large as a buffer should be.
@@ -86,7 +86,8 @@ def load(path: str | os.PathLike[str], trust: bool = False) -> Scene:
         if not stat.S_ISREG(status.st_mode):
             raise UsageError(f"'{path}' is not a regular file")
         try:
-            scene = _read(path, stream, status.st_size)
+            with unchanged(path, stream):
+                scene = _read(path, stream, status.st_size)
         except OSError as error:
             raise DataError(f"cannot read '{path}': {error.strerror or error}") from error
     return cleaned(path, scene)

@@ -9,6 +9,7 @@ import stat
 from collections.abc import Iterator
 from contextvars import ContextVar
 from dataclasses import replace
+from io import IOBase
 from pathlib import Path, PurePosixPath, PureWindowsPath
 from typing import BinaryIO
 
@@ -59,8 +60,42 @@ def opened(path: str | os.PathLike[str]) -> Iterator[tuple[BinaryIO, int]]:
         status = os.fstat(file.fileno())
         if not stat.S_ISREG(status.st_mode):
             raise UsageError(f"'{path}' is not a regular file")
-        with reading(path):
+        with unchanged(path, file), reading(path):
             yield file, status.st_size
+
+
+@contextlib.contextmanager
+def unchanged(path: str | os.PathLike[str], file: IOBase) -> Iterator[None]:
+    """Of a block that reads a file: nobody may write to it meanwhile, or a part of it would be older than another.
+
+    Raises:
+        DataError: the file has another size or time of change than at the beginning, whatever else went wrong.
+    """
+    descriptor = os.dup(file.fileno())  # whoever reads may close the file
+    try:
+        before = _written(descriptor)
+        try:
+            yield
+        except DataError as error:
+            _refuse_changed(path, before, _written(descriptor), error)
+            raise
+        _refuse_changed(path, before, _written(descriptor))
+    finally:
+        os.close(descriptor)
+
+
+def _written(descriptor: int) -> tuple[int, int]:
+    status = os.fstat(descriptor)
+    return status.st_size, status.st_mtime_ns
+
+
+def _refuse_changed(
+    path: str | os.PathLike[str], before: tuple[int, int], after: tuple[int, int], error: Exception | None = None
+) -> None:
+    if after != before:
+        raise DataError(
+            f"'{path}' was changed while it was read: wait until the program that writes it has finished"
+        ) from error
 
 
 @contextlib.contextmanager

@@ -35,6 +35,7 @@ def measurement(
     sights: Sights | None = None,
     spared: NDArray[np.bool_] | None = None,
     dealt: ViewShares | None = None,
+    seen: NDArray[np.int64] | None = None,
 ) -> Iterator[Removal]:
     """A removal sweep over the views of a state, its splats numbered as in the state's scene.
 
@@ -43,6 +44,7 @@ def measurement(
         sights: what the views see, where each had better be looked at with what it sees.
         spared: as of :class:`~potr_cl.stages.pruning.visible_parts.PartedRemoval`; only with ``sights``.
         dealt: the views, for a pool whose workers get what these see and no more of the scene.
+        seen: (n,) numbers of the splats that the sweep is to have, ascending, which it numbers from 0 on; None: all.
 
     Raises:
         DeviceError: the scene or a view does not fit the device.
@@ -52,43 +54,45 @@ def measurement(
         bench.progress("prepare views", done / count)
 
     device, pool, views = bench.opened, bench.pool, state.views
+    splats = len(state.scene) if seen is None else len(seen)
     # A sample of the tiles is drawn from all of them in turn, so one device does it.
     share = None if pool is None or options.sample < 1 else shares(pool, len(views))
     with ExitStack() as stack:
         if pool is None or share is None or not share.others:
             if sights is not None:
-                whole = stack.enter_context(whole_on_device(device, bench.drawable(state.scene)))
+                scene = state.scene if seen is None else state.scene.subset(seen)
+                whole = stack.enter_context(whole_on_device(device, bench.drawable(scene)))
                 others_given = (options, bench.background, progress)
                 if can_go_by_view(whole, device, options):
-                    first = None if spared is None else first_totals(len(state.scene), spared)
+                    first = None if spared is None else first_totals(splats, spared)
                     yield stack.enter_context(ViewByView(device, whole, views, sights, *others_given, first))
                 else:
                     parts = sights.parts()
-                    yield stack.enter_context(
-                        PartedRemoval(device, state.scene, whole, views, parts, *others_given, spared)
-                    )
+                    yield stack.enter_context(PartedRemoval(device, scene, whole, views, parts, *others_given, spared))
                 return
-            drawable = stack.enter_context(lying_on(device, bench.placed(state)))
+            drawable = stack.enter_context(lying_on(device, bench.placed(state, seen)))
             rasterizer = stack.enter_context(Rasterizer(device, drawable, background=bench.background))
             yield stack.enter_context(RemovalSweep(rasterizer, views, options, progress))
             return
+        placed = bench.shared(state, seen) if dealt is None else None
         given: list[tuple[Any, ...]] = []
         if dealt is not None:
-            share = Shares([], [each.numbers for each in dealt.shares])
+            share = Shares([], [each.numbers for each in dealt.shares], dealt.names)
             for part in dealt.shares:
                 excerpt = stack.enter_context(pool.shared(part.excerpt))
                 given.append((excerpt, views, options, bench.background, part.numbers, part.sights))
         else:
-            scene = stack.enter_context(pool.shared(bench.shared(state)))
+            sent = stack.enter_context(pool.shared(placed))
             sights = sights if pool.in_process else None
-            given = [(scene, views, options, bench.background, numbers, sights) for numbers in share.others]
+            given = [(sent, views, options, bench.background, numbers, sights) for numbers in share.others]
         others = stack.enter_context(
-            Parts(pool, RemovalPart, given, options.memory, [len(each) for each in share.others])
+            Parts(pool, RemovalPart, given, options.memory, [len(each) for each in share.others], share.names)
         )
         own: RemovalSweep | ViewByView | None = None
-        stride = len(state.scene)
+        stride = splats
         if share.own:
-            drawable = stack.enter_context(lying_on(device, bench.placed(state)))
+            assert placed is not None, "who sends others excerpts does no views"
+            drawable = stack.enter_context(lying_on(device, placed))
             if sights is not None and can_go_by_view(drawable, device, options):
                 own = ViewByView(
                     device, drawable, views, sights, options, bench.background, progress, numbers=share.own
@@ -103,7 +107,7 @@ def measurement(
         steers = all(others.ask(place, "can_steer") for place in range(len(others)))
         steers = steers and (device.family == "gpu" if own is None else own.steering is not None)
         numbers = None if dealt is None else [each.splats for each in dealt.shares]
-        shared = SharedRemoval(device, len(state.scene), stride, views, own, others, pool, steers, numbers)
+        shared = SharedRemoval(device, splats, stride, views, own, others, pool, steers, numbers)
         yield stack.enter_context(shared)
 
 

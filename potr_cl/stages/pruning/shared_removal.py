@@ -124,8 +124,12 @@ class SharedRemoval(Owner):
         place = 0
         while (found := self._others.ask(part, "importances", place)) is not None:
             number, seen, importances = found
-            yield number, seen.astype(np.int64) if self._numbers is None else self._numbers[part][seen], importances
+            yield number, seen.astype(np.int64) if self._numbers is None else self._numbers_of(part)[seen], importances
             place += 1
+
+    def _numbers_of(self, part: int) -> Indices:
+        assert self._numbers is not None
+        return self._numbers[self._others.origin(part)]
 
     def _places(self, splats: Indices) -> Indices | Each:
         """What tells the parts about these splats."""
@@ -151,7 +155,7 @@ class SharedRemoval(Owner):
         """(N, 2) int64, what they found; valid until the next call."""
         if self._sparse:
             for part, (splats, changes) in enumerate(pending.results()):
-                self._found[splats if self._numbers is None else self._numbers[part][splats]] += changes
+                self._found[splats if self._numbers is None else self._numbers_of(part)[splats]] += changes
             return self._found
         totals: list[NDArray[np.int64]] = pending.results()
         found = totals[0]

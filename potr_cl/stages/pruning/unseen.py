@@ -1,4 +1,4 @@
-"""Splats that no training view sees, set aside while the others are pruned: :func:`set_aside`, :func:`put_back`."""
+"""Splats that no training view sees (:func:`find_unseen`): they are kept, while the others are pruned without them."""
 
 from __future__ import annotations
 
@@ -58,22 +58,6 @@ class Unseen:
         )
 
 
-@dataclass(frozen=True)
-class Split:
-    """A state in two parts.
-
-    Attributes:
-        whole: the state.
-        seen: the state of the splats that views see.
-        seen_splats, unseen_splats: their numbers in the whole state's scene, ascending.
-    """
-
-    whole: State
-    seen: State
-    seen_splats: NDArray[np.int64]
-    unseen_splats: NDArray[np.int64]
-
-
 def find_unseen(
     state: State,
     groups: SplatGroups | None = None,
@@ -111,53 +95,35 @@ def _part_of_area(scene: Scene, splats: NDArray[np.bool_]) -> float:
     return float(areas[splats].sum() / max(float(areas.sum()), 1e-300))
 
 
-def set_aside(state: State, unseen: NDArray[np.bool_]) -> Split:
-    """Part a state in what views see and what they do not."""
-    seen = np.flatnonzero(~unseen)
-    return Split(state, state.keeping(seen), seen, np.flatnonzero(unseen))
-
-
-def put_back(split: Split, pruned: State) -> State:
-    """The state with what pruning left of the seen splats, and with all the others.
-
-    The others lose the coefficients of their colours that depend on the direction: nobody looked at them from any.
-    """
-    scene = split.whole.scene.subset(split.unseen_splats)
-    sh = scene.sh.copy()
-    sh[:, 1:] = 0
-    scene = dataclasses.replace(scene, sh=sh)
-    numbers = np.concatenate([pruned.survivors, split.whole.survivors[split.unseen_splats]])
-    order = np.argsort(numbers, kind="stable")  # the quickest way for two runs
-    together = pruned.scene.joined(scene, order)
-    return dataclasses.replace(pruned, scene=together, survivors=numbers[order], geometry=None, cut=None)
-
-
-def without_directions(state: State, unseen: NDArray[np.int64]) -> State:
-    """The state after some splats have lost what of their colours depends on the direction, as :func:`put_back` does.
+def without_directions(state: State, unseen: NDArray[np.bool_]) -> State:
+    """The state after some splats have lost what of their colours depends on the direction.
 
     Args:
         state: whose scene it is; nobody else may have its colours, which change in place: a copy would take as much
             memory as a large scene has left.
-        unseen: their numbers in the source, ascending; those that are not left do not matter.
+        unseen: (n,) which of its scene's splats these are.
     """
-    own = np.isin(state.survivors, unseen, assume_unique=True)
     sh = state.scene.sh
-    sh[own, 1:] = 0
+    sh[unseen, 1:] = 0
     return state.recoloured(sh)
 
 
-def as_of_whole(split: Split, pruned: Pruned) -> Pruned:
-    """What pruning did to the seen splats, as what it did to all: the unseen ones were kept, and nobody misses them."""
-    aside = len(split.unseen_splats)
-    removed = len(split.seen_splats) - pruned.kept
-    iteration_of = np.full(aside + len(split.seen_splats), -1, np.int32)
-    iteration_of[split.seen_splats] = pruned.iteration_of
+def as_of_whole(seen: NDArray[np.int64], unseen: NDArray[np.int64], pruned: Pruned) -> Pruned:
+    """What pruning did to the splats that views see, as what it did to all: the others were kept, nobody misses them.
+
+    Args:
+        seen, unseen: their numbers, ascending.
+        pruned: what was done to those that are seen.
+    """
+    removed = len(seen) - pruned.kept
+    iteration_of = np.full(len(unseen) + len(seen), -1, np.int32)
+    iteration_of[seen] = pruned.iteration_of
 
     def course() -> Course:
-        seen = split.seen_splats[pruned.order]
+        order = seen[pruned.order]
         return Course(
-            np.concatenate([seen[:removed], split.unseen_splats, seen[removed:]]),
-            tuple(dataclasses.replace(each, left=each.left + aside) for each in pruned.history),
+            np.concatenate([order[:removed], unseen, order[removed:]]),
+            tuple(dataclasses.replace(each, left=each.left + len(unseen)) for each in pruned.history),
         )
 
-    return Pruned(pruned.kept + aside, iteration_of, pruned.iterations, lru_cache(maxsize=1)(course))
+    return Pruned(pruned.kept + len(unseen), iteration_of, pruned.iterations, lru_cache(maxsize=1)(course))

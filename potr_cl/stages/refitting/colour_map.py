@@ -33,17 +33,17 @@ from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.fixed_point import gathered_scale
 from potr_cl.stages.refitting.gathering import Gathered, Gathering
 from potr_cl.stages.refitting.launcher import Launcher
-from potr_cl.stages.refitting.prepared_views import PreparedViews
+from potr_cl.stages.refitting.picked_views import PickedViews
+from potr_cl.stages.refitting.prepared_views import PreparedViews, SweptViews
+from potr_cl.stages.refitting.reached import reached_splats
 from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
 from potr_cl.stages.refitting.targets import TargetCache, Targets, nbytes
 from potr_cl.stages.refitting.vector_space import Vector, VectorSpace
+from potr_cl.stages.refitting.view_colours import ViewColours
 from potr_cl.stages.refitting.view_errors import ViewErrors
 
 #: Bytes a splat and view of a sweep's own buffers: the colours' change and the sums.
 _CHANGE, _TOTALS = 16, 32
-#: Views that a work-item of ``view_colours`` does one after the other, the coefficients in its registers.
-_COLOURED = 8
-
 
 #: Views are divided into so many parts, every second one in each, where each has as many as are enough: with 62 in
 #: each, steps by one part lost 0.01 dB on a captured scene, and 0.03 on its pictures a third as wide.
@@ -114,10 +114,6 @@ class ColourMap(Owner):
         self._coefficients = coefficients
         self._background = background
         self._launcher = launcher
-        self._view_colours = {
-            constant: device.shared_kernel("refit/view_colours.cl", "view_colours", **layout.some(constant))
-            for constant in (False, True)
-        }
         self._gathering = Gathering(device, layout)
         self.total_weight = 3 * REFERENCE_PIXELS * len(cameras)
         self._one = gathered_scale(cameras, [_weight(camera) for camera in cameras])
@@ -125,8 +121,12 @@ class ColourMap(Owner):
         self._views_of_all = len(cameras)
         self.parts = parts_of(len(cameras))
         own_numbers = range(len(cameras)) if numbers is None else numbers
-        # Launches, and what is gathered together, are of one part.
-        self._numbers = sorted(own_numbers, key=lambda number: (number % self.parts, number))
+        reached = reached_splats(rasterizer, [cameras[number] for number in own_numbers])
+        seen = dict(zip(own_numbers, reached, strict=True)) if reached else {}
+        # Launches, and what is gathered together, are of one part. Views of a launch have about as many splats.
+        self._numbers = sorted(
+            own_numbers, key=lambda number: (number % self.parts, -len(seen.get(number, ())), number)
+        )
         of_parts = [sum(number % self.parts == part for number in own_numbers) for part in range(self.parts)]
         breaks = np.cumsum(of_parts).tolist()
         cameras = [cameras[number] for number in self._numbers]
@@ -138,10 +138,17 @@ class ColourMap(Owner):
             columns = np.zeros((3, layout.stride), np.float32)
             columns[:, : layout.splats] = means.T
             self._means = self._memory.upload(columns, "the centres")
-            own = (_CHANGE + _TOTALS) * layout.stride
+            self._view_colours = ViewColours(device, layout, self._means)
             # To render a picture takes many times as long as to project a view, and it takes less room.
             pictures = sum(nbytes(camera) for camera in cameras)
-            self._views = PreparedViews(rasterizer, cameras, self._launcher.most_views, own, memory, breaks, pictures)
+            own, most_views = _CHANGE + _TOTALS, launcher.most_views
+            self._views: SweptViews
+            if reached:
+                some = [seen[number] for number in self._numbers]
+                self._views = PickedViews(rasterizer, cameras, some, most_views, own, memory, breaks, pictures)
+            else:
+                own *= layout.stride
+                self._views = PreparedViews(rasterizer, cameras, most_views, own, memory, breaks, pictures)
             self._owned.append(self._views)
             launches = self._views.launches
             most = max((len(numbers) for numbers in launches), default=0)
@@ -153,13 +160,13 @@ class ColourMap(Owner):
                     for part in range(self.parts)
                 )
             ]
-            at_once = most * together
-            self._change = self._memory.allocate(_CHANGE * layout.stride * at_once, "the colours' change")
-            self._totals = self._memory.allocate(_TOTALS * layout.stride * at_once, "the re-fit's sums")
+            at_once = together * max((len(each) * self._views.stride(each) for each in launches), default=0)
+            self._change = self._memory.allocate(_CHANGE * at_once, "the colours' change")
+            self._totals = self._memory.allocate(_TOTALS * at_once, "the re-fit's sums")
             self._slots = [
                 _Slot(*(_part(of, slot, together) for of in (self._change, self._totals))) for slot in range(together)
             ]
-            self._tables = self._memory.allocate(TABLE_ENTRY * at_once, "the views")
+            self._tables = self._memory.allocate(TABLE_ENTRY * most * together, "the views")
             coefficients.clear(self._totals)
             self.sums = self._memory.allocate(8 * layout.columns * layout.stride, "the sums over views")
             coefficients.clear(self.sums)
@@ -247,12 +254,13 @@ class ColourMap(Owner):
         """
         for group in self._groups_of(None):
             for slot, numbers in zip(self._slots, group, strict=False):
-                with self._views.ready(numbers) as (views, _):
-                    self._enqueue_colours(views, x, views.colours, None)
+                with self._views.ready(numbers) as ready:
+                    views = ready.views
+                    self._view_colours.enqueue(views, self._views.picks(numbers), x, views.colours, None)
                     pictures = self._targets.pictures(targets, numbers)
                     self._enqueue_sweep(numbers, views, views.colours, pictures, blocks is not None, slot)
                     # Which of them are cut, the gathering asks.
-                    nbytes = _CHANGE * self._layout.stride * len(numbers)
+                    nbytes = _CHANGE * views.stride * len(numbers)
                     cl.enqueue_copy(self._device.queue, slot.change, views.colours, byte_count=nbytes)
                     self._enqueue_table(numbers, group, views)
                     self._errors.keep(numbers)
@@ -267,9 +275,9 @@ class ColourMap(Owner):
         self._coefficients.clear(self._change)  # black, and no channel is free
         for group in self._groups_of(None):
             for slot, numbers in zip(self._slots, group, strict=False):
-                with self._views.ready(numbers) as (views, _):
-                    self._enqueue_sweep(numbers, views, slot.change, None, True, slot)
-                    self._enqueue_table(numbers, group, views)
+                with self._views.ready(numbers) as ready:
+                    self._enqueue_sweep(numbers, ready.views, slot.change, None, True, slot)
+                    self._enqueue_table(numbers, group, ready.views)
             self._enqueue_gather(group, blocks, False, first)
 
     def normal(
@@ -313,10 +321,12 @@ class ColourMap(Owner):
         """
         for group in self._groups_of(part):
             for slot, numbers in zip(self._slots, group, strict=False):
-                with self._views.ready(numbers) as (views, anew):
-                    if anew:  # which colours are cut is not known any more
-                        self._enqueue_colours(views, self._coefficients.on_device(at, 1), views.colours, None)
-                    self._enqueue_colours(views, direction, slot.change, unit, constant)
+                with self._views.ready(numbers) as ready:
+                    views, picks = ready.views, self._views.picks(numbers)
+                    if ready.anew:  # which colours are cut is not known any more
+                        at_here = self._coefficients.on_device(at, 1)
+                        self._view_colours.enqueue(views, picks, at_here, views.colours, None)
+                    self._view_colours.enqueue(views, picks, direction, slot.change, unit, constant)
                     self._enqueue_sweep(numbers, views, slot.change, None, False, slot)
                     self._enqueue_table(numbers, group, views)
             self._enqueue_gather(group, None, constant)
@@ -334,24 +344,6 @@ class ColourMap(Owner):
         self._coefficients.clear(sums)
         return sums
 
-    def _enqueue_colours(
-        self, views: ViewSet, x: cl.Buffer, result: cl.Buffer, unit: float | None, constant: bool = False
-    ) -> None:
-        """Enqueue the views' colours, or what ``unit`` times a direction adds to them where none is cut at 0."""
-        kernel = self._view_colours[constant]
-        kernel.bind(
-            coefficients=x,
-            means=self._means,
-            stride=self._layout.stride,
-            views=views.table,
-            view_count=len(views.views),
-            direction=unit is not None,
-            unit=np.float32(1.0 if unit is None else unit),
-            free=views.colours,
-            colours=result,
-        )
-        self._layout.over_splats(kernel, -(-len(views.views) // _COLOURED))
-
     def _enqueue_sweep(
         self,
         numbers: range,
@@ -364,7 +356,7 @@ class ColourMap(Owner):
         """Enqueue the sweep of a launch's views; without a target colours are a change, and black is behind them."""
         self._launcher.sweep(
             views,
-            self._layout.stride,
+            views.stride,
             colours,
             (0.0, 0.0, 0.0) if target is None else self._background,
             target,
@@ -387,7 +379,16 @@ class ColourMap(Owner):
 
         And to the blocks, if the sums have their part: of as many splats as there is room for, from the first one on.
         """
-        gathered = Gathered(self._totals, self._means, self._tables, sum(map(len, group)), self._scales, group[0][0])
+        gathered = Gathered(
+            self._totals,
+            self._means,
+            self._views.stride(group[0]),
+            self._views.picks(group[0]),
+            self._tables,
+            sum(map(len, group)),
+            self._scales,
+            group[0][0],
+        )
         if blocks is not None:
             self._gathering.with_blocks(gathered, self._change, self.sums, blocks, first_block)
         else:

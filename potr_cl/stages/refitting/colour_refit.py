@@ -22,15 +22,17 @@ from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import INRIA, RasterRules
+from potr_cl.raster.scene_buffers import stride_of
 from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import ColourMap
+from potr_cl.stages.refitting.coming_scene import AnyScene, ComingScene, arrived, colourless
 from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import blocks_of, left_for_views, placed, rounding_of, vectors_of
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.rounding import ROUNDS
-from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares, colourless
+from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
 from potr_cl.stages.refitting.targets import Targets
 from potr_cl.stages.refitting.vector_space import Layout, Ridge, Vector
@@ -62,7 +64,7 @@ class HelpFrom:
             WorkerLost: no worker is left.
         """
         if isinstance(self.source, ViewShares):
-            return Shares([], [share.numbers for share in self.source.shares])
+            return Shares([], [share.numbers for share in self.source.shares], self.source.names)
         return colour_shares(self.pool, views)
 
 
@@ -71,7 +73,8 @@ class ColourRefit(Owner):
 
     Args:
         device: to compute on.
-        scene: whose geometry, opacities and SH degree are used.
+        scene: whose geometry, opacities and SH degree are used. If it is still to come, all is made ready meanwhile
+            that its colours are enough for.
         cameras: the views that count, all the same whatever their size.
         rules, background: of the rasterizer.
         memory: bytes of device memory that prepared views and targets may take, together with the vectors where these
@@ -86,12 +89,13 @@ class ColourRefit(Owner):
     Raises:
         UsageError: no camera.
         DeviceError: the scene or a view does not fit the device.
+        What making a scene raises that is still to come.
     """
 
     def __init__(
         self,
         device: Device,
-        scene: Scene,
+        scene: AnyScene,
         cameras: Sequence[Camera],
         rules: RasterRules = INRIA,
         background: tuple[float, float, float] = (0.0, 0.0, 0.0),
@@ -112,27 +116,34 @@ class ColourRefit(Owner):
                             help_from.pool, share, scene, rules, background, help_from.source, cameras, memory
                         )
                     )  # fmt: skip
-            rasterizer = owned.enter_context(Rasterizer(device, colourless(scene), rules))
             launcher = launcher_for(device, rules)
-            layout = Layout(len(scene), rasterizer.stride, scene.sh.shape[1], launcher.lanes)
+            layout = Layout(len(scene), stride_of(len(scene)), scene.sh.shape[1], launcher.lanes)
             # The vectors come first: prepared views can do with less memory, and only take longer then.
             place = placed(device, layout.splats, layout.sh_count, memory, slices) if others is None else None
             if place is not None:
                 memory = place.views
             elif others is None:
                 memory = left_for_views(layout.splats, layout.sh_count, memory)
+            if place is not None:  # the host has no room for vectors beside what rounds the geometry
+                scene = arrived(scene)
             self.coefficients = owned.enter_context(vectors_of(device, layout, place))
             blocks = blocks_of(self.coefficients, place)
             owned.callback(blocks.close)
             self._solver = ColourSolver(self.coefficients, blocks)
+            self._written: FloatArray | None = None  # colours that the start of the next solution has already
+            if isinstance(scene, ComingScene):
+                self.coefficients.write_sh(self._solver.x, scene.sh)
+                self._written = scene.sh
             helpers = None
             if help_from is not None and others is not None:
                 assert isinstance(self.coefficients, Coefficients)
                 in_process = help_from.pool.in_process
                 helpers = owned.enter_context(SharedViews(self.coefficients, others, in_process))
+            here = arrived(scene)
+            rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
             self.colour_map = owned.enter_context(
                 ColourMap(
-                    launcher, rasterizer, self.coefficients, scene.means, cameras, background, memory, own, helpers
+                    launcher, rasterizer, self.coefficients, here.means, cameras, background, memory, own, helpers
                 )
             )
             if others is not None:
@@ -188,7 +199,9 @@ class ColourRefit(Owner):
             DeviceError: the device failed.
         """
         coefficients, solver = self.coefficients, self._solver
-        coefficients.write_sh(solver.x, sh)
+        if self._written is not sh:
+            coefficients.write_sh(solver.x, sh)
+        self._written = None  # it changes
         coefficients.make_room()
         coefficients.activate(active)
         if active is not None and not hold:

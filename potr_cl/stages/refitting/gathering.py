@@ -2,7 +2,9 @@
 
 from __future__ import annotations
 
+from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import pyopencl as cl
 
@@ -22,6 +24,8 @@ class Gathered:
     Attributes:
         totals: (views, stride, 4) int64; 0 once they are gathered.
         means: (3, stride) float32, the splats' centres.
+        stride: room for the splats of each view.
+        picks: (views, stride) uint32, the splats' numbers; None: all views have all, in their order.
         views: their table, ``SetView`` in cl/include/view_set.clh.
         view_count: how many they are.
         scales: float32, by what each view's sums are multiplied. first_scale: number of the first view's.
@@ -29,6 +33,8 @@ class Gathered:
 
     totals: cl.Buffer
     means: cl.Buffer
+    stride: int
+    picks: cl.Buffer | None
     views: cl.Buffer
     view_count: int
     scales: cl.Buffer
@@ -47,19 +53,12 @@ class Gathering:
     """
 
     def __init__(self, device: Device, layout: Layout) -> None:
-        self._layout = layout
-
-        def kernel(name: str, constant: bool = False, weights: bool = False, some: bool = False) -> Kernel:
-            return device.shared_kernel(
-                _SOURCE, name, WEIGHTS=int(weights), SOME_BLOCKS=int(some), **layout.some(constant)
-            )  # fmt: skip
-
-        self._gathers = {constant: kernel("gather", constant) for constant in (False, True)}
+        self._layout, self._device = layout, device
         # A work-item of a GPU would write a whole block for each view: its blocks have a kernel of their own.
-        self._blocks = kernel("gather_blocks") if layout.lanes == 1 else None
-        self._with_blocks = {
-            some: kernel("gather", weights=True, some=some) for some in (False, True) if self._blocks is None
-        }
+        self._apart = layout.lanes == 1
+
+    def _kernel(self, name: str, gathered: Gathered, **macros: int) -> Kernel:
+        return self._device.shared_kernel(_SOURCE, name, PICKED=int(gathered.picks is not None), **macros)
 
     def enqueue(self, gathered: Gathered, free: cl.Buffer, sums: cl.Buffer, constant: bool) -> None:
         """Enqueue: sums += what views add to coefficients.
@@ -70,7 +69,8 @@ class Gathering:
             sums: (3 M, stride) int64.
             constant: only those of the constant coefficients.
         """
-        self._enqueue(self._gathers[constant], gathered, free, sums, sums, 0, self._layout.stride)
+        kernel = self._kernel("gather", gathered, WEIGHTS=0, SOME_BLOCKS=0, **self._layout.some(constant))
+        self._enqueue(kernel, gathered, free, sums, sums, 0, self._layout.stride)
 
     def with_blocks(
         self, gathered: Gathered, free: cl.Buffer, sums: cl.Buffer, blocks: cl.Buffer, first_block: int
@@ -84,23 +84,16 @@ class Gathering:
         """
         layout = self._layout
         count = blocks.size // (8 * (layout.sh_count * (layout.sh_count + 1) // 2))
-        if self._blocks is None:
-            kernel = self._with_blocks[count < layout.stride]
+        if not self._apart:
+            some = int(count < layout.stride)
+            kernel = self._kernel("gather", gathered, WEIGHTS=1, SOME_BLOCKS=some, **layout.macros)
             self._enqueue(kernel, gathered, free, sums, blocks, first_block, count)
             return
-        self._blocks.bind(
-            totals=gathered.totals,
-            means=gathered.means,
-            stride=layout.stride,
-            views=gathered.views,
-            view_count=gathered.view_count,
-            scales=gathered.scales,
-            first_scale=gathered.first_scale,
-            first_block=first_block,
-            block_stride=count,
-            blocks=blocks,
-        )
-        self._blocks.launch((-(-count // _GROUP) * _GROUP, (layout.sh_count + 1) // 2), (_GROUP, 1))
+        kernel = self._kernel("gather_blocks", gathered, WEIGHTS=0, SOME_BLOCKS=0, **layout.macros)
+        for views in self._together(gathered):
+            kernel.bind(**self._arguments(gathered, views), first_block=first_block, block_stride=count, blocks=blocks)
+            items = count if gathered.picks is None else gathered.stride
+            kernel.launch((-(-items // _GROUP) * _GROUP, (layout.sh_count + 1) // 2), (_GROUP, 1))
         self.enqueue(gathered, free, sums, False)
 
     def _enqueue(
@@ -113,18 +106,35 @@ class Gathering:
         first_block: int,
         block_stride: int,
     ) -> None:
-        kernel.bind(
-            totals=gathered.totals,
-            means=gathered.means,
-            stride=self._layout.stride,
-            views=gathered.views,
-            view_count=gathered.view_count,
-            scales=gathered.scales,
-            first_scale=gathered.first_scale,
-            free=free,
-            result=sums,
-            first_block=first_block,
-            block_stride=block_stride,
-            blocks=blocks,
-        )
-        self._layout.over_splats(kernel)
+        for views in self._together(gathered):
+            kernel.bind(
+                **self._arguments(gathered, views),
+                free=free,
+                result=sums,
+                first_block=first_block,
+                block_stride=block_stride,
+                blocks=blocks,
+            )
+            self._layout.over_splats(kernel, stride=gathered.stride)
+
+    def _together(self, gathered: Gathered) -> Iterator[range]:
+        """Views that may add to splats at the same time: all, where a work-item has the same splat in all of them."""
+        if gathered.picks is None:
+            yield range(gathered.view_count)
+        else:
+            for number in range(gathered.view_count):
+                yield range(number, number + 1)
+
+    def _arguments(self, gathered: Gathered, views: range) -> dict[str, Any]:
+        return {
+            "totals": gathered.totals,
+            "means": gathered.means,
+            "stride": self._layout.stride,
+            "apart": gathered.stride,
+            "numbers": gathered.views if gathered.picks is None else gathered.picks,
+            "views": gathered.views,
+            "first_view": views.start,
+            "view_count": len(views),
+            "scales": gathered.scales,
+            "first_scale": gathered.first_scale,
+        }

@@ -5,6 +5,7 @@ from __future__ import annotations
 from collections.abc import Sequence
 from contextlib import ExitStack
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 import pyopencl as cl
@@ -19,16 +20,18 @@ from potr_cl.raster.culling import Sights
 from potr_cl.raster.kept_scene import KeptScene, lying_on, whole_on_device
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.rules import RasterRules
-from potr_cl.raster.scene_buffers import SceneBuffers
+from potr_cl.raster.scene_buffers import SceneBuffers, stride_of
 from potr_cl.raster.view_shares import Excerpt
 from potr_cl.stages.refitting.coefficients import Coefficients
-from potr_cl.stages.refitting.colour_map import ColourMap
+from potr_cl.stages.refitting.colour_map import ColourMap, parts_of
+from potr_cl.stages.refitting.coming_scene import AnyScene, arrived, colourless
 from potr_cl.stages.refitting.launcher import launcher_for
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.targets import RenderedTargets, Targets
 from potr_cl.stages.refitting.vector_space import Layout
 from potr_cl.stages.refitting.visible_targets import VisibleTargets
+from potr_cl.workers.dealing import in_pieces
 from potr_cl.workers.pool import Part
 
 
@@ -58,7 +61,7 @@ class ColourPart(Part):
     Args:
         device: to compute on.
         memory: bytes of its memory that prepared views and targets may take; None: the default.
-        scene: whose geometry and opacities are used; its colours need no more than their constant coefficients.
+        scene: whose geometry and opacities are used, perhaps still to come; its colours are not looked at.
         sh_count: M, coefficients of a channel.
         rules, background: of the rasterizer.
         source: the scene whose pictures are the targets, perhaps kept on devices, with pictures of it there, or what
@@ -75,7 +78,7 @@ class ColourPart(Part):
         self,
         device: Device,
         memory: int | None,
-        scene: Scene,
+        scene: AnyScene,
         sh_count: int,
         rules: RasterRules,
         background: tuple[float, float, float],
@@ -86,7 +89,11 @@ class ColourPart(Part):
     ) -> None:
         self._device = device
         with ExitStack() as owned:
-            rasterizer = owned.enter_context(Rasterizer(device, scene, rules))
+            launcher = launcher_for(device, rules)
+            layout = Layout(len(scene), stride_of(len(scene)), sh_count, launcher.lanes)
+            self._coefficients = owned.enter_context(Coefficients(device, layout))
+            self._packing = owned.enter_context(Packing(self._coefficients))
+            self._x, self._direction = self._coefficients.vector(), self._coefficients.vector()
             ahead, kept = (source, source.source) if isinstance(source, PicturesAhead) else (None, source)
             pictured = owned.enter_context(lying_on(device, kept))
             if sights is not None:
@@ -97,13 +104,10 @@ class ColourPart(Part):
             else:
                 rendering = owned.enter_context(Rasterizer(device, pictured, background=background))
                 of_source = RenderedTargets(rendering, cameras)
-            launcher = launcher_for(device, rules)
-            layout = Layout(len(scene), rasterizer.stride, sh_count, launcher.lanes)
-            self._coefficients = owned.enter_context(Coefficients(device, layout))
-            self._packing = owned.enter_context(Packing(self._coefficients))
-            self._x, self._direction = self._coefficients.vector(), self._coefficients.vector()
+            here = arrived(scene)
+            rasterizer = owned.enter_context(Rasterizer(device, colourless(here), rules))
             self._map = owned.enter_context(
-                ColourMap(launcher, rasterizer, self._coefficients, scene.means, cameras, background, memory, numbers)
+                ColourMap(launcher, rasterizer, self._coefficients, here.means, cameras, background, memory, numbers)
             )
             self._targets: Targets = of_source
             if ahead is not None:
@@ -113,6 +117,11 @@ class ColourPart(Part):
             self._blocks = owned.enter_context(Memory(device))
             self._block_sums: cl.Buffer | None = None
             self._owned = owned.pop_all()
+
+    @classmethod
+    def split(cls, given: tuple[Any, ...], pieces: int) -> list[tuple[Any, ...]]:
+        *before, cameras, numbers, sights = given
+        return [(*before, cameras, own, sights) for own in in_pieces(numbers, pieces, parts_of(len(cameras)))]
 
     def gradient(
         self, x: FloatArray | Lent, flags: NDArray[np.uint32] | Lent, blocks: bool, constant: bool

@@ -3,10 +3,15 @@
 from __future__ import annotations
 
 from collections.abc import Iterator, Sequence
-from contextlib import contextmanager
+from contextlib import AbstractContextManager, contextmanager
+from dataclasses import dataclass
+from typing import Protocol
+
+import pyopencl as cl
 
 from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
+from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner
 from potr_cl.raster.rasterizer import Rasterizer
 from potr_cl.raster.view_cache import ViewCache
@@ -15,6 +20,55 @@ from potr_cl.raster.view_set import ViewSet
 #: Part of the device's memory not yet taken that is the budget unless the caller sets one: of a memory of its own, and
 #: of one that is the host's too.
 _SHARE, _SHARE_OF_HOST = 0.4, 0.25
+
+
+@dataclass(frozen=True)
+class Ready:
+    """A launch's views, with their geometry.
+
+    Attributes:
+        views: the views.
+        anew: whether their colours were made anew since the last time.
+    """
+
+    views: ViewSet
+    anew: bool
+
+
+class SweptViews(Protocol):
+    """Prepared views, launch by launch."""
+
+    #: The numbers of the views of each launch.
+    launches: list[range]
+    #: Its ``room`` is what is left of the memory.
+    budget: ViewCache
+
+    def stride(self, numbers: range) -> int:
+        """Room for the splats of each view of a launch."""
+        ...
+
+    def picks(self, numbers: range) -> cl.Buffer | None:
+        """(views, stride) uint32, the numbers of the splats of each view of a launch; None: all views have all."""
+        ...
+
+    def ready(self, numbers: range) -> AbstractContextManager[Ready]:
+        """Make sure that a launch's views are there, with their geometry, inside the block.
+
+        Raises:
+            DeviceError: they do not fit the device.
+        """
+        ...
+
+    def close(self) -> None:
+        """Give all device memory back."""
+        ...
+
+
+def budget_of(device: Device, memory: int | None) -> float:
+    """Bytes that kept views may take: what is given, or a part of what is free."""
+    free = device.info.memory - device.allocated
+    of_host = device.info.kind == "cpu" or device.info.integrated
+    return free * (_SHARE_OF_HOST if of_host else _SHARE) if memory is None else memory
 
 
 class PreparedViews(Owner):
@@ -51,11 +105,7 @@ class PreparedViews(Owner):
         self._rasterizer = rasterizer
         self._cameras = list(cameras)
         self._breaks = sorted({*breaks, len(cameras)})
-        device = rasterizer.device
-        free = device.info.memory - device.allocated
-        of_host = device.info.kind == "cpu" or device.info.integrated
-        share = _SHARE_OF_HOST if of_host else _SHARE
-        self.budget = ViewCache(rasterizer, free * share if memory is None else memory, others)
+        self.budget = ViewCache(rasterizer, budget_of(rasterizer.device, memory), others)
         self.launches: list[range] = []
         self._kept: dict[range, ViewSet] = {}
         #: Memory for views that are not kept, by their number.
@@ -66,6 +116,14 @@ class PreparedViews(Owner):
         except BaseException:
             self.close()
             raise
+
+    def stride(self, numbers: range) -> int:
+        """That of the scene."""
+        return self._rasterizer.stride
+
+    def picks(self, numbers: range) -> cl.Buffer | None:
+        """None: all views have all splats."""
+        return None
 
     def _prepare_all(self, most: int) -> None:
         number = 0
@@ -97,19 +155,12 @@ class PreparedViews(Owner):
         return self._rasterizer.prepare_set([self._cameras[number] for number in numbers])
 
     @contextmanager
-    def ready(self, numbers: range) -> Iterator[tuple[ViewSet, bool]]:
-        """Make sure that a launch's views are there, with their geometry.
-
-        Yields:
-            The views, and whether their colours were made anew since the last time.
-
-        Raises:
-            DeviceError: they do not fit the device.
-        """
+    def ready(self, numbers: range) -> Iterator[Ready]:
+        """See :meth:`SweptViews.ready`."""
         kept = self._kept.get(numbers)
         views = self._prepare_again(numbers) if kept is None else kept
         with self.budget.geometry(views) as projected:
-            yield views, projected or kept is None
+            yield Ready(views, projected or kept is None)
 
     def _prepare_again(self, numbers: range) -> ViewSet:
         """Views that are not kept, in the memory of others: drivers take long to give memory back and take it anew."""

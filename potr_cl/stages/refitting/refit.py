@@ -22,10 +22,11 @@ from numpy.typing import NDArray
 from potr_cl.codec.quantize import nonzero_levels, to_ycocg
 from potr_cl.host.threads import in_background
 from potr_cl.model.camera import Camera
-from potr_cl.model.scene import FloatArray, Scene
+from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
 from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.stages.refitting.colour_refit import ColourRefit, HelpFrom
+from potr_cl.stages.refitting.coming_scene import AnyScene
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
 from potr_cl.stages.refitting.solver import Solved
 from potr_cl.stages.refitting.targets import Targets
@@ -38,7 +39,7 @@ _ZERO = 1e-6
 
 def refit_colours(
     device: Device,
-    scene: Scene,
+    scene: AnyScene,
     cameras: Sequence[Camera],
     targets: Targets,
     options: RefitOptions | None = None,
@@ -53,7 +54,7 @@ def refit_colours(
 
     Args:
         device: to compute on.
-        scene: its geometry and opacities stay, its colours are the start.
+        scene: its geometry and opacities stay, its colours are the start. It may still be to come.
         cameras: the views that count.
         targets: the picture that each of them should show.
         options: of the solver.
@@ -71,6 +72,7 @@ def refit_colours(
     Raises:
         UsageError: no camera.
         DeviceError: the scene does not fit the device.
+        What making a scene raises that is still to come.
     """
     options = options or RefitOptions()
     more = 0 if fix_ac is None and colour_grid is None else _CONSTANT_STEPS

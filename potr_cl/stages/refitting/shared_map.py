@@ -19,6 +19,7 @@ from potr_cl.raster.rules import RasterRules
 from potr_cl.raster.view_shares import ViewShares
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.colour_map import parts_of
+from potr_cl.stages.refitting.coming_scene import AnyScene, arrived
 from potr_cl.stages.refitting.packing import Packing
 from potr_cl.stages.refitting.part import ColourPart, Gradient
 from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
@@ -117,16 +118,11 @@ def colour_shares(pool: Pool, views: int) -> Shares:
     return shares(pool, views, parts_of(views), _OWN_SPEED)
 
 
-def colourless(scene: Scene) -> Scene:
-    """The same splats in black: a re-fit's rasterizer is never asked for colours."""
-    return replace(scene, sh=np.zeros((len(scene), 1, 3), np.float32))
-
-
 @contextmanager
 def colour_parts(
     pool: Pool,
     share: Shares,
-    scene: Scene,
+    scene: AnyScene,
     rules: RasterRules,
     background: tuple[float, float, float],
     source: Scene | KeptScene | PicturesAhead | ViewShares,
@@ -145,17 +141,21 @@ def colour_parts(
         cameras: all views.
         memory: bytes of a device's memory that prepared views and targets may take; None: the default.
     """
-    constant = replace(scene, sh=np.ascontiguousarray(scene.sh[:, :1]))
+    sh_count = scene.sh.shape[1]
+    if not pool.in_process:  # nobody needs the other colours, and they would travel
+        here = arrived(scene)
+        scene = replace(here, sh=np.ascontiguousarray(here.sh[:, :1]))
     with ExitStack() as stack:
-        shape = stack.enter_context(pool.shared(constant))
+        shape = stack.enter_context(pool.shared(scene))
         pictured: list[tuple[Shared, Sights | None]]
         if isinstance(source, ViewShares):
             pictured = [(stack.enter_context(pool.shared(each.excerpt)), each.sights) for each in source.shares]
         else:
             pictured = [(stack.enter_context(pool.shared(source)), None)] * len(share.others)
         given = [
-            (shape, scene.sh.shape[1], rules, background, own, cameras, numbers, sights)
+            (shape, sh_count, rules, background, own, cameras, numbers, sights)
             for (own, sights), numbers in zip(pictured, share.others, strict=True)
         ]
-        with Parts(pool, ColourPart, given, memory, [len(each) for each in share.others]) as parts:
+        views = [len(each) for each in share.others]
+        with Parts(pool, ColourPart, given, memory, views, share.names) as parts:
             yield parts

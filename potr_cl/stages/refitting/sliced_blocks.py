@@ -6,11 +6,15 @@ import numpy as np
 import pyopencl as cl
 
 from potr_cl.model.scene import FloatArray
+from potr_cl.opencl.ferry import Cargo
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.sliced_coefficients import AnyVector, HostColumns, SlicedCoefficients
 from potr_cl.stages.refitting.vector_space import Ridge
+
+#: Bytes of rows that are added up before they go to the host, about.
+_ROWS = 1 << 26
 
 
 class SlicedBlocks(Owner):
@@ -54,17 +58,19 @@ class SlicedBlocks(Owner):
         """See :meth:`potr_cl.stages.refitting.blocks.SplatBlocks.add_fixed`."""
         device, values = self._coefficients.device, self._columns.values
         first = splats.start in self._unset
+        some = max(_ROWS // (4 * len(splats)), 1)
         with Memory(device) as memory:
-            column = memory.allocate(4 * len(splats), "the splats' normal equations")
-            for row in range(self._triangle):
-                own = values[row, splats.start : splats.stop]
-                with device.errors("failed while computing"):
-                    if first:
-                        self._coefficients.clear(column)
-                    else:
-                        cl.enqueue_copy(device.queue, column, own, is_blocking=True)
-                    self._coefficients.own.add_fixed_some(column, sums, row * len(splats), len(splats), unit)
-                    cl.enqueue_copy(device.queue, own, column, is_blocking=True)
+            columns = memory.allocate(4 * len(splats) * min(some, self._triangle), "the splats' normal equations")
+            for row in range(0, self._triangle, some):
+                rows = values[row : row + some]
+                own = [Cargo(rows, columns=splats)]
+                if first:
+                    self._coefficients.clear(columns)
+                else:
+                    self._coefficients.ferry.to_device(columns, own)
+                count = len(rows) * len(splats)
+                self._coefficients.own.add_fixed_some(columns, sums, row * len(splats), count, unit)
+                self._coefficients.ferry.to_host(own, columns)
         self._unset.discard(splats.start)
 
     def _values(self) -> FloatArray:

@@ -13,7 +13,7 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import TypeAlias
 
 import numpy as np
 import pyopencl as cl
@@ -22,6 +22,7 @@ from numpy.typing import NDArray
 from potr_cl.host import mapped
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.ferry import Cargo, Ferry
 from potr_cl.opencl.memory import Memory
 from potr_cl.raster.scene_buffers import SPLAT_GROUP
 from potr_cl.stages.refitting.coefficients import DOT_ITEMS, Coefficients
@@ -66,6 +67,7 @@ class SlicedCoefficients(VectorSpace):
 
     Attributes:
         own: the slice's vectors and flags on the device.
+        ferry: takes what goes between the host and the device.
 
     Raises:
         PotrError: there is no room for the vectors.
@@ -80,6 +82,7 @@ class SlicedCoefficients(VectorSpace):
         self._resident = resident
         self._words = np.zeros((2, layout.stride), np.uint32)
         self._memory = Memory(device)
+        self.ferry = Ferry(device)
         self._operands: list[cl.Buffer | None] = [None] * _OPERANDS
         self._held: list[tuple[HostColumns, int] | None] = [None] * _OPERANDS
         with device.all_or_nothing():
@@ -186,7 +189,7 @@ class SlicedCoefficients(VectorSpace):
             if x.zero:
                 self.clear(buffer)
             else:
-                self._copy(buffer, x.values)
+                self.ferry.to_device(buffer, [Cargo(x.values.reshape(-1))])
             self._held[place] = (x, x.changes)
         return buffer
 
@@ -277,33 +280,22 @@ class SlicedCoefficients(VectorSpace):
         elif x.zero:
             self.clear(self._slices[place])
         else:
-            self._copy(self._slices[place], x.values.reshape(-1)[first : first + count])
+            self.ferry.to_device(self._slices[place], [Cargo(x.values.reshape(-1)[first : first + count])])
         return self._slices[place]
 
     def _take_piece(self, x: AnyVector, buffer: cl.Buffer, first: int, count: int) -> None:
         if isinstance(x, HostColumns):
-            self._copy(x.values.reshape(-1)[first : first + count], buffer)
+            self.ferry.to_host([Cargo(x.values.reshape(-1)[first : first + count])], buffer)
         else:
             cl.enqueue_copy(self.device.queue, x, buffer, byte_count=4 * count, dst_offset=4 * first)
 
-    def _copy(self, target: Any, source: Any) -> None:
-        with self.device.errors("failed while computing"):
-            cl.enqueue_copy(self.device.queue, target, source, is_blocking=True)
-
     def _rectangle(self, values: FloatArray, part: range, buffer: cl.Buffer, to_device: bool) -> None:
         """Copy some splats of all columns."""
-        pair = (buffer, values) if to_device else (values, buffer)
-        with self.device.errors("failed while computing"):
-            cl.enqueue_copy(
-                self.device.queue,
-                *pair,
-                buffer_origin=(0, 0, 0),
-                host_origin=(4 * part.start, 0, 0),
-                region=(4 * len(part), len(values), 1),
-                buffer_pitches=(4 * self._splats, 0),
-                host_pitches=(4 * values.shape[1], 0),
-                is_blocking=True,
-            )
+        cargo = [Cargo(values, columns=part)]
+        if to_device:
+            self.ferry.to_device(buffer, cargo, pitch=4 * self._splats)
+        else:
+            self.ferry.to_host(cargo, buffer, pitch=4 * self._splats)
 
     def _on_device_rectangle(self, x: cl.Buffer, part: range, buffer: cl.Buffer, to_slice: bool) -> None:
         """The same between a vector on the device and a slice."""
@@ -335,6 +327,7 @@ class SlicedCoefficients(VectorSpace):
         self._held = [None] * _OPERANDS
         self._operands = [None] * _OPERANDS
         self.own.close()
+        self.ferry.close()
         self._memory.close()
 
 

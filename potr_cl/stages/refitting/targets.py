@@ -12,6 +12,7 @@ from potr_cl.host import mapped
 from potr_cl.model.camera import Camera
 from potr_cl.model.scene import FloatArray
 from potr_cl.opencl.device import Device
+from potr_cl.opencl.ferry import Cargo, Ferry
 from potr_cl.opencl.memory import Memory, Owner
 from potr_cl.raster.rasterizer import Rasterizer
 
@@ -53,7 +54,7 @@ class RenderedTargets:
 _TOGETHER = 1 << 26
 
 
-class RememberedTargets:
+class RememberedTargets(Owner):
     """The pictures of others, asked for once and kept on the host: what made them can go.
 
     Where memory is bounded, many of them lie in a temporary file (:mod:`potr_cl.host.mapped`).
@@ -69,7 +70,7 @@ class RememberedTargets:
     """
 
     def __init__(self, device: Device, targets: Targets, cameras: Sequence[Camera]) -> None:
-        self._device = device
+        self._ferry = Ferry(device)
         self._ends = np.cumsum([0, *(nbytes(camera) // 4 for camera in cameras)])
         self._pictures = mapped.array((int(self._ends[-1]),), np.float32, "pictures")
         largest = max(map(nbytes, cameras))
@@ -81,17 +82,20 @@ class RememberedTargets:
                 numbers = range(first, min(first + together, len(cameras)))
                 targets.into(numbers, buffer)
                 own = self._pictures[self._ends[numbers.start] : self._ends[numbers.stop]]
-                with device.errors("failed while computing"):
-                    cl.enqueue_copy(device.queue, own, buffer, is_blocking=True)
+                self._ferry.to_host([Cargo(own)], buffer)
 
     def into(self, numbers: Sequence[int], buffer: cl.Buffer) -> None:
         """See :meth:`Targets.into`."""
-        start = 0
+        cargo, start = [], 0
         for number in numbers:
-            picture = self._picture(number)
-            with self._device.errors("failed to take a picture"):
-                cl.enqueue_copy(self._device.queue, buffer, picture, dst_offset=start, is_blocking=True)
-            start += picture.nbytes
+            cargo.append(Cargo(self._picture(number), start))
+            start += cargo[-1].values.nbytes
+        self._ferry.to_device(buffer, cargo)
+
+    def close(self) -> None:
+        """Keep nothing any more."""
+        self._ferry.close()
+        self._pictures = self._pictures[:0]
 
     def _picture(self, number: int) -> FloatArray:
         return self._pictures[self._ends[number] : self._ends[number + 1]]

@@ -57,10 +57,10 @@ class Layout:
         """The same for kernels that look at all coefficients, or at the constant ones, whose columns come first."""
         return {**self.macros, "SH_COUNT": 1} if constant else self.macros
 
-    def over_splats(self, kernel: Kernel, *others: int) -> None:
-        """Launch a bound kernel over all splats, and in the second dimension over ``others``."""
+    def over_splats(self, kernel: Kernel, *others: int, stride: int | None = None) -> None:
+        """Launch a bound kernel over all splats, or so many, and in the second dimension over ``others``."""
         group = max(_GROUP // self.lanes, 1)
-        kernel.launch((self.stride // self.lanes, *others), (group, *(1 for _ in others)))
+        kernel.launch(((stride or self.stride) // self.lanes, *others), (group, *(1 for _ in others)))
 
 
 @dataclass(frozen=True)

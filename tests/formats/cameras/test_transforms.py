@@ -98,10 +98,13 @@ def test_views_are_moved_to_nerfstudios_training_space(tmp_path: Path, caplog: p
     content["frames"][0]["transform_matrix"] = pose.tolist()
     path = write_json(tmp_path / "transforms.json", content)
     (plain,) = load_cameras(path)
+    assert "put the dataparser_transforms.json of the training's output folder beside the file" in caplog.text
+    caplog.clear()
     noted = {"transform": (oriented @ applied)[:3].tolist(), "scale": scale * applied_scale}
     write_json(tmp_path / "dataparser_transforms.json", noted)
     (moved,) = load_cameras(path)
     assert "moved the views to the training space" in caplog.text
+    assert "taken as they stand" not in caplog.text
 
     seen = plain.centre + plain.rotation.T @ [0.1, -0.2, 3.0]
     trained = scale * (oriented @ [*seen, 1])[:3]

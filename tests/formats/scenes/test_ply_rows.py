@@ -69,3 +69,26 @@ def test_a_scene_of_many_blocks_is_the_scene(tmp_path, plush_excerpt):
     found = load_scene(tmp_path / "scene.ply")
     for name in ("means", "log_scales", "quaternions", "opacity_logits", "sh"):
         assert np.array_equal(getattr(found, name), getattr(plush_excerpt, name)), name
+
+
+@pytest.mark.skipif(not hasattr(os, "preadv"), reason="reads in another way")
+@pytest.mark.parametrize("change", ["grows", "is cut", "is written over"])
+def test_a_file_that_another_program_writes_meanwhile(tmp_path, plush_excerpt, monkeypatch, change):
+    """Values of two states of a file are no scene."""
+    path = tmp_path / "scene.ply"
+    save(plush_excerpt, path)
+    os.utime(path, ns=(0, 0))
+    read = os.preadv
+
+    def disturbed(*arguments):
+        if change == "is cut":
+            os.truncate(path, path.stat().st_size // 2)
+        else:
+            with path.open("r+b") as file:
+                file.seek(0, os.SEEK_END if change == "grows" else os.SEEK_SET)
+                file.write(b"ply")
+        return read(*arguments)
+
+    monkeypatch.setattr(os, "preadv", disturbed)
+    with pytest.raises(DataError, match=r"scene.ply' was changed while it was read: wait until the program"):
+        load_scene(path)

@@ -1,0 +1,115 @@
+"""What an encode has made, and who did the work: :class:`Encoded`."""
+
+from __future__ import annotations
+
+import os
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+from potr_cl.codec.quantize import HyperParameters
+from potr_cl.host.atomic_write import replacing
+from potr_cl.model.scene import Scene
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.stages.fit import LeftOut
+from potr_cl.stages.fitting.fit import Fitted
+from potr_cl.stages.pruning.schedule import Pruned
+from potr_cl.stages.pruning.unseen import Unseen
+from potr_cl.stages.refitting.photographs import PhotographChoice
+from potr_cl.stages.refitting.refit_options import Refitted
+from potr_cl.stages.views_between import Added
+from potr_cl.workers.pool import Pool, Traffic
+
+
+@dataclass(frozen=True)
+class Encoded:
+    """A finished encode.
+
+    Attributes:
+        pieces: the file's bytes, to be written one after another.
+        nbytes: the size of the file.
+        order: (N,) index in the source scene of each splat of the file.
+        pruned: what pruning did; None if it was left out.
+        unseen: the splats that no training view sees; None if pruning was left out.
+        fitted: what the fit of all parameters did, or why it was left out; None if it was not asked for.
+        refitted: what the re-fit of the colours did; None if it was left out.
+        photographs: what held-out photographs say of a fit to photographs; None if none were given.
+        between: the views between the training views that were looked at; None if nobody asked for any.
+        device: the device that did the work; not the one that was asked for if that had too little memory. None if no
+            stage needed a device.
+        seconds: wall time by stage.
+        options: that it was encoded with: those that were given, or that a search for a size or a PSNR has found.
+        source_splats: how many splats the source scene has.
+        parameters: the hyper-parameters that the stages took.
+        shared: who did the work, where views were shared out.
+        left_out: how many of the scene's SH degrees, the highest ones, the file's format has left out.
+    """
+
+    pieces: list[bytes]
+    nbytes: int
+    order: NDArray[np.int64]
+    pruned: Pruned | None
+    unseen: Unseen | None
+    fitted: Fitted | LeftOut | None
+    refitted: Refitted | None
+    photographs: PhotographChoice | None
+    between: Added | None
+    device: Device | None
+    seconds: dict[str, float]
+    options: EncodeOptions
+    source_splats: int
+    parameters: HyperParameters
+    shared: SharedOut | None = None
+    left_out: int = 0
+
+    def __repr__(self) -> str:
+        q = f"q {self.options.q:.4g} of preset {self.options.preset}"
+        splats = f"{len(self.order):,} of {self.source_splats:,} splats"
+        return f"Encoded({self.nbytes:,} bytes, {splats}, {q}, {sum(self.seconds.values()):.1f} s)"
+
+    @property
+    def data(self) -> bytes:
+        """The whole file."""
+        return b"".join(self.pieces)
+
+    @property
+    def scene(self) -> Scene:
+        """What the file's readers will see; it is read anew each time."""
+        return self.options.output.read(self.data, trust=True)
+
+    def save(self, path: str | os.PathLike[str]) -> None:
+        """Write the file, whole or not at all; its name does not tell its kind, ``options.output`` does.
+
+        Raises:
+            UsageError: it cannot be written there.
+            PotrError: the system failed to write.
+        """
+        with replacing(path) as file:
+            for piece in self.pieces:
+                file.write(piece)
+
+
+@dataclass(frozen=True)
+class SharedOut:
+    """How views were shared out.
+
+    Attributes:
+        workers: their names.
+        sent, received: bytes that went to them and came from them.
+    """
+
+    workers: tuple[str, ...]
+    sent: int
+    received: int
+
+    @staticmethod
+    def by(pool: Pool, before: Traffic) -> SharedOut:
+        """What a pool has done since its traffic was ``before``."""
+        now = pool.traffic
+        return SharedOut(pool.names, now.sent - before.sent, now.received - before.received)
+
+    def __str__(self) -> str:
+        megabytes = f"{self.sent / 1e6:,.0f} MB sent, {self.received / 1e6:,.0f} MB received"
+        return f"views shared out to {len(self.workers)} worker{'s' if len(self.workers) != 1 else ''}: {megabytes}"

@@ -1,0 +1,159 @@
+"""Stages run one after the other on a device, each again if memory is short: :class:`Run`."""
+
+from __future__ import annotations
+
+import dataclasses
+import json
+from collections.abc import Sequence
+
+from potr_cl.codec.encoder import Coded
+from potr_cl.model.virtual_cameras import is_virtual
+from potr_cl.opencl.device import Device
+from potr_cl.pipeline.encoded import Encoded, SharedOut
+from potr_cl.pipeline.fallback import on_device
+from potr_cl.pipeline.host_memory import for_views
+from potr_cl.pipeline.options import EncodeOptions
+from potr_cl.pipeline.stopwatch import Stopwatch
+from potr_cl.raster.kept_scene import KeptScene
+from potr_cl.stages.between.price import priced
+from potr_cl.stages.fit import Fit, LeftOut
+from potr_cl.stages.fitting.fit import Fitted
+from potr_cl.stages.prune import Prune
+from potr_cl.stages.refit import Refit
+from potr_cl.stages.stage import Interlude, Stage, State, Workbench
+from potr_cl.workers.pool import Pool, Traffic
+
+
+class Run:
+    """Runs stages one after the other, from the beginning or from any state that one of them has left.
+
+    Args:
+        options: the stages, and what they all share.
+        watch: keeps the time and passes the progress on.
+        device: the first to be tried; by default the best one there is, opened when a stage needs it.
+        kept: the uncompressed scene on that device.
+        pool: workers that views are shared out to, as long as the work is done on the pool's first device.
+
+    Attributes:
+        device: the one on which the last stage ran that needs views; None if none did.
+    """
+
+    def __init__(
+        self,
+        options: EncodeOptions,
+        watch: Stopwatch,
+        device: Device | None = None,
+        kept: KeptScene | None = None,
+        pool: Pool | None = None,
+    ) -> None:
+        self.device: Device | None = None
+        self._pool = pool
+        self._before = Traffic() if pool is None else dataclasses.replace(pool.traffic)
+        self._options, self._watch, self._given, self._kept = options, watch, device, kept
+        if kept is not None and pool is not None:
+            for other in pool.devices:
+                kept.bring_to(other)
+
+    def stages(self, state: State, only: Sequence[type[Stage]] | None = None) -> State:
+        """Run the stages, or some of them, in their order.
+
+        Raises:
+            As :func:`potr_cl.pipeline.encode.encode`.
+        """
+        for stage in self._options.stages:
+            if only is None or type(stage) in only:
+                state = self._one(stage, state)
+        return state
+
+    def _one(self, stage: Stage, state: State) -> State:
+        options = as_done(self._options, state)
+        bench = Workbench(
+            priced(options.parameters, state),
+            memory=options.memory,
+            background=options.background,
+            threads=options.threads,
+            interludes=self._interludes(stage, state),
+            metadata=lambda last: _metadata(last, as_done(options, last)),
+            progress=self._watch,
+            tell=self._watch.tell,
+            output=options.output,
+            kept=self._kept,
+            photographs=next((each.ground_truth for each in options.stages if isinstance(each, Refit)), None),
+        )
+        if not stage.asked_for:
+            return state
+        if not stage.needs_views:
+            return stage.run(state, bench)
+        if not state.views or not stage.looks_at(state.scene):
+            return state
+        if stage.serves_others and not options.look_at_views(state.scene):
+            return state
+
+        def work(device: Device, memory: int | None) -> State:
+            pool = self._pool if self._pool is not None and device is self._pool.first else None
+            room = for_views(device, memory, len(state.source))
+            return stage.run(state, dataclasses.replace(bench, device=device, memory=room, pool=pool))
+
+        device = self.device or self._given or Device()
+        state, self.device = on_device(device, options.memory, work)
+        return state
+
+    def _interludes(self, stage: Stage, state: State) -> tuple[Interlude, ...]:
+        """What other stages want done while this one removes splats."""
+        if stage.removes_in is None:
+            return ()
+        wanted = [each for other in self._options.stages if other.on for each in other.interludes(stage.removes_in)]
+        return tuple(interlude for interlude in wanted if interlude.stage.looks_at(state.source))
+
+    def finished(self, state: State) -> Encoded:
+        """What the stages have made, as the file that it is."""
+        coded: Coded = state.learnt["code"]
+        return Encoded(
+            pieces=coded.pieces,
+            nbytes=coded.nbytes,
+            order=state.survivors[coded.order],
+            pruned=state.learnt.get("prune"),
+            unseen=state.learnt.get("unseen"),
+            fitted=state.learnt.get("fit"),
+            refitted=state.learnt.get("refit"),
+            photographs=state.learnt.get("photographs"),
+            between=state.learnt.get("between"),
+            device=self.device,
+            seconds=self._watch.seconds,
+            options=self._options,
+            source_splats=len(state.source),
+            shared=None if self._pool is None else SharedOut.by(self._pool, self._before),
+            parameters=priced(as_done(self._options, state).parameters, state),
+            left_out=0 if coded.sh_degree is None else state.scene.sh_degree - coded.sh_degree,
+        )
+
+
+def as_done(options: EncodeOptions, state: State) -> EncodeOptions:
+    """The options as a state has followed them: only a fit that made up for splats has the others round finer."""
+    fitted = state.learnt.get(Fit.name)
+    if isinstance(fitted, LeftOut):
+        return options.changed(fit=False)
+    if isinstance(fitted, Fitted) and not fitted.spared:
+        return options.changed(fit={"finer": 0.0})
+    return options
+
+
+def _metadata(state: State, options: EncodeOptions) -> bytes:
+    """What the file says of how it was made."""
+    parameters, views = priced(options.parameters, state), state.views
+    by_name = {stage.name: stage for stage in options.stages if stage.on}
+    prune = by_name.get("prune")
+    by_threshold = isinstance(prune, Prune) and prune.count is None and prune.keep is None
+    compacts = bool(views) and "compact" in by_name
+    facts = {
+        "q": options.q,
+        "cameras": ("virtual" if is_virtual(views) else "given") if views else None,
+        "beta": parameters.beta if views else None,
+        "gamma": parameters.gamma,
+        "delta_mse_max": parameters.delta_mse_max if by_threshold and "prune" in state.learnt else None,
+        "lambda": parameters.lam if compacts else None,
+        "alpha": parameters.alpha if compacts else None,
+        "source_splats": len(state.source),
+        "source_bytes": options.source_bytes,
+    }
+    return json.dumps(facts, separators=(",", ":")).encode()

@@ -1,0 +1,98 @@
+"""Which splats each view reaches, on a GPU: :func:`reached_splats`.
+
+A view reaches a splat if a sweep fetches it, for any of its tiles. Most others lie beside the view; or behind what ends
+all pixels of their tiles, as most of a city does. What a sweep computes is the same to the last bit if the others are
+not there, since geometry and opacities stay as they are in a re-fit (cl/refit/reached.cl).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pyopencl as cl
+from numpy.typing import NDArray
+
+from potr_cl.model.camera import Camera
+from potr_cl.opencl.memory import Memory, Reused
+from potr_cl.raster.picked_splats import Picker
+from potr_cl.raster.rasterizer import Rasterizer
+
+#: Fewer splats are looked at together as fast.
+LEAST_SPLATS = 1 << 19
+#: Views must reach no more than this part of the splats, on the average: on the way from sums to coefficients each
+#: view goes through the coefficients by itself then, and not together with others.
+WORTH_IT = 1 / 5
+#: So many views tell.
+_SAMPLED = 12
+#: Work-items of a tile's work-group.
+_GROUP = 128
+
+
+def reached_splats(rasterizer: Rasterizer, cameras: Sequence[Camera]) -> list[NDArray[np.uint32]] | None:
+    """The numbers of the splats that each view reaches, ascending.
+
+    Args:
+        rasterizer: of the scene, on a GPU.
+        cameras: the views.
+
+    Returns:
+        None where views had better share all splats: there are few, or views reach many of them.
+
+    Raises:
+        DeviceError: a view with all splats does not fit the device.
+    """
+    if rasterizer.device.family != "gpu" or rasterizer.splats < LEAST_SPLATS or not cameras:
+        return None
+    found: dict[int, NDArray[np.uint32]] = {}
+    device = rasterizer.device
+    passing = Reused(device)
+    try:
+        with Memory(device) as memory, Picker(device, np.zeros(rasterizer.splats, np.uint32)) as picker:
+            marks = memory.allocate(rasterizer.stride, "the splats that a view reaches")
+            some = range(0, len(cameras), -(-len(cameras) // _SAMPLED))
+            for number in (*some, *sorted(set(range(len(cameras))) - set(some))):
+                if len(found) == len(some) and not _worth_it(found, rasterizer.splats):
+                    return None
+                found[number] = _reached(rasterizer, cameras[number], picker, marks, passing)
+    finally:
+        passing.give_back()
+        rasterizer.rest()
+    return [found[number] for number in range(len(cameras))] if _worth_it(found, rasterizer.splats) else None
+
+
+def _worth_it(found: dict[int, NDArray[np.uint32]], splats: int) -> bool:
+    return sum(map(len, found.values())) <= WORTH_IT * splats * len(found)
+
+
+def _reached(
+    rasterizer: Rasterizer, camera: Camera, picker: Picker, marks: cl.Buffer, passing: Reused
+) -> NDArray[np.uint32]:
+    device = rasterizer.device
+    try:
+        views = rasterizer.prepare_set([camera], passing)
+        device.fill(marks, np.uint8(0))
+        rules = rasterizer.rules
+        mark = device.shared_kernel(
+            "refit/reached.cl",
+            "mark_reached",
+            ALPHA_CAP=float(rules.alpha_cap),
+            TRANSMITTANCE_THRESHOLD=rules.transmittance_threshold,
+            NATIVE_EXP2=int(device.native_exp2),
+        )
+        mark.bind(
+            views=views.table,
+            stride=views.stride,
+            shapes=views.shapes,
+            colours=views.colours,
+            offsets=views.offsets,
+            intersections=views.intersections,
+            subtiles=views.subtiles,
+            marks=marks,
+        )
+        mark.launch((views.tiles * _GROUP, 1), (_GROUP, 1))
+        numbers, count = picker.pick(passing, np.ones(1, bool), marks, 1)
+        found: NDArray[np.uint32] = device.download(numbers, (count,), np.uint32)
+    finally:
+        passing.close()
+    return found
