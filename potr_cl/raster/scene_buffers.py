@@ -98,6 +98,12 @@ class SceneBuffers(Owner):
         return self._memory.nbytes
 
     @property
+    def parameters(self) -> dict[str, cl.Buffer]:
+        """All parameters by their names; of devices of all kinds they have the same size."""
+        names = ("means", "scales", "quaternions", "log2_opacities", "sh")
+        return {name: getattr(self, name) for name in names}
+
+    @property
     def geometry(self) -> dict[str, Any]:
         """All parameters but the SH coefficients, and the stride, by the names that the projection's arguments have."""
         return {

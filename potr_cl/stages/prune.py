@@ -171,6 +171,8 @@ class Prune(Stage):
         told = state.having_learnt("unseen", Unseen(splats, len(state.scene), kept, area))
         if state.scene is state.source:
             told = replace(told, sights=sights)
+            if sights is not None and bench.kept is not None and bench.kept.is_of(state.source):
+                bench.kept.groups = sights.groups  # for who judges by pictures later
         if self.keep is None and self.count is None:
             told = told.having_learnt("price", bench.parameters.delta_mse_max)
         if not (kept and splats):
