@@ -239,6 +239,15 @@ def test_devices_by_name():
             choose_device(named)
 
 
+def test_all_devices_of_this_process_are_known():
+    """Each loads what the last encode has needed, not the first one alone."""
+    devices = [Device(choose_device()) for _ in range(3)]
+    with open_workers(devices) as workers:
+        assert list(workers.devices) == devices
+    with open_workers(devices[0]) as workers:
+        assert list(workers.devices) == devices[:1]
+
+
 def test_the_environment_may_name_several(monkeypatch, plush_excerpt, plush_excerpt_cameras):
     monkeypatch.setenv("POTR_CL_DEVICE", "all")
     with open_workers() as workers:
