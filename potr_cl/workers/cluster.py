@@ -99,6 +99,9 @@ class ClusterPool(Pool):
         """A worker is sent it when it first makes a part of it, and keeps it for the parts that follow."""
         yield Shared(thing)
 
+    def has(self, thing: Any) -> bool:
+        return all(worker.has(thing) for worker in self._workers if not worker.lost)
+
     def close(self) -> None:
         with self._meeting:
             self._closing.set()
@@ -330,6 +333,10 @@ class _ClusterWorker(Worker):
             return _HeldThere(self._pool, self, number)
 
         return self._pool.begin(made)
+
+    def has(self, thing: Any) -> bool:
+        """Whether the seat has been sent a thing, and keeps it."""
+        return any(known is thing for _, known in self._known)
 
     def _sent(self, thing: Any) -> int:
         """The number by which the seat knows a thing, after sending it if need be."""
