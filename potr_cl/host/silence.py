@@ -1,8 +1,8 @@
 """Warnings of libraries that tell a user nothing, not shown while something is done: :func:`without_warnings`.
 
 Python has one list of filters for all threads, and :class:`warnings.catch_warnings` puts back the one that it has
-found. Where two threads use it at overlapping times, the first to end has the other's warnings shown, and the second one
-leaves its own filters behind for good. So all of this package use one block, which is counted.
+found. Where two threads use it at overlapping times, the first to end has the other's warnings shown, and the second
+one leaves its own filters behind for good. So all of this package use one block, which is counted.
 """
 
 from __future__ import annotations
