@@ -22,6 +22,7 @@ if TYPE_CHECKING:
     from potr_cl.ondevice.decode import Beside
     from potr_cl.opencl.device import Device
     from potr_cl.opencl.discovery import DeviceInfo
+    from potr_cl.outputs.coded_scene import CodedScene
     from potr_cl.pipeline.encoded import Encoded
     from potr_cl.raster.rules import RasterRules
     from potr_cl.raster.scene_buffers import Drawable, SceneBuffers
@@ -122,6 +123,27 @@ def drawable_to_judge(
 
     with on_device(source, device, trust, antialiased=antialiased, beside=sampled) as buffers:  # type: ignore[arg-type]
         yield buffers, joined([each.scene for each in samples])
+
+
+def coded_scene(source: SceneSource, trust: bool = False) -> CodedScene | None:
+    """The .potr file that a source stands for, for other computers to decode; None for anything else.
+
+    Raises:
+        UsageError: it cannot be read.
+    """
+    if not _is_potr(source):
+        return None
+    from potr_cl.outputs.coded_scene import CodedScene
+    from potr_cl.outputs.potr import Potr
+
+    data = encoded_bytes(source)
+    if data is None:
+        assert isinstance(source, (str, os.PathLike))
+        try:
+            data = Path(source).read_bytes()
+        except OSError as error:
+            raise UsageError(f"cannot read '{source}': {error.strerror}") from None
+    return CodedScene(Potr(), data, trust)
 
 
 def _is_potr(source: SceneSource) -> bool:

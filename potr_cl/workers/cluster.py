@@ -99,6 +99,9 @@ class ClusterPool(Pool):
         """A worker is sent it when it first makes a part of it, and keeps it for the parts that follow."""
         yield Shared(thing)
 
+    def has(self, thing: Any) -> bool:
+        return all(worker.has(thing) for worker in self._workers if not worker.lost)
+
     def close(self) -> None:
         with self._meeting:
             self._closing.set()
@@ -155,7 +158,7 @@ class ClusterPool(Pool):
         except Exception as error:
             if self._closing.is_set() or address not in self._alive() or _is_of_transport(error):
                 raise WorkerLost(f"{address} is gone ({_first_line(error)})") from None
-            raise DeviceError(f"worker {address} failed ({_first_line(error)})") from error
+            raise _Failed(address, _first_line(error)) from error
 
     def _answered(self, answer: Any, seconds: float) -> bool:
         """Whether an answer is there, after waiting a little for it."""
@@ -182,7 +185,7 @@ class ClusterPool(Pool):
         """Have each worker that is there say which device it takes.
 
         Raises:
-            UsageError: no worker comes, or one cannot do the work.
+            UsageError: no worker comes, one cannot do the work, or all of them go.
         """
         addresses = self._alive()
         if not addresses:
@@ -194,8 +197,18 @@ class ClusterPool(Pool):
         if not addresses:
             raise UsageError("the cluster has no worker: start some with `dask worker ADDRESS`, one for each device")
         workers = self._invited(addresses)
-        for worker in workers:
-            worker.meet()
+        gone: list[WorkerLost] = []
+        for worker in list(workers):
+            try:
+                worker.meet()
+            except WorkerLost as error:
+                workers.remove(worker)
+                self._refused.add(worker.name)
+                gone.append(error)
+        if not workers:
+            raise UsageError(f"{gone[0]}, and no other worker is there")
+        for lost in gone:
+            _log.warning("%s; it does no views", lost)
         self._take_in(workers)
 
     def _meet_others(self) -> None:
@@ -276,18 +289,27 @@ class _ClusterWorker(Worker):
 
         Raises:
             UsageError: it cannot do the work.
+            WorkerLost: it has gone.
         """
         try:
             self._seat = self._pool.wait_for(self._future, self.name, _HELLO)
             version, name, family = self.ask("hello")
+        except WorkerLost:
+            # As those do that have no potr_cl.
+            raise WorkerLost(
+                f"worker {self.name} of the cluster has gone as it was asked for its device: see what it says itself, "
+                "and install potr_cl there as it is here"
+            ) from None
         except DeviceError as error:
             if "deserialization of the task graph" in str(error):  # which the scheduler does
                 raise UsageError(
                     "the scheduler of the cluster does not know potr_cl: install it there as it is here"
                 ) from None
+            if not isinstance(error, _Failed):
+                raise UsageError(f"worker {self.name} of the cluster cannot do the work: {error}") from None
             raise UsageError(
-                f"worker {self.name} of the cluster cannot do the work ({error}): install potr_cl there as it is here, "
-                "and an OpenCL driver"
+                f"worker {self.name} of the cluster cannot do the work ({error.said}): install potr_cl there as it is "
+                "here"
             ) from None
         _check(self.name, version, name, family, self._pool.first)
         self.device = name
@@ -312,6 +334,10 @@ class _ClusterWorker(Worker):
 
         return self._pool.begin(made)
 
+    def has(self, thing: Any) -> bool:
+        """Whether the seat has been sent a thing, and keeps it."""
+        return any(known is thing for _, known in self._known)
+
     def _sent(self, thing: Any) -> int:
         """The number by which the seat knows a thing, after sending it if need be."""
         number = next((number for number, known in self._known if known is thing), None)
@@ -331,6 +357,18 @@ class _ClusterWorker(Worker):
         """Have Dask forget the seat, and with it all that it holds, as soon as it is idle."""
         with suppress(Exception):
             self._future.release()
+
+
+class _Failed(DeviceError):
+    """Something else than this package failed on a worker.
+
+    Attributes:
+        said: what it says.
+    """
+
+    def __init__(self, address: str, said: str) -> None:
+        super().__init__(f"worker {address} failed ({said})")
+        self.said = said
 
 
 class _HeldThere(Held):

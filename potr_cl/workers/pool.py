@@ -163,6 +163,10 @@ class Pool(ABC):
     def shared(self, thing: Any) -> AbstractContextManager[Shared]:
         """Give something to all workers once, for parts that are made as long as the context lasts."""
 
+    def has(self, thing: Any) -> bool:
+        """Whether all workers have something that was shared with them, so that it is not sent again."""
+        return self.in_process
+
     @abstractmethod
     def close(self) -> None:
         """Leave the workers; none of them goes on working for this pool."""

@@ -29,7 +29,7 @@ _FEWEST, _MOST = 1, 6
 #: to prepare views that it leaves no room for; and of the host's, where a CPU computes: there it is the other way.
 _OF_VECTORS, _OF_HOST = 0.8, 0.5
 #: What a sweep has besides for each splat: geometry, the splats of a view as they are projected, and its sums.
-_SWEEP = 68 + 32 + 16 + 16 + 32 + 8
+_SWEEP = 68 + 32 + 16 + 16 + 32 + 8 + 8
 #: The vectors lie on the device if they take no more than this part of what is free, or of the memory that is given.
 _OF_FREE, _OF_GIVEN = 0.75, 0.5
 #: Of less nobody needs to be careful.
@@ -41,7 +41,7 @@ _LEAST_SLICE, _MOST_SLICE = 1 << 14, 1 << 18
 _MOST_RANGES = 8
 #: Where views have splats of their own: what lies on the device of each splat; what those take of which a launch has as
 #: many as a view at most; and, of the memory, what is left for views in any case.
-_LYING, _LAUNCHED, _LEAST_VIEWS = 68, 160, 1 / 20
+_LYING, _LAUNCHED, _LEAST_VIEWS = 76, 160, 1 / 20
 #: With the coefficients on the device too, which have this rank, no other place is needed to look at views with them.
 _COEFFICIENTS = 3
 
