@@ -31,6 +31,8 @@ _NO_PROMISE = (errno.EOPNOTSUPP, errno.EINVAL, errno.ENOSYS)
 
 #: Bytes of the largest array that is not mapped where memory is bounded.
 _LARGEST: ContextVar[float] = ContextVar("largest", default=math.inf)
+#: What has found no room on the disk in the innermost block; of the first the log is told.
+_TOLD: ContextVar[list[str]] = ContextVar("told")
 #: It is this part of the memory: of arrays just below it there may be twenty at a time, as of the re-fit's vectors.
 _PART = 1 / 64
 #: So many times as much memory must be left as an array takes that was to lie in a file.
@@ -47,10 +49,12 @@ def bounded(memory: float | None) -> Iterator[None]:
         memory: bytes that the work may take about; None: as before.
     """
     token = _LARGEST.set(_LARGEST.get() if memory is None else _PART * memory)
+    told = _TOLD.set([])
     try:
         yield
     finally:
         _LARGEST.reset(token)
+        _TOLD.reset(told)
 
 
 def array(shape: tuple[int, ...], dtype: Any, what: str, first: bool = False) -> np.ndarray[Any, Any]:
@@ -74,7 +78,10 @@ def array(shape: tuple[int, ...], dtype: Any, what: str, first: bool = False) ->
     except PotrError as error:
         if first or memory_left() < _PLENTY * nbytes:
             raise
-        _log.warning("%s; meanwhile it takes memory beyond --memory", error)
+        told = _TOLD.get([])
+        if not told:
+            _log.warning("%s; it and what follows takes memory beyond --memory now", error)
+        told.append(what)
         return np.empty(shape, dtype)
 
 

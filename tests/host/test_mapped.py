@@ -142,8 +142,10 @@ def test_what_finds_no_room_later_is_kept_in_memory_where_there_is_plenty(left, 
             array = mapped.array((1_000_000,), np.float32, "numbers", first)
             assert array.shape == (1_000_000,)
             assert not in_a_file(array)
+            mapped.array((1_000_000,), np.float32, "others")
+            assert len(caplog.records) == 1  # it is said once
             assert "no room for 0.0 GB of numbers" in caplog.text
-            assert "it takes memory beyond --memory" in caplog.text
+            assert "it and what follows takes memory beyond --memory now" in caplog.text
 
 
 def test_an_encode_whose_disk_is_full_after_the_scene_was_read_ends_well(
