@@ -14,6 +14,7 @@ import numpy as np
 import pyopencl as cl
 from numpy.typing import NDArray
 
+from potr_cl.errors import DeviceMemoryError
 from potr_cl.model.camera import Camera
 from potr_cl.opencl.memory import Memory, Reused
 from potr_cl.raster.picked_splats import Picker
@@ -83,11 +84,19 @@ def reached_splats(
             room = min((device.info.memory if memory is None else memory), device.info.memory - device.allocated)
             most = int(min(max(room * _ROOM / (_VIEW * rasterizer.stride), 1), _TOGETHER))
             for views in (some, sorted(set(numbers) - set(some))):
-                for first in range(0, len(views), most):
-                    together = views[first : first + most]
+                left = list(views)
+                while left:
+                    together = left[:most]
                     of_these = [cameras[number] for number in together]
-                    splats = _reached(rasterizer, of_these, picker, marks, passing)
+                    try:
+                        splats = _reached(rasterizer, of_these, picker, marks, passing)
+                    except DeviceMemoryError:
+                        if len(together) == 1:
+                            raise
+                        most = len(together) // 2
+                        continue
                     found.update(zip(together, splats, strict=True))
+                    del left[:most]
                 if not _worth_it(found, rasterizer.splats):
                     return None
     finally:
