@@ -97,7 +97,7 @@ def reached_splats(
                         continue
                     found.update(zip(together, splats, strict=True))
                     del left[:most]
-                if not _worth_it(found, rasterizer.splats):
+                if views is some and not _worth_it(found, rasterizer.splats):
                     return None
     finally:
         passing.give_back()
