@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import numpy as np
 import pyopencl as cl
+from numpy.typing import NDArray
 
 from potr_cl.opencl.device import Device
 from potr_cl.opencl.memory import Owner, Scratch
@@ -38,10 +39,10 @@ class LongLists(Owner):
         Raises:
             DeviceError: the device has no room.
         """
-        keys: list[np.ndarray[tuple[int], np.dtype[np.int64]]] = []
-        lengths: list[np.ndarray[tuple[int], np.dtype[np.int64]]] = []
+        keys: list[NDArray[np.int64]] = []
+        lengths: list[NDArray[np.int64]] = []
         for start, offsets in zip(views.intersection_starts, views.found_offsets, strict=False):
-            length = np.diff(offsets.astype(np.int64))
+            length: NDArray[np.int64] = (offsets[1:] - offsets[:-1]).astype(np.int64)
             tiles = np.flatnonzero(length > LONGEST)
             keys.append(offsets[tiles].astype(np.int64) + start)
             lengths.append(length[tiles])

@@ -134,11 +134,14 @@ class Preparation(Owner):
         """Enqueue what follows the offsets, which the host may know."""
         memory = self.memory
         memory.keys.reserve(self._launcher.key_bytes * views.capacity)
-        long_lists = (
-            memory.long_lists if known and self._launcher.whole_sets and memory.long_lists.find(views) else None
-        )
+        some_are_long = known and self._launcher.whole_sets and memory.long_lists.find(views)
         self._launcher.enqueue_lists(
-            views, memory.bounds.buffer, memory.counts.buffer, memory.keys.buffer, for_frame, long_lists
+            views,
+            memory.bounds.buffer,
+            memory.counts.buffer,
+            memory.keys.buffer,
+            for_frame,
+            memory.long_lists if some_are_long else None,
         )
 
     def _rest(self) -> None:

@@ -22,19 +22,16 @@ def device(request):
 
 def lists_of(device, scene, cameras):
     with Rasterizer(device, scene) as rasterizer, rasterizer.prepare_set(cameras) as views:
-        starts = [offsets for offsets in views.found_offsets]
-        pictures = [rasterizer.render(camera)[0] for camera in cameras]
-        return device.download(views.intersections, (views.capacity,), np.uint32), starts, pictures
+        return device.download(views.intersections, (views.capacity,), np.uint32), views.found_offsets
 
 
-@pytest.mark.parametrize("count", [2500, 9000])
-@pytest.mark.parametrize("longest", [16, 700, 2048], ids="beyond {}".format)
+@pytest.mark.parametrize(("count", "longest"), [(2500, 16), (2500, 700), (9000, 700), (9000, 2048)])
 def test_the_same_order(device, monkeypatch, count, longest):
     """Of lists of any length: shorter than a piece, some pieces, and some that stay as they were."""
     scene = visible_scene(count, 0)
     scene = dataclasses.replace(scene, log_scales=scene.log_scales - 1)
     cameras = ring_of_cameras(3, size=40)
-    wanted, offsets, _ = lists_of(device, scene, cameras)
+    wanted, offsets = lists_of(device, scene, cameras)
     lengths = np.concatenate([np.diff(each.astype(np.int64)) for each in offsets])
     assert lengths.max() > longest
     sorted_apart = []
@@ -47,11 +44,11 @@ def test_the_same_order(device, monkeypatch, count, longest):
     monkeypatch.setattr("potr_cl.raster.preparing_memory.LongLists", Noting)
     monkeypatch.setattr(long_lists, "LONGEST", longest)
     monkeypatch.setattr(launch_gpu, "LONGEST", longest)
-    got, _, _ = lists_of(device, scene, cameras)
+    got, _ = lists_of(device, scene, cameras)
     assert sorted_apart
     assert np.array_equal(got, wanted)
     monkeypatch.setattr(long_lists, "PIECE", 64)
-    got, _, _ = lists_of(device, scene, cameras)
+    got, _ = lists_of(device, scene, cameras)
     assert np.array_equal(got, wanted)
 
 
