@@ -137,8 +137,17 @@ def test_a_view_that_sees_nothing(device, picked):
     assert np.array_equal(errors[0][1], errors[1][1])
 
 
-@pytest.mark.parametrize("way", ["colour_grid", "fix_ac", "solve"])
-@pytest.mark.parametrize("slices", [None, 256], ids=["in one piece", "in slices"])
+@pytest.mark.parametrize(
+    ("slices", "way"),
+    [
+        pytest.param(None, "colour_grid", id="in one piece, colour_grid"),
+        pytest.param(None, "fix_ac", id="in one piece, fix_ac"),
+        pytest.param(256, "solve", id="in slices, solve"),
+        pytest.param(None, "solve", id="in one piece, solve", marks=pytest.mark.slow),
+        pytest.param(256, "colour_grid", id="in slices, colour_grid", marks=pytest.mark.slow),
+        pytest.param(256, "fix_ac", id="in slices, fix_ac", marks=pytest.mark.slow),
+    ],
+)
 def test_a_solution(device, picked, way, slices, monkeypatch):
     """Of two parts of the views."""
     monkeypatch.setattr(colour_map, "ENOUGH", 4)

@@ -32,7 +32,7 @@ from potr_cl.stages.refitting.pictures_ahead import PicturesAhead
 from potr_cl.stages.refitting.placement import blocks_of, left_for_views, placed, rounding_of, vectors_of
 from potr_cl.stages.refitting.reached import reached_splats
 from potr_cl.stages.refitting.refit_options import RefitOptions, Refitted
-from potr_cl.stages.refitting.rounding import ROUNDS
+from potr_cl.stages.refitting.rounding import ROUNDS, Steps
 from potr_cl.stages.refitting.shared_map import SharedViews, colour_parts, colour_shares
 from potr_cl.stages.refitting.solver import ColourSolver, Descent, Selection, Solved
 from potr_cl.stages.refitting.targets import Targets
@@ -249,13 +249,17 @@ class ColourRefit(Owner):
         """(N, M, 3) float32 R, G, B, the solution."""
         return self.coefficients.read_sh(self._solver.x)
 
-    def round_to(self, grid: ColourGrid, targets: Targets, options: RefitOptions) -> Solved:
+    def steps_of(self, grid: ColourGrid) -> Steps:
+        """A grid as :meth:`round_to` takes it. Another thread may ask for it."""
+        return Steps.of(grid, self.coefficients.layout.stride)
+
+    def round_to(self, steps_of_splats: Steps, targets: Targets, options: RefitOptions) -> Solved:
         """Make of the solution what a file can hold, but for the last constant coefficients.
 
         :meth:`error` still knows what it was.
 
         Args:
-            grid: what the file can hold.
+            steps_of_splats: what the file can hold.
             targets, options: that the solution was found with.
 
         Returns:
@@ -270,7 +274,7 @@ class ColourRefit(Owner):
         self.coefficients.copy(self._unrounded, solver.x)
         ridge = Ridge(options.lam, options.chroma_factor, options.prior)
         worth = _WORTH * options.drop * self.colour_map.total_weight
-        with rounding_of(self.coefficients, solver.blocks, grid) as round_some:
+        with rounding_of(self.coefficients, solver.blocks, steps_of_splats) as round_some:
             *first, last = ROUNDS
             for each in first:
                 round_some(solver.x, each, worth)

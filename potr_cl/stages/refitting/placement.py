@@ -13,11 +13,10 @@ from contextlib import contextmanager
 from dataclasses import dataclass
 
 from potr_cl.opencl.device import Device
-from potr_cl.outputs.colour_grid import ColourGrid
 from potr_cl.stages.refitting.blocks import SplatBlocks
 from potr_cl.stages.refitting.coefficients import Coefficients
 from potr_cl.stages.refitting.reached import Reach
-from potr_cl.stages.refitting.rounding import Round, Rounding, SlicedRounding
+from potr_cl.stages.refitting.rounding import Round, Rounding, SlicedRounding, Steps
 from potr_cl.stages.refitting.sliced_blocks import SlicedBlocks
 from potr_cl.stages.refitting.sliced_coefficients import SlicedCoefficients
 from potr_cl.stages.refitting.vector_space import Layout, Vector, VectorSpace
@@ -153,9 +152,9 @@ def blocks_of(vectors: VectorSpace, place: Place | None) -> SplatBlocks | Sliced
 
 @contextmanager
 def rounding_of(
-    vectors: VectorSpace, blocks: SplatBlocks | SlicedBlocks, grid: ColourGrid
+    vectors: VectorSpace, blocks: SplatBlocks | SlicedBlocks, steps: Steps
 ) -> Iterator[Callable[[Vector, Round, float], None]]:
-    """The rounding of vectors where they lie, to the steps of a grid, as long as the context lasts.
+    """The rounding of vectors where they lie, to the splats' steps, as long as the context lasts.
 
     Yields:
         What rounds: called with a vector, what of it is due, and the squared error that it is worth to save an AC
@@ -165,11 +164,11 @@ def rounding_of(
         DeviceError: the device has no room, or the kernels cannot be built.
     """
     if isinstance(vectors, SlicedCoefficients) and isinstance(blocks, SlicedBlocks):
-        in_slices, its_blocks = SlicedRounding(vectors, grid), blocks
+        in_slices, its_blocks = SlicedRounding(vectors, steps), blocks
         yield lambda x, this, worth: in_slices.round(x, its_blocks, this, worth)
         return
     assert isinstance(vectors, Coefficients)
     assert isinstance(blocks, SplatBlocks)
     on_device = blocks
-    with Rounding(vectors, grid) as rounding:
+    with Rounding(vectors, steps) as rounding:
         yield lambda x, this, worth: rounding.round(x, on_device, this, worth)
