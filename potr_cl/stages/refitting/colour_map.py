@@ -120,7 +120,7 @@ class ColourMap(Owner):
         self._views_of_all = len(cameras)
         self.parts = parts_of(len(cameras))
         own_numbers = range(len(cameras)) if numbers is None else numbers
-        reach = reach or reached_splats(rasterizer, cameras, own_numbers)
+        reach = reach or reached_splats(rasterizer, cameras, own_numbers, memory)
         seen = {} if reach is None else {number: len(splats) for number, splats in reach.of.items()}
         # Launches, and what is gathered together, are of one part. Views of a launch have about as many splats.
         self._numbers = sorted(own_numbers, key=lambda each: (each % self.parts, -seen.get(each, 0), each))

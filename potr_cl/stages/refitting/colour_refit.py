@@ -127,7 +127,7 @@ class ColourRefit(Owner):
             if place is not None:
                 scene = arrived(scene)  # the host has no room for vectors beside what rounds the geometry
                 rasterizer = owned.enter_context(Rasterizer(device, colourless(scene), rules))
-                reach = reached_splats(rasterizer, cameras, range(len(cameras)))
+                reach = reached_splats(rasterizer, cameras, range(len(cameras)), memory)
                 if reach is not None:
                     place = placed(device, layout.splats, layout.sh_count, memory, slices, reach) or place
                 memory = place.views
