@@ -230,7 +230,8 @@ class SharedJudging(Owner):
         return scene if there or self._anyway else None
 
     def _lose_parts(self, error: DeviceError) -> None:
-        _log.warning("nobody else can judge (%s): %s does", error, self._device.info)
+        # What else the line says is how to mend it, which nobody has to.
+        _log.warning("nobody else can judge (%s): %s does", str(error).split(":")[0], self._device.info)
         self._parts, self._pool, self._places = None, None, {}
         self._left.close()
 

@@ -188,6 +188,11 @@ def test_photographs_are_judged_by_together(plush_excerpt, cameras, coded, tmp_p
     for kind in (HostPool, ElsewherePool):
         with kind(devices) as pool, coded.on(devices[0]) as candidate:
             assert judge_by_photographs(truth, cameras, (plush_excerpt, candidate), devices[0], pool=pool) == expected
+    alone, together = (
+        potr_cl.compare(plush_excerpt, coded.data, cameras, truth=tmp_path, device=some) for some in (device, devices)
+    )
+    assert "b_against_truth" in alone.worst.figures
+    assert together.figures == alone.figures
     assert [device.allocated for device in devices] == [0] * 2
 
 
@@ -275,3 +280,23 @@ def test_pictures_of_what_views_see(family, where, rules):
     if isinstance(drawable, SceneBuffers):
         drawable.close()
     assert device.allocated == 0
+
+
+def test_scenes_are_compared_together(plush_excerpt, cameras, coded, family, monkeypatch):
+    """Scenes of the host and scenes of files."""
+    alone = open_device(family)
+    worse = coded.output.read(coded.data)
+    expected = potr_cl.compare(plush_excerpt, coded.data, cameras, device=alone)
+    assert potr_cl.compare(plush_excerpt, worse, cameras, device=alone).figures == expected.figures
+    done = []
+    figures = JudgingPart.figures
+    monkeypatch.setattr(JudgingPart, "figures", lambda self, some: done.append(len(some)) or figures(self, some))
+    devices = [open_device(family) for _ in range(2)]
+    for a, b in ((plush_excerpt, coded.data), (plush_excerpt, worse)):
+        found = potr_cl.compare(a, b, cameras, device=devices)
+        assert found.figures == expected.figures
+        assert found.worst == expected.worst
+    assert sum(done) == 2 * 2
+    swapped = potr_cl.compare(coded.data, plush_excerpt, cameras, device=devices)
+    assert swapped.psnr == expected.psnr
+    assert [device.allocated for device in devices] == [0] * 2
