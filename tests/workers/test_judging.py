@@ -20,7 +20,7 @@ from potr_cl.quality.by_photographs import judge_by_photographs
 from potr_cl.quality.evaluator import EvaluationViews, Evaluator
 from potr_cl.quality.ground_truth import GroundTruth
 from potr_cl.quality.judging import JudgingPart
-from potr_cl.raster import culling, seen_rasterizer
+from potr_cl.raster import culling, kept_scene, seen_rasterizer
 from potr_cl.raster.kept_scene import KeptScene
 from potr_cl.raster.rasterizer import Rasterizer, render
 from potr_cl.raster.scene_buffers import SceneBuffers, uploaded
@@ -299,4 +299,18 @@ def test_scenes_are_compared_together(plush_excerpt, cameras, coded, family, mon
     assert sum(done) == 2 * 2
     swapped = potr_cl.compare(coded.data, plush_excerpt, cameras, device=devices)
     assert swapped.psnr == expected.psnr
+    assert [device.allocated for device in devices] == [0] * 2
+
+
+def test_a_ladder_keeps_the_scene_on_the_devices(plush_excerpt, cameras, tmp_path, monkeypatch):
+    options = EncodeOptions.for_preset("fast", prune={"iterations": 2}, between=False)
+    expected = potr_cl.encode_ladder(plush_excerpt, tmp_path / "alone", "0.2,0.4", cameras, options)
+    sent = []
+    upload = kept_scene.uploaded
+    monkeypatch.setattr(kept_scene, "uploaded", lambda device, scene: sent.append(device) or upload(device, scene))
+    devices = [open_device("cpu") for _ in range(2)]
+    found = potr_cl.encode_ladder(plush_excerpt, tmp_path / "together", "0.2,0.4", cameras, options, device=devices)
+    assert found.rungs == expected.rungs
+    assert set(sent) == set(devices)
+    assert len(sent) == 2
     assert [device.allocated for device in devices] == [0] * 2
