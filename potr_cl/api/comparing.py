@@ -162,7 +162,7 @@ def compare(
     cameras: CamerasSource | None = None,
     *,
     truth: str | os.PathLike[str] | None = None,
-    views: Sequence[str | int] | None = None,
+    views: Sequence[str | int] | str | int | None = None,
     split: str | None = None,
     virtual_views: int | None = None,
     turntable: int | None = None,

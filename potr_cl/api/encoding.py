@@ -238,6 +238,8 @@ def encode_options(
     changes = {name: value for name, value in changes.items() if value is not None} | stage_changes(choices, stages)
     if options is None:
         options = EncodeOptions.for_preset(preset or DEFAULT, **changes)
+    elif not isinstance(options, EncodeOptions):
+        raise UsageError(f"the options are an EncodeOptions, not {type(options).__name__}: give a quality as q=0.5")
     elif preset is not None:
         raise UsageError("give either options or a preset: the options have one")
     else:

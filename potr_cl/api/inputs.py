@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import os
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from pathlib import Path
 from typing import TYPE_CHECKING, Any, TypeAlias
@@ -46,10 +46,11 @@ def scene_of(source: SceneSource, trust: bool = False, antialiased: bool | None 
         trust, antialiased: as of :func:`potr_cl.formats.load_scene`.
 
     Raises:
-        UsageError, DataError: as :func:`potr_cl.formats.load_scene`.
+        UsageError, DataError: as :func:`potr_cl.formats.load_scene`; and a scene in memory has no splats, or some with
+            non-finite values.
     """
     if isinstance(source, Scene):
-        return source.rendered(antialiased)
+        return _usable(source).rendered(antialiased)
     data = encoded_bytes(source)
     if data is not None:
         return decode(data, **_trusting(trust)).rendered(antialiased)
@@ -61,6 +62,17 @@ def scene_of(source: SceneSource, trust: bool = False, antialiased: bool | None 
 
         return load_scene(source, **_trusting(trust)).rendered(antialiased)
     raise UsageError(f"a scene is wanted, or the path of its file, not {type(source).__name__}")
+
+
+def _usable(scene: Scene) -> Scene:
+    """A scene in memory, which nobody may have cleaned; mended where no splat has to go, so that numbers stay right."""
+    if not len(scene):
+        raise DataError("the scene holds no splat")
+    clean, report = scene.cleaned()
+    if report.non_finite:
+        many = f"{report.non_finite:,} splats" if report.non_finite > 1 else "a splat"
+        raise DataError(f"the scene holds {many} with non-finite values: give scene.cleaned()[0], which is without")
+    return clean
 
 
 @contextmanager
@@ -184,8 +196,8 @@ def encoded_bytes(source: object) -> bytes | None:
 
 def encoded_file(source: object) -> tuple[str, bytes] | None:
     """The usual suffix and the bytes of what an encode has made, or of a .potr file's bytes; None for anything else."""
-    if isinstance(source, bytes):
-        return ".potr", source
+    if isinstance(source, (bytes, bytearray, memoryview)):
+        return ".potr", bytes(source)
     # Asked by name: what makes an encode's result takes long to import, and is there if there is one.
     pieces = getattr(source, "pieces", None)
     if not isinstance(pieces, list):
@@ -213,10 +225,14 @@ def cameras_of(source: CamerasSource | None, virtual_views: int | None = None) -
         from potr_cl.formats import load_cameras
 
         return load_cameras(source)
-    cameras = list(source)
+    given: object = source  # in notebooks it may be anything
+    cameras = list(given) if isinstance(given, Iterable) else [given]
     if not cameras:
         raise UsageError("the list of cameras is empty: leave it out, and virtual ones are placed")
-    return cameras
+    for camera in cameras:
+        if not isinstance(camera, Camera):
+            raise UsageError(f"cameras are wanted, or the path of their file, not {type(camera).__name__}")
+    return [camera for camera in cameras if isinstance(camera, Camera)]
 
 
 def placed_beside_cameras(option: str) -> UsageError:
@@ -284,12 +300,13 @@ def name_of(source: SceneSource) -> Path:
 
 
 def chosen_views(
-    cameras: Sequence[Camera], views: Sequence[str | int] | None = None, split: str | None = None
+    cameras: Sequence[Camera], views: Sequence[str | int] | str | int | None = None, split: str | None = None
 ) -> list[Camera]:
     """The views that are asked for by name or by split; without either the test views, or all if there are none.
 
     Args:
-        views: names, or indices from 0 in the cameras' order; a view that is named like a number is that view.
+        views: names, or indices from 0 in the cameras' order, or one of these; a view that is named like a number is
+            that view.
         split: "train", "test" or "all".
 
     Raises:
@@ -298,6 +315,7 @@ def chosen_views(
     if views is not None and split is not None:
         raise UsageError("give either views or a split")
     if views is not None:
+        views = [views] if isinstance(views, (str, int)) else views
         by_name = {camera.name: camera for camera in cameras}
         by_name = {str(index): camera for index, camera in enumerate(cameras)} | by_name
         for name in map(str, views):

@@ -138,9 +138,10 @@ def _encode(args: argparse.Namespace) -> None:
 
 
 def _opened(args: argparse.Namespace) -> Workers:
-    """What computes; the device begins to load what the last encode with this preset has needed."""
+    """What computes; the devices begin to load what the last encode with this preset has needed."""
     workers = open_workers(args.device, args.cluster)
-    workers.device.prepare_for(f"encode {args.preset}")
+    for device in workers.devices:
+        device.prepare_for(f"encode {args.preset}")
     return workers
 
 

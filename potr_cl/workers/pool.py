@@ -100,9 +100,15 @@ class Shared:
 
     Attributes:
         handle: by which the pool knows it.
+        part: what of it a worker uses: its method ``subset`` is given this there. None: all of it.
     """
 
     handle: Any
+    part: Any = None
+
+    def of(self, thing: Any) -> Any:
+        """What a worker uses of the thing that this stands for."""
+        return thing if self.part is None else thing.subset(self.part)
 
 
 @dataclass

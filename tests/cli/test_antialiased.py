@@ -92,7 +92,8 @@ def test_info_shows_it(tmp_path, paths, capsys):
 
 def test_encode_is_judged_as_the_scene_is_rendered(tmp_path, paths, capsys):
     plain, _, cameras = paths
-    run("encode", plain, "-o", tmp_path / "a.potr", "--cameras", cameras, "--json", "--antialiased", "yes")
+    few = ["--preset", "fast", "--iterations", 4]
+    run("encode", plain, "-o", tmp_path / "a.potr", "--cameras", cameras, *few, "--json", "--antialiased", "yes")
     report = json.loads(capsys.readouterr().out)
     assert report["source"]["antialiased"] is True
     said = report["quality"]["psnr"]

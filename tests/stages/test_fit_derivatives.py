@@ -14,6 +14,7 @@ from potr_cl.reference.derivatives import gradient
 from potr_cl.reference.scenes import plain_splats, ring_of_cameras, straight_camera, tilted_camera, visible_scene
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
+from tests.cases.kinds_of_scenes import KINDS_OF_SCENES
 from tests.devices import KERNELS, open_device
 
 BACKGROUND = (0.3, 0.6, 0.1)
@@ -62,9 +63,7 @@ def agree(found, exact, tolerance=1e-4):
         assert error < tolerance * np.linalg.norm(array), f"{name}: {error / np.linalg.norm(array):.1e}"
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("rules", [INRIA, GSPLAT], ids=["inria", "gsplat"])
+@pytest.mark.parametrize(("rules", "antialiased", "degree"), KINDS_OF_SCENES)
 def test_every_kind_of_parameter(device, degree, antialiased, rules):
     """Some splats are capped, some colours cut at 0, one splat behind a camera, one transparent. Views differ in size,
     and do not end where tiles do."""

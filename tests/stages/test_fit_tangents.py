@@ -14,6 +14,7 @@ from potr_cl.reference.scenes import ring_of_cameras, tilted_camera, visible_sce
 from potr_cl.stages.compaction.view_weights import REFERENCE_PIXELS
 from potr_cl.stages.fitting.derivatives import PictureDerivatives
 from potr_cl.stages.fitting.tangents import PictureTangents
+from tests.cases.kinds_of_scenes import KINDS_OF_SCENES
 from tests.devices import KERNELS, open_device
 
 BACKGROUND = (0.3, 0.6, 0.1)
@@ -98,9 +99,7 @@ def moved(scene, direction, by):
     return result
 
 
-@pytest.mark.parametrize("degree", [0, 1, 2, 3])
-@pytest.mark.parametrize("antialiased", [False, True])
-@pytest.mark.parametrize("rules", [INRIA, GSPLAT], ids=["inria", "gsplat"])
+@pytest.mark.parametrize(("rules", "antialiased", "degree"), KINDS_OF_SCENES)
 def test_central_differences_of_pictures(device, degree, antialiased, rules):
     """Of the float64 renderer; pixels in which something switches between the two pictures are left out, few."""
     scene, cameras = scene_and_views(degree, antialiased)

@@ -50,20 +50,28 @@ def few(cameras, size=80):
     ]  # fmt: skip
 
 
+#: Ways of :func:`test_the_same_bytes` that are tried in the quick subset: each family once.
+QUICK = {("cpu", "nothing is kept of any view", 3), ("gpu", "a GPU decides itself", 3)}
+
+
 @pytest.fixture(scope="module", params=FAMILIES)
 def family(request):
     return request.param
 
 
 @pytest.mark.parametrize(
-    "options",
+    ("family", "options", "count"),
     [
-        pytest.param(OPTIONS, marks=pytest.mark.slow),
-        OPTIONS.changed(memory=0),  # nothing is kept of any view
-        OPTIONS.changed(prune={"keep": None}),  # a GPU decides itself
+        pytest.param(family, options, count, marks=() if (family, name, count) in QUICK else pytest.mark.slow)
+        for family in FAMILIES
+        for count in (2, 3)
+        for name, options in {
+            "by number": OPTIONS,
+            "nothing is kept of any view": OPTIONS.changed(memory=0),
+            "a GPU decides itself": OPTIONS.changed(prune={"keep": None}),
+        }.items()
     ],
 )
-@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 3])
 def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options, count):
     cameras = few(plush_excerpt_cameras)
     alone = open_device(family)
@@ -80,7 +88,10 @@ def test_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, options, c
     assert [device.allocated for device in devices] == [0] * count
 
 
-def test_steps_by_a_part_of_the_views_give_the_same_bytes(plush_excerpt, plush_excerpt_cameras, family, monkeypatch):
+@pytest.mark.parametrize("count", [pytest.param(2, marks=pytest.mark.slow), 4])
+def test_steps_by_a_part_of_the_views_give_the_same_bytes(
+    plush_excerpt, plush_excerpt_cameras, family, count, monkeypatch
+):
     """Every device knows which of its views these are, and whether there are any."""
     cameras = few(plush_excerpt_cameras)
     options = OPTIONS.changed(prune={"iterations": 2}, compact=False)
@@ -88,10 +99,9 @@ def test_steps_by_a_part_of_the_views_give_the_same_bytes(plush_excerpt, plush_e
     monkeypatch.setattr("potr_cl.stages.refitting.colour_map.ENOUGH", 2)
     expected = encode(plush_excerpt, cameras, options, device=open_device(family)).data
     assert expected != every
-    for count in (2, 4):
-        devices = [open_device(family) for _ in range(count)]
-        with HostPool(devices) as pool:
-            assert encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).data == expected
+    devices = [open_device(family) for _ in range(count)]
+    with HostPool(devices) as pool:
+        assert encode(plush_excerpt, cameras, options, device=devices[0], pool=pool).data == expected
 
 
 def test_pictures_are_rendered_ahead_by_the_device_that_needs_them(plush_excerpt, plush_excerpt_cameras, monkeypatch):

@@ -58,7 +58,8 @@ def array_fields(scene):
 @pytest.mark.parametrize(
     "options",
     [
-        OPTIONS,
+        # The host decides, as it does on a CPU whatever the options.
+        pytest.param(OPTIONS, marks=pytest.mark.slow),
         # Nothing is kept of any view; tests/workers/test_host.py has that without slow ones.
         pytest.param(OPTIONS.changed(memory=0, prune={"tolerance": 0.0}), marks=pytest.mark.slow),
         OPTIONS.changed(prune={"keep": None}),  # a GPU decides itself, and what nobody sees stays
@@ -93,6 +94,21 @@ def test_the_same_bytes(family, options, monkeypatch):
         constant = 2 * 56 * len(scene)
         assert pool.scenes < sum(made[:3]) * scene.nbytes / len(scene) + constant
     assert [device.allocated for device in devices] == [0] * 4
+
+
+def test_the_uncompressed_scene_travels_once(family, monkeypatch):
+    """Where workers get all of it: of what is pruned, once unseen splats are set aside, they get the numbers."""
+    monkeypatch.setattr(visible_parts, "LEAST_SPLATS", 1 << 40)
+    scene, cameras = street(5, 500, across=True)
+    scene = with_a_house_that_nobody_sees(scene)
+    options = OPTIONS.changed(prune={"keep": None}, refit={"at": ()})
+    devices = [open_device(family) for _ in range(3)]
+    expected = encode(scene, cameras, options, device=devices[0])
+    assert expected.unseen.splats > 100
+    with ElsewherePool(devices) as pool:
+        assert encode(scene, cameras, options, device=devices[0], pool=pool).data == expected.data
+        constant = 56 * len(scene)
+        assert pool.scenes < scene.nbytes + constant
 
 
 @pytest.mark.parametrize("keep", [0.4, None])

@@ -5,7 +5,8 @@
 An index shows the README away from its repository. So in a copy of the tracked files the links of the README become
 absolute, to the tag of this version, and pyproject.toml gets the project's URLs; from that copy both are built. Then
 ``twine check --strict`` and ``check-wheel-contents`` look at them, and what may not be in them is looked for: relative
-links, and anything of scenes that are not free. Needs the extra ``release``; git tells which files are tracked.
+links, and anything of scenes that are not free. The sdist must have every tracked file, so that the tests run from it.
+Needs the extra ``release``; git tells which files are tracked.
 """
 
 from __future__ import annotations
@@ -17,6 +18,7 @@ import sys
 import tarfile
 import tempfile
 import zipfile
+from collections.abc import Sequence
 from pathlib import Path
 
 from potr_cl import __version__
@@ -34,7 +36,8 @@ def main() -> None:
     with tempfile.TemporaryDirectory() as folder:
         copy = Path(folder)
         listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, check=True).stdout
-        for name in filter(None, listed.decode().split("\0")):
+        tracked = [name for name in listed.decode().split("\0") if name]
+        for name in tracked:
             (copy / name).parent.mkdir(parents=True, exist_ok=True)
             (copy / name).write_bytes((ROOT / name).read_bytes())
         readme, project = copy / "README.md", copy / "pyproject.toml"
@@ -48,8 +51,11 @@ def main() -> None:
     _run("twine", "check", "--strict", str(wheel), str(sdist))
     _run("check_wheel_contents", str(wheel))
     with zipfile.ZipFile(wheel) as contents, tarfile.open(sdist) as source:
-        names = [*contents.namelist(), *source.getnames()]
+        members = source.getnames()
+        names = [*contents.namelist(), *members]
         shown = contents.read(f"{stem}.dist-info/METADATA").decode()
+    if missing := left_out(tracked, members):
+        sys.exit(f"the sdist lacks {', '.join(missing)}: add them to MANIFEST.in")
     unfree = [name for name in names if "lego" in name.lower()]
     left = relative_links(shown.partition("\n\n")[2])
     if unfree or left:
@@ -91,6 +97,12 @@ def with_urls(project: str, url: str) -> str:
     }
     lines = "".join(f'{name} = "{each}"\n' for name, each in urls.items())
     return project.replace("[project.scripts]\n", f"[project.urls]\n{lines}\n[project.scripts]\n")
+
+
+def left_out(tracked: Sequence[str], members: Sequence[str]) -> list[str]:
+    """Tracked files that an sdist lacks, whose members all lie in one folder; git's own do not count."""
+    found = {member.partition("/")[2] for member in members}
+    return [name for name in tracked if name not in found and Path(name).name != ".gitignore"]
 
 
 def _run(module: str, *arguments: str) -> None:
