@@ -86,7 +86,9 @@ def expected(scene, cameras, device):
 def test_the_same_bytes(workers, scene, cameras, device, expected):
     with local_cluster(workers) as cluster:
         with ClusterPool(cluster.scheduler_address, device) as pool:
+            assert not pool.has(scene)
             found = encode(scene, cameras, OPTIONS, device=device, pool=pool)
+            assert pool.has(scene)  # to judge by
             again = encode(scene, cameras, OPTIONS, device=device, pool=pool)
         assert found.data == again.data == expected
         assert found.shared is not None
