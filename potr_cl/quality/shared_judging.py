@@ -71,9 +71,9 @@ class SharedJudging(Owner):
         if isinstance(reference, KeptScene):
             here = reference.drawable(device, reference.scene)
             there = isinstance(here, SceneBuffers)
-            # What is not kept there takes too much of what the user allows.
+            large = reference.is_large_for(device)
             self._groups = groups_worth_it(
-                device, reference.scene, views, looks.rules.near, there, not there, reference.groups
+                device, reference.scene, views, looks.rules.near, there, large, reference.groups
             )
         else:
             here = reference
